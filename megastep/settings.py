@@ -32,6 +32,7 @@ __all__ = [
     "closest",
     "frozen",
     "located",
+    "parameters_of",
     "sentence",
     "settings_class",
     "settings_of",
@@ -109,24 +110,53 @@ def arguments_of(
     An argument without an annotation has the type of its default.
 
     Args:
-        constructor: the class or function.
+        constructor: the class or function, with the arguments of `parameters_of`.
         reserved: arguments to leave out.
         missing: defaults for arguments that may have none.
         more: fields to add: a type, or (type, default).
     """
-    function = constructor.__init__ if inspect.isclass(constructor) else constructor
     fields = {name: f if isinstance(f, tuple) else (f,) for name, f in more.items()}
-    hints = typing.get_type_hints(function, include_extras=True)
-    for name, argument in inspect.signature(constructor).parameters.items():
-        if name in reserved or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
-            continue
-        if name in more:
-            raise ValueError(f"none of its arguments can be called {name}")
-        default = argument.default
-        if default is inspect.Parameter.empty:
-            default = (missing or {}).get(name, default)
-        fields[name] = _field(hints.get(name), default)
+    for function, arguments in _signatures(constructor):
+        hints = typing.get_type_hints(function, include_extras=True)
+        for name, argument in arguments.items():
+            if name in reserved or (name in fields and name not in more):
+                continue
+            if name in more:
+                raise ValueError(f"none of its arguments can be called {name}")
+            default = argument.default
+            if default is inspect.Parameter.empty:
+                default = (missing or {}).get(name, default)
+            fields[name] = _field(hints.get(name), default)
     return constructor.__name__, fields
+
+
+def parameters_of(constructor: Callable) -> dict[str, inspect.Parameter]:
+    """Returns the named arguments of a class or function. If a class takes `**kwargs`, those of its
+    base class are among them.
+    """
+    found = {}
+    for _, arguments in _signatures(constructor):
+        found = {**found, **{k: one for k, one in arguments.items() if k not in found}}
+    return found
+
+
+def _signatures(constructor):
+    """Yields (function, {name: parameter}) of a class or function, and of the base classes that its
+    `**kwargs` go to.
+    """
+    bases = constructor.__mro__[1:-1] if inspect.isclass(constructor) else ()
+    for one in (constructor, *(base for base in bases if "__init__" in vars(base))):
+        try:
+            arguments = inspect.signature(one).parameters
+        except ValueError:  # of a built-in class
+            if one is constructor:
+                raise
+            return
+        kinds = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+        named = {name: a for name, a in arguments.items() if a.kind not in kinds}
+        yield (one.__init__ if inspect.isclass(one) else one), named
+        if not any(a.kind is a.VAR_KEYWORD for a in arguments.values()):
+            return
 
 
 def settings_class(name: str, fields: Mapping[str, tuple]) -> type:

@@ -16,6 +16,7 @@ import torch
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.utils import JobRuntime
 
+from megastep.agents.cli import blocks
 from tests.helpers.in_this_process import InThisProcess
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -50,7 +51,8 @@ def composed_once():
         folders = [path for path in paths if not path.startswith(("pkg://", "structured://"))]
         if [Path(folder).resolve() for folder in folders] != [CONFIGS]:
             return method(loader, *arguments, **options)
-        key = str((method, JobRuntime.instance().get("name"), arguments, options))
+        name = JobRuntime.instance().get("name")
+        key = str((method, name, arguments, options, blocks.applied))
         if key not in cached:
             cached[key] = method(loader, *arguments, **options)
         return copy.deepcopy(cached[key])

@@ -118,6 +118,8 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
                 return sweeps.sweep(composer, words)
             if team is None and (settings.device != "auto" or gpu.is_available()):
                 gpu.wake(settings.device)  # beside the imports of what runs
+            if composer.note:
+                console.say(composer.note)
             script.run(settings)
     return 0
 

@@ -1,8 +1,8 @@
 """The words of a command line -> Hydra -> checked settings, before anything is written.
 
-Only Hydra's public API is used: its grammar reads the words, `hydra.compose` composes the groups,
-and keys are set in what comes out, so that every error has its own word. Jobs of sweeps compose in
-the same way, in whichever process they run.
+Only Hydra's public API is used: its grammar reads the words, `hydra.compose` composes the groups
+from files with their `blocks`, and keys are set in what comes out, so that every error has its own
+word. Jobs of sweeps compose in the same way, in whichever process they run.
 """
 
 import copy
@@ -24,10 +24,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from megastep.agents import package
+from megastep.agents.cli import blocks
 from megastep.agents.cli.scripts import Script
 from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory import check, settings
-from megastep.agents.launch import gpu
 from megastep.settings import closest
 
 #: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
@@ -47,8 +47,6 @@ OPEN = {
 }
 #: What Hydra raises for words that it cannot use.
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
-#: Words that choose a preset, or add folders with files that may.
-NOT_OURS = ("preset=", "+preset=", "++preset=", "hydra.searchpath")
 STORE = config_store.ConfigStore.instance()
 # Hydra copies its sources of files time and again, and in them this one, which took a third of a
 # second: there is only one
@@ -77,16 +75,19 @@ class Composer:
         name: another file than the script's own.
         folder: a folder whose files and groups are found beside ours.
         main: a folder in place of ours.
+
+    Attributes:
+        note: a sentence on what a learner of the user has from our files, if it has anything.
     """
 
     def __init__(
         self, script: Script, name: str | None = None, folder: str | None = None, main: Any = None
     ):
         self.script, self.name, self.folder = script, name or script.name, folder
-        self.main = os.path.abspath(main or check.CONFIGS)
+        self.main = os.path.abspath(main or package.CONFIGS)
         if absent := [p for p in (folder, self.main) if p and not os.path.isdir(p)]:
             raise UserError(f"There is no folder {absent[0]} with configurations")
-        self.has_our_presets = (self.name, folder, main) == ("train", None, None)
+        self.note = ""
         FolderOfUser.path = folder and os.path.abspath(folder)
         plugins.Plugins.instance().register(FolderOfUser)
         global_hydra.GlobalHydra.instance().clear()
@@ -98,7 +99,8 @@ class Composer:
 
     def groups(self) -> dict[str, list[str]]:
         """Returns {group: members} of the groups to choose from."""
-        names = {group for group in self.composed().hydra.runtime.choices if "/" not in group}
+        choices = self.composed(device="cpu").hydra.runtime.choices
+        names = {group for group in choices if "/" not in group}
         names |= {*self.loader.list_groups("")} if self.folder else set()
         # import paths that were given in this process are members too
         files = {name: [m for m in self.members(name) if ":" not in m] for name in sorted(names)}
@@ -154,6 +156,7 @@ class Composer:
             errors += settings.missing_sources(tree)
             chosen = check.check(self.script.kind, tree, groups + self.loader.list_groups(""))
             errors += settings.ignored_geometry(chosen.env, typed)
+            self.note = blocks.note(config, typed)
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))
         except ConfigErrors as error:
@@ -201,7 +204,10 @@ class Composer:
             elif group in settings.IMPORTED and all(map(is_import_path, others)):
                 for name in others:
                     node = {"name": name}
-                    node = {settings.label(name): node} if group == "logger" else node
+                    if group == "logger":
+                        node = {settings.label(name): node}
+                    elif group == "learner":  # it has the file of the one that it derives from
+                        node["defaults"] = [blocks.built_in(name), "_self_"]
                     STORE.store(group=group, name=name, node=node)
                 groups.append(override.input_line)
             else:
@@ -211,8 +217,12 @@ class Composer:
                     hint = f"is not installed: pip install '{package.DISTRIBUTION}[sweep]'"
                 errors.append((key, f"{shortened(repr(unknown))} {hint}"))
         try:
-            device = str(keys["device"].value()) if "device" in keys else None
-            config = copy.deepcopy(self.composed(*groups, device=device))
+            device, learner = (
+                str(keys[key].value()) if key in keys else None
+                for key in ("device", "learner.name")
+            )
+            config = copy.deepcopy(self.composed(*groups, device=device, learner=learner))
+            blocks.fit(config, learner)
         except HYDRA_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
@@ -233,15 +243,19 @@ class Composer:
                 errors.append((key, str(error).partition("\n")[0]))
         return config, errors
 
-    def _composed(self, *groups: str, device: str | None = None) -> DictConfig:
-        # preset=auto stands for gpu or cpu, by the device of the process that composes. It is the
-        # default in train.yaml and no other file of ours, so this often saves composing twice
-        if self.has_our_presets and not any(one.startswith(NOT_OURS) for one in groups):
-            groups = *groups, preset_for(device)
-        config = hydra.compose(self.name, [*groups], return_hydra_config=True)
-        if config.hydra.runtime.choices.get("preset") == "auto":
-            groups = *groups, preset_for(device or config.get("device"))
-            config = hydra.compose(self.name, [*groups], return_hydra_config=True)
+    def _composed(
+        self, *groups: str, device: str | None = None, learner: str | None = None
+    ) -> DictConfig:
+        # with the blocks of what is typed, and once more if files choose another device or learner
+        typed = dict(word.lstrip("+").split("=", 1) for word in groups if "=" in word)
+        blocks.apply(device or "auto", learner or typed.get("learner"))
+        composed = functools.partial(hydra.compose, self.name, [*groups], return_hydra_config=True)
+        config, before = composed(), dict(blocks.applied)
+        blocks.apply(
+            device or config.get("device"), learner or OmegaConf.select(config, "learner.name")
+        )
+        if blocks.applied != before:
+            config = composed()
         OmegaConf.set_struct(config, False)
         return config
 
@@ -252,10 +266,6 @@ class Composer:
         hydra.main(config_path=self.main, config_name=self.name, version_base="1.3")(
             task or self.script.run
         )()
-
-
-def preset_for(device: str | None) -> str:
-    return "preset=gpu" if device != "cpu" and gpu.is_available() else "preset=cpu"
 
 
 def key_of(override: types.Override) -> str:

@@ -43,7 +43,7 @@ The most common words:
   experiment=quickstart        the recipe of `make train`: train, evaluate on unseen homes, film
   env=minimal geometry=box     another environment, other homes
   seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
-  preset=gpu env.n_envs=256    the sizes for a GPU, or your own
+  env.n_envs=256 device=cpu    another size, another device
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
                                learner.buffer=replay also learns from old experience
@@ -246,12 +246,21 @@ def check_run(cfg: settings.Evaluate | settings.Record) -> None:
         folders.find(cfg.run)
 
 
+def without_training(tree: Tree, typed: list[str]) -> Tree:
+    """Returns the tree without what files, such as environments', set for training alone."""
+    train, played = ({*kind.__pydantic_fields__} for kind in (settings.Train, settings.Played))
+    absent = train - played - {key.split(".")[0] for key in typed}
+    return {key: value for key, value in tree.items() if key not in absent}
+
+
 def names_in_list(word: str) -> str:
     """Returns `against=a,b` as the list that it means here, not the sweep that it is to Hydra."""
     return re.sub(r"^against=(?!\[|null$)(.*)", r"against=[\1]", word)
 
 
 TRAIN = Script("train", settings.Train, TRAIN_HELP, check_training, prepare_training)
-EVALUATE = Script("evaluate", settings.Evaluate, EVALUATE_HELP, check_run, reword=names_in_list)
-RECORD = Script("record", settings.Record, RECORD_HELP, check_run)
+EVALUATE = Script(
+    "evaluate", settings.Evaluate, EVALUATE_HELP, check_run, without_training, names_in_list
+)
+RECORD = Script("record", settings.Record, RECORD_HELP, check_run, without_training)
 SCRIPTS = {script.name: script for script in (TRAIN, EVALUATE, RECORD)}

@@ -189,7 +189,7 @@ def new_job(composer: Composer, folder: Path) -> "Job":
 class Job:
     """Runs one job, in whichever process a launcher starts, and records what became of it.
 
-    It is what Hydra's main calls. Composes again, since `preset=auto` depends on the machine.
+    It is what Hydra's main calls. Composes again, as the machine may have another device.
 
     Attributes:
         source: the script's name, and the other arguments of the Composer.
@@ -257,7 +257,10 @@ class Job:
             self.record(row)
             try:
                 with signals.interrupting():
-                    cfg = self.composer().settings(words)
+                    composer = self.composer()
+                    cfg = composer.settings(words)
+                    if composer.note:
+                        console.say(composer.note)
                     cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
                     grouped = {
                         label: settings.changed(one, group=Path(self.folder).name)

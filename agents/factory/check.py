@@ -7,12 +7,10 @@ import json
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from megastep.agents.errors import ConfigErrors
-from megastep.agents.factory import settings
-from megastep.agents.package import CONFIGS
+from megastep.agents.factory import components, settings
 from megastep.settings import sentence
 
 Tree = dict[str, Any]
@@ -93,8 +91,7 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
 
 def _unknown(path: list[str], keys: list[str]) -> str:
     group, leaf = path[0], path[-1]
-    for file in (CONFIGS / group).glob("*.yaml") if group in settings.IMPORTED else ():
-        name = yaml.safe_load(file.read_text())["name"]
+    for member, name in components.members(group).items() if group in settings.IMPORTED else ():
         if path[1:] == [leaf] and leaf in settings.kind_of(group, name).__pydantic_fields__:
-            return f"no such key here; {group}={file.stem} has it"
+            return f"no such key here; {group}={member} has it"
     return f"no such key; {closest_key('.'.join(path), keys)}"

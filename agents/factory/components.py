@@ -22,7 +22,7 @@ import megastep
 from megastep import cache
 from megastep.agents import package
 from megastep.imports import import_object
-from megastep.settings import arguments_of
+from megastep.settings import arguments_of, parameters_of
 
 POLICY = "megastep.agents.networks.policy:Policy"
 FILES = "megastep.geometries.sources:files"
@@ -80,15 +80,10 @@ def read() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str
     the environments that take floor plans.
     """
     names = [("agent", POLICY), ("opponents", OPPONENTS)]
-    for path in package.CONFIGS.glob("*/*.yaml"):
-        tree = yaml.safe_load(path.read_text()) or {}
-        names.append((path.parent.name, str(tree.get("name"))))
+    for group in ARGUMENTS:
+        paths = members(group).values()
+        names += [(group, path) for path in paths if path.startswith("megastep.")]
     names += [("logger", path) for path in _loggers()]
-    names = [
-        (group, name)
-        for group, name in names
-        if group in ARGUMENTS and name.startswith("megastep.")
-    ]
     arguments = {
         (group, name): arguments_of(import_object(name), **ARGUMENTS[group])
         for group, name in names
@@ -105,8 +100,19 @@ def _loggers():
                 yield f"{file.name}:{name}"
 
 
+@functools.cache
+def members(group: str) -> dict[str, str]:
+    """Returns {member: its `name`} of the files of a group that name a component."""
+    trees = {
+        path.stem: yaml.safe_load(path.read_text()) or {}
+        for path in sorted((package.CONFIGS / group).glob("*.yaml"))
+    }
+    trees = {member: tree.get(group, tree) for member, tree in trees.items()}
+    return {member: tree["name"] for member, tree in trees.items() if "name" in tree}
+
+
 def _takes_geometries(env):
-    return "geometries" in inspect.signature(import_object(env)).parameters
+    return "geometries" in parameters_of(import_object(env))
 
 
 def _sources():

@@ -31,6 +31,7 @@ from megastep.agents.training import loggers
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.capture import state_tree
 from megastep.imports import import_object
+from megastep.settings import parameters_of
 from megastep.types import n_lanes, optional
 
 #: Number of environments in which the memory of one is measured.
@@ -57,13 +58,28 @@ errors = functools.partial(user_errors, kinds=KINDS)
 def construct(settings: Any, constructor: Callable | None = None, **arguments: Any) -> Any:
     """Calls a class or function with those of the settings and arguments that it takes.
 
+    A setting that a class passes on to its base class as one of its `**kwargs` is left out if it
+    has the default there: a class may fix one.
+
     Args:
         constructor: default: the one at the import path in `settings.name`.
     """
     with errors():
         constructor = constructor or import_object(settings.name)
-        taken = inspect.signature(constructor).parameters
-        return constructor(**{k: v for k, v in (vars(settings) | arguments).items() if k in taken})
+        taken, own = parameters_of(constructor), inspect.signature(constructor).parameters
+        values = {
+            key: value
+            for key, value in vars(settings).items()
+            if key in own or (key in taken and value != taken[key].default)
+        }
+        values |= {key: value for key, value in arguments.items() if key in taken}
+        try:
+            return constructor(**values)
+        except TypeError as error:
+            if "multiple values" not in str(error):
+                raise
+            cure = "an argument that it sets itself belongs in its own signature"
+            raise ValueError(f"{settings.name} cannot be made: {error}; {cure}") from error
 
 
 def make_device(name: str, index: int | None = None) -> torch.device:

@@ -18,7 +18,15 @@ from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_
 
 from megastep.agents.factory import components
 from megastep.imports import import_object
-from megastep.settings import AtMost, closest, frozen, located, settings_class, settings_of
+from megastep.settings import (
+    AtMost,
+    closest,
+    frozen,
+    located,
+    parameters_of,
+    settings_class,
+    settings_of,
+)
 
 
 def _device(name: str) -> str:
@@ -76,7 +84,7 @@ def kind_of(group: str, name: str) -> type:
         return settings_class(*components.built_in()[group, name])
     constructor, spec = import_object(name), components.ARGUMENTS[group]
     try:
-        taken = inspect.signature(constructor).parameters
+        taken = parameters_of(constructor)
         if missing := [f"{k}, {text}" for k, text in IMPORTED[group].items() if k not in taken]:
             raise ValueError(f"it takes no {missing[0]}")
         methods = METHODS.get(group, ()) if inspect.isclass(constructor) else ()

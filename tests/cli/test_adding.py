@@ -14,6 +14,7 @@ import textwrap
 
 import pytest
 
+from megastep.agents import package
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.factory.settings import kind_of
 from megastep.agents.runs import checkpoint, folders
@@ -149,10 +150,8 @@ def test_custom_environment(outside, capsys):
 
 def test_custom_environment_with_a_config_file(outside, monkeypatch, tmp_path):
     """configs/env/counter.yaml holds the import path and differences from the defaults."""
-    from megastep.agents.factory import check
-
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
-    monkeypatch.setattr(check, "CONFIGS", tmp_path / "configs")
+    monkeypatch.setattr(package, "CONFIGS", tmp_path / "configs")
     yaml = "name: counter:Counter\nlimit: 4\n"
     add(outside, "environment", {"counter.py": COUNTER, "configs/env/counter.yaml": yaml})
     assert train.main(["env=counter", *RUN]) == 0

@@ -12,8 +12,9 @@ from megastep.agents.cli import scripts, sweeps, train
 from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import components
-from megastep.agents.factory.check import CONFIGS, as_tree, check
+from megastep.agents.factory.check import as_tree, check, leaves
 from megastep.agents.factory.settings import IMPORTED, Agent, Train, kind_of, label, loggers
+from megastep.agents.package import CONFIGS
 from megastep.geometries import sources
 from tests.helpers.tiny import changed
 from tests.helpers.tiny import settings as compose
@@ -33,92 +34,72 @@ MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
 def test_every_group_member_composes():
     groups = Composer(scripts.TRAIN).groups()
     parts = {"env", "geometry", "agent", "learner", "curriculum", "logger"}
-    assert set(groups) == parts | {"preset", "experiment"}
+    assert set(groups) == parts | {"experiment"}
     assert set(groups["env"]) == set(envs.ENVS)
     assert set(groups["geometry"]) == set(geometries.SOURCES)
     for choice in [f"{group}={member}" for group in groups for member in groups[group]]:
         assert isinstance(compose(choice, *MORE.get(choice, ())), Train)
 
 
-def leaves(tree, prefix=""):
-    """Returns {dotted key: value} of nested dicts."""
-    pairs = {}
-    for key, value in tree.items():
-        nested = leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {}
-        pairs |= nested or {prefix + key: value}
-    return pairs
+#: The names of blocks, the last of which wins.
+BLOCKS = "cpu", "gpu", "ppo", "vtrace", "r2d2"
 
 
-#: Groups whose files are part of another.
-PACKAGES = {"preset/recipe": "learner", "preset/env": "learner"}
-
-
-def values(file, script):
-    """Returns {dotted key: value} of a file of configs/, without its defaults list."""
-    text = (CONFIGS / f"{file}.yaml").read_text()
+def layers(file, applied):
+    """Yields ((file, its block), {dotted key: value}) of a file of configs/ and those it begins
+    with, in order of precedence.
+    """
+    text, group = (CONFIGS / f"{file}.yaml").read_text(), file.rpartition("/")[0]
     tree = yaml.safe_load(text) or {}
-    tree.pop("defaults", None)
-    own = file == script or "@package _global_" in text
-    if own:
-        return leaves(tree)
-    group = file.rpartition("/")[0]
-    return leaves({PACKAGES.get(group, group.rpartition("/")[2]): tree})
+    for parent in tree.pop("defaults", []) if group else ():
+        if isinstance(parent, str):
+            yield from layers(f"{group}/{parent}", applied)
+    for block, content in with_blocks(tree, applied):
+        content = content if not group or "@package _global_" in text else {group: content}
+        yield (file, block), dict(leaves(content))
 
 
-def with_parents(file):
-    """Returns a file of configs/ after those of its folder that its defaults list names."""
-    path = CONFIGS / f"{file}.yaml"
-    if not path.exists():
-        return []
-    parents = (yaml.safe_load(path.read_text()) or {}).get("defaults", [])
-    folder = file.rpartition("/")[0]
-    return [f for parent in parents for f in with_parents(f"{folder}/{parent}")] + [file]
+def with_blocks(tree, applied, path=""):
+    """Yields (block, what is in it) of what is in a file."""
+    yield path, {key: value for key, value in tree.items() if key not in BLOCKS}
+    for name in BLOCKS:
+        if name in tree and name in applied:
+            yield from with_blocks(tree[name], applied, f"{path}.{name}")
 
 
 def compositions():
-    """Yields for each member of each group the files it is composed of, [(file, {key: value})], in
-    order of precedence.
-    """
-    for name, script in scripts.SCRIPTS.items():
-        composer = Composer(script)
-        groups = {group: m for group, m in composer.groups().items() if group != "logger"}
-        for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
-            choices = composer.composed(*choice).hydra.runtime.choices
-            files = [f"{g}/{choices[g]}" for g in groups if choices[g] is not None]
-            last = [f for f in files if f.startswith("preset/")]
-            env, learner, preset = (choices.get(g) for g in ("env", "learner", "preset"))
-            if last:
-                last += with_parents(f"preset/env/{preset}_{env}")
-                last += with_parents(f"preset/learner/{preset}_{learner}")
-                last += with_parents(f"preset/env/{preset}_{learner}_{env}")
-            if (CONFIGS / f"preset/agent/{choices.get('learner')}.yaml").exists():
-                last.append(f"preset/agent/{choices['learner']}")
-            last += [f for f in files if f.startswith("experiment/")]
-            by_preset = f"preset/experiment/{choices.get('preset')}_{choices.get('experiment')}"
-            by_learner = f"preset/recipe/{choices.get('learner')}_{choices.get('experiment')}"
-            for file in (by_preset, by_learner):
-                last += [file] if (CONFIGS / f"{file}.yaml").exists() else []
-            order = [f for f in files if f not in last] + [name] + last
-            yield [(file, values(file, name)) for file in order]
+    """Yields the layers of each member of each group, on both devices, with each learner."""
+    defaults = [*yaml.safe_load((CONFIGS / "train.yaml").read_text())["defaults"]]
+    groups = [*(one for one in defaults if isinstance(one, dict) and "hydra" not in one)]
+    groups = {group: member for one in groups for group, member in one.items()}
+    members = [(path.parent.name, path.stem) for path in CONFIGS.glob("*/*.yaml")]
+    for device in "cpu", "gpu":
+        for learner in BLOCKS[2:]:
+            for group, member in members:
+                chosen = groups | {"learner": learner}
+                if group == "experiment":
+                    text = (CONFIGS / group / f"{member}.yaml").read_text()
+                    chosen |= dict(re.findall(r"override /(\w+): (\w+)", text))
+                chosen |= {group: member} if group in groups else {}
+                files = ["train", *(f"{g}/{m}" for g, m in chosen.items() if m)]
+                yield [one for file in files for one in layers(file, (device, chosen["learner"]))]
 
 
 @pytest.mark.slow
-def test_no_config_value_is_unused_or_repeated(monkeypatch):
-    written, in_force, twice = set(), set(), set()
-    for gpu in (False, True):
-        monkeypatch.setattr("torch.cuda.is_available", lambda gpu=gpu: gpu)
-        for files in compositions():
-            last = {}
-            for file, pairs in files:
-                written |= {(file, key) for key in pairs}
-                twice |= {
-                    (file, key) for key in pairs if key in last and last[key][1] == pairs[key]
-                }
-                last |= {key: (file, value) for key, value in pairs.items()}
-            in_force |= {(file, key) for key, (file, _) in last.items()}
-    assert written == in_force and not twice, (written - in_force, twice)
+def test_no_config_value_is_unused_or_repeated():
+    written, in_force, differing = set(), set(), set()
+    for composed in compositions():
+        last = {}
+        for place, pairs in composed:
+            written |= {(place, key) for key in pairs}
+            changed = [key for key in pairs if key not in last or last[key][1] != pairs[key]]
+            differing |= {(place, key) for key in changed}
+            last |= {key: (place, value) for key, value in pairs.items()}
+        in_force |= {(place, key) for key, (place, _) in last.items()}
+    assert written == in_force == differing, (written - in_force, written - differing)
     names = {str(path.relative_to(CONFIGS))[:-5] for path in CONFIGS.rglob("*.yaml")}
-    assert names - {file for file, _ in written} == {"preset/auto", "hydra/default"}
+    names -= {"hydra/default", "agent/lstm", "evaluate", "record"}
+    assert names == {file for (file, _), _ in written}
 
 
 def test_settings_are_frozen():
@@ -134,11 +115,12 @@ def test_settings_round_trip():
 @pytest.mark.parametrize("group", ["env", "geometry", "learner", "curriculum", "agent"])
 def test_config_files_hold_no_constructor_defaults(group):
     for path in (CONFIGS / group).glob("*.yaml"):
-        dotted = values(f"{group}/{path.stem}", "train")
-        pairs = {key.split(".")[1]: value for key, value in dotted.items() if "." in key}
+        dotted = {k: v for _, pairs in layers(f"{group}/{path.stem}", ()) for k, v in pairs.items()}
+        pairs = {k.partition(".")[2]: v for k, v in dotted.items() if k.startswith(f"{group}.")}
         kind = kind_of(group, pairs["name"]) if group in IMPORTED else Agent
         defaults = {field.name: field.default for field in dataclasses.fields(kind)}
-        assert not [key for key in pairs if pairs[key] == defaults[key]], path
+        # a number of environments is stated over that of train.yaml
+        assert not [k for k in pairs if pairs[k] == defaults[k] and k != "n_envs"], path
 
 
 @pytest.mark.parametrize(
@@ -216,14 +198,12 @@ def test_a_logger_is_a_class_in_a_file_of_its_name(tmp_path, monkeypatch):
     assert {*loggers()} == {"csv", "tensorboard", "wandb"}
 
 
-def test_preset_auto_follows_device(monkeypatch):
-    cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
-    assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
+def test_values_follow_the_device(monkeypatch):
+    cpu, gpu = compose("device=cpu"), compose("device=cuda")
+    assert compose() == dataclasses.replace(cpu, device="auto")
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
-    assert compose() == compose("preset=auto") == gpu != cpu
-    assert compose("preset=cpu") == cpu
+    assert compose() == dataclasses.replace(gpu, device="auto") != compose("device=cpu") == cpu
     assert compose("experiment=quickstart").env == gpu.env
-    assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
     assert compose("env.n_envs=7", "learner.n_minibatches=1").env.n_envs == 7
 
 
@@ -239,24 +219,13 @@ def test_cpu_and_gpu_recipes():
     )
     same |= dict(max_grad_norm=0.5, target_kl=None, auxiliary_coef=0.5, lambda_=0.95, anneal="auto")
     same |= dict(value_clip=None, normalise_advantage="rollout", critic_lr=None, weight_decay=0.0)
-    cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
+    cpu, gpu = compose("device=cpu"), compose("device=cuda")
     assert dataclasses.asdict(cpu.learner) == same | dict(lr=3e-3, gamma=0.98, entropy_coef=0.02)
     assert dataclasses.asdict(gpu.learner) == same | dict(lr=1e-3, gamma=0.995, entropy_coef=0.01)
     assert (cpu.env.n_envs, cpu.agent.width, cpu.log_every) == (256, 64, 4)
     assert (gpu.env.n_envs, gpu.agent.width, gpu.log_every) == (4096, 256, 100)
     assert dataclasses.replace(cpu.env, n_envs=4096) == gpu.env
     assert compose("experiment=quickstart").seconds == 160
-
-
-def test_experiment_differs_by_preset():
-    cpu, gpu = (compose("experiment=pong", f"preset={preset}") for preset in ("cpu", "gpu"))
-    assert (cpu.seconds, gpu.seconds) == (240, 12) and cpu.env.n_envs == 256
-    assert (cpu.agent.core, cpu.learner.n_epochs) == ("none", 2)
-    assert compose("experiment=pong", "preset=cpu", "seconds=7").seconds == 7
-    assert compose("experiment=pong", "learner=r2d2", "preset=cpu").learner.name.endswith(":R2D2")
-    cpu, gpu = (compose("experiment=deathmatch", f"preset={preset}") for preset in ("cpu", "gpu"))
-    assert (cpu.env.n_envs, gpu.env.n_envs) == (64, 8192)
-    assert (cpu.samples, gpu.samples, cpu.seconds, gpu.seconds) == (4_000_000, None, None, 60)
 
 
 def test_typo_hints_nearest_key():

@@ -12,7 +12,6 @@ from tests.cli.test_train import configured
 EXPLORER = [
     "env=explorer",
     "geometry=box",
-    "preset=cpu",
     "env.n_envs=4",
     "env.res=8",
     "env.patience=3",

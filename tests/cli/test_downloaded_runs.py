@@ -66,7 +66,7 @@ def test_downloaded_run_is_refused_before_anything_is_imported(main, words, monk
 
 def test_downloaded_opponent_is_refused(monkeypatch, capsys):
     save(monkeypatch, "agent.core")
-    mine = ["folder=mine", "env=pong", "preset=cpu", "device=cpu", "env.n_envs=8"]
+    mine = ["folder=mine", "env=pong", "device=cpu", "env.n_envs=8"]
     assert train.main([*mine, "agent.width=8", "learner.n_minibatches=2", "samples=64"]) == 0
     assert evaluate.main(["run=mine", "against=run", "episodes=8"]) == 2
     assert "planted:Thing" in capsys.readouterr().err and not IMPORTED.exists()

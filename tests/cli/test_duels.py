@@ -226,7 +226,7 @@ def test_ratings_of_draws():
 # ---- The scripts ----
 
 PONG = [
-    *("env=pong", "env.self_play=true", "env.n_envs=8", "preset=cpu", "agent.width=8"),
+    *("env=pong", "env.self_play=true", "env.n_envs=8", "agent.width=8"),
     *("agent.core=none", "learner.n_steps=16", "learner.n_minibatches=2", "device=cpu"),
     "log_every=1",
 ]
@@ -398,7 +398,7 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["env=tests.helpers.games:Matrix", "env.n_agents=3", "env.n_envs=4", "geometry=homes"]
     options = ["geometry.n=7", "samples=1", "folder=run", *PONG[4:]]
-    train.run(configured(*words, *options, tiny=["preset=cpu", "agent.width=8"]))
+    train.run(configured(*words, *options, tiny=["agent.width=8"]))
     played, real = [], duels.play
 
     def play(env, *rest, **options):
@@ -424,7 +424,7 @@ def test_duels_in_each_source_of_a_suite(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=box"]
     options = ["samples=1", "folder=run", *PONG[4:]]
-    train.run(configured(*words, *options, tiny=["preset=cpu", "agent.width=8"]))
+    train.run(configured(*words, *options, tiny=["agent.width=8"]))
     parts = "geometry.parts={dense: {source: homes, n: 3, density: 1.5}, maze: {n: 2, size: 3}}"
     words = ["run=run", "geometry=suite", parts, "episodes=12", "device=cpu"]
     assert evaluate.main([*words, "against=[tests.helpers.games:High,random]"]) == 0

@@ -372,7 +372,7 @@ def test_metrics_of_each_part_of_a_mix(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     house = "{source: megastep.geometries.sources:bench, n: 1}"
     words = ["geometry=mixed", f"geometry.parts={{homes: 1, maze: 1, house: {house}}}"]
-    words += ["env=explorer", "preset=cpu", "env.n_envs=4", "env.patience=1", "env.res=4"]
+    words += ["env=explorer", "env.n_envs=4", "env.patience=1", "env.res=4"]
     words += ["env.subsample=1", "agent.width=8", "learner.n_steps=8"]
     words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
     seen, first_episodes = [], playing.first_episodes
@@ -442,7 +442,7 @@ def test_a_row_is_scored_by_what_compares_between_homes():
 def explorer(tmp_path, monkeypatch):
     """A run of an explorer."""
     monkeypatch.chdir(tmp_path)
-    words = ["env=explorer", "preset=cpu", "geometry=box", "env.n_envs=4", "env.patience=1"]
+    words = ["env=explorer", "geometry=box", "env.n_envs=4", "env.patience=1"]
     words += ["env.res=4", "env.subsample=1", "agent.width=8", "learner.n_steps=8"]
     words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
     return train.run(settings(*words))
@@ -488,7 +488,7 @@ def test_suite_of_imported_plans(explorer, tmp_path):
 @pytest.mark.parametrize("geometry", ["suite", "maze"])
 def test_a_geometry_that_the_environment_does_not_take_is_refused(tmp_path, monkeypatch, geometry):
     monkeypatch.chdir(tmp_path)
-    pong = ["env=pong", "preset=cpu", "env.n_envs=4", "learner.n_steps=8", "agent.width=8"]
+    pong = ["env=pong", "env.n_envs=4", "learner.n_steps=8", "agent.width=8"]
     run = train.run(settings(*pong, "learner.n_minibatches=2", "device=cpu", "samples=1"))
     typed = settings("run=x", f"geometry={geometry}", script="evaluate").geometry
     message = f"pong takes no floor plans, so it cannot be played in geometry={geometry}"
@@ -506,7 +506,7 @@ def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
     shape = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
     learner = ["learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"]
     homes = ["geometry=bench", "geometry.n=4", "env.resample=true"]
-    run = train.run(settings("env=explorer", "preset=cpu", *homes, *shape, *learner))
+    run = train.run(settings("env=explorer", *homes, *shape, *learner))
     seen = {}
 
     def spied(env, *args):

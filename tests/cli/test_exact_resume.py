@@ -22,10 +22,7 @@ from tests.helpers.processes import HUNG
 SELF_PLAY = ["opponents.past=0.5", "opponents.snapshots=2", "opponents.every=3"]
 REPLAY = ["learner.replay.capacity=200"]
 SMALL = ["geometry=box", "env.n_envs=4", "agent.width=8", "learner.n_steps=8", "device=cpu"]
-FIGHT = [
-    *("env=deathmatch", "env.n_agents=2", "env.res=8", *SMALL),
-    *("learner.n_minibatches=2", "preset=cpu"),
-]
+FIGHT = [*("env=deathmatch", "env.n_agents=2", "env.res=8", *SMALL), "learner.n_minibatches=2"]
 DRAWN = [*SMALL[1:], "geometry=bench", "geometry.n=4", "env.res=8", "learner.n_minibatches=2"]
 PONG = ["env=pong", "env.n_envs=8", "agent.width=8", "learner.n_steps=8", "device=cpu"]
 DATA = pathlib.Path(__file__).parents[1] / "data"
@@ -67,8 +64,7 @@ CASES = {
         *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[2:], "agent.continuous=beta"),
     ],
     "gymnasium": [
-        *("env=gymnasium", "env.id=CartPole-v1", *SMALL[1:]),
-        *("learner.n_minibatches=2", "preset=cpu"),
+        *("env=gymnasium", "env.id=CartPole-v1", *SMALL[1:], "learner.n_minibatches=2"),
     ],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[2:]],
 }
@@ -238,7 +234,7 @@ def test_interrupted_run_has_the_same_bits(here, monkeypatch):
 
 SIDE_BY_SIDE = {
     "cpu": (2, [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=512"]),
-    "cuda": (8, ["env=explorer", "geometry=bench", "preset=gpu", "samples=20_000_000"]),
+    "cuda": (8, ["env=explorer", "geometry=bench", "samples=20_000_000"]),
 }
 
 

@@ -12,7 +12,7 @@ from tests.helpers import tiny
 
 pytest.importorskip("gymnasium")
 WORDS = [
-    *("env=gymnasium", "preset=cpu", "device=cpu", "env.n_envs=4", "agent.width=8"),
+    *("env=gymnasium", "device=cpu", "env.n_envs=4", "agent.width=8"),
     *("learner.n_steps=8", "learner.n_minibatches=2", "samples=64", "log_every=1"),
 ]
 
@@ -23,9 +23,9 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("preset", ["cpu", "gpu"])
-def test_few_environments_unless_told_otherwise(preset):
-    words = ["env=gymnasium", f"preset={preset}"]
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_few_environments_unless_told_otherwise(device):
+    words = ["env=gymnasium", f"device={device}"]
     assert tiny.settings(*words).env.n_envs <= 64 < tiny.settings(words[1]).env.n_envs
     assert tiny.settings(*words, "env.n_envs=16").env.n_envs == 16
     assert tiny.settings(*words).agent.encoder == "cnn"

@@ -23,7 +23,7 @@ NAME = "tiny_agent"
 PARTS = "geometry.parts={bench: 2, braided: {source: maze, n: 2, braid: 1}}"
 TINY = [
     *("env=deathmatch", "env.n_agents=2", "env.res=16", "env.n_envs=4", "env.limit=20"),
-    *("geometry=mixed", PARTS, "preset=cpu", "device=cpu", "agent.width=8", "seed=1"),
+    *("geometry=mixed", PARTS, "device=cpu", "agent.width=8", "seed=1"),
     *("learner.n_steps=8", "learner.n_minibatches=2", "log_every=4"),
 ]
 SUITE = ["geometry=suite", PARTS, "episodes=8", "device=cpu"]
@@ -190,7 +190,7 @@ def test_is_recorded_into_its_folder(folder):
 
 
 def test_starts_a_run_with_a_new_critic(file, capsys):
-    words = [f"init={NAME}", "device=cpu", "preset=cpu", "learner.n_minibatches=2"]
+    words = [f"init={NAME}", "device=cpu", "learner.n_minibatches=2"]
     assert train.main([*words, "learner.lr=1e-12", "samples=1", "folder=second"]) == 0
     assert "tiny_agent has no critic, so this run begins with a new one" in capsys.readouterr().out
     loaded = checkpoint.load_latest("second/checkpoints")

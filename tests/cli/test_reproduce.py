@@ -57,9 +57,7 @@ def test_rows_for_two_cores_end_within_ten_minutes():
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS.values(), ids=ROWS)
 def test_words_of_a_row_compose(row):
-    """Those for a GPU with its preset, as `auto` would choose on a machine with one."""
-    preset = f"preset={'cpu' if row.device == 'cpu' else 'gpu'}"
-    tiny.settings(*row.train.split(), preset)
+    tiny.settings(*row.train.split(), f"device={row.device}")
     for result in row.results:
         words = map(scripts.EVALUATE.reword, result.evaluate.split())
         tiny.settings("run=runs/x", *words, script="evaluate")

@@ -74,7 +74,6 @@ class Payer:
 UPDATE = 4 * 8  # samples
 SMALL = [
     "env=payer:Payer",
-    "preset=cpu",
     "env.n_envs=4",
     "learner.n_steps=8",
     "learner.n_minibatches=2",
@@ -393,7 +392,7 @@ def test_kill_9(here, victim):
 # ---- Where jobs run ----
 
 
-def test_preset_is_chosen_where_the_job_runs(here, monkeypatch):
+def test_values_are_those_of_the_device_where_the_job_runs(here, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     job = sweeps.new_job(Composer(scripts.TRAIN), here)
     job = cloudpickle.loads(cloudpickle.dumps(job))

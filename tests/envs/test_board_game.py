@@ -68,7 +68,7 @@ class Board:
         figure.subplots().bar([0, 1, 2], [int(state.lit) == i for i in range(3)])
         return figure
 '''
-WORDS = ["env=board:Board", "env.n_envs=32", "preset=cpu", "agent.width=16", "device=cpu"]
+WORDS = ["env=board:Board", "env.n_envs=32", "agent.width=16", "device=cpu"]
 WORDS += ["learner.n_steps=16", "learner.n_minibatches=2", "learner.lr=0.01", "samples=20000"]
 
 

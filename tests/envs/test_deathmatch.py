@@ -650,7 +650,7 @@ def test_train_evaluate_and_record_in_self_play(tmp_path, monkeypatch):
 def test_recipe_learns_to_hit(tmp_path, monkeypatch):
     """With a quarter of its samples, five times as many as it needs to show."""
     monkeypatch.chdir(tmp_path)
-    words = ["experiment=deathmatch", "preset=cpu", "geometry=box", "samples=250_000"]
+    words = ["experiment=deathmatch", "geometry=box", "samples=250_000"]
     assert train.main([*words, "finish.record=false", "device=cpu", "folder=run"]) == 0
     assert evaluate.main(["run=run", "episodes=256", "split=all", "device=cpu"]) == 0
     trained, random = (row["metrics"]["accuracy"] for row in rows_of("run"))

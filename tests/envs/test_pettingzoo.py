@@ -117,7 +117,7 @@ class Free(Relay):
 def test_trains_and_evaluates(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = [
-        *("env=pettingzoo", f"env.id={__name__}:Free", "preset=cpu", "device=cpu", "env.n_envs=4"),
+        *("env=pettingzoo", f"env.id={__name__}:Free", "device=cpu", "env.n_envs=4"),
         *("learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8", "samples=96"),
     ]
     assert train.main([*words, "folder=run"]) == 0

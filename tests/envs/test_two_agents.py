@@ -15,7 +15,7 @@ from megastep.agents.runs import checkpoint
 from tests.helpers import pages
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "new-environment.md"
-SMALL = ["preset=cpu", "learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8"]
+SMALL = ["learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8"]
 
 
 @pytest.fixture(scope="module")

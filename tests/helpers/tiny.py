@@ -8,12 +8,12 @@ from megastep.agents.cli.scripts import SCRIPTS
 TINY = [
     "env=minimal",
     "geometry=box",
-    "preset=cpu",
     "env.n_envs=4",
     "env.res=8",
     "learner.n_steps=8",
     "learner.n_minibatches=2",
     "agent.width=8",
+    "log_every=4",
     "device=cpu",
 ]
 #: A small run with what a GPU brings: CUDA graphs, and a host that is updates ahead.
@@ -21,7 +21,6 @@ ON_GPU = [
     "env=explorer",
     "geometry=homes",
     "geometry.n=8",
-    "preset=gpu",
     "env.n_envs=64",
     "agent.width=32",
     "learner.n_steps=8",

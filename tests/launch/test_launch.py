@@ -107,7 +107,7 @@ def test_dry_run(here, capsys):
 
 
 def test_dry_run_counts_lanes_that_learn(here, capsys):
-    duels = "env=deathmatch", "geometry=box", "preset=cpu", "device=cpu", "dry_run=true"
+    duels = "env=deathmatch", "geometry=box", "device=cpu", "dry_run=true"
     sizes = "env.n_envs=10", "env.n_agents=3", "opponents.past=0.4", "opponents.snapshots=2"
     assert train.main([*duels, *sizes, "opponents.bot=0.2", "learner.n_steps=8"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]

@@ -165,7 +165,7 @@ def test_another_number_of_ranks_goes_on(alone, here, capsys):
 def test_ranks_share_duels_and_evaluations(here):
     """Together they play what one process plays: as often in each home and from each place."""
     words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=homes"]
-    words += ["geometry.n=7", "samples=1", "folder=games", "preset=cpu", "agent.width=8"]
+    words += ["geometry.n=7", "samples=1", "folder=games", "agent.width=8"]
     device = "device=cpu"
     assert train.main([*words, device, *NO_FINISH, "learner.n_minibatches=2"]) == 0
     counts, script = [], ranks.ROOT / "evaluate.py"
@@ -212,7 +212,7 @@ class Copy:
 
 def learning_curves(n_envs):
     """Returns the mean returns of each report of three runs with other seeds."""
-    words = ["env=tests.distributed.test_rank_runs:Copy", "preset=cpu", "device=cpu"]
+    words = ["env=tests.distributed.test_rank_runs:Copy", "device=cpu"]
     words += [
         "agent.width=16",
         f"env.n_envs={n_envs}",

@@ -8,7 +8,7 @@ import pytest
 import train_plain
 from paths import ROOT
 
-TINY = "experiment=deathmatch preset=cpu geometry=box env.n_envs=8 seconds=null finish.record=false"
+TINY = "experiment=deathmatch geometry=box env.n_envs=8 seconds=null finish.record=false"
 
 
 def test_an_unknown_part_is_refused(capsys):

@@ -19,7 +19,7 @@ from tests.helpers.synchronisation import no_synchronisation
 
 LEARNER = SimpleNamespace(gamma=0.9, lambda_=0.8)
 SMALL = [
-    *("device=cpu", "preset=cpu", "geometry=bench", "geometry.n=4", "env.n_envs=4", "env.res=8"),
+    *("device=cpu", "geometry=bench", "geometry.n=4", "env.n_envs=4", "env.res=8"),
     *("agent.width=8", "learner.n_steps=8", "learner.n_minibatches=2", "samples=64"),
 ]
 

@@ -1,0 +1,264 @@
+"""Recipes: the settings of each on a CPU and on a GPU, and how the blocks of files are merged."""
+
+import functools
+import json
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from megastep.agents.cli import blocks, evaluate, sweeps, train
+from megastep.agents.cli.compose import Composer
+from megastep.agents.cli.scripts import TRAIN
+from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory.check import as_tree, leaves
+from tests.helpers import tiny
+
+#: {"device words": the settings that differ from those of a row above, or the errors}.
+TABLE = json.loads((Path(__file__).parents[1] / "data/settings.json").read_text())
+#: Keys that are not in it.
+ABSENT = ("nonfinite_replay", "logger.", "profile")
+#: Rows that are compared at every change.
+FEW = ["cpu env=explorer learner=ppo", "cuda env=gymnasium learner=ppo"]
+FEW += ["cpu experiment=pong learner=ppo", "cuda experiment=deathmatch_anywhere learner=vtrace"]
+FEW += ["cuda experiment=pointgoal learner=r2d2"]
+
+
+@functools.cache
+def row(name):
+    """Returns {dotted key: value} of a row."""
+    entry = TABLE[name]
+    base = row(entry["like"]) if "like" in entry else {}
+    return {k: v for k, v in base.items() if k not in entry.get("without", ())} | entry["set"]
+
+
+@pytest.fixture
+def on(monkeypatch):
+    """A function that pretends that there is a GPU, or none, and returns the settings of words."""
+
+    def settings(device, *words):
+        monkeypatch.setattr("torch.cuda.is_available", lambda: device == "cuda")
+        return tiny.settings(*words)
+
+    return settings
+
+
+def differences(on, name):
+    """Returns {key: (in the table, composed)} of what differs in a row."""
+    device, *words = name.split()
+    try:
+        found = dict(leaves(as_tree(on(device, *words))))
+        expected = {} if "errors" in TABLE[name] else row(name)
+    except ConfigErrors as error:
+        found, expected = dict(error.errors), dict(TABLE[name].get("errors", ()))
+    pairs = {key: (repr(expected.get(key)), repr(found.get(key))) for key in {*found, *expected}}
+    return {k: pair for k, pair in pairs.items() if pair[0] != pair[1] and not k.startswith(ABSENT)}
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_settings_of_a_few_recipes(on, name):
+    assert differences(on, name) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", {*TABLE} - {*FEW})
+def test_settings_of_a_recipe(on, name):
+    assert differences(on, name) == {}
+
+
+# ---- Blocks ----
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A function that writes a file, in a current folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(name, text):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(textwrap.dedent(text))
+        return path
+
+    return write
+
+
+def composed(*words):
+    """Returns the settings of words, with files of conf/ beside ours."""
+    return Composer(TRAIN, folder="conf").settings(words)
+
+
+RECIPE = """\
+    # @package _global_
+    env: {n_envs: 7}
+    learner: {gamma: 0.5, n_minibatches: 1}
+    cpu:
+      env: {n_envs: 5}
+      ppo: {seed: 8}
+    gpu: {seed: 9}
+    vtrace:
+      env: {n_envs: 6}
+      cpu:
+    """
+
+
+def test_blocks_win_over_their_file_and_words_over_blocks(here):
+    here("conf/experiment/mine.yaml", RECIPE)
+    assert composed("experiment=mine").env.n_envs == 5
+    assert composed("experiment=mine", "learner=vtrace").env.n_envs == 6
+    assert composed("experiment=mine", "env.n_envs=3").env.n_envs == 3
+    assert composed("experiment=mine", "device=cuda").env.n_envs == 7
+    words = [], ["device=cuda"], ["learner=vtrace"]
+    assert [composed("experiment=mine", *more).seed for more in words] == [8, 9, 1]
+
+
+def test_a_later_file_wins_over_the_blocks_of_an_earlier_one(here):
+    here("conf/experiment/mine.yaml", RECIPE)
+    gammas = composed().learner.gamma, composed("experiment=mine").learner.gamma
+    assert gammas == (0.98, 0.5)
+
+
+def test_blocks_of_a_component_and_of_a_device_that_a_file_chooses(here):
+    here("conf/learner/mine.yaml", "defaults: [vtrace]\nlr: 0.1\ncpu: {lr: 0.2, gamma: 0.3}\n")
+    here("conf/experiment/gpu.yaml", "# @package _global_\ndevice: cuda\n")
+    cfg = composed("learner=mine")
+    assert (cfg.learner.lr, cfg.learner.gamma, cfg.learner.advantage_floor) == (0.2, 0.3, 0.3)
+    cfg = composed("learner=mine", "experiment=gpu")
+    assert (cfg.learner.lr, cfg.learner.gamma, cfg.env.n_envs) == (0.1, 0.995, 4096)
+
+
+def test_wrong_keys_of_blocks_are_named(here):
+    here("conf/experiment/mine.yaml", "# @package _global_\ncpu: {learner: {lrr: 1}, sed: 2}\n")
+    here("conf/experiment/value.yaml", "# @package _global_\ncpu: 3\n")
+    with pytest.raises(ConfigErrors) as error:
+        composed("experiment=mine")
+    assert dict(error.value.errors) == {
+        "learner.lrr": "no such key; did you mean learner.lr?",
+        "sed": "no such key; did you mean seed?",
+    }
+    for words in (["experiment=value"], ["cpu.seed=2"]):
+        with pytest.raises(ConfigErrors, match="cpu.*: no such key"):
+            composed(*words)
+
+
+def test_no_block_is_left_in_settings_or_in_what_is_printed(here, capsys):
+    here("conf/experiment/mine.yaml", RECIPE)
+    assert train.main(["--config-dir", "conf", "experiment=mine", "--cfg", "job"]) == 0
+    text = capsys.readouterr().out
+    assert "n_envs: 5" in text and not {"cpu:", "gpu:", "ppo:"} & {*text.split()}
+
+
+def test_files_of_environments_say_nothing_of_training_in_evaluations(capsys):
+    cfg = tiny.settings("run=x", "env=gymnasium", "env.id=a", script="evaluate")
+    assert cfg.env.name.endswith("Gymnasium") and cfg.episodes == 1024
+    assert evaluate.main(["run=x", "env=gymnasium", "env.id=a", "learner.lr=1"]) == 2
+    assert "learner: no such key" in capsys.readouterr().err
+
+
+# ---- Learners of one's own ----
+
+OWN = """
+    from megastep.agents.algorithms.ppo import PPO
+    from megastep.agents.algorithms.r2d2 import R2D2
+    from megastep.envs import Explorer
+
+
+    class MyPPO(PPO):
+        def __init__(self, policy, *, mine: float = 1.0, **kwargs):
+            super().__init__(policy, **kwargs)
+            self.mine = mine
+
+
+    class Clipped(PPO):
+        def __init__(self, policy, **kwargs):
+            super().__init__(policy, clip=0.1, **kwargs)
+
+
+    class Slow(PPO):
+        def __init__(self, policy, **kwargs):
+            super().__init__(policy, lr=1e-5, **kwargs)
+
+
+    class MyR2D2(R2D2):
+        pass
+
+
+    class A2C:
+        def __init__(self, policy, *, lr: float = 7e-4, gamma: float = 0.99, n_steps: int = 5):
+            raise ValueError(f"made with lr={lr}")
+
+
+    class Rover(Explorer):
+        def __init__(self, *args, mine: int = 3, **kwargs):
+            super().__init__(*args, **kwargs)
+    """
+
+
+@pytest.fixture
+def own(here, monkeypatch):
+    """The name of a module of the current folder."""
+    name = f"own_{here('x', '').parent.name}"
+    here(f"{name}.py", OWN)
+    return name
+
+
+def test_a_class_has_the_blocks_of_the_learner_it_derives_from(own):
+    cfg = tiny.settings(f"learner={own}:MyPPO", "learner.gamma=0.5", "learner.mine=2").learner
+    assert (cfg.lr, cfg.gamma, cfg.entropy_coef, cfg.mine) == (3e-3, 0.5, 0.02, 2)
+    cfg = tiny.settings(f"learner={own}:MyR2D2")
+    assert (cfg.learner.lr, cfg.learner.replay.capacity) == (5e-4, 100_000)
+    assert (cfg.agent.output, cfg.agent.critic) == ("duelling", None)
+    cfg = tiny.settings(f"learner={own}:MyPPO", "experiment=pong", "device=cuda").learner
+    assert (cfg.lr, cfg.gamma, cfg.n_epochs) == (1e-3, 0.99, 2)
+    assert tiny.settings(f"learner.name={own}:MyPPO").learner.lr == 3e-3
+    assert [blocks.built_in(f"{own}:{name}") for name in ("MyR2D2", "A2C", "No")] == [
+        *("r2d2", "ppo", "ppo")
+    ]
+
+
+def test_another_class_has_values_of_the_arguments_that_it_takes(own):
+    words = [f"learner={own}:A2C", "experiment=popgym"]
+    cfg = tiny.settings(*words, "learner.lr=0.5").learner
+    assert {k: v for k, v in vars(cfg).items() if k != "name"} == {
+        "lr": 0.5,
+        "gamma": 0.99,
+        "n_steps": 104,
+        "anneal": "auto",
+    }
+    composer = Composer(TRAIN)
+    composer.settings([*words, "learner.lr=0.5"])
+    assert composer.note == (
+        f"learner={own}:A2C takes gamma=0.99, n_steps=104 from the CPU values of ppo and "
+        "experiment=popgym"
+    )
+    composer.settings(words[1:])
+    assert composer.note == ""
+    with pytest.raises(ConfigErrors, match="learner.clip: no such key here; learner=ppo has it"):
+        composer.settings([*words, "learner.clip=0.1"])
+
+
+def test_training_says_what_a_class_takes(own, capsys):
+    words = *tiny.TINY[:4], "agent.width=8", "samples=32", "device=cpu"
+    assert train.main([f"learner={own}:A2C", *words]) == 2
+    out, err = capsys.readouterr()
+    assert f"learner={own}:A2C takes lr=0.003, gamma=0.98 from the CPU values of ppo" in out
+    assert err.endswith("made with lr=0.003\n")
+
+
+def test_a_class_may_fix_an_argument(own, capsys):
+    assert train.main([f"learner={own}:Clipped", *tiny.TINY, "samples=32"]) == 0
+    assert train.main([f"learner={own}:Slow", *tiny.TINY, "samples=32"]) == 2
+    text = capsys.readouterr().err
+    assert "multiple values for keyword argument 'lr'; an argument that it sets itself" in text
+
+
+def test_an_environment_passes_arguments_on(own):
+    cfg = tiny.settings(f"env={own}:Rover", "env.patience=9", "env.mine=4").env
+    assert (cfg.patience, cfg.mine, cfg.n_envs) == (9, 4, 256)
+    assert train.main([f"env={own}:Rover", "env.fov=90", *tiny.TINY[1:], "samples=32"]) == 0
+
+
+def test_jobs_of_a_sweep_have_the_blocks_of_their_learners(own):
+    composer = Composer(TRAIN)
+    _, jobs, _ = sweeps.jobs_of(composer, [f"learner=ppo,r2d2,{own}:MyR2D2"])
+    assert [cfg.learner.lr for cfg in jobs] == [3e-3, 5e-4, 5e-4]
