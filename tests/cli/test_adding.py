@@ -232,7 +232,8 @@ def test_custom_learner(outside, capsys):
         '''
     add(outside, "learner", {"counter.py": COUNTER, "reinforce.py": learner})
     words = ["env=counter:Counter", *(w for w in SMALL if not w.startswith("learner."))]
-    learner_words = ["learner=reinforce:Reinforce", "learner.length=4", "learner.anneal=never"]
+    learner_words = ["learner=reinforce:Reinforce", "learner.lr=0.1", "learner.length=4"]
+    learner_words += ["learner.anneal=never"]
     assert train.main([*words, *learner_words, "samples=48", "log_every=1"]) == 0
     config = saved().config["train"]["learner"]
     assert config == {
