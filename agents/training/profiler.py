@@ -14,8 +14,8 @@ from megastep.agents.training.performance import PHASES, PhaseTimer
 
 #: Updates before a profile: the first ones initialise libraries and capture CUDA graphs.
 N_SKIPPED = 3
-#: Rows in the table of operations.
-N_ROWS = 30
+#: Rows in the table of operations, and characters of a name: those of templates have hundreds.
+N_ROWS, MAX_NAME = 30, 90
 
 
 class Profiler:
@@ -75,8 +75,9 @@ class Profiler:
             activities.append(torch.profiler.ProfilerActivity.CUDA)
             torch.cuda.synchronize(self.device)  # what was launched before is no part of it
         os.environ.setdefault("KINETO_LOG_LEVEL", "6")  # it prints a line at each start and stop
-        profile = torch.profiler.profile(activities=activities)
-        profile.start()
+        profile = torch.profiler.profile(activities=activities, acc_events=True)
+        with unhurried():
+            profile.start()  # takes seconds on a GPU
         self._profile = profile
 
     def _close_range(self):
@@ -114,7 +115,7 @@ class Profiler:
 
         phases = [(phase, *cells(1000 * seconds.get(phase, 0.0) / n)) for phase in PHASES]
         operations = [
-            (name, f"{n_calls / n:.3g}", *cells(time / 1000 / n))
+            (name[:MAX_NAME], f"{n_calls / n:.3g}", *cells(time / 1000 / n))
             for name, (n_calls, time) in sorted(times.items(), key=lambda item: -item[1][1])
         ]
         texts = (

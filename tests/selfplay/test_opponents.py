@@ -52,9 +52,7 @@ def test_opponents_act_once_per_step(begins):
     actions = []
     for one in (env, other):
         step = one.env.step
-        one.env.step = lambda decision, step=step: (
-            actions.append(decision.actions) or step(decision)
-        )
+        one.env.step = lambda given, step=step: actions.append(given["actions"]) or step(given)
     for _ in range(5):
         if begins:
             env.begin_step()

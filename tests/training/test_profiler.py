@@ -45,9 +45,8 @@ def test_profiled_run_has_a_trace_a_table_and_the_same_metrics(device, learner, 
     head, numbers = table_of("run")
     assert head.startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 4} on {device}")
     assert min(numbers[phase] for phase in ("collect", "update", "rest")) > 0
-    names = [
-        event.get("name") for event in events_of("run") if event.get("cat") == "user_annotation"
-    ]
+    ranges = [event for event in events_of("run") if event.get("cat") == "user_annotation"]
+    names = [event["name"] for event in ranges]
     assert [names.count(phase) for phase in ("collect", "update", "rest")] == [4, 4, 4]
     if device == "cuda":
         kernels = {event["name"] for event in events_of("run") if event.get("cat") == "kernel"}
