@@ -87,7 +87,8 @@ OWN_USERS = {
         "agents/networks/*_cpu.py",
         "agents/networks/kernels/*.py",
         "agents/selfplay/opponents.py",
-        "agents/storage/*.py",
+        "agents/storage/copies.py",
+        "agents/storage/replay_kernels.py",
         "agents/training/episode_stats.py",
     ),
 }
