@@ -207,7 +207,7 @@ class Composer:
                     if group == "logger":
                         node = {settings.label(name): node}
                     elif group == "learner":  # it has the file of the one that it derives from
-                        node["defaults"] = [blocks.built_in(name), "_self_"]
+                        node["defaults"] = [*filter(None, [blocks.built_in(name)]), "_self_"]
                     STORE.store(group=group, name=name, node=node)
                 groups.append(override.input_line)
             else:

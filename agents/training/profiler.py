@@ -76,8 +76,7 @@ class Profiler:
             torch.cuda.synchronize(self.device)  # what was launched before is no part of it
         os.environ.setdefault("KINETO_LOG_LEVEL", "6")  # it prints a line at each start and stop
         profile = torch.profiler.profile(activities=activities, acc_events=True)
-        with unhurried():
-            profile.start()  # takes seconds on a GPU
+        profile.start()  # takes seconds on a GPU
         self._profile = profile
 
     def _close_range(self):
