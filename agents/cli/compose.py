@@ -27,7 +27,7 @@ from megastep.agents import package
 from megastep.agents.cli import blocks
 from megastep.agents.cli.scripts import Script
 from megastep.agents.errors import ConfigErrors, UserError, shortened
-from megastep.agents.factory import check, settings
+from megastep.agents.factory import check, components, settings
 from megastep.settings import closest
 
 #: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
@@ -88,6 +88,10 @@ class Composer:
         if absent := [p for p in (folder, self.main) if p and not os.path.isdir(p)]:
             raise UserError(f"There is no folder {absent[0]} with configurations")
         self.note = ""
+        for group in ("env", "geometry", "learner"):
+            for member, path in components.members(group).items():
+                if not os.path.exists(package.CONFIGS / group / f"{member}.yaml"):
+                    STORE.store(group=group, name=member, node={"name": path})
         FolderOfUser.path = folder and os.path.abspath(folder)
         plugins.Plugins.instance().register(FolderOfUser)
         global_hydra.GlobalHydra.instance().clear()

@@ -152,7 +152,7 @@ def run_name(cfg: Any) -> str:
 
 def loggers() -> dict[str, str]:
     """Returns the import paths of megastep's loggers by label."""
-    return {label(name): name for group, name in components.built_in() if group == "logger"}
+    return components.members("logger")
 
 
 def _chosen_loggers(tree):

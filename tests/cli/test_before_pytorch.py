@@ -82,13 +82,13 @@ def test_environments_that_take_geometries_are_cached():
 def test_arguments_are_read_again_after_a_change(tmp_path, monkeypatch):
     monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
     read = []
-    monkeypatch.setattr(components, "read", lambda: read.append(1) or {})
+    monkeypatch.setattr(components, "read", lambda: read.append(1) or ({}, set(), {}))
     monkeypatch.setattr(components.package, "CONFIGS", tmp_path / "agents/configs")
     source = tmp_path / "agents/module.py"
     source.parent.mkdir()
     for text, n_reads in (("x = 1", 1), ("x = 1", 1), ("x = 2", 2), ("x = 1", 2)):
         source.write_text(text)
-        assert components.cached.__wrapped__() == {} and len(read) == n_reads
+        assert components.cached.__wrapped__().arguments == {} and len(read) == n_reads
 
 
 HEAVY = ("torch", "numpy", "scipy", "matplotlib", "rich", "tensorboard", "loky")
@@ -97,7 +97,7 @@ import json, sys
 from megastep.agents.cli import entry
 for script, code, words in json.loads(sys.argv[1]):
     sys.argv[1:] = words
-    assert entry.run_script(script) == code, words
+    assert entry.run_command(script) == code, words
 print([name for name in json.loads(sys.argv[0]) if name in sys.modules], file=sys.__stderr__)
 """.replace("sys.argv[0]", repr(json.dumps(HEAVY)))
 

@@ -13,7 +13,7 @@ from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree, check, leaves
-from megastep.agents.factory.settings import IMPORTED, Agent, Train, kind_of, label, loggers
+from megastep.agents.factory.settings import IMPORTED, Agent, Train, kind_of, loggers
 from megastep.agents.package import CONFIGS
 from megastep.geometries import sources
 from tests.helpers.tiny import changed
@@ -192,9 +192,8 @@ def test_a_logger_is_a_class_in_a_file_of_its_name(tmp_path, monkeypatch):
     (tmp_path / "memo.py").write_text("class Memo:\n    pass\n\n\nclass Other(Memo):\n    pass\n")
     package = importlib.import_module(components.LOGGERS)
     monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
-    found = {*components._loggers()} - {*loggers().values()}
-    assert found == {f"{components.LOGGERS}.memo:Memo"}
-    assert [label(path) for path in found] == ["memo"]
+    found = components.read().members["logger"]
+    assert found == {**loggers(), "memo": f"{components.LOGGERS}.memo:Memo"}
     assert {*loggers()} == {"csv", "tensorboard", "wandb"}
 
 

@@ -225,11 +225,11 @@ def test_rounding_error_sees_other_weights(folder, exported):
 
 
 def test_inspect_prints_what_is_in_a_file(file, capsys):
-    assert inspect.run([NAME]) == 0
+    assert inspect.main([NAME]) == 0
     out = capsys.readouterr().out
     assert f"{NAME}.safetensors: intact" in out and "samples: 512" in out and "policy" in out
     file.write_bytes(file.read_bytes()[:-1] + b"!")
-    assert inspect.run([NAME]) == 1
+    assert inspect.main([NAME]) == 1
     assert "SHA-256" in capsys.readouterr().out
 
 
