@@ -15,6 +15,7 @@ from megastep.agents.cli import evaluate, record, train
 from megastep.agents.launch import train as launch_train
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.training import loggers
+from megastep.agents.training.trainer import Trainer
 from tests.helpers import tiny
 
 pytestmark = pytest.mark.cuda
@@ -104,13 +105,13 @@ def test_rollouts_differ_after_resume(stopped, trainers):
     """A captured call advances the hidden state and the generator."""
     collected = []
 
-    def store(self, losses, real=launch_train.Trainer.log):
+    def store(self, losses, real=Trainer.log):
         real(self, losses)
         rollout = self.rollout
         collected.append((rollout.actions.clone(), rollout.state.cell.clone()))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(launch_train.Trainer, "log", store)
+        patch.setattr(Trainer, "log", store)
         assert train.main([f"resume={stopped}", f"samples={2 * STOPPED}"]) == 0
     assert is_captured(trainers[0])
     assert len(collected) == 6
