@@ -2,7 +2,7 @@
 
 import sys
 
-from megastep.agents.cli.entry import run_script
+from megastep.agents.cli.entry import run_command
 
 if __name__ == "__main__":
-    sys.exit(run_script("record"))
+    sys.exit(run_command("record"))

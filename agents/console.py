@@ -106,21 +106,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool 
     return text.getvalue().strip()
 
 
-def sections(milliseconds: dict[str, float], iteration: float) -> str:
-    """Returns a table of where an iteration's time goes.
-
-    Args:
-        milliseconds: of an iteration, by section.
-        iteration: of a whole iteration, in milliseconds.
-    """
-    times = milliseconds | {"other": max(0.0, iteration - sum(milliseconds.values()))}
-    times["iteration"] = iteration
-    rows = [
-        (name, f"{time:.3g}", f"{100 * time / iteration:.1f} %") for name, time in times.items()
-    ]
-    return table(("section", "ms", "share"), rows)
-
-
 def restore() -> None:
     """Shows the cursor, which a progress bar hides, where a process ends at once."""
     if sys.stdout.isatty():

@@ -25,6 +25,7 @@ __all__ = [
     "Moments",
     "OpponentPool",
     "RolloutLike",
+    "RunLogger",
     "SaverLike",
     "with_defaults",
 ]
@@ -164,7 +165,24 @@ def with_defaults(owner: Any, options: type[T]) -> T:
 
 
 class Logger(Protocol):
-    """Writes the metrics of a run."""
+    """What `logger=module:Class` names.
+
+    Its constructor takes those that it wants of `folder`, the run folder, a Path; `step`, the
+    environment steps at which a resumed run starts, 0 in others; `run_name`, the folder's name; and
+    `config`, the run's settings as nested dicts. Its other arguments are settings.
+
+    If the constructor or a method raises, the logger is dropped with a warning and the run goes on.
+    """
+
+    def write(self, step: int, values: Mapping[str, float | str]) -> None:
+        """Writes one report after ``step`` environment steps: metrics, rates and times by name."""
+
+    def close(self) -> None:
+        """Writes what is buffered and closes files and connections."""
+
+
+class RunLogger(Protocol):
+    """Writes the metrics of a run: its JSON lines, and each logger that was chosen."""
 
     def write(
         self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]

@@ -17,18 +17,11 @@ class Mp4Writer:
 
     Args:
         fps: frames per second.
-
-    Raises:
-        ImportError: PyAV is not installed.
     """
 
     def __init__(self, fps: float):
-        try:
-            import av
-        except ImportError:
-            raise ImportError(
-                "recording videos needs PyAV, which is not installed: pip install av"
-            ) from None
+        import av  # which is needed for no other output
+
         self._from_array = av.VideoFrame.from_ndarray
         self._buffer = io.BytesIO()
         self._container = av.open(self._buffer, "w", format="mp4")

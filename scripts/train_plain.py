@@ -16,7 +16,7 @@ import torch
 from torch.nn import functional
 
 from megastep.agents.algorithms import adam, order, ppo, ppo_loss
-from megastep.agents.cli.entry import run_script
+from megastep.agents.cli.entry import run_command
 from megastep.agents.networks import (
     cores,
     critic,
@@ -175,7 +175,7 @@ def main(argv: list[str]) -> int:
     for name in names:
         PARTS[name]()
     sys.argv = ["train.py", *argv[1:]]
-    return run_script("train")
+    return run_command("train")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ DOCS = ROOT / "docs"
 PAGES = [*ROOT.glob("*.md"), *DOCS.glob("*.md"), *DOCS.glob("lab/*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.
 NEEDS_FILES = (
-    r"resume=|rerun=|init=|my_package|cores:|encoders:|my_a2c:|safe:|rover:|convoy:|my_rooms:"
+    r"resume=|rerun=|init=|my_package|cores:|encoders:|my_a2c:|safe:|rover:|convoy:|my_rooms:|my_sqlite:"
     r"|--config-dir"
 )
 

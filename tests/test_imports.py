@@ -32,7 +32,7 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("errors", "generator", "package", "sections", "types"),
+    ("errors", "generator", "package", "types"),
     ("distributed",),
     ("console", "networks"),
     ("storage",),
@@ -82,11 +82,14 @@ OWN_USERS = {
         "megastep/envs/pointgoal/path_graph.py",
         "megastep/kernels/build/*.py",
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
-        "agents/algorithms/adam.py",
+        "agents/algorithms/*.py",
         "agents/algorithms/kernels/*.py",
+        "agents/networks/*_cpu.py",
         "agents/networks/kernels/*.py",
+        "agents/selfplay/opponents.py",
         "agents/storage/copies.py",
         "agents/storage/replay_kernels.py",
+        "agents/training/episode_stats.py",
     ),
 }
 # The files that may import these packages, directly or through importlib, as glob patterns.
@@ -111,8 +114,8 @@ OUTSIDE_USERS = {
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/evaluation/ratings.py",),
     "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
-    "tensorboard": ("agents/training/loggers.py",),
-    "wandb": ("agents/training/loggers.py",),
+    "tensorboard": ("agents/training/loggers/tensorboard.py",),
+    "wandb": ("agents/training/loggers/wandb.py",),
 }
 
 
@@ -377,7 +380,7 @@ PLANTED = [
     (learner_knows_trees_and_spaces_only, "megastep.agents.networks.policy", "megastep.envs"),
     (
         learner_knows_trees_and_spaces_only,
-        "megastep.agents.storage.replay",
+        "megastep.agents.training.trainer",
         "megastep.kernels.build.compile",
     ),
     (learner_knows_trees_and_spaces_only, "megastep.agents.training.loggers", "train"),

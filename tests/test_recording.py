@@ -348,12 +348,6 @@ def test_notebook_embeds_the_video(monkeypatch):
         encoder.notebook()
 
 
-def test_missing_pyav_is_named_with_the_cure(monkeypatch):
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ImportError, match="pip install av$"), ParallelEncoder(plot_grey):
-        pass
-
-
 SCRIPT = """
 import numpy as np
 from megastep import arrdict, recording

@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 
-from megastep.agents.algorithms.kernels import program
-from megastep.kernels.build.launch import launch_blocks
+from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.kernels.build.launch import Blocks, launch
 
-_MAX_ROWS = program.PROGRAM.constants["ADAM_ROWS"]
-_THREADS = program.PROGRAM.constants["ADAM_THREADS"]
+_MAX_ROWS = PROGRAM.constants["ADAM_ROWS"]
+_THREADS = PROGRAM.constants["ADAM_THREADS"]
 _NONE = MappingProxyType({})
 
 
@@ -77,14 +77,14 @@ class Adam:
         n_sums, first_sum = sum(n_blocks for _, n_blocks in launches), 0
         sums = self.n_steps.new_empty(n_sums)
         for rows, n_blocks in launches:
-            struct = program.PROGRAM.params.SquaredNormParams(
+            launch(
+                *(PROGRAM, "squared_norm", sums.device, Blocks(n_blocks, threads=_THREADS)),
                 rows=b"".join(rows),
-                sums=sums.data_ptr(),
+                sums=sums,
                 n_rows=len(rows),
                 n_sums=n_sums,
                 first_sum=first_sum,
             )
-            self._launch("squared_norm", struct, n_blocks)
             first_sum += n_blocks
         return sums
 
@@ -131,19 +131,19 @@ class Adam:
     ) -> None:
         """Takes a `step` that `n_steps` counts already, if it `is_fused`."""
         for rows, n_blocks in self._launches():
-            struct = program.PROGRAM.params.AdamParams(
+            launch(
+                *(PROGRAM, "adam", self.lr.device, Blocks(n_blocks, threads=_THREADS)),
                 rows=b"".join(rows),
-                lr=self.lr.data_ptr(),
-                n_steps=self.n_steps.data_ptr(),
-                grad_norm=0 if grad_norm is None else grad_norm.data_ptr(),
-                is_taken=is_taken.data_ptr(),
+                lr=self.lr,
+                n_steps=self.n_steps,
+                grad_norm=grad_norm,
+                is_taken=is_taken,
                 n_rows=len(rows),
                 max_norm=max_norm,
                 beta1=self.betas[0],
                 beta2=self.betas[1],
                 eps=self.eps,
             )
-            self._launch("adam", struct, n_blocks)
 
     def _launches(self):
         """Yields the packed rows of a launch, at most `_MAX_ROWS`, and its number of blocks."""
@@ -158,7 +158,7 @@ class Adam:
                 addresses = [x.data_ptr() for x in (p, p.grad, mean, square)]
                 names = "parameter", "gradient", "mean", "square"
                 rows.append(
-                    program.PROGRAM.params.AdamRowParams(
+                    PROGRAM.params.AdamRowParams(
                         **dict(zip(names, addresses, strict=True)),
                         n=p.numel(),
                         first_block=n_blocks,
@@ -169,9 +169,6 @@ class Adam:
                 )
                 n_blocks += max(1, -(-p.numel() // (4 * _THREADS)))
         yield rows, n_blocks
-
-    def _launch(self, operation, struct, n_blocks):
-        launch_blocks(program.PROGRAM, operation, struct, self.lr.device, (n_blocks, 1), _THREADS)
 
     def zero_grad(self) -> None:
         """Frees the gradients."""

@@ -53,10 +53,6 @@ class CudaGraphUpdate:
         self._rollout = None
         self._n_warm_ups_left = _N_WARM_UPS
 
-    def recapture(self) -> None:
-        """Discards the graph. The next update captures again, without warming up."""
-        self.graph = self._rollout = None
-
     def __call__(self, rollout: RolloutLike) -> Metrics:
         """Performs one update. The tensors it returns are not overwritten by the next one."""
         if self.stream is None:

@@ -6,10 +6,10 @@ from typing import Any
 import torch
 
 from megastep.agents.algorithms.adam import Adam
-from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.kernels import PROGRAM
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
-from megastep.agents.sections import section
+from megastep.kernels.build.launch import Blocks, launch
 
 
 class GradientSteps:
@@ -74,7 +74,6 @@ class GradientSteps:
         self._totals = None
         return self._is_finite, pooled
 
-    @section("backward")
     def backward(
         self, loss: torch.Tensor, metrics: dict[str, torch.Tensor], n_valid: torch.Tensor
     ) -> dict[str, torch.Tensor]:
@@ -95,7 +94,6 @@ class GradientSteps:
         self._n_valid, self._metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
         return self._metrics
 
-    @section("optimiser")
     def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
         """Takes one step down the gradient. Without a valid transition, it is not taken.
 
@@ -105,7 +103,7 @@ class GradientSteps:
         Returns:
             () bool, whether the step was taken.
         """
-        max_metrics = program.PROGRAM.constants["JUDGED_METRICS"]
+        max_metrics = PROGRAM.constants["JUDGED_METRICS"]
         if self.optimizer.is_fused and len(self._metrics) <= max_metrics:
             grad_norm, is_taken = self._judge_on_gpu(is_enabled)
             self.optimizer.step_on_gpu(is_taken, grad_norm, self.max_grad_norm)
@@ -132,16 +130,14 @@ class GradientSteps:
         """Does `_judge` in two kernels, and counts the step."""
         sums, device = self.optimizer.squared_norms(), self._lr.device
         metrics = [value.float() for value in self._metrics.values()]
-        pack = program.PROGRAM.params.MetricParams
+        pack = PROGRAM.params.MetricParams
         is_first = self._totals is None
         if is_first:
             self._totals = sums.new_empty(len(metrics) + 3)
         grad_norm, is_taken = sums.new_empty(()), torch.empty_like(self._is_finite)
-        n_threads = program.PROGRAM.constants["ADAM_THREADS"]
-        program.run(
-            *("judge", device, n_threads),
-            block=n_threads,
-            metrics=b"".join(pack(values=value.data_ptr()) for value in metrics),
+        launch(
+            *(PROGRAM, "judge", device, Blocks(1, threads=PROGRAM.constants["ADAM_THREADS"])),
+            metrics=b"".join(pack(values=value) for value in metrics),
             sums=sums,
             is_finite=self._is_finite,
             is_enabled=None if is_enabled is True else torch.as_tensor(is_enabled, device=device),

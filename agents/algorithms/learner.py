@@ -28,10 +28,6 @@ Rules:
   `generator.stream_seed(seed, name)` turns into that of a random stream of its own; `graph` is true
   if updates should be captured as a CUDA graph.
 - A replay buffer belongs to the learner or to its collector.
-- A learner or collector that replays CUDA graphs may have a method `recapture()`: it discards them,
-  so that the next call captures again. A GPU's sections are measured that way; see
-  `agents/sections.py` for how to time sections of your own. A collector's returns what collects
-  without an update beside it, usually itself.
 - `megastep.agents.types.LearnerOptions` and `CollectorOptions` list what is optional.
   `bytes_per_env(env)` and, with a replay buffer, `replay_size(env)` are what a run checks its
   memory with before it starts.
@@ -50,7 +46,6 @@ from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.gradient_steps import GradientSteps
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
-from megastep.agents.sections import section
 from megastep.agents.storage.rollout import Rollout
 
 # Types of settings that several learners have.
@@ -134,8 +129,7 @@ class GradientLearner:
         )
         self.check, self.optimizer = self.steps.check, self.steps.optimizer
         self.generator = SeededGenerator(stream_seed(seed, "learner"))
-        update = section("returns")(self._update)  # all but the sections inside it
-        self.cuda_graph = CudaGraphUpdate(update, self.device, graph, (self.generator,))
+        self.cuda_graph = CudaGraphUpdate(self._update, self.device, graph, (self.generator,))
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Learns from a rollout.
@@ -152,10 +146,6 @@ class GradientLearner:
     def _update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Performs one update without synchronising, so that it can be captured."""
         raise NotImplementedError
-
-    def recapture(self) -> None:
-        """Discards the CUDA graph. The next update captures again."""
-        self.cuda_graph.recapture()
 
     def set_lr(self, lr: float) -> None:
         """Changes Adam's step size, the critic's by the same factor, also for a captured update."""

@@ -2,7 +2,8 @@
 
 import torch
 
-from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.kernels.build.launch import WARP, launch
 
 _MAX_COUNTED = 16_384  # keys; counting takes the square of their number
 
@@ -27,6 +28,5 @@ def order(keys: torch.Tensor) -> torch.Tensor:
 def _order_on_gpu(keys):
     """Does `order` in one kernel."""
     n, result = len(keys), torch.empty_like(keys, dtype=torch.int64)
-    n_threads = n * program.PROGRAM.constants["WARP"]
-    program.run("order", keys.device, n_threads, keys=keys, order=result, n=n)
+    launch(PROGRAM, "order", keys.device, n * WARP, keys=keys, order=result, n=n)
     return result

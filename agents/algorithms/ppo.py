@@ -21,7 +21,6 @@ from megastep.agents.algorithms.order import random_order
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
 from megastep.agents.networks.policy import Policy
-from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.settings import MAX_ENVS, AtMost, checked
@@ -146,7 +145,6 @@ class PPO(GradientLearner):
         self.policy.add_moments(of_obs, is_finite)
         return {**self.steps.end(), "explained_variance": explained}
 
-    @section("forward")
     def _losses(self, rollout, lanes, batch):
         """Returns the loss of a minibatch and its metrics, tensors ().
 

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.kernels import PROGRAM
 from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.arrdict import arrdict
+from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
 METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
 
@@ -99,12 +100,11 @@ class _FusedLoss(torch.autograd.Function):
         inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
         n_rows = logprobs.numel()
-        sums = logprobs.new_empty(program.n_blocks(n_rows), program.PROGRAM.constants["N_SUMS"])
+        blocks = Blocks(-(-n_rows // BLOCK))
+        sums = logprobs.new_empty(blocks.x, PROGRAM.constants["N_SUMS"])
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
-        program.run(
-            "ppo_loss",
-            logprobs.device,
-            n_rows,
+        launch(
+            *(PROGRAM, "ppo_loss", logprobs.device, blocks),
             logprobs=logprobs.contiguous(),
             **dict(zip(("entropies", "values", "errors"), inputs, strict=True)),
             old_logprobs=batch.logprobs.contiguous(),

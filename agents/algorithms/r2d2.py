@@ -12,7 +12,6 @@ from pydantic import Field
 from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
 from megastep.agents.algorithms.td_loss import Settings, td_loss
 from megastep.agents.networks.policy import Policy
-from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
@@ -185,7 +184,6 @@ class R2D2(GradientLearner):
             "priority_mean": (priorities.sum() / n_available).float(),
         }
 
-    @section("forward")
     def _losses(self, batch):
         """Returns the `td_loss.Result` of a minibatch."""
         burn_in = self.replay_settings.burn_in

@@ -12,9 +12,9 @@ the value is 0; after a truncated step returns bootstrap from V. No sum crosses 
 import torch
 
 from megastep import arrdict
-from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.kernels import PROGRAM
 from megastep.agents.networks.scan import linear_scan
-from megastep.agents.sections import section
+from megastep.kernels.build.launch import launch
 
 
 def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor:
@@ -71,10 +71,8 @@ def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_):
     n_steps, n_lanes = reward.shape
     advantages, targets = reward.new_empty(2, n_steps, n_lanes)
     valid = torch.empty_like(advantages, dtype=torch.bool)
-    program.run(
-        "gae",
-        value.device,
-        n_lanes,
+    launch(
+        *(PROGRAM, "gae", value.device, n_lanes),
         reward=reward.contiguous(),
         values=value.contiguous(),
         last_value=last_value.contiguous(),
@@ -90,7 +88,6 @@ def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_):
     return arrdict.arrdict(advantages=advantages, targets=targets, valid=valid)
 
 
-@section("returns")
 def vtrace(
     log_ratio: torch.Tensor,
     reward: torch.Tensor,
@@ -150,10 +147,8 @@ def _vtrace_on_gpu(steps, value, last_value, settings):
     """Computes `vtrace` in one kernel, lane by lane."""
     n_steps, n_lanes = value.shape
     advantages, targets = value.new_empty(2, n_steps, n_lanes)
-    program.run(
-        "vtrace",
-        value.device,
-        n_lanes,
+    launch(
+        *(PROGRAM, "vtrace", value.device, n_lanes),
         **{name: leaf.contiguous() for name, leaf in steps.items()},
         values=torch.cat([value, last_value[None]]),
         advantages=advantages,
@@ -165,7 +160,6 @@ def _vtrace_on_gpu(steps, value, last_value, settings):
     return arrdict.arrdict(advantages=advantages, targets=targets, valid=~steps["reset"])
 
 
-@section("returns")
 def n_step_returns(
     reward: torch.Tensor,
     value: torch.Tensor,

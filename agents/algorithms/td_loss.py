@@ -10,19 +10,20 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.kernels import PROGRAM
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
 from megastep.agents.networks.outputs import Output
 from megastep.agents.storage.rollout import without_last
 from megastep.arrdict import arrdict
+from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Tree
 
 METRICS = "td", "td_error", "q", "staleness", "effective_samples"
 _ENDS = "reward", "terminal", "truncated"
 _EPS = 1e-3  # of `returns.rescale`
-_THREADS = program.PROGRAM.constants["TD_THREADS"]
-_SEQUENCES = program.PROGRAM.constants["TD_SEQUENCES"]
-_N_SUMS, _N_METRICS = (program.PROGRAM.constants[f"N_TD_{name}"] for name in ("SUMS", "METRICS"))
+_THREADS = PROGRAM.constants["TD_THREADS"]
+_SEQUENCES = PROGRAM.constants["TD_SEQUENCES"]
+_N_SUMS, _N_METRICS = (PROGRAM.constants[f"N_TD_{name}"] for name in ("SUMS", "METRICS"))
 
 
 class Settings(NamedTuple):
@@ -117,11 +118,8 @@ class _FusedLoss(torch.autograd.Function):
         sums, metrics = q.new_empty(n_blocks, _N_SUMS), q.new_empty(_N_METRICS)
         names = *_ENDS, "actions", "starts", "learns", "weight", "age"
         tensors = {name: batch[name].contiguous() for name in names}
-        program.run(
-            "td_loss",
-            q.device,
-            n_blocks * _THREADS,
-            block=_THREADS,
+        launch(
+            *(PROGRAM, "td_loss", q.device, Blocks(n_blocks, threads=_THREADS)),
             q=q.contiguous(),
             target_q=target_q.contiguous(),
             **tensors,
@@ -138,11 +136,8 @@ class _FusedLoss(torch.autograd.Function):
             eta=settings.eta,
             eps=_EPS,
         )
-        program.run(
-            "td_metrics",
-            q.device,
-            _THREADS,
-            block=_THREADS,
+        launch(
+            *(PROGRAM, "td_metrics", q.device, Blocks(1, threads=_THREADS)),
             sums=sums,
             metrics=metrics,
             n_blocks=n_blocks,

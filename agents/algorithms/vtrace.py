@@ -29,7 +29,6 @@ from megastep.agents.algorithms.order import random_order
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.policy import Policy
-from megastep.agents.sections import section
 from megastep.agents.storage import mixed_batches
 from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
@@ -193,7 +192,6 @@ class VTrace(GradientLearner):
         self.policy.add_moments(of_obs, is_finite)
         return self.steps.end()
 
-    @section("forward")
     def _batch(self, rollout, lanes):
         batch = mixed_batches.from_rollout(rollout, lanes)
         if self.replay_buffer is None:
@@ -204,7 +202,6 @@ class VTrace(GradientLearner):
             batch, self.replay_buffer, self.policy, n_replayed, generator
         )
 
-    @section("forward")
     def _losses(self, batch, n_fresh):
         """Returns the loss of a minibatch, its metrics, tensors (), and V-trace's estimates.
 

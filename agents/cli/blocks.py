@@ -7,7 +7,7 @@
         gamma: 0.98
 
 A block is merged as Hydra loads its file, so that a later file wins over the blocks of an earlier
-one. A learner of a user has the blocks of the built-in learner that it derives from, else of PPO.
+one. A learner of a user has the blocks of the built-in learner that it derives from, if of any.
 """
 
 import functools
@@ -23,8 +23,6 @@ from megastep.agents.factory import check, components, settings
 from megastep.agents.launch import gpu
 from megastep.imports import import_object
 
-#: The learner whose blocks a class that derives from none of ours has.
-DEFAULT = "ppo"
 #: The names of blocks, the last of which wins, and whether they are laid over their files.
 applied: dict[str, bool] = {}
 
@@ -40,9 +38,9 @@ def apply(device: Any, learner: Any) -> None:
     applied.update({"cpu": is_cpu, "gpu": not is_cpu, **learners})
 
 
-def built_in(learner: str) -> str:
+def built_in(learner: str) -> str | None:
     """Returns the name of the built-in learner whose blocks a learner has, from its name or import
-    path.
+    path; None if it has none.
     """
     names = {path: name for name, path in components.members("learner").items()}
     paths = [learner]
@@ -51,7 +49,7 @@ def built_in(learner: str) -> str:
             bases = getattr(import_object(learner), "__mro__", ())
             paths = [f"{base.__module__}:{base.__qualname__}" for base in bases]
     known = [names[path] for path in paths if path in names]
-    return learner if learner in names.values() else [*known, DEFAULT][0]
+    return learner if learner in names.values() else next(iter(known), None)
 
 
 def merged(tree: dict[str, Any]) -> dict[str, Any]:
@@ -84,10 +82,13 @@ def note(config: DictConfig, typed: list[str]) -> str:
     taken = [f"{key}={value}" for key, value in values if f"learner.{key}" not in typed]
     if not taken:
         return ""
-    recipe = config.hydra.runtime.choices.get("experiment")
-    source = f"{'the CPU' * applied['cpu'] or 'the'} values of {built_in(name)}"
-    source += f" and experiment={recipe}" if recipe else ""
-    return f"learner={name} takes {', '.join(taken)} from {source}"
+    sources, base = [], built_in(name)
+    if base:
+        sources.append(f"{'the CPU' * applied['cpu'] or 'the'} values of {base}")
+    if recipe := config.hydra.runtime.choices.get("experiment"):
+        sources.append(f"experiment={recipe}")
+    sources = " and ".join(sources) or "configuration files"
+    return f"learner={name} takes {', '.join(taken)} from {sources}"
 
 
 def _fields(learner):

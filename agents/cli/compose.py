@@ -27,7 +27,7 @@ from megastep.agents import package
 from megastep.agents.cli import blocks
 from megastep.agents.cli.scripts import Script
 from megastep.agents.errors import ConfigErrors, UserError, shortened
-from megastep.agents.factory import check, settings
+from megastep.agents.factory import check, components, settings
 from megastep.settings import closest
 
 #: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
@@ -43,7 +43,7 @@ EXTRAS = ("joblib", "optuna", "submitit_local", "submitit_slurm")
 #: Groups with keys that no file has, for they are arguments of constructors.
 OPEN = {
     key: OmegaConf.create({}, flags={"struct": False})
-    for key in (*settings.IMPORTED, "agent", "opponents", "logger")
+    for key in (*settings.IMPORTED, "agent", "opponents")
 }
 #: What Hydra raises for words that it cannot use.
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
@@ -52,6 +52,9 @@ STORE = config_store.ConfigStore.instance()
 # second: there is only one
 config_store.ConfigStore.__deepcopy__ = lambda store, memo: store
 STORE.store(name="open", node=OmegaConf.create(OPEN))
+STORE.store(group="logger", name="none", node={})
+for label, path in settings.loggers().items():
+    STORE.store(group="logger", name=label, node={label: {"name": path}})
 
 
 class FolderOfUser(SearchPathPlugin):
@@ -85,6 +88,10 @@ class Composer:
         if absent := [p for p in (folder, self.main) if p and not os.path.isdir(p)]:
             raise UserError(f"There is no folder {absent[0]} with configurations")
         self.note = ""
+        for group in ("env", "geometry", "learner"):
+            for member, path in components.members(group).items():
+                if not os.path.exists(package.CONFIGS / group / f"{member}.yaml"):
+                    STORE.store(group=group, name=member, node={"name": path})
         FolderOfUser.path = folder and os.path.abspath(folder)
         plugins.Plugins.instance().register(FolderOfUser)
         global_hydra.GlobalHydra.instance().clear()
@@ -167,7 +174,7 @@ class Composer:
         word = word.lstrip("+")
         names = [name for name, _ in check.fields_of(self.script.kind, {})]
         group, is_nested, _ = word.partition(".")
-        if word in names or (is_nested and group in settings.GROUPS):
+        if word in names or (is_nested and group in settings.IMPORTED):
             return f"has no value; write {word}=..."
         groups = []
         with suppress(*HYDRA_ERRORS):  # in files, which are named when they are composed
@@ -187,23 +194,32 @@ class Composer:
         for override in overrides:
             key, group, value = key_of(override), override.key_or_group, override.value()
             options = self.members(group)
+            chosen = value if group == "logger" and isinstance(value, list) else [value]
+            others = [one for one in chosen if one not in options]
+            labels = [settings.label(one) for one in {*map(str, chosen)}]
             if override.is_sweep_override():
                 errors.append((key, f"{override.input_line!r} has several values; add -m to sweep"))
-            elif key == "hydra.searchpath" or options and value in options:
+            elif len({*labels}) < len(labels):
+                errors.append((key, "two loggers have the same class name, and so the same keys"))
+            elif key == "hydra.searchpath" or options and not others:
                 groups.append(override.input_line)
             elif not options or isinstance(value, dict):
                 keys[key] = override
-            elif group in settings.IMPORTED and is_import_path(value):
-                # a learner has the file of the one that it derives from
-                base = [blocks.built_in(value)] if group == "learner" else []
-                node = {"defaults": [*base, "_self_"], "name": value}
-                STORE.store(group=group, name=value, node=node)
+            elif group in settings.IMPORTED and all(map(is_import_path, others)):
+                for name in others:
+                    node = {"name": name}
+                    if group == "logger":
+                        node = {settings.label(name): node}
+                    elif group == "learner":  # it has the file of the one that it derives from
+                        node["defaults"] = [*filter(None, [blocks.built_in(name)]), "_self_"]
+                    STORE.store(group=group, name=name, node=node)
                 groups.append(override.input_line)
             else:
-                hint = f"is unknown; {closest(value, options)}"
-                if value in EXTRAS:
+                unknown = next(one for one in others if not is_import_path(one))
+                hint = f"is unknown; {closest(unknown, options)}"
+                if unknown in EXTRAS:
                     hint = f"is not installed: pip install '{package.DISTRIBUTION}[sweep]'"
-                errors.append((key, f"{shortened(repr(value))} {hint}"))
+                errors.append((key, f"{shortened(repr(unknown))} {hint}"))
         try:
             device, learner = (
                 str(keys[key].value()) if key in keys else None

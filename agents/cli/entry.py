@@ -1,7 +1,8 @@
-"""Starts train, evaluate, record and reproduce: as scripts, as the command `megastep`, or with
-`python -m megastep`. Signals and closed streams are handled before anything else is imported.
+"""Starts commands: as scripts, as the command `megastep`, or with `python -m megastep`. Signals and
+closed streams are handled before anything else is imported.
 """
 
+import importlib
 import os
 import sys
 import threading
@@ -10,17 +11,14 @@ from megastep.agents import package
 from megastep.agents.errors import UserError
 from megastep.agents.launch import signals
 
-SCRIPTS = {
-    "train": "trains a policy",
-    "evaluate": "measures a trained policy",
-    "record": "films a trained policy",
-    "reproduce": "lists the results in docs/lab; makes one again",
-}
-#: Commands about one run, which is their argument, or a file of it.
-ON_RUNS = {
+#: The commands, each a module of this package with `main(words) -> int`, the exit code.
+COMMANDS = {
+    "train": "trains a policy; --help says more",
+    "evaluate": "measures a trained policy; --help says more",
+    "record": "films a trained policy; --help says more",
+    "reproduce": "lists the results in docs/lab; makes one again; --help says more",
     "inspect": "verifies a run's checkpoints and prints what is in them",
     "rerun": "repeats a run and compares its metrics, byte for byte",
-    "replay": "shows a NaN of a run again, from the file that the run wrote",
 }
 #: What only a clone of the repository has, and what runs it there.
 IN_A_CLONE = {
@@ -40,26 +38,16 @@ def main() -> int:
             os.environ["COMP_LINE"] = line.replace(script, "", 1)
             words = [script, *words]
         else:
-            print(" ".join(name for name in SCRIPTS | ON_RUNS if name.startswith(script)))
+            print(" ".join(name for name in COMMANDS if name.startswith(script)))
             words = [""]
-    if words[0] == "rerun" and len(words) > 1:
-        words = ["train", f"rerun={words[1]}", *words[2:]]
-    if words[0] in SCRIPTS:
-        sys.argv[1:] = words[1:]
-        return run_script(words[0])
-    if words[0] == "inspect":
-        return inspect_run(words[1:])
-    if words[0] == "replay":
-        sys.argv[1:] = words[1:]
-        return replay_file()
+    if words[0] in COMMANDS:
+        return run_command(words[0], words[1:])
     from megastep.agents import console
     from megastep.settings import closest
 
     console.open_streams()
     if words[0] in ("-h", "--help"):
-        for name, text in SCRIPTS.items():
-            console.say(f"  {package.command(name, 'python -m '):<28}{text}; --help says more")
-        for name, text in ON_RUNS.items():
+        for name, text in COMMANDS.items():
             console.say(f"  {package.command(name, 'python -m '):<28}{text}")
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
     elif words[0] == "--version":
@@ -69,49 +57,22 @@ def main() -> int:
         console.say(f"megastep: {text}", sys.stderr)
         return 2
     elif words[0]:
-        console.say(
-            f"megastep: {words[0]!r} is unknown; {closest(words[0], [*SCRIPTS, *ON_RUNS])}",
-            sys.stderr,
-        )
+        text = f"{words[0]!r} is unknown; {closest(words[0], COMMANDS)}"
+        console.say(f"megastep: {text}", sys.stderr)
         return 2
     return 0
 
 
-def run_script(name: str) -> int:
-    """Runs a script of this package by its name. Returns the exit code."""
+def run_command(name: str, words: list[str] | None = None) -> int:
+    """Runs a command, by default with the words of this process. Returns the exit code."""
+    sys.argv[1:] = words = sys.argv[1:] if words is None else words
     signals.exit_on_signals(name)
     from megastep.agents import console
 
     console.open_streams()
     threading.excepthook = console.warn_of_thread
-    if name == "reproduce":
-        from megastep.agents.cli import reproduce
-
-        return reproduce.main(sys.argv[1:])
-    from megastep.agents.cli import command, scripts
-
-    return command.run_command(scripts.SCRIPTS[name])
-
-
-def inspect_run(words: list[str]) -> int:
-    """Runs `megastep inspect`. Returns the exit code."""
-    signals.exit_on_signals("inspect")
-    from megastep.agents import console
-    from megastep.agents.cli import inspect
-
-    console.open_streams()
     try:
-        return inspect.run(words)
+        return importlib.import_module(f"megastep.agents.cli.{name}").main(words)
     except UserError as error:
-        console.say(f"megastep inspect: {error}", sys.stderr)
+        console.say(f"{package.command(name)}: {error}", sys.stderr)
         return error.code
-
-
-def replay_file() -> int:
-    """Runs `megastep replay`. Returns the exit code."""
-    signals.exit_on_signals("replay")
-    from megastep.agents import console
-    from megastep.agents.cli import replay
-
-    console.open_streams()
-    return replay.main()

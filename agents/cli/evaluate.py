@@ -1,11 +1,17 @@
-"""The command that measures a trained policy. `evaluate --help` lists the choices; `run(cfg)` is
-the same from Python.
-"""
+"""The command that measures a trained policy. `evaluate --help` lists the choices."""
 
 import functools
+from pathlib import Path
 
 from megastep.agents.cli import command, scripts
-from megastep.agents.evaluation.evaluate import run as run
+from megastep.agents.factory import settings
 
-#: Runs the script with words of a command line, by default this process's.
+#: Runs the command with words of a command line, by default this process's.
 main = functools.partial(command.run_command, scripts.EVALUATE)
+
+
+def run(cfg: settings.Evaluate) -> Path:
+    """Evaluates a run; see `megastep.agents.evaluation.evaluate.run`."""
+    from megastep.agents.evaluation import evaluate  # with PyTorch
+
+    return evaluate.run(cfg)

@@ -15,7 +15,7 @@ HELP = """Verifies a run's checkpoints and prints what is in them.
   megastep inspect RUN     a run folder, one of its checkpoints, latest, or a pretrained agent"""
 
 
-def run(words: list[str]) -> int:
+def main(words: list[str]) -> int:
     """Inspects the run named by the words of a command line. Returns the exit code: 1 if one of its
     checkpoints is damaged.
     """

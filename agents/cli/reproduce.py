@@ -7,7 +7,6 @@ import itertools
 import json
 import os
 import re
-import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -98,14 +97,10 @@ def main(words: Sequence[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         console.say(listing(rows.values()))
         return 0
-    try:
-        if len(words) > 1 or words[0] not in rows:
-            unknown = f"{words[0]!r} is unknown; {closest(words[0], rows)}"
-            raise UserError("takes the name of one row" if words[1:] else unknown)
-        return reproduce(rows[words[0]])
-    except UserError as error:
-        console.say(f"{package.command('reproduce')}: {error}", sys.stderr)
-        return error.code
+    if len(words) > 1 or words[0] not in rows:
+        unknown = f"{words[0]!r} is unknown; {closest(words[0], rows)}"
+        raise UserError("takes the name of one row" if words[1:] else unknown)
+    return reproduce(rows[words[0]])
 
 
 def listing(rows: Iterable[Row]) -> str:

@@ -3,7 +3,6 @@ before PyTorch is imported.
 """
 
 import contextlib
-import functools
 import importlib
 import re
 from collections.abc import Callable, Iterator
@@ -66,7 +65,8 @@ The most common words:
   init=RUN                     start a new run from its weights, in its environment and homes; also
                                the name of a pretrained agent
   env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
-  logger=wandb logger.mode=offline"""
+  logger=[tensorboard,wandb] logger.wandb.mode=offline
+                               several loggers; csv, none, or a class of your own"""
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
 #: what it learns.
 RESUMABLE = (
@@ -82,7 +82,7 @@ RESUMABLE = (
     "keep_checkpoints",
     "replay_every",
     "desync",
-    "nonfinite_replay",
+    "profile",
     "snapshots",
     "ranks",
     "restarts",
@@ -101,6 +101,7 @@ REPEATABLE = (
     "checkpoint_seconds",
     "keep_checkpoints",
     "replay_every",
+    "profile",
     "restarts",
     "dry_run",
     "logger",
@@ -123,6 +124,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     keys and groups.
     """
     set_ranks(tree, typed)
+    tree.setdefault("logger", {})  # as it is with logger=none
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if len(given) > 1:
         raise ConfigErrors([(given[1], f"cannot be combined with {given[0]}")])
@@ -155,7 +157,10 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
         saved |= {"resume": None, "folder": None}
     for key in typed:
         *groups, leaf = key.split(".")
-        source, target = (functools.reduce(dict.get, groups, one) for one in (tree, saved))
+        source, target = tree, saved
+        for group in groups:
+            # a logger that the run did not have
+            source, target = source[group], target.setdefault(group, {})
         target[leaf] = source[leaf]
     if how == "resume" and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
         raise ConfigErrors(errors)

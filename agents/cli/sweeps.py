@@ -262,10 +262,12 @@ class Job:
                     if composer.note:
                         console.say(composer.note)
                     cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
-                    logger = getattr(cfg, "logger", None)
-                    if getattr(logger, "group", "") is None:
-                        logger = settings.changed(logger, group=Path(self.folder).name)
-                        cfg = settings.changed(cfg, logger=logger)
+                    grouped = {
+                        label: settings.changed(one, group=Path(self.folder).name)
+                        for label, one in getattr(cfg, "logger", {}).items()
+                        if getattr(one, "group", "") is None
+                    }
+                    cfg = settings.changed(cfg, logger=getattr(cfg, "logger", {}) | grouped)
                     with places.taken(cfg) as cfg:
                         result = scripts.SCRIPTS[self.source[0]].run(cfg)
                     row |= {"state": DONE, **(scores.outcome(result) if result else {})}

@@ -2,8 +2,10 @@
 which takes seconds to import.
 """
 
+import contextlib
 import os
 import socket
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 NAMES = "RANK", "WORLD_SIZE", "LOCAL_RANK"
@@ -45,3 +47,19 @@ def rank() -> int:
 
 def hostname() -> str:
     return socket.gethostname()
+
+
+@contextlib.contextmanager
+def variables(changes: Mapping[str, str]) -> Iterator[None]:
+    """Sets environment variables, also of processes that are started, for the time of this
+    context.
+    """
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, text in before.items():
+            os.environ.pop(name, None)
+            if text is not None:
+                os.environ[name] = text

@@ -60,12 +60,18 @@ def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, An
     """
     for name, field in kind.__pydantic_fields__.items():
         yield prefix + name, field
-        below, value = field.annotation, tree.get(name) if isinstance(tree, dict) else None
-        if name in settings.GROUPS:
-            with contextlib.suppress(KeyError, TypeError, ValueError):
-                below = settings.kind_of(name, str(value["name"]))
-        if dataclasses.is_dataclass(below):
-            yield from fields_of(below, value, f"{prefix}{name}.")
+        value = tree.get(name) if isinstance(tree, dict) else None
+        members = {f"{prefix}{name}": value}
+        if name == "logger" and isinstance(value, dict):
+            members = {f"{prefix}logger.{label}": one for label, one in value.items()}
+            yield from ((key, field) for key in members)
+        for key, member in members.items():
+            below = field.annotation
+            if name in settings.IMPORTED:
+                with contextlib.suppress(KeyError, TypeError, ValueError):
+                    below = settings.kind_of(name, str(member["name"]))
+            if dataclasses.is_dataclass(below):
+                yield from fields_of(below, member, f"{key}.")
 
 
 def leaves(tree: Tree, prefix: str = "") -> list[tuple[str, Any]]:
@@ -85,7 +91,7 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
 
 def _unknown(path: list[str], keys: list[str]) -> str:
     group, leaf = path[0], path[-1]
-    for member, name in components.members(group).items() if group in settings.GROUPS else ():
+    for member, name in components.members(group).items() if group in settings.IMPORTED else ():
         if path[1:] == [leaf] and leaf in settings.kind_of(group, name).__pydantic_fields__:
             return f"no such key here; {group}={member} has it"
     return f"no such key; {closest_key('.'.join(path), keys)}"

@@ -7,10 +7,14 @@ hash of the sources.
 
 import functools
 import hashlib
+import importlib
+import inspect
 import pickle
+import pkgutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import pydantic
 import yaml
@@ -27,6 +31,9 @@ MIXED = "megastep.geometries.sources:mixed"
 CHECK_PARTS = "megastep.geometries.sources:check_parts"
 SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
+#: Where components are found without a file in configs/.
+ENVS, SOURCES = "megastep.envs", "megastep.geometries.sources"
+LEARNERS, LOGGERS = "megastep.agents.algorithms", "megastep.agents.training.loggers"
 #: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
 #: are passed by the program, `missing` are defaults, and the others are settings beside them.
 ARGUMENTS = {
@@ -41,6 +48,7 @@ ARGUMENTS = {
         anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
     ),
     "curriculum": dict(reserved=("env", "learner", "rollout", "sources"), name=str),
+    "logger": dict(reserved=("folder", "step", "run_name", "config"), name=str),
     "agent": dict(reserved=("obs_space", "action_space", "privileged_space", "seed")),
     "opponents": dict(
         reserved=("env", "policy", "scripted", "seed"),
@@ -51,42 +59,75 @@ ARGUMENTS = {
 VERSIONS = 8
 
 
+class Components(NamedTuple):
+    """The components of megastep.
+
+    Attributes:
+        arguments: what `arguments_of` returns of each, by (group, import path).
+        takers: import paths of the environments that take floor plans.
+        members: {group: {name: import path}} of those that need no file in configs/.
+    """
+
+    arguments: dict[tuple[str, str], tuple[str, dict[str, tuple]]]
+    takers: set[str]
+    members: dict[str, dict[str, str]]
+
+
 def built_in() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
     """Returns what `arguments_of` returns of each component, by (group, import path)."""
-    return cached()[0]
+    return cached().arguments
 
 
 def takes_geometries(env: str) -> bool:
     """Returns whether the environment of an import path takes floor plans."""
-    built_in, takers = cached()
-    return env in takers if ("env", env) in built_in else _takes_geometries(env)
+    return env in cached().takers if ("env", env) in built_in() else _takes_geometries(env)
+
+
+def members(group: str) -> dict[str, str]:
+    """Returns {member: its `name`} of a group's components, with a file in configs/ or without."""
+    return cached().members.get(group, {}) | _files(group)
 
 
 @functools.cache
-def cached() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str]]:
+def cached() -> Components:
     """Returns what `read` does, from the cache on disk if no source has changed."""
-    content, _ = cache.fetch(f"arguments-{_sources()}", lambda: pickle.dumps(read()))
+    content, _ = cache.fetch(f"arguments-{_sources()}", lambda: pickle.dumps(tuple(read())))
     cache.prune("arguments-", VERSIONS)
-    return pickle.loads(content)
+    return Components(*pickle.loads(content))
 
 
-def read() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str]]:
-    """Imports every component of megastep. Returns what `built_in` does, and the import paths of
-    the environments that take floor plans.
-    """
+def read() -> Components:
+    """Imports every component of megastep."""
+    envs, sources = map(importlib.import_module, (ENVS, SOURCES))
+    found = {
+        "env": {name: f"{ENVS}.{name}:{kind.__name__}" for name, kind in envs.ENVS.items()},
+        "geometry": {name: f"{SOURCES}:{name}" for name in sources.__all__},
+        "learner": {k: v for k, v in _classes(LEARNERS) if hasattr(import_object(v), "collector")},
+        "logger": dict(_classes(LOGGERS)),
+    }
     names = [("agent", POLICY), ("opponents", OPPONENTS)]
     for group in ARGUMENTS:
-        paths = members(group).values()
+        paths = {*found.get(group, {}).values(), *_files(group).values()}
         names += [(group, path) for path in paths if path.startswith("megastep.")]
     arguments = {
         (group, name): arguments_of(import_object(name), **ARGUMENTS[group])
         for group, name in names
     }
-    return arguments, {name for group, name in names if group == "env" and _takes_geometries(name)}
+    takers = {name for group, name in names if group == "env" and _takes_geometries(name)}
+    return Components(arguments, takers, found)
+
+
+def _classes(package: str) -> Iterator[tuple[str, str]]:
+    """Yields (file, import path) of the classes that have the name of their file, in lower case."""
+    for file in pkgutil.iter_modules(importlib.import_module(package).__path__):
+        module = importlib.import_module(f"{package}.{file.name}")
+        for name, value in vars(module).items():
+            if inspect.isclass(value) and name.lower() == file.name:
+                yield file.name, f"{package}.{file.name}:{name}"
 
 
 @functools.cache
-def members(group: str) -> dict[str, str]:
+def _files(group: str) -> dict[str, str]:
     """Returns {member: its `name`} of the files of a group that name a component."""
     trees = {
         path.stem: yaml.safe_load(path.read_text()) or {}

@@ -137,11 +137,9 @@ def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
     return sample
 
 
-def check_memory(
-    env: Env, sample: Any, learner: Any, n_copies: int, geometries: list, **arguments: Any
-) -> None:
+def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **arguments: Any) -> None:
     """Raises UserError with the number that fits, if there are too many environments, or too many
-    observations in a replay buffer, for the memory, which holds `n_copies` of each environment.
+    observations in a replay buffer, for the memory.
 
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
@@ -149,7 +147,7 @@ def check_memory(
     options = with_defaults(learner, LearnerOptions)
     n_bytes = options.bytes_per_env(sample)
     n, each = options.replay_size(sample)
-    total = n_copies * _nbytes(sample)
+    total = _nbytes(sample)
     with errors():
         engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
         n_bytes += n * each / env.n_envs
@@ -159,7 +157,7 @@ def check_memory(
             if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
                 probe = changed(env, n_envs=PROBE)
                 probe = construct(probe, geometries=geometries[:1], **arguments)
-                n_bytes += (n_copies * _nbytes(probe) - total) / (PROBE - sample.n_envs)
+                n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
                 engine.fit(env.n_envs, n_bytes, sample.device)
 
 
@@ -287,7 +285,8 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
 def config_of(loaded: checkpoint.Checkpoint) -> Train:
     """Returns the settings that a checkpoint was trained with. UserError if they cannot be used."""
     with user_errors(f"{loaded.path} cannot be used: ", (ConfigErrors,)):
-        return check.check(Train, loaded.config["train"])
+        # without loggers: who plays needs none, and a class of another user's may not be here
+        return check.check(Train, loaded.config["train"] | {"logger": {}})
 
 
 def spaces_of(env: Any) -> dict[str, str]:

@@ -6,6 +6,7 @@ opponents are the arguments of their constructors, with the bounds and defaults 
 
 import dataclasses
 import functools
+import inspect
 import json
 import operator
 import os
@@ -51,30 +52,12 @@ Split = Literal["training", "test", "all"]
 
 
 @frozen
-class LocalLogger:
-    """TensorBoard and JSON lines, which are always written."""
-
-    name: str
-
-
-@frozen
-class WandbLogger:
-    """Weights & Biases as well."""
-
-    name: str
-    project: str
-    mode: Literal["online", "offline"]
-    group: str | None = None
-
-
-@frozen
 class NoCurriculum:
     """Every home is drawn alike."""
 
     name: str
 
 
-LOGGERS = {"none": LocalLogger, "wandb": WandbLogger}
 #: Groups of configs/ whose member has `name`, the import path of a class or function, and decides
 #: which settings there are: its arguments. Those it must have, with what each means.
 IMPORTED = {
@@ -82,8 +65,10 @@ IMPORTED = {
     "geometry": {"n": "the number of geometries", "split": "its split", "seed": "an integer"},
     "learner": {"policy": "the policy to improve"},
     "curriculum": {"env": "the environment", "rollout": "the rollout"},
+    "logger": {},
 }
-GROUPS = (*IMPORTED, "logger")
+#: Methods of a group's classes.
+METHODS = {"logger": ("write", "close")}
 
 
 @functools.cache
@@ -93,10 +78,6 @@ def kind_of(group: str, name: str) -> type:
     Raises:
         ValueError: if nothing can be imported under this name, or it takes other arguments.
     """
-    if group == "logger":
-        if name not in LOGGERS:
-            raise ValueError(f"{name!r} is unknown; {closest(name, LOGGERS)}")
-        return LOGGERS[name]
     if (group, name) == ("curriculum", "none"):
         return NoCurriculum
     if (group, name) in components.built_in():
@@ -106,6 +87,9 @@ def kind_of(group: str, name: str) -> type:
         taken = parameters_of(constructor)
         if missing := [f"{k}, {text}" for k, text in IMPORTED[group].items() if k not in taken]:
             raise ValueError(f"it takes no {missing[0]}")
+        methods = METHODS.get(group, ()) if inspect.isclass(constructor) else ()
+        if absent := [method for method in methods if not hasattr(constructor, method)]:
+            raise ValueError(f"it has no method {absent[0]}")
         return settings_of(constructor, **spec)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from error
@@ -166,7 +150,38 @@ def run_name(cfg: Any) -> str:
     return "-".join([env_name(cfg.env), *geometry, str(cfg.seed)])
 
 
-Env, Geometry, Learner, Curriculum, Logger = map(_group, GROUPS)
+def loggers() -> dict[str, str]:
+    """Returns the import paths of megastep's loggers by label."""
+    return components.members("logger")
+
+
+def _chosen_loggers(tree):
+    """Returns nested dicts of loggers by label. Raises for keys of loggers that were not chosen."""
+    if not isinstance(tree, dict):
+        raise ValueError(f"is a group of keys, got {tree!r}")
+    errors, known = [], loggers()
+    for key, value in tree.items():
+        if dataclasses.is_dataclass(value) or (isinstance(value, dict) and "name" in value):
+            continue
+        owners = [one for one, path in known.items() if key in _own_settings(path)]
+        text = f"no such key or logger; {closest(key, known)}"
+        if key in known:
+            text = f"is not chosen; add logger={key}, or logger=[tensorboard,{key}] for both"
+        elif owners:
+            text = f"no such key; did you mean logger.{owners[0]}.{key}?"
+        errors.append((key, text))
+    if errors:
+        raise located(errors)
+    return tree
+
+
+def _own_settings(logger):
+    return kind_of("logger", logger).__pydantic_fields__.keys() - {"name"}
+
+
+Env, Geometry, Learner, Curriculum, Logger = map(_group, IMPORTED)
+#: {label: settings}, such as {"wandb": ...}
+Loggers = Annotated[dict[str, Logger], BeforeValidator(_chosen_loggers)]
 Agent = kind_of("agent", components.POLICY)
 Opposition = kind_of("opponents", components.OPPONENTS)
 
@@ -235,7 +250,7 @@ class Train(Common):
     learner: Learner
     curriculum: Curriculum = NoCurriculum(name="none")
     opponents: Opposition = Opposition()
-    logger: Logger
+    logger: Loggers = dataclasses.field(default_factory=dict)
     finish: Finish
     samples: Samples | None
     seconds: Above0 | None
@@ -246,7 +261,7 @@ class Train(Common):
     keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
     replay_every: Count = 20
     desync: bool = True
-    nonfinite_replay: bool = True
+    profile: Annotated[int, Field(ge=0, le=1000)] = 0
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
     restarts: Annotated[int, Field(ge=0, le=1000)] = 0

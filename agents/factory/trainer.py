@@ -2,6 +2,7 @@
 another.
 """
 
+import functools
 import math
 import random
 from collections import Counter
@@ -17,9 +18,18 @@ from megastep.agents.distributed import process_group
 from megastep.agents.errors import UserError
 from megastep.agents.factory import check, settings
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
-from megastep.agents.runs import agent_file, annealing, checkpoint, folders, provenance, saver
+from megastep.agents.runs import (
+    agent_file,
+    annealing,
+    checkpoint,
+    folders,
+    provenance,
+    repeat,
+    saver,
+)
 from megastep.agents.runs.rank_files import RankFiles
 from megastep.agents.training import budget, loggers
+from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
 
@@ -54,8 +64,7 @@ def make_trainer(
     policy.generator = SeededGenerator(stream_seed(seed, "policy"))
     learner = factory.make_learner(cfg.learner, policy, seed)
     cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)
-    n_copies = 2 if cfg.nonfinite_replay else 1  # of the environments' state
-    factory.check_memory(cfg.env, sample, learner, n_copies, **where)
+    factory.check_memory(cfg.env, sample, learner, **where)
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
         path = folders.find(cfg.resume or cfg.init)
@@ -67,7 +76,6 @@ def make_trainer(
     for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
     config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
-    wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
     made_with = provenance.made_with(device, package.version(), n_ranks)
     checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
     with factory.errors():
@@ -75,13 +83,19 @@ def make_trainer(
         logger, writers = loggers.NoLogger(), {}
         rank_files = RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
-            wandb = wandb if cfg.logger.name == "wandb" else None
-            logger = loggers.Loggers(folder, had["samples_at_report"], wandb)
+            step = had["samples_at_report"]
+            facts = dict(folder=folder, step=step, run_name=folder.name, config=config["train"])
+            makers = {
+                label: functools.partial(factory.construct, one, **facts)
+                for label, one in cfg.logger.items()
+            }
+            logger = loggers.Loggers(folder, step, makers)
             snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
             writers = dict(
                 on_log=on_log,
                 snapshot_saver=saver.SnapshotSaver(snapshots, cfg.snapshots),
                 annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
+                profiler=Profiler(folder, cfg.profile, device) if cfg.profile else None,
             )
         improves = Trainer(
             opponents or env,
@@ -97,7 +111,7 @@ def make_trainer(
             desync=cfg.desync,
             make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
             layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
-            replay_folder=folder if cfg.nonfinite_replay else None,
+            repeat_hint=functools.partial(repeat.hint, is_resumed=cfg.resume is not None),
             **writers,
         )
         if cfg.resume:

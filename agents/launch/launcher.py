@@ -17,9 +17,7 @@ import sys
 import tempfile
 import threading
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
@@ -81,7 +79,7 @@ def run(cfg: settings.Train) -> Path:
     cfg = settings.changed(cfg, ranks=n_ranks(cfg))
     with contextlib.ExitStack() as stack:
         job = Job(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="megastep-"))), cfg)
-        stack.enter_context(variables(job.folder, cfg.ranks))
+        stack.enter_context(environment.variables(variables(job.folder, cfg.ranks)))
         agent = threading.Thread(target=job.run_agent, daemon=True)
         with signals.handled(job.stop, job.quit) as numbers:
             agent.start()
@@ -221,10 +219,9 @@ def launch_ranks(n_ranks: int, n_restarts: int) -> None:
     elastic_launch(config, sys.executable)("-c", RANK)
 
 
-@contextlib.contextmanager
-def variables(job: Path, n_ranks: int) -> Iterator[None]:
-    """Sets the environment variables of ranks on one machine, for the time of this context."""
-    changes: dict[str, Any] = {JOB: str(job)}
+def variables(job: Path, n_ranks: int) -> dict[str, str]:
+    """Returns the environment variables of ranks on one machine."""
+    changes = {JOB: str(job)}
     if (package.ROOT / "train.py").exists():  # in a checkout, which need not be installed
         paths = filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
         changes["PYTHONPATH"] = os.pathsep.join(paths)
@@ -237,14 +234,4 @@ def variables(job: Path, n_ranks: int) -> Iterator[None]:
     }
     if os.path.exists("/sys/class/net/lo"):  # whether or not the machine's name has an address
         defaults["GLOO_SOCKET_IFNAME"] = "lo"
-    changes |= {name: text for name, text in defaults.items() if name not in os.environ}
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, text in before.items():
-            if text is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = text
+    return changes | {name: text for name, text in defaults.items() if name not in os.environ}

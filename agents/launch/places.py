@@ -9,10 +9,11 @@ import itertools
 import os
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu, launcher
@@ -101,7 +102,8 @@ def taken(cfg: Any) -> Iterator[Any]:
             names = _names(n_gpus)
             if _has_ranks(cfg):
                 place = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
-                stack.enter_context(_visible(names[i] for i in place))
+                visible = {VISIBLE: ",".join(names[i] for i in place)}
+                stack.enter_context(environment.variables(visible))
             else:
                 (number,) = stack.enter_context(_locked(names, 1))
                 cfg = _on_gpu(cfg, number, stack)
@@ -155,16 +157,3 @@ def _on_gpu(cfg: Any, number: int, stack: contextlib.ExitStack) -> Any:
     stack.callback(torch.cuda.set_device, torch.cuda.current_device())
     torch.cuda.set_device(number)
     return settings.changed(cfg, device=f"cuda:{number}") if cfg.device == "cuda" else cfg
-
-
-@contextlib.contextmanager
-def _visible(names: Iterable[str]) -> Iterator[None]:
-    """In this context processes that are started see these GPUs only."""
-    before = os.environ.get(VISIBLE)
-    os.environ[VISIBLE] = ",".join(names)
-    try:
-        yield
-    finally:
-        os.environ.pop(VISIBLE, None)
-        if before is not None:
-            os.environ[VISIBLE] = before

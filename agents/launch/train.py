@@ -13,7 +13,7 @@ from megastep import engine
 from megastep.agents import console, factory, package
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.agreement import any_rank, from_rank_0, together
+from megastep.agents.distributed.agreement import from_rank_0, together
 from megastep.agents.distributed.drift import DriftError
 from megastep.agents.errors import Differs, NonFinite, UserError, memory_problem, user_errors
 from megastep.agents.evaluation import evaluate, record
@@ -24,7 +24,6 @@ from megastep.agents.runs import folders, provenance
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
-from megastep.agents.training.trainer import Trainer
 
 
 def with_more(cfg: settings.Train) -> settings.Train:
@@ -109,10 +108,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 contextlib.closing(running),
             ):
                 running.train(lambda: bool(numbers))
-                if not any_rank(bool(numbers)):
-                    measure_sections(running)
         except NonFiniteError as error:
-            saved = f"What was saved before is in {folder}{running.nonfinite_guard.replay_hint}"
+            saved = f"What was saved before is in {folder}{running.nonfinite_guard.hint}"
             raise NonFinite(f"{error}. {saved}") from error
         except DriftError as error:
             raise UserError(f"{error}. What was saved before is in {folder}") from error
@@ -128,9 +125,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             if is_first:
                 with process_group.unhurried():
                     curves.plot_curves(folder)
-        times = running.section_times
-        if is_first and times.is_known:
-            console.say(console.sections(times.milliseconds(), times.iteration))
+        if running.profiler and running.profiler.path:
+            console.say(f"Profile: {running.profiler.path}, and a trace beside it")
         # a signal that one rank got stops all, and so does a checkpoint that one could not save
         ends = process_group.gather_objects((numbers[:1], running.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
@@ -139,7 +135,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             )
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
-        nonfinite, replay = running.nonfinite_guard.value, running.nonfinite_guard.replay_hint
+        nonfinite, hint = running.nonfinite_guard.value, running.nonfinite_guard.hint
         del running  # its memory is the evaluation's now
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
         common["trust"] = True  # what it names has just run
@@ -152,19 +148,10 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All else was learnt from, and is in {folder}"
-            raise NonFinite(f"{nonfinite}. {learnt}{replay}")
+            raise NonFinite(f"{nonfinite}. {learnt}{hint}")
         if cfg.rerun and is_first:
             compare(folder, folders.folder_of(folders.find(cfg.rerun)))
     return folder
-
-
-def measure_sections(running: Trainer) -> None:
-    """Measures where an iteration's time goes; the training is done, and no failure may end it."""
-    try:
-        running.measure_sections()
-    except RuntimeError as error:
-        reason = str(error).partition("\n")[0]
-        console.warn(f"the sections of an iteration could not be measured: {reason}")
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:

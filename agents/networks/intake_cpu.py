@@ -10,8 +10,10 @@ import torch
 from torch import nn
 
 from megastep.agents.networks.encoders import Flat
-from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
+from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
 from megastep.agents.networks.running_norm import RunningNorm
+from megastep.engine.devices import threads
+from megastep.kernels.build.launch import launch
 
 DTYPES = torch.float16, torch.float32
 
@@ -46,8 +48,8 @@ def normalised(
     for leaf, norm, size in zip(leaves, norms, sizes, strict=True):
         n_channels = norm.mean.numel()
         leaf = leaf.contiguous()
-        run_on_cpu(
-            "normalise_leaf",
+        launch(
+            *(CORES, "normalise_leaf", out.device, 0),
             obs=leaf,
             mean=norm.mean,
             scale=norm.scale,
@@ -57,6 +59,7 @@ def normalised(
             n_channels=n_channels,
             n_pixels=size // n_channels,
             is_half=leaf.dtype == torch.float16,
+            n_threads=threads(),
         )
         first += size
     if n_padding:

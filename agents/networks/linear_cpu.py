@@ -5,7 +5,9 @@ engine's threads. `torch.nn.functional.linear` is the same in PyTorch.
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
+from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
+from megastep.engine.devices import threads
+from megastep.kernels.build.launch import launch
 
 MIN_OUTPUTS = 16  # of a layer; PyTorch takes less time for fewer, such as actions and values
 
@@ -39,8 +41,8 @@ def matmul(
     """
     if out is None:
         out = torch.empty(len(a), b.shape[1])
-    run_on_cpu(
-        "matmul",
+    launch(
+        *(CORES, "matmul", a.device, 0),
         a=a,
         b=b,
         bias=None if bias is None else bias.contiguous(),
@@ -55,6 +57,7 @@ def matmul(
         depth=len(b),
         adds=adds,
         has_relu=has_relu,
+        n_threads=threads(),
     )
     return out
 

@@ -6,8 +6,10 @@ T time, B lanes, W width. `megastep.agents.networks.lstm` has the same as PyTorc
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
+from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
 from megastep.agents.networks.linear_cpu import matmul
+from megastep.engine.devices import threads
+from megastep.kernels.build.launch import launch
 
 MULTIPLE = 16  # of which the width must be one
 
@@ -28,8 +30,8 @@ class CpuSequence(torch.autograd.Function):
         hiddens, cells, outputs = (torch.empty_like(x) for _ in range(3))
         last_cell = torch.empty_like(cell)
         n_steps, n_lanes, width = x.shape
-        run_on_cpu(
-            "lstm_sequence_forward",
+        launch(
+            *(CORES, "lstm_sequence_forward", x.device, 0),
             x=x,
             input_weight=input_weight,
             bias=bias,
@@ -45,6 +47,7 @@ class CpuSequence(torch.autograd.Function):
             n_steps=n_steps,
             n_lanes=n_lanes,
             width=width,
+            n_threads=threads(),
         )
         ctx.save_for_backward(x, input_weight, weight, reset, gates, hiddens, cells)
         return outputs, last_cell
@@ -56,8 +59,8 @@ class CpuSequence(torch.autograd.Function):
         d_gates, d_x = torch.empty_like(gates), torch.empty_like(x)
         d_output, d_cell = torch.empty_like(d_last_cell), torch.empty_like(d_last_cell)
         n_steps, n_lanes, width = x.shape
-        run_on_cpu(
-            "lstm_sequence_backward",
+        launch(
+            *(CORES, "lstm_sequence_backward", x.device, 0),
             input_weight=input_weight,
             weight=weight,
             reset=reset,
@@ -72,6 +75,7 @@ class CpuSequence(torch.autograd.Function):
             n_steps=n_steps,
             n_lanes=n_lanes,
             width=width,
+            n_threads=threads(),
         )
         flat = d_gates.flatten(0, 1)
         d_input_weight, d_weight = (matmul(flat.T, rows.flatten(0, 1)) for rows in (x, hiddens))

@@ -11,6 +11,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.kernels import layers as kernels
+from megastep.agents.networks.kernels.program import DTYPES
 from megastep.agents.networks.layers import CategoricalTerms, linear
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.arrdict import arrdict
@@ -79,7 +80,7 @@ class MultiDiscreteOutput(Output):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Does the same as `Output.act`, on a GPU in one kernel."""
         dtype = compute_dtype(self.linear.weight)
-        is_fused = x.is_cuda and dtype in kernels.DTYPES and not torch.is_grad_enabled()
+        is_fused = x.is_cuda and dtype in DTYPES and not torch.is_grad_enabled()
         if not is_fused or self.shape[1] > kernels.MAX_CHOICES or x.shape[-1] % 8:
             return super().act(x, sample, generator)
         noise = None

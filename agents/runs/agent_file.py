@@ -1,27 +1,28 @@
 """An agent in one file: its acting weights, and what rebuilds its environment and policy.
 
-The format is safetensors (https://github.com/huggingface/safetensors): eight bytes with the length
-of a JSON header, the header, and the bytes of all tensors. The header's `__metadata__`, texts by
-name, holds
+The format is safetensors (https://github.com/huggingface/safetensors). The metadata of its header,
+texts by name, holds
 
     format    of what follows, `FORMAT`
     config    as config.json of a checkpoint, JSON
     facts     what made the agent, such as samples, seconds, command and commit, JSON
     tables    its evaluations: a list of {title, command, rows}, JSON
-    sha256    of the bytes of all tensors
+    sha256    of the bytes after the header, which are those of all tensors
 
-Weights are float16, statistics float32. The header is read without PyTorch.
+Weights are float16, statistics float32. Reading without a device does not import PyTorch.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import safetensors
+
+from megastep.agents.errors import shortened
 from megastep.agents.runs import trust
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
 
 SUFFIX = ".safetensors"
 FORMAT = "1"
-#: Names of PyTorch's dtypes, and their bytes, by safetensors' names.
-DTYPES = {"F16": ("float16", 2), "F32": ("float32", 4), "F64": ("float64", 8), "I64": ("int64", 8)}
+#: Names of dtypes by safetensors' names.
+DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I64": "int64"}
 _MAX_HEADER = 2**24  # bytes
 
 
@@ -60,24 +61,24 @@ def write(
         ValueError: a tensor has another dtype than those of `DTYPES`.
         OSError: the file cannot be written.
     """
-    names = {dtype: name for name, (dtype, _) in DTYPES.items()}
-    header, parts, end = {}, [], 0
-    # the widest first, so that each tensor begins at a multiple of its element's size
-    for name, tensor in sorted(tensors.items(), key=lambda item: (-item[1].itemsize, item[0])):
-        dtype = str(tensor.dtype).removeprefix("torch.")
-        if dtype not in names:
-            raise ValueError(f"{name} is {dtype}, and files of agents hold {', '.join(names)}")
-        parts.append(tensor.detach().contiguous().numpy().tobytes())
-        start, end = end, end + len(parts[-1])
-        entry = {"dtype": names[dtype], "shape": [*tensor.shape], "data_offsets": [start, end]}
-        header[name] = entry
-    data = b"".join(parts)
+    from safetensors.numpy import save
+
+    arrays = {name: tensor.detach().contiguous().numpy() for name, tensor in tensors.items()}
+    for name, array in arrays.items():
+        if array.dtype.name not in DTYPES.values():
+            allowed = ", ".join(DTYPES.values())
+            raise ValueError(f"{name} is {array.dtype}, and files of agents hold {allowed}")
+    _, data = _split(save(arrays))
     metadata = {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
     for name, value in (("config", config), ("facts", dict(facts)), ("tables", [*tables])):
         metadata[name] = json.dumps(value)
-    text = json.dumps({"__metadata__": metadata, **header}).encode()
-    text += b" " * (-len(text) % 8)
-    write_atomically(path, len(text).to_bytes(8, "little") + text + data)
+    write_atomically(path, save(arrays, metadata))
+
+
+def _split(content):
+    """Returns the header of a file, and the bytes of its tensors."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    return content[8:end], content[end:]
 
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
@@ -90,14 +91,14 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
         DamagedCheckpoint: the file is damaged, or no agent's.
         CheckpointError: a later version of megastep wrote it.
     """
-    header, metadata, data = _read(path)
+    metadata, entries = _read(path)
     return Checkpoint(
         path,
         step=metadata["facts"]["samples"],
         numbers={},
         config=metadata["config"],
         made_with={},
-        state=None if device is None else {"policy": _tensors(header, data, device)},
+        state=None if device is None else {"policy": _tensors(entries, device)},
         untrusted=metadata["untrusted"],
     )
 
@@ -108,68 +109,52 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
     Raises: as `read`.
     """
-    return _read(path)[1]
+    return _read(path)[0]
 
 
 def _read(path):
-    """Returns the entries of the header, what `read_metadata` returns, and the tensors' bytes."""
+    """Returns what `read_metadata` does, and dtype, shape and bytes of each tensor by name."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise DamagedCheckpoint(f"{path} cannot be read ({error.strerror})") from None
+    header, data = _split(content)
     try:
-        n = int.from_bytes(content[:8], "little")
-        if not 0 < n <= min(_MAX_HEADER, len(content) - 8):
-            raise ValueError("it has no header of safetensors")
-        header, data = json.loads(content[8 : 8 + n]), memoryview(content)[8 + n :]
-        texts = header.pop("__metadata__")
+        if len(header) > _MAX_HEADER:
+            raise ValueError("its header is too long")
+        entries = dict(sorted(safetensors.deserialize(content)))
+        texts = json.loads(header)["__metadata__"]
         version = texts["format"]
         if version == FORMAT:
             if hashlib.sha256(data).hexdigest() != texts["sha256"]:
                 raise ValueError("its tensors do not match their SHA-256")
-            _check(header, len(data))
+            if any(entry["dtype"] not in DTYPES for entry in entries.values()):
+                raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
             metadata = {name: json.loads(texts[name]) for name in ("config", "facts", "tables")}
             if type(metadata["facts"]["samples"]) is not int:
                 raise ValueError("its number of samples is none")
             if not {"train", "spaces"} <= metadata["config"].keys():
                 raise ValueError("its configuration is not whole")
-            config = texts["config"].encode(errors="surrogatepass")
-            metadata["untrusted"] = tuple(trust.foreign_names(config))
-            return header, metadata, data
+            metadata["untrusted"] = tuple(trust.foreign_names(texts["config"].encode()))
+            return metadata, entries
+    except safetensors.SafetensorError as error:
+        problem = shortened(error)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         problem = str(error) if type(error) is ValueError else "its header is not an agent's"
-        raise DamagedCheckpoint(f"{path} is damaged, or no agent of megastep: {problem}") from None
-    raise CheckpointError(
-        f"{path} has format {version!r}, and this version of megastep reads {FORMAT}. Update "
-        "megastep"
-    )
+    else:
+        raise CheckpointError(
+            f"{path} has format {version!r}, and this version of megastep reads {FORMAT}. Update "
+            "megastep"
+        )
+    raise DamagedCheckpoint(f"{path} is damaged, or no agent of megastep: {problem}")
 
 
-def _check(header, n_bytes):
-    """Raises ValueError, KeyError or TypeError unless tensors fill the bytes without gaps."""
-    end = 0
-    for entry in sorted(header.values(), key=lambda entry: entry["data_offsets"]):
-        start, stop = entry["data_offsets"]
-        sizes = [*entry["shape"], DTYPES[entry["dtype"]][1]]
-        if any(type(n) is not int or n < 0 for n in sizes):
-            raise ValueError("the shape of a tensor is none")
-        if start != end or stop - start != math.prod(sizes):
-            raise ValueError("its tensors have gaps or overlap")
-        end = stop
-    if end != n_bytes:
-        raise ValueError("it is cut off, or too long")
-
-
-def _tensors(header, data, device):
+def _tensors(entries, device):
+    import numpy as np
     import torch
 
-    content, tensors = bytearray(data), {}
-    for name, entry in header.items():
-        dtype = getattr(torch, DTYPES[entry["dtype"]][0])
-        start, stop = entry["data_offsets"]
-        tensor = torch.empty(0, dtype=dtype)
-        if stop > start:
-            n = (stop - start) // dtype.itemsize
-            tensor = torch.frombuffer(content, dtype=dtype, count=n, offset=start).clone()
-        tensors[name] = tensor.reshape(entry["shape"]).to(device)
+    tensors = {}
+    for name, entry in entries.items():
+        array = np.frombuffer(entry["data"], DTYPES[entry["dtype"]]).reshape(entry["shape"])
+        tensors[name] = torch.tensor(array, device=device)
     return tensors

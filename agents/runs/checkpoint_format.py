@@ -43,6 +43,7 @@ MIGRATED = 6
 #: The keys of a state that are in files of their own.
 PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
 _RANK_FILE = re.compile(r"rank[1-9]\d*\.pt")
+_LOGGERS = "megastep.agents.training.loggers"
 _CHUNK = 2**24  # bytes
 
 
@@ -312,6 +313,19 @@ def _migrated(state, manifest):
             pad(one, (0, n_metrics)) if len(one) else one for one in stats["windows"]
         ]
     return state | {"samples_at_report": state.get("samples", 0)}
+
+
+def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
+    """Returns a configuration with loggers by label. Before there were several, `train.logger` had
+    the keys of W&B, or of none, and TensorBoard was always written.
+    """
+    match config:
+        case {"train": {"logger": {"name": "none" | "wandb" as name, **keys}} as train}:
+            chosen = {"tensorboard": {"name": f"{_LOGGERS}.tensorboard:TensorBoard"}}
+            if name == "wandb":
+                chosen["wandb"] = {"name": f"{_LOGGERS}.wandb:Wandb", **keys}
+            return config | {"train": train | {"logger": chosen}}
+    return config
 
 
 def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = None) -> None:

@@ -1,6 +1,7 @@
 """Run folders: new ones, existing ones by name, and their locks."""
 
 import contextlib
+import dataclasses
 import difflib
 import errno
 import itertools
@@ -14,11 +15,13 @@ from typing import Any
 
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.runs import agent_file, checkpoint
+from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
 STARTED = RUNS / "started.txt"
+#: Settings of earlier runs that no longer exist, and changed nothing that a run learns.
+REMOVED = ("nonfinite_replay",)
 #: The beginning of an error's message.
 CANNOT = "{} cannot be written; choose another with folder=: "
 
@@ -184,20 +187,24 @@ def load_checkpoint(
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
+    with contextlib.suppress(AttributeError, KeyError, TypeError):  # a planted one holds anything
+        for key in REMOVED:
+            loaded.config["train"].pop(key, None)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "
             f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
             "trust it, add trust=true"
         )
-    return loaded
+    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(loaded.config))
 
 
-def resume_command(folder: Path) -> str:
+def resume_command(folder: Path, key: str = "resume") -> str:
+    """Returns the command that resumes a run or, with the key `rerun`, repeats it."""
     # quoted for the shell and for Hydra where needed
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
-    return f"{package.command('train', 'python ')} {shlex.quote(f'resume={name}')}"
+    return f"{package.command('train', 'python ')} {shlex.quote(f'{key}={name}')}"
 
 
 def checkpoints_of(path: Path) -> Path:

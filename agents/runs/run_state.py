@@ -52,6 +52,15 @@ class RunState:
     def is_resumable(self) -> bool:
         return optional(self.env_state.env, "resumable")
 
+    def incomplete(self) -> str | None:
+        """Returns why a checkpoint does not hold everything, as a clause; None if it does."""
+        if not self.is_resumable:
+            return f"they do not hold {type(self.env_state.env).__name__}"
+        if not hasattr(self.collect, "state_dict"):
+            return f"{type(self.collect).__name__} has no state_dict"
+        names = self.env_state.unreachable()
+        return f"they cannot hold {', '.join(names)} of the environment" if names else None
+
     def state_dict(self, has_episodes: bool = True) -> dict[str, Any]:
         """Returns the state as dicts of tensors and plain values, most of which share their memory
         with what trains. Nothing may step the environment meanwhile.

@@ -20,7 +20,7 @@ from pathlib import Path
 
 KEY_BYTES = 32
 #: Groups of settings that may hold import paths.
-GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum")
+GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum", "logger")
 #: Import paths of megastep's own components.
 OWN = re.compile(
     r"megastep\.(envs|geometries|agents\.(algorithms|networks|selfplay|training))(\.\w+)*:\w+"

@@ -4,12 +4,12 @@ Axes: N environments of A agents, B = N A lanes; M of the environments have oppo
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field, SkipValidation
 
-from megastep.agents.algorithms.kernels.program import run
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
@@ -17,9 +17,12 @@ from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
+from megastep.kernels.build.launch import launch
+from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 from megastep.settings import checked
 from megastep.types import Env, PolicyLike, World, optional
 
+PROGRAM = Program(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -49,7 +52,6 @@ class Opponents:
             policy), "past" and "bot". Names without environments are absent.
         snapshots: the snapshots, as policies. Refreshed in place.
         scripted: the bot, or None if it does not play.
-        on_actions: called in each step with the actions of all lanes, (B, ...), if not None.
 
     All other attributes are those of `env`.
 
@@ -72,7 +74,7 @@ class Opponents:
         seed: int = 1,
     ):
         self.env, self.every, device = env, every, env.device
-        self.on_actions, self.scripted = None, scripted if bot else None
+        self.scripted = scripted if bot else None
         n_per_snapshot, n_bot = count_environments(env, env.n_envs, past, bot, snapshots)
         if bot and scripted is None:
             raise ValueError(
@@ -147,8 +149,6 @@ class Opponents:
         lanes = self.mixed_policy.lanes
         replace = mapping(lambda leaf, theirs: leaf.index_copy(0, lanes, theirs.to(leaf)))
         actions = replace(decision["actions"], opponent_actions)
-        if self.on_actions is not None:
-            self.on_actions(actions)
         world = self.env.step(arrdict(actions=actions))
         self._count_pairs(world)
         return self._observed(world)
@@ -166,8 +166,8 @@ class Opponents:
             for key in ("reward", "terminal", "truncated")
         )
         if reward.is_cuda and reward.dtype == torch.float32:
-            run(
-                *("count_pairs", reward.device, self.n_opposed),
+            launch(
+                *(PROGRAM, "count_pairs", reward.device, self.n_opposed),
                 **dict(reward=reward, terminal=terminal, truncated=truncated, slots=self.slots),
                 **dict(returns=self.returns, pairs=self.pairs),
                 **dict(n_envs=self.n_opposed, n_agents=self.env.n_agents),

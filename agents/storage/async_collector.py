@@ -115,13 +115,6 @@ class AsyncCollector:
         if self.on_gpu:
             self.stream.synchronize()
 
-    def recapture(self) -> Collector:
-        """Waits, and returns what collects a rollout without an update beside it. Its next call
-        captures again.
-        """
-        self.wait()
-        return self.slots[0].collect.recapture()
-
     def state_dict(self) -> dict[str, Any]:
         """Returns the actor state and the rollouts collected in advance. Call `wait` first."""
         rollouts = [slot.rollout.state_dict() for slot in self.slots] if self.is_ahead else []

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from megastep.agents.sections import section
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
@@ -33,7 +32,6 @@ def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
 
 
 @torch.no_grad()
-@section("store")
 def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> arrdict:
     """Fills a rollout: T times act, step, store. Never synchronises, so it can be captured.
 
@@ -49,23 +47,21 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     with policy.compute_dtype():
         seen = rollout.store_world(0, world)
         for t in range(rollout.n_steps):
-            with section("env"), torch.autocast(rollout.reward.device.type, enabled=False):
+            with torch.autocast(rollout.reward.device.type, enabled=False):
                 optional(env, "begin_step")()
-            with section("act"):
-                decision, state = policy(seen, state)
+            decision, state = policy(seen, state)
             rollout.store_decision(t, decision)
             if rollout.values is not None:
                 features.append(decision["features"])
-            with section("env"), torch.autocast(rollout.reward.device.type, enabled=False):
+            with torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
             layout = None if rollout.layouts is None else env.layout
             seen = rollout.store_outcome(t, world, layout)
 
         if rollout.values is not None:
-            with section("act"):
-                features.append(policy(seen, state, sample=False)[0]["features"])
-                rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
+            features.append(policy(seen, state, sample=False)[0]["features"])
+            rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
     # Clear a non-finite hidden state, which would otherwise last until the lane's episode ends.
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=_stored(world), state=state)
@@ -143,12 +139,6 @@ class Collector:
     def allocate_layouts(self) -> None:
         """Has rollouts hold the environment's layouts. Call before the first rollout."""
         self.rollout.allocate_layouts()
-
-    def recapture(self) -> "Collector":
-        """Discards the graph, if there is one. The next call captures again. Returns itself."""
-        if self.graph is not None:
-            self.n_collected, self.graph = 1, None
-        return self
 
     def state_dict(self) -> dict[str, Tree]:
         """Returns the actor state: what the next rollout starts from, besides the environment."""

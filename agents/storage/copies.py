@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
-from megastep.kernels.build.launch import BLOCK, launch_blocks
+from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.kernels.build.program import Program
 from megastep.types import Tree
 
@@ -48,22 +48,20 @@ def copy_all(
             is_aligned = not (target.data_ptr() | source.data_ptr()) % 16
             rows.append(
                 PROGRAM.params.CopyParams(
-                    target=target.data_ptr(),
-                    source=source.data_ptr(),
+                    target=target,
+                    source=source,
                     n_bytes=n_bytes,
                     first_block=n_blocks,
                     is_aligned=int(is_aligned),
                 )
             )
             n_blocks += -(-n_bytes // _BLOCK_BYTES)
-        struct = PROGRAM.params.CopyAllParams(
+        launch(
+            *(PROGRAM, "copy_all", fused[0][0].device, Blocks(n_blocks)),
             copies=b"".join(rows),
-            condition=0 if condition is None else condition.data_ptr(),
+            condition=condition,
             n_copies=len(rows),
         )
-        if n_blocks:
-            device = fused[0][0].device
-            launch_blocks(PROGRAM, "copy_all", struct, device, (n_blocks, 1), BLOCK)
 
 
 def _is_plain_copy(target, source):
@@ -98,8 +96,8 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
             word_size = next(size for size in (16, 8, 4, 1) if not addresses % size)
             rows.append(
                 PROGRAM.params.SelectParams(
-                    target=results[i].data_ptr(),
-                    source=tensor.data_ptr(),
+                    target=results[i],
+                    source=tensor,
                     n_steps=n_steps,
                     n_words=n_bytes // word_size,
                     first_block=n_blocks,
@@ -107,16 +105,14 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
                 )
             )
             n_blocks += -(-n_steps * len(lanes) * (n_bytes // word_size) // _BLOCK_WORDS)
-        struct = PROGRAM.params.SelectLanesParams(
+        launch(
+            *(PROGRAM, "select_lanes", lanes.device, Blocks(n_blocks)),
             tensors=b"".join(rows),
-            lanes=lanes.data_ptr(),
+            lanes=lanes,
             n_lanes=tensors[chosen[0]].shape[1],
             n_selected=len(lanes),
             n_tensors=len(rows),
         )
-        if n_blocks:
-            device = lanes.device
-            launch_blocks(PROGRAM, "select_lanes", struct, device, (n_blocks, 1), BLOCK)
     return [
         results[i] if i in results else tensor.index_select(1, lanes)
         for i, tensor in enumerate(tensors)

@@ -14,7 +14,6 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
-from megastep.agents.sections import section
 from megastep.agents.storage import replay_kernels as kernels
 from megastep.agents.storage.replay_columns import Column, stored_dtype
 from megastep.agents.storage.replay_settings import ReplaySettings
@@ -112,7 +111,6 @@ class ReplayBuffer:
         return (self.n_available > 0) & (n_collected >= self.settings.start)
 
     @torch.no_grad()
-    @section("store")
     def add(self, rollout: Rollout, is_finite: torch.Tensor | bool = True) -> None:
         """Stores a rollout in place of the oldest.
 
@@ -158,7 +156,6 @@ class ReplayBuffer:
         self.n_available.copy_((self.tree.priorities > 0).sum())
 
     @torch.no_grad()
-    @section("forward")
     def sample(self, n: int, generator: torch.Generator | None = None) -> arrdict:
         """Draws M = n sequences. While none can be drawn, all numbers are finite but meaningless.
 
@@ -217,7 +214,6 @@ class ReplayBuffer:
         return arrdict(batch, **dict(zip(_FLAGS, flags, strict=True)))
 
     @torch.no_grad()
-    @section("store")
     def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
         """Sets the priorities of sequences of the last sample to values (M,) to the power alpha.
 

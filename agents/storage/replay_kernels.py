@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 
 from megastep.agents.storage.copies import PROGRAM
-from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+from megastep.kernels.build.launch import WARP, Blocks, launch
 
 MAX_LEVELS = PROGRAM.constants["MAX_LEVELS"]
 MAX_SET = PROGRAM.constants["MAX_SET"]  # indices of `set_tree` and `set_priorities`
@@ -42,15 +42,14 @@ def draw(levels: Sequence[torch.Tensor], shares: torch.Tensor) -> tuple[torch.Te
     """
     index = torch.empty_like(shares, dtype=torch.int64)
     probability = torch.empty_like(shares)
-    packed = PROGRAM.params.SampleTreeParams(
+    launch(
+        *(PROGRAM, "sample_tree", shares.device, WARP * len(shares)),
         tree=_packed(levels),
-        shares=shares.data_ptr(),
-        index=index.data_ptr(),
-        probability=probability.data_ptr(),
+        shares=shares,
+        index=index,
+        probability=probability,
         n_samples=len(shares),
     )
-    n_blocks = -(-len(shares) * WARP // BLOCK), 1
-    launch_blocks(PROGRAM, "sample_tree", packed, shares.device, n_blocks, BLOCK)
     return index, probability
 
 
@@ -62,10 +61,13 @@ def set_tree(levels: Sequence[torch.Tensor], index: torch.Tensor, values: torch.
         index: (n,) int64.
         values: (n,) float64.
     """
-    packed = PROGRAM.params.SetTreeParams(
-        tree=_packed(levels), index=index.data_ptr(), values=values.data_ptr(), n=len(index)
+    launch(
+        *(PROGRAM, "set_tree", index.device, Blocks(1, threads=_SET_THREADS)),
+        tree=_packed(levels),
+        index=index,
+        values=values,
+        n=len(index),
     )
-    launch_blocks(PROGRAM, "set_tree", packed, index.device, (1, 1), _SET_THREADS)
 
 
 def set_priorities(
@@ -91,20 +93,20 @@ def set_priorities(
         alpha: exponent.
     """
     values = torch.empty_like(errors, dtype=torch.float64)
-    packed = PROGRAM.params.SetPrioritiesParams(
+    launch(
+        *(PROGRAM, "set_priorities", index.device, Blocks(1, threads=_SET_THREADS)),
         tree=_packed(levels),
-        index=index.data_ptr(),
-        errors=errors.data_ptr(),
-        values=values.data_ptr(),
-        n_added=counts[0].data_ptr(),
-        n_available=counts[1].data_ptr(),
-        new_priority=new_priority.data_ptr(),
+        index=index,
+        errors=errors,
+        values=values,
+        n_added=counts[0],
+        n_available=counts[1],
+        new_priority=new_priority,
         n=len(index),
         first_rollouts=min(first_rollouts, _MAX_ENTRIES - 1),
         smallest=smallest,
         alpha=alpha,
     )
-    launch_blocks(PROGRAM, "set_priorities", packed, index.device, (1, 1), _SET_THREADS)
 
 
 def can_read(tensors: Sequence[tuple[torch.Tensor, torch.dtype]], n_words: int) -> bool:
@@ -163,8 +165,8 @@ def read_sequences(
             n_words, kind = n_bytes // word_size, _COPIES[word_size]
         packed.append(
             PROGRAM.params.ReadTensorParams(
-                target=result.data_ptr(),
-                source=rows.data_ptr(),
+                target=result,
+                source=rows,
                 n_rows=n_rows,
                 n_words=n_words,
                 rows_per_rollout=len(rows) // n_rollouts,
@@ -178,17 +180,18 @@ def read_sequences(
     bools = [torch.empty(n, n_sequences, dtype=torch.bool, device=device) for n in lengths]
     weights, age = torch.empty_like(probability), torch.empty_like(index)
     weight = torch.empty_like(probability, dtype=torch.float32)
-    struct = PROGRAM.params.ReadSequencesParams(
+    launch(
+        *(PROGRAM, "read_sequences", device, Blocks(n_blocks, threads=_READ_THREADS)),
         tensors=b"".join(packed),
-        flags=flags.data_ptr(),
-        **dict(zip(("starts", "learns", "terminal", "truncated"), (b.data_ptr() for b in bools))),
-        index=index.data_ptr(),
-        probability=probability.data_ptr(),
-        weights=weights.data_ptr(),
-        weight=weight.data_ptr(),
-        age=age.data_ptr(),
-        n_added=counts[0].data_ptr(),
-        n_available=counts[1].data_ptr(),
+        flags=flags,
+        **dict(zip(("starts", "learns", "terminal", "truncated"), bools)),
+        index=index,
+        probability=probability,
+        weights=weights,
+        weight=weight,
+        age=age,
+        n_added=counts[0],
+        n_available=counts[1],
         n_tensors=len(tensors),
         n_sequences=n_sequences,
         n_steps=n_steps,
@@ -197,10 +200,9 @@ def read_sequences(
         rows_per_rollout=len(flags) // n_rollouts,
         beta=beta,
     )
-    launch_blocks(PROGRAM, "read_sequences", struct, device, (n_blocks, 1), _READ_THREADS)
     return results, bools, weight, age
 
 
 def _packed(levels):
-    addresses = [PROGRAM.params.TreeLevelParams(sums=level.data_ptr()) for level in levels]
-    return PROGRAM.params.SumTreeParams(levels=b"".join(addresses), n_levels=len(levels))
+    rows = [PROGRAM.params.TreeLevelParams(sums=level) for level in levels]
+    return PROGRAM.params.SumTreeParams(levels=b"".join(rows), n_levels=len(levels))

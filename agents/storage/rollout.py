@@ -13,7 +13,6 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
-from megastep.agents.sections import section
 from megastep.agents.storage.copies import copy_all, select_lanes, select_tree
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
@@ -226,7 +225,6 @@ class Rollout:
             truncated=self.truncated,
         )
 
-    @section("forward")
     def sequences(
         self,
         lanes: torch.Tensor,

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from megastep.agents.runs import json_lines
-from megastep.agents.training.optional_packages import not_installed
 
 MAX_COLUMNS = 4
 #: Statistics of episodes that are no curves of their own: how many they are of, and their spread.
@@ -20,13 +19,11 @@ def plot_curves(folder: Path | str) -> None:
     """Draws `curves.png` in a run folder: a panel for each mean over episodes, with a line per
     group of lanes, for each loss, and for the training speed. Does nothing before the first report.
 
-    Warns if matplotlib is not installed, a file cannot be read, or the disk is full.
+    Warns if a file cannot be read, or the disk is full.
     """
-    try:
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import EngFormatter
-    except ImportError:
-        return warnings.warn(not_installed("matplotlib"), stacklevel=2)
+    from matplotlib.figure import Figure  # which takes a while
+    from matplotlib.ticker import EngFormatter
+
     folder = Path(folder)
     try:
         rows = [json_lines.read(folder / name) for name in ("metrics.jsonl", "perf.jsonl")]

@@ -6,13 +6,17 @@ Axes: T time, B lanes, G groups of lanes, D layouts, S sources of layouts.
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 
-from megastep.agents.algorithms.kernels import program
 from megastep.agents.algorithms.nonfinite import LIMIT
+from megastep.kernels.build.launch import Blocks, launch
+from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 from megastep.types import Env, optional
+
+PROGRAM = Program(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
 
 #: Means are over at least this many episodes, once so many have ended.
 MIN_EPISODES = 100
@@ -122,7 +126,7 @@ class EpisodeStats:
         return (
             reward.is_cuda
             and isinstance(learns, torch.Tensor)
-            and len(values) <= program.PROGRAM.constants["EPISODE_METRICS"]
+            and len(values) <= PROGRAM.constants["EPISODE_METRICS"]
             and all(value.dtype == torch.float32 for value in (reward, *values))
         )
 
@@ -130,17 +134,15 @@ class EpisodeStats:
         """Does the same as `add` in two kernels."""
         n_steps, n_lanes = reward.shape
         values = [metrics[name].contiguous() for name in self.metrics]
-        pack = program.PROGRAM.params.EpisodeMetricParams
+        pack = PROGRAM.params.EpisodeMetricParams
         of_lanes = self.sums.new_empty(len(self.sums), n_lanes)
         source_sums = None
         if self.sources:
             source_sums = self.sums.new_empty(len(self.sums), len(self.sources), n_lanes)
             layouts = layouts.contiguous()
-        program.run(
-            "episodes",
-            reward.device,
-            n_lanes,
-            metrics=b"".join(pack(values=value.data_ptr()) for value in values),
+        launch(
+            *(PROGRAM, "episodes", reward.device, n_lanes),
+            metrics=b"".join(pack(values=value) for value in values),
             reward=reward.contiguous(),
             reset=reset.contiguous(),
             done=done.contiguous(),
@@ -160,10 +162,10 @@ class EpisodeStats:
             n_lanes=n_lanes,
             limit=LIMIT,
         )
-        n_threads = program.PROGRAM.constants["COLUMNS_THREADS"]
         n_sums, n_columns = self.sums.shape
-        program.run(
-            *("episode_columns", reward.device, n_columns * n_threads, n_sums, n_threads),
+        blocks = Blocks(n_columns, n_sums, PROGRAM.constants["COLUMNS_THREADS"])
+        launch(
+            *(PROGRAM, "episode_columns", reward.device, blocks),
             of_lanes=of_lanes,
             members=self.members,
             source_sums=source_sums,

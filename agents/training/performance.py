@@ -1,24 +1,15 @@
 """Where a run's time and memory go."""
 
 import time
-from collections import Counter, deque
-from collections.abc import Callable
+from collections import deque
 
 import torch
 
-from megastep.agents import sections
-
-#: The sections of an iteration. "log" is all between two iterations: statistics, reports,
-#: checkpoints, snapshots.
-SECTIONS = "act", "env", "store", "returns", "forward", "backward", "optimiser", "log"
 #: The phases of an iteration.
 PHASES = "collect", "update", "rest"
 #: Seconds after which the host no longer waits for a GPU: another rank may be lost, which the host
 #: notices when it speaks to the others.
 PATIENCE = 5.0
-#: Iterations before sections are measured on a GPU, so that clocks and caches are as in training,
-#: and after: the last one counts.
-N_WARM_UPS, N_REPLAYS = 3, 4
 
 
 class PhaseTimer:
@@ -94,65 +85,6 @@ class PhaseTimer:
                 return
             self._seconds[phase] = self._seconds.get(phase, 0.0) + seconds
             self._starts.popleft()
-
-
-class SectionTimes:
-    """Where the iterations of a run spend their time, in milliseconds.
-
-    On a CPU sections always add up. On a GPU they are unknown until `measure`, but for "log".
-
-    Args:
-        device: where the iterations are done.
-
-    Attributes:
-        iteration: an iteration of the run so far, in milliseconds; 0 before the first `add`.
-    """
-
-    def __init__(self, device: torch.device | str):
-        self.on_gpu = torch.device(device).type == "cuda"
-        self.n, self.seconds, self.total, self.measured = 0, Counter(), 0.0, {}
-
-    @property
-    def is_known(self) -> bool:
-        """Whether there is more to say than what "log" takes."""
-        return self.n > 0 and not (self.on_gpu and not self.measured)
-
-    @property
-    def iteration(self) -> float:
-        return 1000 * self.total / max(1, self.n)
-
-    def add(self, phases: dict[str, float], n: int) -> dict[str, float]:
-        """Adds `n` iterations. Returns the milliseconds of one of them by section.
-
-        Args:
-            phases: seconds of each phase of a `PhaseTimer`.
-        """
-        seconds = {} if self.on_gpu else sections.pop()
-        seconds["log"] = phases.get("rest", 0.0)
-        self.n, self.total = self.n + n, self.total + sum(phases.values())
-        self.seconds.update(seconds)
-        return _milliseconds(seconds, n)
-
-    def measure(self, collect: Callable[[], object], update: Callable[[], object]) -> None:
-        """Measures the sections of a GPU. The functions capture CUDA graphs in their next call."""
-        with sections.Spans() as collecting:
-            collect()
-        with sections.Spans() as updating:
-            update()
-        for _ in range(N_REPLAYS):
-            collect()
-            update()
-        seconds = Counter(collecting.seconds())
-        seconds.update(updating.seconds())
-        self.measured = _milliseconds(seconds, 1)
-
-    def milliseconds(self) -> dict[str, float]:
-        """Returns the milliseconds of an iteration of the run by section, in order."""
-        return self.measured | _milliseconds(self.seconds, max(1, self.n))
-
-
-def _milliseconds(seconds, n):
-    return {name: 1000 * seconds[name] / n for name in SECTIONS if name in seconds}
 
 
 def device_memory(device: torch.device | str) -> dict[str, int]:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from megastep.agents import sections
-from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue
 from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
@@ -20,13 +18,7 @@ from megastep.agents.runs.run_state import RunState
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
-from megastep.agents.training.performance import (
-    N_WARM_UPS,
-    PHASES,
-    PhaseTimer,
-    SectionTimes,
-    device_memory,
-)
+from megastep.agents.training.performance import PHASES, PhaseTimer, device_memory
 from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
@@ -34,7 +26,8 @@ if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.runs.annealing import AnnealingRecord
     from megastep.agents.training.curriculum import Curriculum
-    from megastep.agents.types import Learner, Logger, RolloutLike, SaverLike
+    from megastep.agents.training.profiler import Profiler
+    from megastep.agents.types import Learner, RolloutLike, RunLogger, SaverLike
 
 
 #: Updates that the host may be ahead of a GPU. The learning rate of an update follows the clock at
@@ -66,19 +59,19 @@ class Trainer:
             over the ranks. Whatever it plays in is not the environment of the training.
         snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
             update and after each.
-        replay_folder: where a file is written that replays the first NaN or infinity of the
-            environment, see `nonfinite_recorder`; None for no file.
+        repeat_hint: returns how to meet the first NaN or infinity of the run again, as the rest of
+            a sentence, see `NonFiniteGuard`; it gets the trainer, too.
         annealing_record: such as `annealing.AnnealingRecord`: gets the factor of the learning rate
             in each update, and is flushed before each report.
         make_curriculum: returns what draws the homes of new episodes, such as `curriculum.SFL`, for
             the environment, the learner and the rollout; None leaves that to the environment.
         layout_sources: the name of the source of each of the environment's layouts, whose episodes
             have statistics of their own; None for none.
+        profiler: profiles some of the updates, if not None.
 
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
         clock: counts the seconds of training.
-        section_times: where they go.
         lr: the current learning rate.
         score: the last mean return that was logged, or None before `MIN_EPISODES` have ended: that
             of few episodes is luck, and would mark the first checkpoint as the best.
@@ -100,7 +93,7 @@ class Trainer:
         env: Env,
         policy: Policy,
         learner: Learner,
-        logger: Logger,
+        logger: RunLogger,
         saver: SaverLike,
         budget: Budget,
         *,
@@ -110,17 +103,18 @@ class Trainer:
         on_log: Callable[[Trainer], None] = lambda trainer: None,
         evaluator: Callable[[Policy], Mapping[str, float]] = lambda policy: {},
         snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
-        replay_folder: Path | None = None,
+        repeat_hint: Callable[[Trainer, NonFiniteValue], str] = lambda trainer, value: "",
         annealing_record: AnnealingRecord | None = None,
         make_curriculum: Callable[[Env, Learner, RolloutLike], Curriculum] | None = None,
         layout_sources: Sequence[str] | None = None,
+        profiler: Profiler | None = None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.logger, self.saver, self.budget = logger, saver, budget
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.on_log, self.evaluator, self.snapshot_saver = on_log, evaluator, snapshot_saver
         self.opponents = optional(env, "opponent_pool")
-        self.annealing_record = annealing_record
+        self.annealing_record, self.profiler = annealing_record, profiler
         if budget.anneal != "never" and not with_defaults(learner, LearnerOptions).set_lr:
             raise ValueError(
                 f"{type(learner).__name__} has no set_lr(lr), so its learning rate cannot fall "
@@ -148,9 +142,8 @@ class Trainer:
         self.run_state = RunState(
             env, policy, learner, self.collect, self.episode_stats, self.curriculum
         )
-        self.nonfinite_guard = NonFiniteGuard(env, learner, self.collect, replay_folder)
+        self.nonfinite_guard = NonFiniteGuard(env, learner, lambda value: repeat_hint(self, value))
         self.clock, self.timer = Stopwatch(), PhaseTimer(env.device)
-        self.section_times = SectionTimes(env.device)
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.samples_per_second = None
@@ -180,24 +173,22 @@ class Trainer:
         try:
             self.snapshot_saver(self)
             while (plan := self.plan(stop())).goes_on:
-                if plan.saves and self.nonfinite_guard.check(self.rollout, self.samples):
+                if plan.saves and self.nonfinite_guard.check(self.rollout):
                     self.save_checkpoint()
-                self.timer.start("collect")
-                self.nonfinite_guard.start_rollout()
+                self.start("collect")
                 self.rollout = self.collect()
-                self.nonfinite_guard.end_rollout(self.rollout)
-                self.timer.start("update")
+                self.start("update")
                 losses = self.update(plan.lr_fraction)
                 with unhurried():
                     self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
                     self.samples_at_report = self.samples
                     self.log(losses)
-                    self.nonfinite_guard.check(self.rollout, self.samples)
+                    self.nonfinite_guard.check(self.rollout)
             state = self.state_dict()  # a resumed run repeats what this last report empties
             if self.updates > self.updates_at_log:
                 self.log(losses)
-            self.nonfinite_guard.check(self.rollout, self.samples)
+            self.nonfinite_guard.check(self.rollout)
         except NonFiniteError as error:
             if error.is_from_env:  # the skipped updates left the policy unchanged
                 self.save_what_was_learnt()
@@ -212,9 +203,9 @@ class Trainer:
         finally:
             with contextlib.suppress(Exception):  # as above
                 self.wait_for_collector()
-            self.wait_for_saver()
+            self.wait_for_files()
         self.save_checkpoint(state, is_last=True)
-        self.wait_for_saver()
+        self.wait_for_files()
 
     def close(self) -> None:
         """Closes the environment and the files of metrics, after training."""
@@ -242,6 +233,13 @@ class Trainer:
         is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
         return agree(plan, is_stopped, is_behind)
 
+    def start(self, phase: str) -> None:
+        """Starts one of the `PHASES` of an update."""
+        if self.profiler is not None:
+            with unhurried():
+                self.profiler.start(phase)
+        self.timer.start(phase)
+
     def wait_for_collector(self) -> None:
         """Waits until an async collector has stopped stepping the environment."""
         self.collector_options.wait()
@@ -259,7 +257,7 @@ class Trainer:
             self.lr = self.learner.lr * lr_fraction
             self.learner.set_lr(self.lr)
         losses = self.learner.update(rollout)
-        self.timer.start("rest")
+        self.start("rest")
         self.episode_stats.add(
             rollout.reward,
             rollout.reset,
@@ -281,7 +279,6 @@ class Trainer:
             self.seconds_at_checkpoint = self.clock.seconds
             self.samples_at_log, self.seconds_at_log = self.samples, self.clock.seconds
             self.timer.pop()
-            sections.pop()
         return losses
 
     def log(self, losses: dict[str, torch.Tensor]) -> None:
@@ -321,11 +318,7 @@ class Trainer:
             n_samples = self.samples - self.samples_at_log
             self.samples_per_second = n_samples / (seconds - self.seconds_at_log)
             perf["perf/rate"] = self.samples_per_second
-            phases = self.timer.pop()
-            perf |= {f"perf/{phase}": time for phase, time in phases.items()}
-            n_iterations = n_samples // (self.rollout.n_steps * self.rollout.n_lanes * n_ranks())
-            times = self.section_times.add(phases, n_iterations)
-            perf |= {f"section/{name}": time for name, time in times.items()}
+            perf |= {f"perf/{phase}": time for phase, time in self.timer.pop().items()}
         perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
         self.updates_at_log = self.updates
@@ -337,32 +330,6 @@ class Trainer:
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
         self.on_log(self)
-
-    def measure_sections(self) -> None:
-        """Measures the sections of an iteration on a GPU, and logs them; a CPU knows them already.
-
-        Call it after `train`, on all ranks. Collects and learns a few times more, which nothing
-        saves, with CUDA graphs that are captured anew, hold events and are dropped afterwards.
-        """
-        is_gpu = torch.device(self.env.device).type == "cuda"
-        if not is_gpu or not self.section_times.n or self.nonfinite_guard.value is not None:
-            return
-        for _ in range(N_WARM_UPS):
-            self.rollout = self.collect()
-            self.learner.update(self.rollout)
-        collect = self._recapture()
-        try:
-            self.section_times.measure(collect, lambda: self.learner.update(self.rollout))
-        finally:
-            self._recapture()  # replayed again, graphs would write to events that are gone
-        times = {f"section/{name}": n for name, n in self.section_times.milliseconds().items()}
-        self.logger.write(self.samples, None, {"perf/seconds": self.seconds_at_log, **times})
-
-    def _recapture(self):
-        """Drops the graphs of collecting and learning. Returns what collects in the foreground."""
-        if hasattr(self.learner, "recapture"):
-            self.learner.recapture()
-        return self.collect.recapture() if hasattr(self.collect, "recapture") else self.collect
 
     def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update. All ranks call it.
@@ -385,8 +352,10 @@ class Trainer:
         self.updates_at_checkpoint = self.updates
 
     @unhurried()
-    def wait_for_saver(self) -> None:
-        """Waits until the last checkpoint is written, or has failed."""
+    def wait_for_files(self) -> None:
+        """Waits until the last checkpoint and a profile are written, or have failed."""
+        if self.profiler is not None:
+            self.profiler.finish()
         self.saver.wait()
 
     @unhurried()

@@ -81,16 +81,16 @@ def _pack(scenery, radius, n_threads):
             )
     return ENGINE.params.SceneryParams(
         walls=address("scenery.layouts.lines.vals", layouts.lines.vals, layouts.n_walls, 2, 2),
-        wall_starts=layouts.wall_starts.data_ptr(),
-        texel_starts=layouts.texel_starts.data_ptr(),
-        boxes=layouts.boxes.data_ptr(),
-        box_starts=layouts.box_starts.data_ptr(),
+        wall_starts=layouts.wall_starts,
+        texel_starts=layouts.texel_starts,
+        boxes=layouts.boxes,
+        box_starts=layouts.box_starts,
         texels=texels,
         lights=address("scenery.layouts.lights.vals", layouts.lights.vals, layouts.n_lights, 3),
-        light_starts=layouts.light_starts.data_ptr(),
+        light_starts=layouts.light_starts,
         layout=address("scenery.layout", scenery.layout, n, dtype=torch.int32),
-        model=scenery.model.data_ptr(),
-        model_texels=scenery.model_texels.data_ptr(),
+        model=scenery.model,
+        model_texels=scenery.model_texels,
         agent_textures=address(
             "scenery.layouts.agent_textures", layouts.agent_textures, len(layouts), k, 3
         ),

@@ -22,13 +22,13 @@ def bake(scenery: Scenery) -> None:
     layouts.update_bounding_boxes()
     texel_wall = _owners(layouts.textures.widths, layouts.n_texels)
     wall_layout = _owners(layouts.lines.widths, layouts.n_walls)
-    packed = ENGINE.params.BakeParams(
+    launch(
+        *(ENGINE, "bake", scenery.device, layouts.n_texels),
         scenery=packed_scenery,
-        texel_wall=texel_wall.data_ptr(),
-        wall_layout=wall_layout.data_ptr(),
+        texel_wall=texel_wall,
+        wall_layout=wall_layout,
         n_texels=layouts.n_texels,
     )
-    launch(ENGINE, "bake", packed, scenery.device, threads=layouts.n_texels)
 
 
 def _owners(widths, total):

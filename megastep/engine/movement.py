@@ -65,10 +65,11 @@ def physics(
         actions_at, controls_at = _addresses(actions, lanes, n_moves, device)
     progress = torch.empty(lanes, device=device)
     threads_per_env = _threads_per_env(n, device)
-    packed = ENGINE.params.PhysicsParams(
+    launch(
+        *(ENGINE, _kernel(n, device), device, threads_per_env * n),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
-        progress=progress.data_ptr(),
+        progress=progress,
         error_flag=error_flag_address(scenery, agents),
         actions=actions_at,
         controls=controls_at,
@@ -78,7 +79,6 @@ def physics(
         seconds=1 / agents.fps,
         threads_per_env=threads_per_env,
     )
-    launch(ENGINE, _kernel(n, device), packed, device, threads_per_env * n)
     check_on_cpu(agents)
     return Physics(progress)
 

@@ -20,7 +20,7 @@ from megastep.engine.launch_params import (
 )
 from megastep.engine.outputs import Observation, Render
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, addresses, launch
+from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
 
 __all__ = ["observe", "render", "update_agent_geometry"]
 
@@ -44,13 +44,13 @@ _OPTIONAL = dict.fromkeys(
 def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) -> None:
     """Moves the agents' lines to their current poses, and computes the light on them if ``lit``."""
     n, a = lanes_of(scenery, agents)
-    packed = ENGINE.params.UpdateAgentGeometryParams(
+    launch(
+        *(ENGINE, "update_agent_geometry", scenery.device, WARP * n * a),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         error_flag=error_flag_address(scenery, agents),
         lit=int(checks.flag("lit", lit)),
     )
-    launch(ENGINE, "update_agent_geometry", packed, scenery.device, threads=WARP * n * a)
     check_on_cpu(agents)
 
 
@@ -149,8 +149,12 @@ def _seen_fields(scenery, seen, clear_mask):
 def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     res, device = agents.res, scenery.device
     half_width = math.tan(math.radians(agents.fov / 2))
-    fields = addresses(outputs)
-    packed = ENGINE.params.RenderParams(
+    shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
+    n = scenery.n_envs * scenery.n_agents
+    kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
+    n_per_block = 1 if kernel == "render_split" else BLOCK // WARP
+    launch(
+        *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared * n_per_block)),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         yaws=checks.address("agents.yaws", agents.yaws, (agents.n_cameras,), torch.float32, device),
@@ -170,15 +174,8 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
         n_pixels=res // subsample,
         inv_subsample=1 / subsample,
         inv_max_depth=1 / max_depth,
-        **{**_OPTIONAL, **fields},
+        **{**_OPTIONAL, **outputs},
     )
-    shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)
-    n = scenery.n_envs * scenery.n_agents
-    kernel = "render" if "indices" in fields else _kernel(scenery, res, subsample)
-    if kernel == "render_split":
-        launch(ENGINE, kernel, packed, device, BLOCK * n, shared * WARP // BLOCK)
-    else:
-        launch(ENGINE, kernel, packed, device, WARP * n, shared)
     check_on_cpu(agents)
 
 

@@ -66,7 +66,10 @@ def spawn(
     cumulative_at = 0
     if cumulative is not None:
         cumulative_at = checks.address("cumulative", cumulative, (n_layouts,), torch.int32, device)
-    packed = ENGINE.params.SpawnParams(
+    is_hidden, n_envs = checks.flag("hidden", hidden), scenery.n_envs
+    kernel, n_threads = ("spawn_hidden", WARP * n_envs) if is_hidden else ("spawn", n_envs)
+    launch(
+        *(ENGINE, kernel, device, n_threads),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
         mask=checks.address("mask", mask, lanes, torch.bool, device),
@@ -79,10 +82,6 @@ def spawn(
         n_points=n_points,
         resample=int(checks.flag("resample", resample)),
     )
-    if checks.flag("hidden", hidden):
-        launch(ENGINE, "spawn_hidden", packed, device, threads=WARP * scenery.n_envs)
-    else:
-        launch(ENGINE, "spawn", packed, device, threads=scenery.n_envs)
     check_on_cpu(agents)
 
 
@@ -100,7 +99,8 @@ def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tens
         ``out``.
     """
     n, device = checks.length("counts", counts), counts.device
-    packed = ENGINE.params.UniformParams(
+    launch(
+        *(ENGINE, "uniform", device, n),
         counts=checks.address("counts", counts, (n,), torch.int32, device),
         mask=checks.address("mask", mask, (n,), torch.bool, device),
         out=checks.address("out", out, (n, 4), torch.float32, device),
@@ -108,6 +108,5 @@ def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tens
         n_lanes=n,
         n_threads=threads(),
     )
-    launch(ENGINE, "uniform", packed, device, threads=n)
     counts.add_(mask)
     return out

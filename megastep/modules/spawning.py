@@ -183,11 +183,8 @@ class RandomSpawns:
         if not self.resample:
             raise ValueError("environments keep their homes: use resample=True to draw them anew")
         if self._weights is None:
-            n, n_envs, n_agents = self._n_layouts, self.core.n_envs, self.core.n_agents
-            # of another length than a tensor with a row per environment or lane, which recordings
-            # of NaN would take it for
-            length = next(k for k in range(n, n + 3) if k not in (n_envs, n_envs * n_agents))
-            self._weights = torch.arange(1, length + 1, dtype=torch.int32, device=self.core.device)
+            n, device = self._n_layouts, self.core.device
+            self._weights = torch.arange(1, n + 1, dtype=torch.int32, device=device)
         return self.cumulative
 
     @property
@@ -195,7 +192,7 @@ class RandomSpawns:
         """(D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``; None
         before `weigh_layouts`: every layout is as likely.
         """
-        return None if self._weights is None else self._weights[: self._n_layouts]
+        return self._weights
 
 
 def _all_points(geometries, n, n_agents, radius, seed):

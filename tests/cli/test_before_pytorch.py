@@ -10,11 +10,13 @@ import sys
 import pytest
 from pydantic import ValidationError
 
+from megastep.agents import factory
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree
+from megastep.agents.factory.settings import loggers
 from megastep.agents.launch import train as launch_train
-from megastep.agents.runs import checkpoint
+from megastep.agents.runs import checkpoint, folders
 from megastep.imports import import_object
 from megastep.settings import arguments_of, sentence, settings_class
 from tests.helpers.tiny import TINY, settings
@@ -80,13 +82,13 @@ def test_environments_that_take_geometries_are_cached():
 def test_arguments_are_read_again_after_a_change(tmp_path, monkeypatch):
     monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
     read = []
-    monkeypatch.setattr(components, "read", lambda: read.append(1) or {})
+    monkeypatch.setattr(components, "read", lambda: read.append(1) or ({}, set(), {}))
     monkeypatch.setattr(components.package, "CONFIGS", tmp_path / "agents/configs")
     source = tmp_path / "agents/module.py"
     source.parent.mkdir()
     for text, n_reads in (("x = 1", 1), ("x = 1", 1), ("x = 2", 2), ("x = 1", 2)):
         source.write_text(text)
-        assert components.cached.__wrapped__() == {} and len(read) == n_reads
+        assert components.cached.__wrapped__().arguments == {} and len(read) == n_reads
 
 
 HEAVY = ("torch", "numpy", "scipy", "matplotlib", "rich", "tensorboard", "loky")
@@ -95,7 +97,7 @@ import json, sys
 from megastep.agents.cli import entry
 for script, code, words in json.loads(sys.argv[1]):
     sys.argv[1:] = words
-    assert entry.run_script(script) == code, words
+    assert entry.run_command(script) == code, words
 print([name for name in json.loads(sys.argv[0]) if name in sys.modules], file=sys.__stderr__)
 """.replace("sys.argv[0]", repr(json.dumps(HEAVY)))
 
@@ -131,6 +133,58 @@ def test_errors_need_no_pytorch(stopped):
     assert process.returncode == 0, process.stderr
     assert process.stderr.splitlines()[-1] == "[]", "modules that errors do not need"
     assert "Traceback" not in process.stderr and process.stdout.count("most common words") == 2
+
+
+# ---- Loggers of runs ----
+
+WANDB = {"name": "wandb", "project": "p", "mode": "offline", "group": None}
+
+
+def save_with(logger):
+    """Saves the run `run` with another value of the setting `logger`."""
+    config = {"train": as_tree(settings(*TINY)) | {"logger": logger}, "spaces": {}}
+    checkpoint.save("run/checkpoints", 64, dict(samples=64, updates=2, seconds=2.5), config)
+
+
+@pytest.mark.parametrize(
+    "logger, words, expected",
+    [
+        ({"name": "none"}, [], {"tensorboard": {}}),
+        (WANDB, [], {"tensorboard": {}, "wandb": {**WANDB}}),
+        (
+            WANDB,
+            ["logger.wandb.mode=online"],
+            {"tensorboard": {}, "wandb": WANDB | {"mode": "online"}},
+        ),
+        (WANDB, ["logger=none"], {}),
+        ({"name": "none"}, ["logger=csv"], {"csv": {}}),
+        ({}, [], {}),
+    ],
+)
+def test_run_with_the_keys_of_a_single_logger_is_resumed(
+    tmp_path, monkeypatch, logger, words, expected
+):
+    monkeypatch.chdir(tmp_path)
+    save_with(logger)
+    chosen = as_tree(settings("resume=run", *words))["logger"]
+    paths = {label: {"name": path} for label, path in loggers().items()}
+    assert chosen == {label: keys | paths[label] for label, keys in expected.items()}
+
+
+def test_logger_that_a_resumed_run_does_not_have(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_with({"name": "none"})
+    with pytest.raises(ConfigErrors, match="logger.wandb: is not chosen; add logger=wandb"):
+        settings("resume=run", "logger.wandb.mode=offline")
+
+
+def test_evaluation_needs_no_logger(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save_with({"gone": {"name": "gone:Gone", "uri": "x"}})
+    loaded = folders.load_checkpoint(pathlib.Path("run"), trust=True)
+    assert factory.config_of(loaded).logger == {}
+    with pytest.raises(ConfigErrors, match="logger.gone: gone:Gone cannot be imported"):
+        settings("resume=run", "trust=true")
 
 
 # ---- Budgets of resumed runs ----

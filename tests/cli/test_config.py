@@ -1,7 +1,7 @@
 """Composing and checking configurations. No test starts a run."""
 
 import dataclasses
-import inspect
+import importlib
 import re
 
 import pytest
@@ -11,10 +11,10 @@ from megastep import envs, geometries
 from megastep.agents.cli import scripts, sweeps, train
 from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree, check, leaves
-from megastep.agents.factory.settings import IMPORTED, Agent, Train, WandbLogger, kind_of
+from megastep.agents.factory.settings import IMPORTED, Agent, Train, kind_of, loggers
 from megastep.agents.package import CONFIGS
-from megastep.agents.training.loggers import Wandb
 from megastep.geometries import sources
 from tests.helpers.tiny import changed
 from tests.helpers.tiny import settings as compose
@@ -123,9 +123,78 @@ def test_config_files_hold_no_constructor_defaults(group):
         assert not [k for k in pairs if pairs[k] == defaults[k] and k != "n_envs"], path
 
 
-def test_logger_keys_are_constructor_arguments():
-    keys = {field.name for field in dataclasses.fields(WandbLogger)}
-    assert keys - {"name"} <= set(inspect.signature(Wandb).parameters)
+@pytest.mark.parametrize(
+    "words, labels",
+    [
+        ([], {"tensorboard"}),
+        (["logger=none"], set()),
+        (["logger=[]"], set()),
+        (["logger=csv"], {"csv"}),
+        (["logger=[tensorboard,wandb,csv]"], {"tensorboard", "wandb", "csv"}),
+        (["logger=[csv,tests.cli.test_config:Memo]"], {"csv", "memo"}),
+    ],
+)
+def test_loggers_of_a_run(words, labels):
+    assert compose(*words).logger.keys() == labels
+
+
+class Memo:
+    """A logger outside megastep."""
+
+    def __init__(self, folder, config, path: str = "memo", size: int = 3):
+        pass
+
+    def write(self, step, values):
+        pass
+
+    def close(self):
+        pass
+
+
+class CSV(Memo):
+    """Called as one of megastep's."""
+
+
+def test_each_logger_has_settings_of_its_own():
+    path = "tests.cli.test_config:Memo"
+    own = ["logger.wandb.mode=offline", "logger.wandb.project=p", "logger.memo.size=4"]
+    chosen = compose(f"logger=[wandb,{path}]", *own).logger
+    assert dataclasses.asdict(chosen["memo"]) == {"name": path, "path": "memo", "size": 4}
+    wandb = dict(name=loggers()["wandb"], project="p", mode="offline", group=None)
+    assert dataclasses.asdict(chosen["wandb"]) == wandb
+    assert compose(f"logger={path}", "logger.memo.path=here").logger["memo"].path == "here"
+
+
+@pytest.mark.parametrize(
+    "words, key, text",
+    [
+        (["logger.mode=offline"], "logger.mode", "no such key; did you mean logger.wandb.mode?"),
+        (["logger=wandb", "logger.group=g"], "logger.group", "did you mean logger.wandb.group?"),
+        (["logger.wandb.mode=offline"], "logger.wandb", "is not chosen; add logger=wandb, or"),
+        (["logger=wandb", "logger.wandb.mod=x"], "logger.wandb.mod", "logger.wandb.mode?"),
+        (["logger=wandb", "logger.wandb.mode=x"], "logger.wandb.mode", "'x' is unknown; there are"),
+        (["logger.mlfow.uri=x"], "logger.mlfow", "no such key or logger; there are csv"),
+        (["logger=wandbb"], "logger", "'wandbb' is unknown; did you mean wandb?"),
+        (["logger=[csv,wandbb]"], "logger", "'wandbb' is unknown; did you mean wandb?"),
+        (["logger=null"], "logger", "None is unknown"),
+        (["logger=nowhere:Memo"], "logger.memo", "nowhere:Memo cannot be imported"),
+        (["logger=[csv,nowhere:Memo]"], "logger.memo", "nowhere:Memo cannot be imported"),
+        (["logger=pathlib:Path"], "logger.path", "cannot be used: it has no method write"),
+        (["logger=[csv,tests.cli.test_config:CSV]"], "logger", "the same class name"),
+    ],
+)
+def test_loggers_that_are_refused(words, key, text):
+    messages = errors(*words)
+    assert list(messages) == [key] and text in messages[key]
+
+
+def test_a_logger_is_a_class_in_a_file_of_its_name(tmp_path, monkeypatch):
+    (tmp_path / "memo.py").write_text("class Memo:\n    pass\n\n\nclass Other(Memo):\n    pass\n")
+    package = importlib.import_module(components.LOGGERS)
+    monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
+    found = components.read().members["logger"]
+    assert found == {**loggers(), "memo": f"{components.LOGGERS}.memo:Memo"}
+    assert {*loggers()} == {"csv", "tensorboard", "wandb"}
 
 
 def test_values_follow_the_device(monkeypatch):
@@ -167,7 +236,6 @@ def test_typo_hints_nearest_key():
 
 
 def test_key_of_another_member():
-    assert errors("logger.mode=offline")["logger.mode"] == "no such key here; logger=wandb has it"
     messages = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.outer=false")
     assert messages["env.patience"] == "no such key here; env=explorer has it"
     assert messages["geometry.outer"] == "no such key here; geometry=homes has it"
@@ -179,7 +247,7 @@ def test_unknown_member_hints_nearest():
     assert "quickstart?" in errors("experiment=quickstrt")["experiment"]
     assert "test?" in errors("run=x", "split=tset", script="evaluate")["split"]
     assert "import path" in errors("env.name=zzz")["env"]
-    assert "wandb" in errors("logger.name=zzz")["logger"]
+    assert "wandb" in errors("logger.name=zzz")["logger.name"]
 
 
 def test_all_errors_are_listed_at_once():
@@ -412,9 +480,9 @@ def test_value_with_equals_sign():
 def test_environment_variables_are_refused(monkeypatch, capsys):
     monkeypatch.setenv("SECRET", "hush")
     messages = errors(
-        "logger=wandb", "logger.project=${oc.env:SECRET}", "folder=x/${oc.env:SECRET}"
+        "logger=wandb", "logger.wandb.project=${oc.env:SECRET}", "folder=x/${oc.env:SECRET}"
     )
-    assert set(messages) == {"logger.project", "folder"} and "hush" not in str(messages)
+    assert set(messages) == {"logger.wandb.project", "folder"} and "hush" not in str(messages)
     assert train.main(["--cfg", "hydra", "hydra.sweep.dir=${oc.env:SECRET}/x"]) == 0
     shown = capsys.readouterr().out
     assert "dir: ${oc.env:SECRET}/x" in shown and "hush" not in shown

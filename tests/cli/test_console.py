@@ -38,16 +38,3 @@ def test_dumb_terminal_gets_plain_lines(monkeypatch, kind):
 def test_tiny_terminal_gets_a_bar(monkeypatch):
     text = shown(monkeypatch, "xterm")
     assert "\x1b[" in text and text.isascii()
-
-
-def test_table_of_sections():
-    text = console.sections({"act": 1.5, "env": 6.0}, 10.0)
-    words = [line.replace("┃", "│").strip("│").split("│") for line in text.splitlines()]
-    rows = [[word.strip() for word in row] for row in words if len(row) == 3]
-    assert rows == [
-        ["section", "ms", "share"],
-        ["act", "1.5", "15.0 %"],
-        ["env", "6", "60.0 %"],
-        ["other", "2.5", "25.0 %"],
-        ["iteration", "10", "100.0 %"],
-    ]

@@ -302,7 +302,7 @@ def test_resume_with_another_number_of_threads(here, capsys):
 def test_format_6_is_migrated(here, capsys):
     """A checkpoint of the format before environments were saved, of a run with opponents."""
     shutil.copytree(DATA / "format6", here / "run")
-    assert entry.inspect_run(["run"]) == 0 and "format 6" in capsys.readouterr().out
+    assert entry.run_command("inspect", ["run"]) == 0 and "format 6" in capsys.readouterr().out
     saved = checkpoint.load_latest("run/checkpoints").state
     run("resume=run", "more_samples=96")
     assert "not bit for bit: its environments were not saved" in capsys.readouterr().out
@@ -331,15 +331,18 @@ def test_run_of_before_a_learner_had_some_settings_resumes_bit_for_bit(here, cap
 def test_inspect(here, capsys):
     run(*tiny.TINY, "samples=64", "folder=run", "log_every=1")
     capsys.readouterr()
-    assert entry.inspect_run(["rum"]) == 2 and "did you mean run?" in capsys.readouterr().err
-    assert entry.inspect_run(["latest"]) == 0
+    assert (
+        entry.run_command("inspect", ["rum"]) == 2
+        and "did you mean run?" in capsys.readouterr().err
+    )
+    assert entry.run_command("inspect", ["latest"]) == 0
     out = capsys.readouterr().out
     assert "step_64: intact, format 7" in out and "updates 2" in out
     assert all(word in out for word in ("world.pt", "policy", "actor_state.world.obs", "torch"))
     with open(here / "run/checkpoints/step_64/world.pt", "r+b") as file:
         file.seek(1000)
         file.write(b"?")
-    assert entry.inspect_run(["run"]) == 1
+    assert entry.run_command("inspect", ["run"]) == 1
     assert "world.pt does not match the SHA-256" in capsys.readouterr().out
 
 

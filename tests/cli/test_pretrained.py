@@ -183,7 +183,6 @@ def test_meets_others_in_duels(exported, capsys):
 
 @pytest.mark.usefixtures("drawn_in_this_process")
 def test_is_recorded_into_its_folder(folder):
-    pytest.importorskip("av")
     words = [f"run={NAME}", "geometry=box", "steps=1", "device=cpu"]
     assert record.main(words) == record.main([*words, f"against={NAME}"]) == 0
     names = sorted(path.name for path in Path(f"runs/pretrained-{NAME}").iterdir())
@@ -226,11 +225,11 @@ def test_rounding_error_sees_other_weights(folder, exported):
 
 
 def test_inspect_prints_what_is_in_a_file(file, capsys):
-    assert inspect.run([NAME]) == 0
+    assert inspect.main([NAME]) == 0
     out = capsys.readouterr().out
     assert f"{NAME}.safetensors: intact" in out and "samples: 512" in out and "policy" in out
-    file.write_bytes(file.read_bytes()[:-1])
-    assert inspect.run([NAME]) == 1
+    file.write_bytes(file.read_bytes()[:-1] + b"!")
+    assert inspect.main([NAME]) == 1
     assert "SHA-256" in capsys.readouterr().out
 
 
@@ -280,11 +279,13 @@ def changed(content, **texts):
 
 
 DAMAGES = {
-    "empty": (lambda content: b"", "no header"),
-    "cut off": (lambda content: content[:-7], "do not match their SHA-256"),
+    "empty": (lambda content: b"", "header too small"),
+    "cut off": (lambda content: content[:-7], "file not fully covered"),
     "a bit": (lambda content: content[:-3] + b"!" + content[-2:], "do not match their SHA-256"),
     "header": (lambda content: content[:30] + b"!" + content[31:], "no agent of megastep"),
-    "long header": (lambda content: b"\xff" * 8 + content, "no header"),
+    "no text": (lambda content: content[:30] + b"\xff" + content[31:], "invalid UTF-8 in header"),
+    "long header": (lambda content: b"\xff" * 8 + content, "header too large"),
+    "spaces": (lambda content: (2**25).to_bytes(8, "little") + b" " * 2**25, "too long"),
     "of others": (lambda content: b"\x02" + b"\0" * 7 + b"{}", "not an agent's"),
     "no samples": (lambda content: changed(content, facts='{"samples": null}'), "samples"),
     "no config": (lambda content: changed(content, config="{}"), "not whole"),
@@ -309,7 +310,10 @@ def test_damaged_files_are_one_sentence(damage, text, file, capsys):
         {"dtype": "F16", "shape": [2], "data_offsets": [4, 8]},
         {"dtype": "F16", "shape": [-2], "data_offsets": [0, 4]},
         {"dtype": "F8", "shape": [2], "data_offsets": [0, 4]},
+        {"dtype": "BF16", "shape": [2], "data_offsets": [0, 4]},
+        {"dtype": "F16", "shape": [2**62, 2**62], "data_offsets": [0, 4]},
         {"dtype": "F16", "shape": [2]},
+        {"dtype": "a\nb", "shape": [2], "data_offsets": [0, 4]},
     ],
 )
 def test_tensors_that_do_not_fill_the_file_are_refused(entry, tmp_path):
@@ -320,8 +324,9 @@ def test_tensors_that_do_not_fill_the_file_are_refused(entry, tmp_path):
     header = json.loads(content[8 : 8 + n]) | {"w": entry}
     text = json.dumps(header).encode()
     path.write_bytes(len(text).to_bytes(8, "little") + text + content[8 + n :])
-    with pytest.raises(DamagedCheckpoint, match="a.safetensors is damaged, or no agent"):
+    with pytest.raises(DamagedCheckpoint, match="a.safetensors is damaged, or no agent") as info:
         agent_file.read(path, "cpu")
+    assert "\n" not in str(info.value)
 
 
 def test_modules_of_others_need_trust(file, capsys):
@@ -338,22 +343,15 @@ def test_modules_of_others_need_trust(file, capsys):
 # ---- The format ----
 
 
-def test_format_is_that_of_safetensors(tmp_path):
-    """The same tensors as written by the package safetensors, 0.7, without its texts."""
+def test_tensors_are_read_as_written(tmp_path):
     path = tmp_path / "a.safetensors"
-    tensors = {"b": torch.tensor([[1.0, 2.0]]).half(), "a": torch.tensor(3.5)}
+    tensors = {"b": torch.rand(2, 3).half().T, "a": torch.tensor(3.5)}
+    tensors["c"] = torch.zeros(0, 2, dtype=torch.int64)
     agent_file.write(path, tensors, {"train": {}, "spaces": {}}, {"samples": 7})
-    content = path.read_bytes()
-    n = int.from_bytes(content[:8], "little")
-    header = json.loads(content[8 : 8 + n])
-    assert all(type(text) is str for text in header.pop("__metadata__").values())
-    assert json.dumps(header, separators=(",", ":")) == (
-        '{"a":{"dtype":"F32","shape":[],"data_offsets":[0,4]},'
-        '"b":{"dtype":"F16","shape":[1,2],"data_offsets":[4,8]}}'
-    )
-    assert content[8 + n :] == b"\x00\x00`@\x00<\x00@" and n % 8 == 0
     read = agent_file.read(path, "cpu").state["policy"]
-    assert all(torch.equal(read[name], tensors[name]) for name in ("a", "b"))
+    assert [*read] == ["a", "b", "c"]
+    for name, tensor in tensors.items():
+        assert read[name].dtype == tensor.dtype and torch.equal(read[name], tensor)
     with pytest.raises(ValueError, match="w is bool"):
         agent_file.write(path, {"w": torch.ones(1).bool()}, {}, {})
 

@@ -12,7 +12,7 @@ from matplotlib import pyplot as plt
 from megastep import plotting, recording
 from megastep.agents.cli import record, train
 from megastep.agents.runs import checkpoint
-from tests.helpers import faults, tiny
+from tests.helpers import tiny
 from tests.helpers.tiny import settings
 
 TINY = [*tiny.TINY, "samples=1"]
@@ -58,7 +58,7 @@ def test_recordings_take_the_next_free_name(trained, tmp_path, monkeypatch, caps
     assert (copy / "video.mp4").read_text() == "5", "a file that is named is overwritten"
 
 
-def test_png_is_the_last_frame(trained, tmp_path, monkeypatch):
+def test_png_is_the_last_frame(trained, tmp_path):
     import av
 
     video, still = tmp_path / "a.mp4", tmp_path / "folder" / "a.png"
@@ -66,7 +66,6 @@ def test_png_is_the_last_frame(trained, tmp_path, monkeypatch):
     assert record.main([*common, f"file={video}"]) == 0
     with av.open(str(video)) as file:
         *_, last = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
-    faults.not_installed(monkeypatch, "av")
     assert record.main([*common, f"file={still}"]) == 0
     drawn = (255 * plt.imread(still)[..., :3]).round()
     height, width = drawn.shape[:2]  # of the video, sizes are even
@@ -142,14 +141,6 @@ def test_training_survives_a_failed_video(trained, tmp_path, monkeypatch, capsys
     assert train.main([*TINY, "finish.record=true"]) == 0
     assert "Frame 0 could not be drawn" in capsys.readouterr().err
     assert not list(tmp_path.glob("runs/*/*.mp4"))
-
-
-def test_training_without_the_encoder(tmp_path, monkeypatch, capsys, with_curves):
-    monkeypatch.chdir(tmp_path)
-    faults.not_installed(monkeypatch, "av")
-    assert train.main([*TINY, "finish.record=true"]) == 0
-    assert "pip install av" in capsys.readouterr().err
-    assert len(list(tmp_path.glob("runs/*/curves.png"))) == 1
 
 
 def test_geometry_keys_need_a_geometry(capsys):

@@ -3,7 +3,6 @@ job and a signal do. Jobs run an environment that pays a known return in millise
 """
 
 import csv
-import dataclasses
 import json
 import logging
 import os
@@ -28,7 +27,6 @@ from megastep.agents.factory.settings import kind_of
 from megastep.agents.launch import places
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import folders, scores
-from megastep.agents.training import loggers
 from tests.helpers.processes import HUNG, is_running, wait_until
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -247,21 +245,19 @@ def test_hydra_run_dir_is_the_folder(here, capsys):
 
 @pytest.mark.slow
 def test_wandb_group_of_a_sweep(here, monkeypatch):
-    loggers_added = []
-    monkeypatch.setattr(
-        loggers.Loggers,
-        "_add_optional",
-        lambda self, sink, *_, **options: loggers_added.append(options),
-    )
-    wandb = ["logger=wandb", "logger.mode=offline"]
-    assert train.main([*SHORT, *wandb, "-m", "seed=1", "hydra.sweep.dir=mine"]) == 0
-    assert train.main([*SHORT, *wandb, "-m", "seed=1", "hydra.sweep.dir=x", "logger.group=g"]) == 0
-    assert train.main([*SHORT, *wandb, "folder=alone"]) == 0
-    assert [options["group"] for options in loggers_added if "group" in options] == [
-        "mine",
-        "g",
-        None,
-    ]
+    groups = []
+
+    class Wandb:
+        def __init__(self, group):
+            groups.append(group)
+
+    monkeypatch.setattr("megastep.agents.training.loggers.wandb.Wandb", Wandb)
+    own = [*SHORT, "logger=[csv,wandb]", "logger.wandb.mode=offline"]
+    assert train.main([*own, "-m", "seed=1", "hydra.sweep.dir=mine"]) == 0
+    typed = "logger.wandb.group=g"
+    assert train.main([*own, "-m", "seed=1", "hydra.sweep.dir=x", typed]) == 0
+    assert train.main([*own, "folder=alone"]) == 0
+    assert groups == ["mine", "g", None]
 
 
 # ---- Other launchers and sweepers ----
@@ -623,6 +619,8 @@ def test_config_dir_and_config_name(here, capsys):
         ("-m hydra/launcher=ba", "hydra/launcher=basic"),
         ("folder=./pay", "folder=./payer.py"),
         ("env=explorr learner.la", ""),
+        ("logger=ten", "logger=tensorboard"),
+        ("logger=[csv,wandb] logger.wandb.pro", "logger.wandb.project="),
     ],
 )
 def test_shell_completion(monkeypatch, capsys, line, expected):
@@ -631,6 +629,7 @@ def test_shell_completion(monkeypatch, capsys, line, expected):
     assert capsys.readouterr().out.strip() == expected
 
 
-def test_wandb_group_without_a_sweep():
-    settings = Composer(scripts.TRAIN).settings(["logger=wandb"])
-    assert dataclasses.asdict(settings.logger)["group"] is None
+def test_loggers_are_swept():
+    words = ["logger=csv,[csv,tensorboard],none"]
+    _, jobs, _ = sweeps.jobs_of(Composer(scripts.TRAIN), words)
+    assert [[*job.logger] for job in jobs] == [["csv"], ["csv", "tensorboard"], []]

@@ -28,9 +28,10 @@ from megastep.agents.launch import train as launch_train
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.runs.folders import locked
-from megastep.agents.training import loggers, performance
+from megastep.agents.training import loggers
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.progress import few_means, progress_of
+from megastep.agents.training.trainer import Trainer
 from megastep.settings import MAX_ENVS
 from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
@@ -88,21 +89,11 @@ def test_files_of_a_run(here, with_curves):
     assert not any("perf" in name for row in rows for name in row)
     perf = json_lines.read(folder / "perf.jsonl")[-1]
     assert {"perf/rate", "perf/collect", "perf/update", "perf/rest"} <= set(perf)
-    assert {"section/env", "section/backward", "section/log"} < set(perf)
     (start,) = json_lines.read(folder / "provenance.jsonl")
     assert start["samples"] == 0 and {"command", "device", "megastep", "torch"} <= set(start)
     loaded = checkpoint.load_latest(folder / "checkpoints")
     assert loaded.step == loaded.state["samples"] == 3 * UPDATE
     assert loaded.config["spaces"]["obs"].startswith("MultiImage")
-
-
-@pytest.mark.parametrize("is_known", [True, False])
-def test_ends_with_a_table_of_sections_that_are_known(here, is_known, monkeypatch, capsys):
-    """A GPU does not know them if it was interrupted."""
-    if not is_known:
-        monkeypatch.setattr(performance.SectionTimes, "is_known", False)
-    train.run(configured(f"samples={2 * UPDATE}"))
-    assert ("backward" in capsys.readouterr().out) == is_known
 
 
 def test_seeds(here):
@@ -232,7 +223,7 @@ def test_killed_after_resuming_an_earlier_checkpoint(here, monkeypatch):
     )
     first = folder / "checkpoints" / f"step_{UPDATE}"
     with monkeypatch.context() as patch:
-        patch.setattr(launch_train.Trainer, "train", lambda *_: None)  # as if killed at once
+        patch.setattr(Trainer, "train", lambda *_: None)  # as if killed at once
         train.run(configured(f"resume={first}", tiny=[]))
     assert [row["samples"] for row in json_lines.read(folder / "metrics.jsonl")] == [UPDATE]
     assert checkpoint.load_latest(folder / "checkpoints").step == UPDATE
@@ -459,7 +450,7 @@ def test_full_disk_warns_once(here, monkeypatch):
 
 
 def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
-    real, full = launch_train.Trainer.log, contextlib.ExitStack()
+    real, full = Trainer.log, contextlib.ExitStack()
 
     def report(self, losses):
         real(self, losses)
@@ -468,7 +459,7 @@ def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
             full.enter_context(faults.full_disk(8000))
 
     with full, monkeypatch.context() as patch:
-        patch.setattr(launch_train.Trainer, "log", report)
+        patch.setattr(Trainer, "log", report)
         code = train.main([*TINY, f"samples={5 * UPDATE}", "checkpoint_seconds=1e-9", "folder=run"])
     warning, *others, error = capsys.readouterr().err.splitlines()
     assert code == 2 and all("curves.png" in line for line in others)
@@ -568,14 +559,14 @@ def test_interrupted_has_the_signal():
 
 @pytest.mark.slow
 def test_long_run_leaks_nothing(here, monkeypatch):
-    real, seen = launch_train.Trainer.log, {}
+    real, seen = Trainer.log, {}
 
     def report(self, losses):
         real(self, losses)
         pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
         seen[self.updates] = pages * 4096 / 1e6, len(os.listdir("/proc/self/fd"))
 
-    monkeypatch.setattr(launch_train.Trainer, "log", report)
+    monkeypatch.setattr(Trainer, "log", report)
     train.run(configured(f"samples={1200 * UPDATE}", "checkpoint_seconds=0.5"))
     (early, _), (late, _) = seen[400], seen[1200]
     # a checkpoint that is being written has a file open

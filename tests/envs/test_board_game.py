@@ -103,7 +103,6 @@ def test_a_board_game_is_trained_evaluated_and_recorded(folder, capsys):
     output = capsys.readouterr().out
     assert "right" in output and "geometry=" not in output
 
-    pytest.importorskip("av")
     assert record.main(["run=run", "steps=4", "file=board.mp4", "device=cpu"]) == 0
     assert (folder / "board.mp4").stat().st_size > 500
 

@@ -1,9 +1,9 @@
 """docs/new-environment.md: its code runs in order and behaves as the text says."""
 
-import importlib.util
 import re
 from pathlib import Path
 
+import av
 import loky
 import pytest
 import torch
@@ -23,8 +23,7 @@ def names(tmp_path_factory):
         patch.chdir(variables["folder"])
         patch.setattr(loky, "ProcessPoolExecutor", InThisProcess)
         for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
-            if "record.film" not in block or importlib.util.find_spec("av"):
-                exec(compile(block, str(PAGE), "exec"), variables)
+            exec(compile(block, str(PAGE), "exec"), variables)
     return variables
 
 
@@ -33,7 +32,6 @@ def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
     """The commands of the first parts, in an empty folder. test_two_agents.py has the last one's.
     Safe has only what is required, so it trains and is evaluated, but cannot be filmed.
     """
-    pytest.importorskip("av")
     text = PAGE.read_text().split("## Two agents")[0]
     for name, body in zip(("safe.py", "rover.py"), pages.code(text)):
         assert f"This is `{name}`" in text
@@ -93,7 +91,6 @@ def test_rover_is_displayed(names):
 
 
 def test_video_has_the_fps_of_rover(names):
-    av = pytest.importorskip("av")
     with av.open(str(names["folder"] / "rover.mp4")) as container:
         video = container.streams.video[0]
         assert (video.frames, video.average_rate) == (20, 10)

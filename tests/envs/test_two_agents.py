@@ -40,7 +40,6 @@ def convoy(section, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("drawn_in_this_process")
 @pytest.mark.slow
 def test_commands_train_evaluate_and_record(section, convoy, tmp_path, capsys):
-    pytest.importorskip("av")
     commands = re.findall(r"^python (\S+\.py) (.*)$", section, re.M)
     assert [script for script, _ in commands] == list(pages.MAINS)
     for script, words in commands:

@@ -10,7 +10,7 @@ import torch
 
 from megastep.engine import movement, rendering
 from megastep.kernels.build import compile, headers
-from megastep.kernels.build import launch as launching
+from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
 HEADER = Path(__file__).with_name("blocks_on_cpu.h")
 #: In place of headers of this name.
@@ -27,8 +27,8 @@ ORDERS = "forward", "reversed", "shuffled"
 SCHEDULES = ("forward", False), ("reversed", True), ("shuffled", False), ("shuffled", True)
 #: Kernels that give the CPU's bits have the CPU's half of backend.h here.
 BACKEND = """
+#undef KERNEL
 #include "common/backend.h"
-#define DEVICE static inline
 #define BOUNDS(n_blocks)
 constexpr unsigned int FULL_WARP = ~0u;
 """
@@ -78,23 +78,19 @@ class CudaOnCpu:
         """Returns a tensor, of the same memory, that counts as on a GPU."""
         return tensor.as_subclass(TensorOnCpu)
 
-    def __call__(self, program, operation, packed, device, threads, shared=0):
+    def __call__(self, program, operation, device, shape, /, **fields):
         """Stands in for `launch`."""
-        n_blocks, n_shared = -(-threads // launching.BLOCK), shared * 2
-        assert launching.BLOCK == 2 * launching.WARP
-        self.launch_blocks(
-            program, operation, packed, device, (n_blocks, 1), launching.BLOCK, n_shared
-        )
-
-    def launch_blocks(self, program, operation, packed, device, n_blocks, n_threads, shared=0):
-        """Stands in for the function of this name."""
-        assert device.type == "cpu" and min(n_blocks) > 0
+        assert device.type == "cpu"
+        blocks = shape if isinstance(shape, Blocks) else Blocks(-(-shape // BLOCK))
+        if not all(blocks[:3]):
+            return
+        packed = program.packers[program.cuda_operations[operation]](fields)
         if program not in self._libraries:
             self._libraries[program] = self._build(program)
         function = getattr(self._libraries[program], f"run_{operation}")
         function.restype = ctypes.c_char_p
         cluster = _cluster(program, operation)
-        numbers = *n_blocks, n_threads, shared, cluster, ORDERS.index(self.order), self.is_late
+        numbers = *blocks, cluster, ORDERS.index(self.order), self.is_late
         numbers = map(ctypes.c_uint, numbers)
         message = function(ctypes.c_char_p(packed), *numbers)
         assert not message, f"{operation}: {message.decode()}"
@@ -147,12 +143,10 @@ class CudaOnCpu:
         return ctypes.CDLL(str(library))
 
     def install(self, monkeypatch):
-        """Replaces `launch` and `launch_blocks` in all modules that import them."""
+        """Replaces `launch` in all modules that import it."""
         self.launched.clear()
         for module in movement, rendering:
             monkeypatch.setattr(module, "n_resident_threads", lambda *_: RESIDENT_THREADS)
-        for name, stand_in in ("launch", self), ("launch_blocks", self.launch_blocks):
-            original = getattr(launching, name)
-            for path, module in list(sys.modules.items()):
-                if path.startswith("megastep.") and vars(module).get(name) is original:
-                    monkeypatch.setattr(module, name, stand_in)
+        for path, module in list(sys.modules.items()):
+            if path.startswith("megastep.") and vars(module).get("launch") is launch:
+                monkeypatch.setattr(module, "launch", self)

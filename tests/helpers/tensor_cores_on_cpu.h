@@ -5,7 +5,6 @@
 // a warp.
 #pragma once
 
-#define DEVICE static inline
 #define __cluster_dims__(...)
 #define __align__(n) alignas(n)
 

@@ -21,6 +21,8 @@ from megastep.envs.pong.step import PROGRAM as PONG
 from megastep.kernels.build import compile, launch, program
 from megastep.kernels.build.launch import ENGINE
 
+GPU = torch.device("cuda", 0)
+UNIFORM = dict(counts=None, mask=None, out=None, key0=1, key1=2, n_lanes=0, n_threads=1)
 ROOT = Path(__file__).resolve().parents[2]
 STEP = """
 import torch
@@ -254,49 +256,48 @@ def test_a_thread_without_a_context_gets_the_gpus_and_launches_again(monkeypatch
     monkeypatch.setattr(launch, "_can_start_early", lambda index: False)
     monkeypatch.setattr(launch, "_config", launch._config.__wrapped__)
     for _ in range(2):
-        launch.launch(ENGINE, "uniform", b"params", torch.device("cuda", 1), threads=100)
+        launch.launch(ENGINE, "uniform", torch.device("cuda", 1), 100, **UNIFORM)
     assert current == ["context of device 1"] and len(calls) == 3
     assert calls[0] == calls[1] and calls[0][1] == "function"
     config = calls[0][0]
     assert (config.gridDimX, config.gridDimY, config.gridDimZ, config.hStream) == (2, 1, 1, 7)
 
 
-@pytest.mark.parametrize("blocks", [False, True])
-def test_a_gpu_launch_of_an_unknown_operation_is_named(monkeypatch, blocks):
-    monkeypatch.setattr(launch, "cuda", lambda program, index: {"uniform": "function"})
-    device, message = torch.device("cuda", 0), r"No \.cu file in .* defines the operation unifrom: "
+def test_a_gpu_launch_of_an_unknown_operation_is_named():
+    message = r"No \.cu file in .* defines the operation unifrom: "
     with pytest.raises(compile.EngineError, match=message + r".*or run on a CPU \(device=cpu\)"):
-        if blocks:
-            launch.launch_blocks(ENGINE, "unifrom", b"params", device, (1, 1), 64)
-        else:
-            launch.launch(ENGINE, "unifrom", b"params", device, threads=100)
+        launch.launch(ENGINE, "unifrom", GPU, 100, **UNIFORM)
+
+
+@pytest.mark.parametrize("shape", [0, launch.Blocks(0), launch.Blocks(3, 0)])
+def test_a_gpu_launch_without_threads_does_nothing(monkeypatch, shape):
+    monkeypatch.setattr(launch, "cuda", None)
+    launch.launch(ENGINE, "uniform", GPU, shape, **UNIFORM)
+
+
+@pytest.mark.parametrize("shape", [2**32, launch.Blocks(2**22, threads=1024)])
+def test_a_gpu_launch_of_too_many_threads_is_refused(monkeypatch, shape):
+    monkeypatch.setattr(launch, "cuda", None)
+    with pytest.raises(compile.EngineError, match="uniform needs 4,294,967,296 threads on cuda:0"):
+        launch.launch(ENGINE, "uniform", GPU, shape, **UNIFORM)
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize(
-    "shape, action",
+    "blocks, action",
     [
-        (((1, 1), 2048), "Launching uniform"),
-        (((0, 1), 64), "Launching uniform"),
-        (((1, 2**16), 64), "Launching uniform"),
-        (((1, 1), 64, 2**30), "Reserving shared memory"),
+        (launch.Blocks(1, threads=2048), "Launching uniform"),
+        (launch.Blocks(1, 2**16), "Launching uniform"),
+        (launch.Blocks(1, shared=2**30), "Reserving shared memory"),
     ],
 )
-def test_a_launch_that_the_gpu_refuses_is_named(shape, action):
+def test_a_launch_that_the_gpu_refuses_is_named(blocks, action):
     """The next one works again."""
     counts = torch.zeros(1, dtype=torch.int32, device="cuda")
     mask = torch.ones(1, dtype=torch.bool, device="cuda")
     out = torch.full((1, 4), -1.0, device="cuda")
-    packed = ENGINE.params.UniformParams(
-        counts=counts.data_ptr(),
-        mask=mask.data_ptr(),
-        out=out.data_ptr(),
-        key0=1,
-        key1=2,
-        n_lanes=1,
-        n_threads=1,
-    )
+    fields = UNIFORM | dict(counts=counts, mask=mask, out=out, n_lanes=1)
     with pytest.raises(compile.EngineError, match=f"{action} failed with CUDA_ERROR_INVALID_VALUE"):
-        launch.launch_blocks(ENGINE, "uniform", packed, out.device, *shape)
-    launch.launch_blocks(ENGINE, "uniform", packed, out.device, (1, 1), 64)
+        launch.launch(ENGINE, "uniform", out.device, blocks, **fields)
+    launch.launch(ENGINE, "uniform", out.device, 1, **fields)
     assert ((0 <= out) & (out < 1)).all()

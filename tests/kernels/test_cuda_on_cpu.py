@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from megastep.kernels.build.launch import Blocks
 from megastep.kernels.build.program import Program
 from tests.helpers.cuda_on_cpu import ORDERS, SCHEDULES, CudaOnCpu
 
@@ -50,10 +51,8 @@ def exchange(tmp_path):
 
         def after():
             after = np.full_like(numbers, -1)
-            packed = program.params.NumbersParams(
-                before=numbers.ctypes.data, after=after.ctypes.data, n=len(numbers)
-            )
-            launch(program, "exchange", packed, CPU, len(numbers), shared=256)
+            fields = dict(before=numbers.ctypes.data, after=after.ctypes.data, n=len(numbers))
+            launch(program, "exchange", CPU, Blocks(-(-len(numbers) // 64), shared=512), **fields)
             return [torch.from_numpy(after)]
 
         (after,) = launch.in_every_order(after) if in_every_order else after()
@@ -213,7 +212,6 @@ CLUSTER = """
 #include "common/tensor_cores.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
 #define BOUNDS(n_blocks) __cluster_dims__(n_blocks, 1, 1)
 
 extern __shared__ __align__(16) unsigned char shared_memory[];
@@ -255,10 +253,7 @@ def test_blocks_of_a_cluster_send_each_other_numbers(tmp_path, missing, message,
     after = torch.full_like(before, -1)
 
     def run():
-        packed = program.params.NumbersParams(
-            before=before.data_ptr(), after=after.data_ptr(), n=256
-        )
-        launch.launch_blocks(program, "exchange", packed, CPU, (4, 1), 64, 1024)
+        launch(program, "exchange", CPU, Blocks(4, shared=1024), before=before, after=after, n=256)
         return [after.clone()]
 
     if not message:

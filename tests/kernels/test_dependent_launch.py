@@ -111,7 +111,9 @@ def test_only_kernels_that_wait_are_launched_early(relays, monkeypatch, can_star
     monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
     monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=7))
     for operation in ("waits", "careless"):
-        launch.launch_blocks(relays, operation, b"", torch.device("cuda", 0), (3, 2), 32, 100)
+        blocks = launch.Blocks(3, 2, threads=32, shared=100)
+        fields = dict(first=None, second=None, after=None, n=0, pause=0)
+        launch.launch(relays, operation, torch.device("cuda", 0), blocks, **fields)
     for config in configs.values():
         assert (config.gridDimX, config.gridDimY, config.gridDimZ) == (3, 2, 1)
         assert (config.blockDimX, config.blockDimY, config.blockDimZ) == (32, 1, 1)
@@ -173,14 +175,8 @@ def rounds(program, n_rounds, tensors, side):
     a, b, c, d = tensors
 
     def relay(operation, first, second, after, pause):
-        packed = program.params.RelayParams(
-            first=first.data_ptr(),
-            second=second.data_ptr(),
-            after=after.data_ptr(),
-            n=len(a),
-            pause=pause,
-        )
-        launch.launch(program, operation, packed, a.device, threads=len(a))
+        fields = dict(first=first, second=second, after=after, n=len(a), pause=pause)
+        launch.launch(program, operation, a.device, len(a), **fields)
 
     for _ in range(n_rounds):
         relay("waits", a, a, b, 10_000)

@@ -5,12 +5,15 @@ import re
 import subprocess
 
 import pytest
+import torch
 
-from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
+from megastep.agents.algorithms.kernels import PROGRAM as ALGORITHMS
 from megastep.agents.networks.kernels.lstm_sequence import PROGRAM as SEQUENCES
 from megastep.agents.networks.kernels.mingru_step import PROGRAM as ACTING
 from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.selfplay.opponents import PROGRAM as SELFPLAY
 from megastep.agents.storage.copies import PROGRAM as COPIES
+from megastep.agents.training.episode_stats import PROGRAM as TRAINING
 from megastep.envs.deathmatch.step import PROGRAM as DEATHMATCH
 from megastep.envs.explorer.step import PROGRAM as EXPLORER
 from megastep.envs.pointgoal.step import PROGRAM as POINTGOAL
@@ -19,10 +22,9 @@ from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
 GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
-LEARNER = dict(
-    cores=CORES, sequences=SEQUENCES, acting=ACTING, algorithms=ALGORITHMS, copies=COPIES
-)
-PROGRAMS = dict(engine=ENGINE, **LEARNER, **GAMES)
+NETWORKS = dict(cores=CORES, sequences=SEQUENCES, acting=ACTING)
+LEARNER = dict(algorithms=ALGORITHMS, copies=COPIES, selfplay=SELFPLAY, training=TRAINING)
+PROGRAMS = dict(engine=ENGINE, **NETWORKS, **LEARNER, **GAMES)
 programs = pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
 
 
@@ -54,7 +56,6 @@ def test_packed_structs_have_the_compilers_layout(program, tmp_path):
         )
     checks = compiled(tmp_path, program, code)
     for name, data in packed.items():
-        assert len(data) == program.sizes[name]
         assert getattr(checks, f"check_{name}")(data, len(data)), name
 
 
@@ -87,13 +88,14 @@ def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
     """Structs without a pointer have other sizes and places than those with one."""
     structs = headers.struct_fields({"params.h": NESTED})
     pack = {name: headers.builder(name, fields) for name, fields in structs.items()}
-    numbers = [pack["NumbersParams"](count=i, size=i + 0.5, mask=2**31 + i) for i in range(2)]
-    pointers = [pack["PointerParams"](count=5 + i, values=2**40 + i, size=-i) for i in range(2)]
+    numbers = [dict(count=i, size=i + 0.5, mask=2**31 + i) for i in range(2)]
+    pointers = [dict(count=5 + i, values=2**40 + i, size=-i) for i in range(2)]
+    numbers = [pack["NumbersParams"](fields) for fields in numbers]
+    pointers = [pack["PointerParams"](fields) for fields in pointers]
+    arrays = dict(numbers=b"".join(numbers), pointers=b"".join(pointers))
     packed = dict(
-        ArraysParams=pack["ArraysParams"](
-            first=-1, numbers=b"".join(numbers), second=-2, pointers=b"".join(pointers), third=-3
-        ),
-        OneParams=pack["OneParams"](first=-1, one=numbers[1]),
+        ArraysParams=pack["ArraysParams"](dict(first=-1, second=-2, third=-3, **arrays)),
+        OneParams=pack["OneParams"](dict(first=-1, one=numbers[1])),
     )
     code = (
         NESTED
@@ -234,14 +236,20 @@ def test_a_field_that_cannot_be_packed_is_named(field):
         headers.struct_fields({"params.h": f"struct AParams {{\n    int a;\n    {field}\n}};\n"})
 
 
-def test_fields_are_required_keyword_arguments():
+def test_a_field_that_is_missing_or_unknown_is_named():
     fields = dict(counts=0, mask=0, out=0, key0=1, key1=2, n_lanes=0, n_threads=1)
     pack = ENGINE.params.UniformParams
     pack(**fields)
-    with pytest.raises(TypeError, match=r"UniformParams\(\) got an unexpected .* 'n_lane'"):
+    with pytest.raises(TypeError, match="UniformParams has no field 'n_lane'"):
         pack(**fields, n_lane=3)
     del fields["key1"]
-    with pytest.raises(TypeError, match=r"UniformParams\(\) missing 1 required .* 'key1'"):
-        pack(**fields)
-    with pytest.raises(TypeError):
-        pack(0, 0, 0, 1, 2, 0, 1)
+    for others in ({}, dict(n_lane=3)):
+        with pytest.raises(TypeError, match="UniformParams needs the field 'key1'"):
+            pack(**fields, **others)
+
+
+def test_a_tensor_stands_for_its_address_and_none_for_null():
+    tensor, pack = torch.zeros(3), ENGINE.params.UniformParams
+    numbers = dict(key0=1, key1=2, n_lanes=0, n_threads=1)
+    expected = pack(counts=tensor[1:].data_ptr(), mask=0, out=7, **numbers)
+    assert pack(counts=tensor[1:], mask=None, out=7, **numbers) == expected

@@ -66,10 +66,8 @@ def written(folder, *names):
 def roll(program, device, n=1000):
     counts = torch.arange(n, device=device)
     out = torch.zeros(n, dtype=torch.int32, device=device)
-    packed = program.params.RollDiceParams(
-        counts=counts.data_ptr(), out=out.data_ptr(), key0=1, key1=0, n_lanes=n, offset=1.0
-    )
-    launch(program, "roll_dice", packed, out.device, threads=n)
+    fields = dict(counts=counts, out=out, key0=1, key1=0, n_lanes=n, offset=1.0)
+    launch(program, "roll_dice", out.device, n, **fields)
     return out
 
 

@@ -7,12 +7,14 @@ import torch
 from torch.nn import functional
 
 from megastep.agents.networks.kernels.conv import (
+    PROGRAM,
+    backward_kernel,
     conv_backward,
     is_supported,
-    launch_backward,
     n_outputs,
 )
 from megastep.agents.networks.kernels.layers import sum_rows
+from megastep.kernels.build.launch import launch
 
 DEVICE = "cuda"
 BF16 = torch.bfloat16
@@ -177,8 +179,9 @@ def test_policies():
     )
     sizes = [F * n_channels * 8, F, F * F * 4, F]
     sums = torch.full((n_policies, n_blocks, sum(sizes)), torch.nan, device=DEVICE)
-    launch_backward(
-        (n_blocks, n_policies),
+    kernel, blocks, shared_sizes = backward_kernel(n_channels, n_columns, n_blocks, n_policies)
+    launch(
+        *(PROGRAM, kernel, rows.device, blocks),
         d_features=d_features,
         features=features,
         rows=rows,
@@ -192,6 +195,7 @@ def test_policies():
         d_stride=d_features.stride(1),
         feature_stride=features.stride(1),
         row_stride=rows.stride(1),
+        **shared_sizes,
     )
     for i in range(n_policies):
         expected = torch.cat([each.flatten() for each in conv_backward(*alone[i])])

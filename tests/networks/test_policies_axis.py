@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from megastep.agents.algorithms.adam import Adam
-from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
-from megastep.agents.algorithms.kernels.program import n_blocks
+from megastep.agents.algorithms.kernels import PROGRAM as ALGORITHMS
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.kernels import (
     conv,
@@ -19,23 +18,13 @@ from megastep.agents.networks.kernels.program import CORES
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.value_output import ValueOutput
 from megastep.arrdict import arrdict
-from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 from megastep.spaces import MultiVector
 
 pytestmark = pytest.mark.cuda
 P = 3
 BF16 = torch.bfloat16
-
-
-def launch(program, operation, n_blocks, n_threads=BLOCK, **fields):
-    """Launches an operation; a tensor stands for its address."""
-    values = {
-        name: field.data_ptr() if isinstance(field, torch.Tensor) else field
-        for name, field in fields.items()
-    }
-    pack = getattr(program.params, program.cuda_operations[operation])
-    device = torch.device("cuda", torch.cuda.current_device())
-    launch_blocks(program, operation, pack(**values), device, n_blocks, n_threads)
+GPU = torch.device("cuda")
 
 
 @pytest.fixture(autouse=True)
@@ -55,9 +44,9 @@ def test_intake():
     features = torch.empty(P, n_steps, 7, n_columns, dtype=BF16, device="cuda")
     packed = [
         CORES.params.IntakeLeafParams(
-            values=leaf.data_ptr(),
-            mean=mean.data_ptr(),
-            scale=scale.data_ptr(),
+            values=leaf,
+            mean=mean,
+            scale=scale,
             n_features=leaf.shape[-1],
             group=leaf.shape[-1] // mean.shape[-1],
             is_half=int(leaf.dtype == torch.float16),
@@ -66,7 +55,7 @@ def test_intake():
     ]
     n_threads = n_columns // 4 * -(-7 // CORES.constants["NORMALISED_ROWS"])
     launch(
-        *(CORES, "normalise", (-(-n_threads // BLOCK), P * n_steps)),
+        *(CORES, "normalise", GPU, Blocks(-(-n_threads // BLOCK), P * n_steps)),
         leaves=b"".join(packed),
         lanes=lanes,
         features=features,
@@ -95,8 +84,9 @@ def test_convolutions(shape):
         second_bias=randn(32).to(BF16),
     )
     features = torch.full((P, n_rows, n_features), torch.nan, dtype=BF16, device="cuda")
-    conv.launch_forward(
-        (2, P),
+    kernel, blocks, sizes = conv.forward_kernel(*shape, 2, P)
+    launch(
+        *(conv.PROGRAM, kernel, GPU, blocks),
         rows=rows,
         **weights,
         features=features,
@@ -105,6 +95,7 @@ def test_convolutions(shape):
         n_columns=shape[1],
         row_stride=shape[0] * shape[1],
         feature_stride=n_features,
+        **sizes,
     )
     for i in range(P):
         alone = conv.conv_forward(rows[i], *(weight[i] for weight in weights.values()))
@@ -124,7 +115,8 @@ def test_mingru_step(n_lanes, width):
         start=start,
     )
     results = dict(outputs=torch.full_like(x, torch.nan), last=torch.full_like(start, torch.nan))
-    mingru_step.launch(P, **inputs, **results, n_lanes=n_lanes, is_residual=1)
+    where = mingru_step.PROGRAM, f"mingru_step_{width}", GPU, mingru_step.blocks(n_lanes, width, P)
+    launch(*where, **inputs, **results, n_lanes=n_lanes, is_residual=1)
     for i in range(P):
         of_policy = {name: leaf[i] for name, leaf in inputs.items()}
         of_policy |= {name: of_policy[name][None] for name in ("x", "reset")}
@@ -145,9 +137,9 @@ def test_statistics_of_observations():
     n_counted = torch.empty(P, dtype=torch.int64, device="cuda")
     packed = [
         CORES.params.IntakeLeafParams(
-            values=leaf.data_ptr(),
-            mean=0,
-            scale=0,
+            values=leaf,
+            mean=None,
+            scale=None,
             n_features=leaf.shape[-1],
             group=leaf.shape[-1] // n,
             is_half=int(leaf.dtype == torch.float16),
@@ -155,7 +147,7 @@ def test_statistics_of_observations():
         for leaf, n in zip(leaves, sizes, strict=True)
     ]
     launch(
-        *(CORES, "moments", (sum(sizes), P), threads),
+        *(CORES, "moments", GPU, Blocks(sum(sizes), P, threads)),
         leaves=b"".join(packed),
         is_counted=is_counted,
         moments=results,
@@ -175,12 +167,12 @@ def test_statistics_of_observations():
             norm.count.copy_(count[i])
     packed = [
         CORES.params.RunningNormParams(
-            mean=mean.data_ptr(),
-            scale=scale.data_ptr(),
-            count=count.data_ptr(),
-            new_mean=new_mean.data_ptr(),
-            new_variance=new_variance.data_ptr(),
-            n_counted=n_counted.data_ptr(),
+            mean=mean,
+            scale=scale,
+            count=count,
+            new_mean=new_mean,
+            new_variance=new_variance,
+            n_counted=n_counted,
             n=n,
             min_scale=norms[0][0].min_scale,
         )
@@ -191,9 +183,9 @@ def test_statistics_of_observations():
     are_added = torch.tensor([False, True, True], device="cuda")
     for flags in (None, are_added):
         launch(
-            *(CORES, "add_moments", (len(sizes), P), threads),
+            *(CORES, "add_moments", GPU, Blocks(len(sizes), P, threads)),
             norms=b"".join(packed),
-            is_counted=0 if flags is None else flags,
+            is_counted=flags,
         )
     assert counts.tolist() == [[2, 2, 5], [2, 2, 3]]
     for i in range(P):
@@ -220,14 +212,14 @@ def test_statistics_of_returns():
     pack = CORES.params.MaskedArrayParams
     shared = dict(parts=parts, n_arrays=len(arrays))
     launch(
-        *(CORES, "masked_parts", (n_parts, P * len(arrays)), threads),
-        arrays=b"".join(pack(values=array.data_ptr()) for array in arrays),
+        *(CORES, "masked_parts", GPU, Blocks(n_parts, P * len(arrays), threads)),
+        arrays=b"".join(pack(values=array) for array in arrays),
         valid=valid,
         n=n,
         **shared,
     )
     launch(
-        *(CORES, "masked_moments", (1, P * len(arrays)), threads),
+        *(CORES, "masked_moments", GPU, Blocks(1, P * len(arrays), threads)),
         **shared,
         moments=results,
         n_valid=n_valid,
@@ -236,7 +228,7 @@ def test_statistics_of_returns():
     means, variances = (column.contiguous() for column in results[:, 1].unbind(1))
     normalised = torch.empty_like(arrays[1])
     launch(
-        *(CORES, "normalise_masked", (-(-n // BLOCK), P)),
+        *(CORES, "normalise_masked", GPU, Blocks(-(-n // BLOCK), P)),
         values=arrays[1],
         valid=valid,
         mean=means,
@@ -257,7 +249,7 @@ def test_statistics_of_returns():
         for name in names
     }
     launch(
-        *(CORES, "add_returns", (1, P), threads),
+        *(CORES, "add_returns", GPU, Blocks(1, P, threads)),
         **of_all,
         new_mean=means,
         new_variance=variances,
@@ -285,9 +277,9 @@ def test_bias_gradient(n_columns):
     n_strips = -(-n_rows // strip)
     d, activated = randn(n_rows, n_columns).to(BF16), randn(n_rows, n_columns).to(BF16).relu()
     d_masked, sums = torch.empty_like(d), randn(n_strips, n_columns)
+    n_parts, n_threads = -(-n_columns // (8 * WARP)), CORES.constants["STRIP_THREADS"]
     launch(
-        *(CORES, "bias_gradient", (n_strips, P * -(-n_columns // (8 * WARP)))),
-        CORES.constants["STRIP_THREADS"],
+        *(CORES, "bias_gradient", GPU, Blocks(n_strips, P * n_parts, n_threads)),
         d=d,
         activated=activated,
         d_masked=d_masked,
@@ -311,15 +303,15 @@ def test_casts():
     for weight, target, size in zip(weights, targets, sizes, strict=True):
         rows.append(
             CORES.params.CastRowParams(
-                source=weight.data_ptr(),
-                target=target.data_ptr(),
+                source=weight,
+                target=target,
                 n=weight[0].numel(),
                 n_padded=size,
                 first_block=n,
             )
         )
         n += -(-size // (8 * threads))
-    launch(*(CORES, "cast", (n, P), threads), rows=b"".join(rows), n_rows=len(rows))
+    launch(CORES, "cast", GPU, Blocks(n, P, threads), rows=b"".join(rows), n_rows=len(rows))
     for weight, target in zip(weights, targets, strict=True):
         rounded = weight.flatten(1).to(BF16)
         assert torch.equal(target[:, : rounded.shape[1]], rounded)
@@ -334,7 +326,7 @@ def test_categorical_actions():
     actions = torch.empty(P, n_lanes, shape[0], dtype=torch.int64, device="cuda")
     n_threads = CORES.constants["ACT_THREADS"] * n_lanes
     launch(
-        *(CORES, "categorical_act_bfloat16", (-(-n_threads // BLOCK), P)),
+        *(CORES, "categorical_act_bfloat16", GPU, Blocks(-(-n_threads // BLOCK), P)),
         features=features,
         weight=weight,
         bias=bias,
@@ -364,7 +356,7 @@ def test_heads():
     inputs = dict(product=columns, target=target, actions=actions)
     weights = {f"value_{name}": leaf for name, leaf in values._asdict().items()}
     launch(
-        *(CORES, "heads_forward", (n_strips, P), CORES.constants["STRIP_THREADS"]),
+        *(CORES, "heads_forward", GPU, Blocks(n_strips, P, CORES.constants["STRIP_THREADS"])),
         **inputs,
         **weights,
         **dict(zip(names, results)),
@@ -373,7 +365,7 @@ def test_heads():
     )
     d_columns, sums = torch.empty_like(columns), randn(n_strips, n_columns + 264 + 8)
     launch(
-        *(CORES, "heads_backward", (3 * n_strips, P), CORES.constants["STRIP_THREADS"]),
+        *(CORES, "heads_backward", GPU, Blocks(3 * n_strips, P, CORES.constants["STRIP_THREADS"])),
         **inputs,
         value_weight=values.weight,
         value_scale=values.scale,
@@ -421,7 +413,7 @@ def test_adam():
         names = "parameter", "gradient", "mean", "square"
         rows.append(
             ALGORITHMS.params.AdamRowParams(
-                **{name: leaf.data_ptr() for name, leaf in zip(names, row, strict=True)},
+                **dict(zip(names, row, strict=True)),
                 n=row[0][0].numel(),
                 first_block=n,
                 is_aligned=1,
@@ -432,12 +424,16 @@ def test_adam():
         n += -(-row[0][0].numel() // (4 * n_threads))
     packed, sums = dict(rows=b"".join(rows), n_rows=len(rows)), randn(n)
     launch(
-        *(ALGORITHMS, "squared_norm", (n, P), n_threads), **packed, sums=sums, n_sums=n, first_sum=0
+        *(ALGORITHMS, "squared_norm", GPU, Blocks(n, P, n_threads)),
+        **packed,
+        sums=sums,
+        n_sums=n,
+        first_sum=0,
     )
     judged = dict(grad_norm=randn(), is_taken=torch.empty_like(is_taken), totals=randn(4))
     launch(
-        *(ALGORITHMS, "judge", (1, P), n_threads),
-        metrics=ALGORITHMS.params.MetricParams(values=lr.data_ptr()),
+        *(ALGORITHMS, "judge", GPU, Blocks(1, P, n_threads)),
+        metrics=ALGORITHMS.params.MetricParams(values=lr),
         sums=sums,
         is_finite=torch.tensor([True, True, False], device="cuda"),
         is_enabled=torch.ones_like(is_taken),
@@ -454,7 +450,7 @@ def test_adam():
     expected[2] = torch.tensor([0, 0, 0, 1])
     torch.testing.assert_close(judged["totals"], expected)
     launch(
-        *(ALGORITHMS, "adam", (n, P), n_threads),
+        *(ALGORITHMS, "adam", GPU, Blocks(n, P, n_threads)),
         **packed,
         lr=lr,
         n_steps=n_steps,
@@ -484,10 +480,10 @@ def test_ppo_loss():
     )
     value_scale = randn().abs() + 0.5
     gradients = {f"d_{name}": randn(n_steps, n_lanes) for name in names}
-    sums = randn(n_blocks(n_rows), ALGORITHMS.constants["N_SUMS"])
+    sums = randn(-(-n_rows // BLOCK), ALGORITHMS.constants["N_SUMS"])
     batch["n_valid"] = batch.valid.sum((1, 2))
     launch(
-        *(ALGORITHMS, "ppo_loss", (n_blocks(n_rows), P)),
+        *(ALGORITHMS, "ppo_loss", GPU, Blocks(-(-n_rows // BLOCK), P)),
         **inputs,
         old_logprobs=batch.logprobs,
         old_values=batch.old_value,
@@ -521,7 +517,7 @@ def test_duelling():
     values, logprobs = randn(n_rows, *shape), randn(n_rows)
     actions = torch.empty(P, n_rows, 2, dtype=torch.int64, device="cuda")
     launch(
-        *(CORES, "duelling_act", (-(-n_rows // 8), P)),
+        *(CORES, "duelling_act", GPU, Blocks(-(-n_rows // 8), P)),
         **dict(zip(names, weights, strict=True)),
         **dict(hidden=hidden, noise=noise, epsilon=epsilon, values=values),
         **dict(actions=actions, logprobs=logprobs, n_rows=n_rows, width=width),
@@ -530,7 +526,7 @@ def test_duelling():
     d_values, d_hidden = randn(n_rows, *shape), torch.empty_like(hidden)
     sums = randn(1, (2 + 2 + 6) * width + 8)
     launch(
-        *(CORES, "duelling_backward", (1, P), CORES.constants["DUELLING_THREADS"]),
+        *(CORES, "duelling_backward", GPU, Blocks(1, P, CORES.constants["DUELLING_THREADS"])),
         **dict(hidden=hidden, value_weight=weights[0], advantage_weight=weights[2]),
         **dict(d_values=d_values, d_hidden=d_hidden, sums=sums, n_rows=n_rows, width=width),
         **dict(n_agents=2, n_choices=3, n_parts=1, n_sums=sums.shape[-1]),

@@ -37,6 +37,13 @@ def test_names_outside_megastep_are_found_at_any_depth(name):
         assert trust.untrusted_names(text, None) == [name]
 
 
+def test_logger_outside_megastep_is_found():
+    tree = {"train": {"logger": {"csv": {"name": "megastep.agents.training.loggers.csv:CSV"}}}}
+    assert trust.untrusted_names(json.dumps(tree).encode(), None) == []
+    tree["train"]["logger"]["mine"] = {"name": "mine:Mine"}
+    assert trust.untrusted_names(json.dumps(tree).encode(), None) == ["mine:Mine"]
+
+
 def test_signature_is_of_one_user_and_one_configuration(home, monkeypatch):
     signature = trust.sign(config())
     assert trust.untrusted_names(config(), signature) == []

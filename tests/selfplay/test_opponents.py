@@ -50,7 +50,9 @@ def test_opponents_act_once_per_step(begins):
     for one in (env, other):
         one.reset()
     actions = []
-    env.on_actions = other.on_actions = actions.append
+    for one in (env, other):
+        step = one.env.step
+        one.env.step = lambda given, step=step: actions.append(given["actions"]) or step(given)
     for _ in range(5):
         if begins:
             env.begin_step()
@@ -300,7 +302,7 @@ def test_nonfinite_number_is_named_by_its_lane_in_the_environment(tmp_path):
     with pytest.warns(
         UserWarning, match=rf"reward of lane {lane} \(environment {lane // 2}\) was nan"
     ):
-        run.nonfinite_guard.check(run.rollout, run.samples)
+        run.nonfinite_guard.check(run.rollout)
 
 
 @pytest.mark.parametrize(

@@ -49,9 +49,9 @@ def cases(to):
 
 
 def test_copies_what_copy_does(device, monkeypatch):
-    launches, launch_blocks = [], copies.launch_blocks
+    launches, launch = [], copies.launch
     monkeypatch.setattr(
-        copies, "launch_blocks", lambda *args: launches.append(args) or launch_blocks(*args)
+        copies, "launch", lambda *args, **fields: launches.append(args) or launch(*args, **fields)
     )
     (ours, n_plain), (theirs, _) = (cases(on(device)) for _ in range(2))
     copy_all([(target, source) for _, target, source in ours])

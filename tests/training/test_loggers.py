@@ -1,5 +1,7 @@
 """Loggers: files that survive crashes, and failures that do not stop a run."""
 
+import csv
+import functools
 import json
 import os
 import pathlib
@@ -13,12 +15,19 @@ from megastep.agents.runs import json_lines
 from megastep.agents.training import loggers
 from megastep.agents.training.curves import panels_of, plot_curves
 from megastep.agents.training.loggers import Loggers
+from megastep.agents.training.loggers.csv import CSV
+from megastep.agents.training.loggers.tensorboard import TensorBoard
+from megastep.agents.training.loggers.wandb import Wandb
 from tests.helpers import faults
 from tests.helpers.processes import HUNG
 
 
+def with_tensorboard(folder):
+    return Loggers(folder, others={"tensorboard": lambda: TensorBoard(folder, 0)})
+
+
 def test_files_and_tensorboard_hold_what_was_written(tmp_path):
-    run_loggers = Loggers(tmp_path)
+    run_loggers = with_tensorboard(tmp_path)
     metrics = {"loss/value": 0.25, "episode/count": 3, "bad": float("nan"), "anneal": "never"}
     run_loggers.write(64, metrics, {"perf/rate": 1e6})
     run_loggers.close()
@@ -126,23 +135,60 @@ def test_kill_during_truncation_leaves_the_old_file(tmp_path, monkeypatch):
     assert path.read_bytes() == lines(9)
 
 
-TENSORBOARD = ("torch.utils.tensorboard", "tensorboard")
+# ---- progress.csv ----
 
 
-@pytest.mark.parametrize("package, modules", [("tensorboard", TENSORBOARD), ("wandb", ("wandb",))])
-def test_missing_package_is_named_with_the_cure(tmp_path, monkeypatch, package, modules):
-    faults.not_installed(monkeypatch, *modules)
-    with pytest.warns(UserWarning, match=f"pip install {package}"):
-        run_loggers = Loggers(tmp_path, wandb=WANDB if package == "wandb" else None)
+def table(folder):
+    with open(folder / "progress.csv", newline="") as file:
+        return list(csv.reader(file))
+
+
+def test_csv_has_a_column_per_metric_from_its_first_report_on(tmp_path):
+    logger = CSV(tmp_path, 0)
+    for step, values in (8, {"lr": 0.5}), (16, {"anneal": 'a,"b"'}), (24, {"lr": 0.1}):
+        logger.write(step, values)
+    logger.close()
+    assert table(tmp_path) == [
+        ["samples", "lr", "anneal"],
+        ["8", "0.5", ""],
+        ["16", "", 'a,"b"'],
+        ["24", "0.1", ""],
+    ]
+
+
+@pytest.mark.parametrize("cut", [1, 4, 7])
+def test_csv_of_a_resumed_run_has_no_row_after_its_checkpoint(tmp_path, cut):
+    logger = CSV(tmp_path, 0)
+    for step in 10, 20, 30:
+        logger.write(step, {"x": step})
+    path = tmp_path / "progress.csv"
+    path.write_bytes(path.read_bytes() + b"31,31\n"[:-cut])  # a kill cut the last row short
+    logger = CSV(tmp_path, 20)
+    logger.write(30, {"x": -1})
+    logger.write(40, {"x": 4, "y": 5})
+    rows = [["10", "10", ""], ["20", "20", ""], ["30", "-1", ""], ["40", "4", "5"]]
+    assert table(tmp_path) == [["samples", "x", "y"], *rows]
+
+
+def test_csv_that_fails_is_dropped_and_keeps_what_it_has(tmp_path):
+    run_loggers = Loggers(tmp_path, others={"csv": lambda: CSV(tmp_path, 0)})
+    run_loggers.write(1, {"x": 1}, {})
+    with faults.full_disk(0), pytest.warns(UserWarning, match="File too large") as warnings:
+        run_loggers.write(2, {"y": 2}, {})
+    assert str(warnings[-1].message).startswith("logger=csv failed and is dropped (")
+    assert table(tmp_path) == [["samples", "x"], ["1", "1"]]
+
+
+# ---- Weights & Biases ----
+
+
+def test_wandb_that_is_not_installed_is_named_with_the_cure(tmp_path, monkeypatch):
+    faults.not_installed(monkeypatch, "wandb")
+    with pytest.warns(UserWarning, match="logger=wandb skipped: .*pip install wandb$"):
+        run_loggers = with_wandb(tmp_path)
     run_loggers.write(1, {"x": 1}, {})
     run_loggers.close()
     assert json_lines.read(tmp_path / "metrics.jsonl") == [{"samples": 1, "x": 1}]
-
-
-def test_curves_without_matplotlib_warn(tmp_path, monkeypatch):
-    faults.not_installed(monkeypatch, "matplotlib", "matplotlib.figure")
-    with pytest.warns(UserWarning, match="curves.png.*pip install matplotlib"):
-        plot_curves(tmp_path)
 
 
 def fake_wandb(monkeypatch, key="key", init=None, log=None):
@@ -168,12 +214,14 @@ def failing(*_, **__):
     raise ConnectionError("the network is unreachable\nand more lines")
 
 
-WANDB = dict(project="p", mode="online", name="n", config={})
+def with_wandb(folder, step=0):
+    make = functools.partial(Wandb, folder, run_name="n", config={}, project="p")
+    return Loggers(folder, step, {"wandb": make})
 
 
 def test_wandb_logs_metrics_and_perf(tmp_path, monkeypatch):
     logged = fake_wandb(monkeypatch)
-    run_loggers = Loggers(tmp_path, wandb=WANDB)
+    run_loggers = with_wandb(tmp_path)
     run_loggers.write(5, {"a": 1}, {"b": 2})
     assert logged == [(5, {"samples": 5, "a": 1, "b": 2})]
 
@@ -182,7 +230,7 @@ def test_resumed_run_continues_its_wandb_run(tmp_path, monkeypatch):
     fake_wandb(monkeypatch)
     for folder, step in ((tmp_path / "a", 0), (tmp_path / "b", 0), (tmp_path / "a", 5)):
         folder.mkdir(exist_ok=True)
-        Loggers(folder, step, WANDB).close()
+        with_wandb(folder, step).close()
     started = sys.modules["wandb"].options
     assert [options["id"] for options in started] == [None, None, "id1"]
     assert [options["resume"] for options in started] == ["allow"] * 3
@@ -195,14 +243,14 @@ def test_resumed_run_continues_its_wandb_run(tmp_path, monkeypatch):
         (dict(init=failing), "did not start.*the network is unreachable.$"),
         (
             dict(log=failing),
-            "Wandb failed.*the network is unreachable.$",
+            "logger=wandb failed.*the network is unreachable.$",
         ),
     ],
 )
 def test_wandb_failure_is_one_warning(tmp_path, monkeypatch, fault, message):
     fake_wandb(monkeypatch, **fault)
     with pytest.warns(UserWarning, match=message) as warnings:
-        run_loggers = Loggers(tmp_path, wandb=WANDB)
+        run_loggers = with_wandb(tmp_path)
         for step in range(3):
             run_loggers.write(step, {"x": step}, {})
         run_loggers.close()
@@ -212,7 +260,7 @@ def test_wandb_failure_is_one_warning(tmp_path, monkeypatch, fault, message):
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_full_disk_is_one_warning_per_file_and_loses_no_line(tmp_path):
-    run_loggers = Loggers(tmp_path)
+    run_loggers = with_tensorboard(tmp_path)
     run_loggers.write(1, {"x": 1}, {"y": 2})
     size = (tmp_path / "metrics.jsonl").stat().st_size
     with pytest.warns(UserWarning, match="File too large") as warnings:
@@ -220,8 +268,8 @@ def test_full_disk_is_one_warning_per_file_and_loses_no_line(tmp_path):
             run_loggers.write(2, {"x": 1}, {"y": 2})
             run_loggers.write(3, {"x": 1}, {"y": 2})
     names = sorted(str(w.message).split(" ")[0].rpartition("/")[2] for w in warnings)
-    if "TensorBoard" in names:  # its thread may hit the full disk, too
-        names.remove("TensorBoard")
+    if "logger=tensorboard" in names:  # its thread may hit the full disk, too
+        names.remove("logger=tensorboard")
     assert names == ["metrics.jsonl", "perf.jsonl"]
     run_loggers.write(4, {"x": 1}, {"y": 2})
     run_loggers.close()
@@ -270,10 +318,12 @@ def test_curves_are_those_that_the_rows_have():
 def logged_with_real_wandb(folder, mode, **environment):
     """Writes one report in a process of its own. Returns the warnings."""
     script = f"""
-from megastep.agents.training import loggers
-loggers.WANDB_TIMEOUT = 2
-wandb = dict(project="p", mode={mode!r}, name="n", config=dict(a=1))
-run_loggers = loggers.Loggers({str(folder)!r}, wandb=wandb)
+import pathlib
+from megastep.agents.training.loggers import Loggers, wandb
+wandb.TIMEOUT = 2
+folder = pathlib.Path({str(folder)!r})
+make = lambda: wandb.Wandb(folder, "n", dict(a=1), "p", {mode!r})
+run_loggers = Loggers(folder, others=dict(wandb=make))
 run_loggers.write(1, dict(x=1), dict(y=2))
 run_loggers.close()"""
     process = subprocess.run(

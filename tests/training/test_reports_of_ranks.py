@@ -54,7 +54,7 @@ def test_nan_of_another_rank_is_told_by_rank_0(tmp_path, one_by_one, recwarn):
         run = make_trainer(tmp_path, faults)
         run.rollout = run.collect()
         run.update()
-        assert not run.nonfinite_guard.check(run.rollout, run.samples)
+        assert not run.nonfinite_guard.check(run.rollout)
         trainers.append(run)
     (warning,) = recwarn
     sentence = r"reward of lane 3 was nan at step 2 \(rank 1 on there\); its rollout was skipped"
@@ -72,7 +72,7 @@ def test_all_ranks_end_with_the_same_sentence(tmp_path, one_by_one):
             run.update()
         told = pytest.warns(UserWarning) if rank == 0 else contextlib.nullcontext()
         with told, pytest.raises(nonfinite_guard.NonFiniteError) as caught:
-            run.nonfinite_guard.check(run.rollout, run.samples)
+            run.nonfinite_guard.check(run.rollout)
         assert caught.value.is_from_env
         sentences.append(str(caught.value))
     of_rank_1, of_rank_0 = sentences

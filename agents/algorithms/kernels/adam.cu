@@ -6,9 +6,7 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
 #define BOUNDS(n_threads) __launch_bounds__(n_threads)
-#define DEVICE static __device__ __forceinline__
 
 static_assert(sizeof(AdamParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
 static_assert(sizeof(SquaredNormParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));

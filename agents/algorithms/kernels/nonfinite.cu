@@ -4,9 +4,7 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
 #define BOUNDS(n_threads) __launch_bounds__(n_threads)
-#define DEVICE static __device__ __forceinline__
 
 static_assert(sizeof(FindBadParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
 static_assert(sizeof(RecordParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));

@@ -4,8 +4,6 @@
 #include "common/dependent_launch.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
-
 KERNEL order(OrderParams p) {
     wait_for_previous();
     int at = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, n_before = 0;

@@ -5,8 +5,6 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
-
 KERNEL ppo_loss(PpoLossParams p) {
     wait_for_previous();
     int of_policy = blockIdx.x * blockDim.x + threadIdx.x;

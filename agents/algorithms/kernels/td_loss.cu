@@ -5,9 +5,6 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
-#define DEVICE static __device__ __forceinline__
-
 constexpr int PHASES = TD_THREADS / TD_SEQUENCES;  // threads of a sequence
 constexpr int TD_WARPS = TD_THREADS / WARP;
 

@@ -3,8 +3,6 @@
 #include "common/dependent_launch.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
-
 KERNEL vtrace(VtraceParams p) {
     wait_for_previous();
     int lane = blockIdx.x * blockDim.x + threadIdx.x;

@@ -2,8 +2,8 @@
 
 import torch
 
-from megastep.agents.networks.kernels.layers import launch_for_policy
 from megastep.agents.networks.kernels.program import CORES
+from megastep.kernels.build.launch import Blocks, launch
 
 _MAX_ROWS, _THREADS = CORES.constants["CAST_ROWS"], CORES.constants["CAST_THREADS"]
 
@@ -24,17 +24,16 @@ def cast(weights: list[torch.Tensor], multiple: int) -> list[torch.Tensor]:
         for weight, target in zip(weights[some], targets[some], strict=True):
             rows.append(
                 CORES.params.CastRowParams(
-                    source=weight.data_ptr(),
-                    target=target.data_ptr(),
+                    source=weight,
+                    target=target,
                     n=weight.numel(),
                     n_padded=target.numel(),
                     first_block=n_blocks,
                 )
             )
             n_blocks += max(1, -(-target.numel() // (8 * _THREADS)))
-        launch_for_policy(
-            *("cast", memory, n_blocks * _THREADS),
-            block=_THREADS,
+        launch(
+            *(CORES, "cast", memory.device, Blocks(n_blocks, threads=_THREADS)),
             rows=b"".join(rows),
             n_rows=len(rows),
         )

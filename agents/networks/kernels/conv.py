@@ -9,14 +9,13 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import CUDA_FLAGS, aligned, aligned_rows
-from megastep.kernels.build.launch import addresses, launch_blocks
-from megastep.kernels.build.program import Program
+from megastep.agents.networks.kernels.program import aligned, aligned_rows
+from megastep.kernels.build.launch import Blocks, launch
+from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
 # Lambdas with type parameters are device code only if everything is.
-PROGRAM = Program(
-    Path(__file__).parent / "convolutions", (*CUDA_FLAGS, "--device-as-default-execution-space")
-)
+_FLAGS = *FAST_CUDA_FLAGS, "--device-as-default-execution-space"
+PROGRAM = Program(Path(__file__).parent / "convolutions", _FLAGS)
 MAX_CHANNELS = PROGRAM.constants["CONV_INPUTS"]
 CHANNELS = PROGRAM.constants["CONV_CHANNELS"]
 _ROWS, _THREADS, _BLOCKS = (
@@ -83,32 +82,36 @@ def conv_forward(
     )
     gpu = torch.cuda.get_device_properties(rows.device)
     n_blocks = min(-(-n_rows // _ROWS), _BLOCKS * gpu.multi_processor_count)
-    if n_rows:
-        launch_forward(
-            (n_blocks, 1),
-            rows=rows,
-            **{name: aligned(weight) for name, weight in weights.items()},
-            features=features,
-            n_rows=n_rows,
-            n_channels=n_channels,
-            n_columns=n_columns,
-            row_stride=rows.stride(0),
-            feature_stride=features.stride(0),
-        )
+    kernel, blocks, sizes = forward_kernel(n_channels, n_columns, n_blocks)
+    launch(
+        *(PROGRAM, kernel, rows.device, blocks),
+        rows=rows,
+        **{name: aligned(weight) for name, weight in weights.items()},
+        features=features,
+        n_rows=n_rows,
+        n_channels=n_channels,
+        n_columns=n_columns,
+        row_stride=rows.stride(0),
+        feature_stride=features.stride(0),
+        **sizes,
+    )
     return features
 
 
-def launch_forward(n_blocks: tuple[int, int], **fields) -> None:
-    """Launches the kernel of `conv_forward`.
+def forward_kernel(
+    n_channels: int, n_columns: int, *n_blocks: int
+) -> tuple[str, Blocks, dict[str, int]]:
+    """Returns the kernel of `conv_forward`, its blocks and the fields of its struct that are sizes
+    in shared memory.
 
     Args:
+        n_channels: C.
+        n_columns: W.
         n_blocks: per policy, and policies.
-        fields: the fields of its struct but the sizes in shared memory. A tensor stands for its
-            address.
     """
-    sizes = _forward_sizes(fields["n_channels"], fields["n_columns"])
-    kernel = f"conv_forward_{4 if fields['n_channels'] <= 4 else 8}"
-    _launch(kernel, "ConvForwardParams", n_blocks, _forward_bytes(**sizes), **fields, **sizes)
+    sizes = _forward_sizes(n_channels, n_columns)
+    blocks = Blocks(*n_blocks, threads=_THREADS, shared=_forward_bytes(**sizes))
+    return f"conv_forward_{4 if n_channels <= 4 else 8}", blocks, sizes
 
 
 def _forward_sizes(n_channels, n_columns):
@@ -165,8 +168,9 @@ def conv_backward(
     gpu = torch.cuda.get_device_properties(rows.device)
     n_blocks = _backward_blocks(n_rows, n_channels, n_columns, gpu)
     sums = rows.new_empty(n_blocks, sum(sizes), dtype=torch.float32)
-    launch_backward(
-        (n_blocks, 1),
+    kernel, blocks, shared_sizes = backward_kernel(n_channels, n_columns, n_blocks)
+    launch(
+        *(PROGRAM, kernel, rows.device, blocks),
         d_features=d_features,
         features=features,
         rows=rows,
@@ -180,23 +184,19 @@ def conv_backward(
         d_stride=d_features.stride(0),
         feature_stride=features.stride(0),
         row_stride=rows.stride(0),
+        **shared_sizes,
     )
     parts = sum_rows(sums).split(sizes)
     return parts[0].view_as(first_weight), parts[1], parts[2].view_as(second_weight), parts[3]
 
 
-def launch_backward(n_blocks: tuple[int, int], **fields) -> None:
-    """Launches the kernel of `conv_backward`; see `launch_forward`."""
-    sizes, n_bytes = _backward_sizes(fields["n_channels"], fields["n_columns"])
-    kernel = f"conv_backward_{-(-fields['n_channels'] // 2) * 2}"
-    _launch(kernel, "ConvBackwardParams", n_blocks, n_bytes, **fields, **sizes)
-
-
-def _launch(kernel, struct, n_blocks, shared, **fields):
-    values = addresses(fields)
-    packed = getattr(PROGRAM.params, struct)(**values)
-    device = fields["rows"].device
-    launch_blocks(PROGRAM, kernel, packed, device, n_blocks, _THREADS, shared)
+def backward_kernel(
+    n_channels: int, n_columns: int, *n_blocks: int
+) -> tuple[str, Blocks, dict[str, int]]:
+    """Returns the kernel of `conv_backward`, as `forward_kernel` does."""
+    sizes, n_bytes = _backward_sizes(n_channels, n_columns)
+    blocks = Blocks(*n_blocks, threads=_THREADS, shared=n_bytes)
+    return f"conv_backward_{-(-n_channels // 2) * 2}", blocks, sizes
 
 
 def _backward_blocks(n_rows, n_channels, n_columns, gpu):

@@ -10,7 +10,7 @@ import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.program import CORES
-from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 
 MAX_OUTPUTS = CORES.constants["DUELLING_OUTPUTS"]
 _STRIP, _THREADS = CORES.constants["DUELLING_STRIP"], CORES.constants["DUELLING_THREADS"]
@@ -28,7 +28,7 @@ def values(
             advantages, float32.
         shape: (A, n).
     """
-    return _launch("values", hidden, parameters, shape)
+    return _forward("values", hidden, parameters, shape)
 
 
 def act(
@@ -58,27 +58,25 @@ def act(
     logprobs = torch.empty(n_lanes, device=device)
     results = dict(actions=actions, logprobs=logprobs)
     options = dict(noise=noise, epsilon=epsilon, usual_epsilon=usual_epsilon)
-    return _launch("act", hidden, parameters, shape, **results, **options), actions, logprobs
+    return _forward("act", hidden, parameters, shape, **results, **options), actions, logprobs
 
 
-def _launch(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors):
+def _forward(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors):
     n_rows, n_features = hidden.shape
     values = torch.empty(n_rows, *shape, device=hidden.device)
     names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"
-    tensors |= dict(zip(names, parameters, strict=True), hidden=hidden, values=values)
-    names = *names, "hidden", "values", "noise", "epsilon", "actions", "logprobs"
-    addresses = {name: _address(tensors.get(name)) for name in names}
-    packed = CORES.params.DuellingParams(
-        **addresses,
+    optional = dict.fromkeys(("noise", "epsilon", "actions", "logprobs"))
+    blocks = Blocks(-(-n_rows // _BLOCK_ROWS))
+    launch(
+        *(CORES, f"duelling_{operation}", hidden.device, blocks),
+        **dict(zip(names, parameters, strict=True), hidden=hidden, values=values),
+        **(optional | tensors),
         n_rows=n_rows,
         width=n_features // 2,
         n_agents=shape[0],
         n_choices=shape[1],
         usual_epsilon=usual_epsilon,
     )
-    if n_rows:
-        n_blocks = -(-n_rows // _BLOCK_ROWS), 1
-        launch_blocks(CORES, f"duelling_{operation}", packed, hidden.device, n_blocks, BLOCK)
     return values
 
 
@@ -106,13 +104,14 @@ def backward(
     n_strips, n_parts = -(-n_rows // _STRIP), -(-width // _THREADS)
     d_hidden = torch.empty_like(hidden)
     sums = d_values.new_empty(n_strips, sum(sizes))
-    packed = CORES.params.DuellingBackwardParams(
-        hidden=hidden.data_ptr(),
-        value_weight=value_weight.data_ptr(),
-        advantage_weight=advantage_weight.data_ptr(),
-        d_values=d_values.data_ptr(),
-        d_hidden=d_hidden.data_ptr(),
-        sums=sums.data_ptr(),
+    launch(
+        *(CORES, "duelling_backward", hidden.device, Blocks(n_strips, n_parts, _THREADS)),
+        hidden=hidden,
+        value_weight=value_weight,
+        advantage_weight=advantage_weight,
+        d_values=d_values,
+        d_hidden=d_hidden,
+        sums=sums,
         n_rows=n_rows,
         width=width,
         n_agents=n_agents,
@@ -120,13 +119,6 @@ def backward(
         n_parts=n_parts,
         n_sums=sum(sizes),
     )
-    if n_rows:
-        n_blocks = n_strips, n_parts
-        launch_blocks(CORES, "duelling_backward", packed, hidden.device, n_blocks, _THREADS)
     d_bias, d_value, d_advantage, d_value_bias, d_advantage_bias = sum_rows(sums).split(sizes)
     d_weights = d_value.view_as(value_weight), d_advantage.view_as(advantage_weight)
     return d_hidden, [d_bias, d_weights[0], d_value_bias, d_weights[1], d_advantage_bias]
-
-
-def _address(tensor):
-    return 0 if tensor is None else tensor.data_ptr()

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import torch
 
-from megastep.agents.networks.kernels.layers import launch_for_policy, sum_rows
+from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.program import CORES
-from megastep.kernels.build.launch import WARP
+from megastep.kernels.build.launch import WARP, Blocks, launch
 
 MULTIPLE = 8  # of which W is one
 MAX_ROWS = 2**31 - CORES.constants["STRIP"]
@@ -74,15 +74,14 @@ def values(hidden: torch.Tensor, value: Value) -> torch.Tensor:
 
 
 def _forward(columns, outputs, value, sizes):
-    launch_for_policy(
-        "heads_forward",
-        columns["product"],
-        _STRIP_THREADS * _n_strips(columns["product"]),
-        block=_STRIP_THREADS,
+    product = columns["product"]
+    blocks = Blocks(_n_strips(product), threads=_STRIP_THREADS)
+    launch(
+        *(CORES, "heads_forward", product.device, blocks),
         **columns,
         **{f"value_{name}": leaf for name, leaf in value._asdict().items()},
         **outputs,
-        n_rows=len(columns["product"]),
+        n_rows=len(product),
         **sizes._asdict(),
     )
 
@@ -107,11 +106,9 @@ def backward(
     d_product = torch.empty_like(product)
     sums = product.new_empty(n_strips, n_columns + sizes.width + MULTIPLE, dtype=torch.float32)
     names = "d_logprobs", "d_entropies", "d_errors", "d_values"
-    launch_for_policy(
-        "heads_backward",
-        product,
-        _STRIP_THREADS * n_strips * n_parts,
-        block=_STRIP_THREADS,
+    blocks = Blocks(n_strips * n_parts, threads=_STRIP_THREADS)
+    launch(
+        *(CORES, "heads_backward", product.device, blocks),
         product=product,
         target=target,
         actions=actions,

@@ -5,7 +5,6 @@
 #include "common/dependent_launch.h"
 #include "number.h"
 
-#define KERNEL extern "C" __global__ void
 #define BOUNDS(n_threads) __launch_bounds__(n_threads)
 
 // A thread's lane, and the offsets of its units in an array (B, W) and in the first gate of an

@@ -8,8 +8,8 @@ import itertools
 
 import torch
 
-from megastep.agents.networks.kernels.program import CORES, DTYPES
-from megastep.kernels.build.launch import BLOCK, WARP, addresses, launch_blocks
+from megastep.agents.networks.kernels.program import CORES, kernel
+from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
 MAX_CHOICES = CORES.constants["ACT_THREADS"]
@@ -41,19 +41,18 @@ def normalise(
     plain = itertools.takewhile(lambda leaf: leaf.shape[-1] % 4 == 0, leaves)
     packed = [
         CORES.params.IntakeLeafParams(
-            values=leaf.data_ptr(),
-            mean=mean.data_ptr(),
-            scale=scale.data_ptr(),
+            values=leaf,
+            mean=mean,
+            scale=scale,
             n_features=leaf.shape[-1],
             group=leaf.shape[-1] // mean.numel(),
             is_half=int(leaf.dtype == torch.float16),
         )
         for leaf, mean, scale in zip(leaves, means, scales, strict=True)
     ]
-    launch_for_policy(
-        "normalise",
-        features,
-        n_columns // 4 * -(-n_selected // CORES.constants["NORMALISED_ROWS"]),
+    n_threads = n_columns // 4 * -(-n_selected // CORES.constants["NORMALISED_ROWS"])
+    launch(
+        *(CORES, "normalise", features.device, Blocks(-(-n_threads // BLOCK), n_steps)),
         leaves=b"".join(packed),
         lanes=lanes,
         features=features,
@@ -62,7 +61,6 @@ def normalise(
         n_selected=n_selected,
         n_columns=n_columns,
         n_plain_words=sum(leaf.shape[-1] // 4 for leaf in plain),
-        n_blocks_y=n_steps,
     )
     return features
 
@@ -82,12 +80,9 @@ def bias_gradient(
     n_strips = -(-n_rows // _STRIP)
     d_masked = d if activated is None else torch.empty_like(activated)
     sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
-    launch_for_policy(
-        "bias_gradient",
-        d,
-        _STRIP_THREADS * n_strips,
-        n_blocks_y=-(-n_words // WARP),
-        block=_STRIP_THREADS,
+    blocks = Blocks(n_strips, -(-n_words // WARP), _STRIP_THREADS)
+    launch(
+        *(CORES, "bias_gradient", d.device, blocks),
         d=d,
         activated=activated,
         d_masked=None if activated is None else d_masked,
@@ -103,12 +98,9 @@ def bias_gradient(
 def sum_rows(rows: torch.Tensor) -> torch.Tensor:
     """Returns the sums (columns,) of rows (n, columns) float32, always in the same order."""
     sums = rows.new_empty(rows.shape[1])
-    n_threads = _STRIP_THREADS * -(-rows.shape[1] // WARP)
-    launch_for_policy(
-        "sum_rows",
-        rows,
-        n_threads,
-        block=_STRIP_THREADS,
+    blocks = Blocks(-(-rows.shape[1] // WARP), threads=_STRIP_THREADS)
+    launch(
+        *(CORES, "sum_rows", rows.device, blocks),
         rows=rows,
         sums=sums,
         n_rows=rows.shape[0],
@@ -140,10 +132,9 @@ def act(
     logits = features.new_empty(n_lanes, *shape, dtype=torch.float32)
     actions = torch.empty(n_lanes, shape[0], dtype=torch.int64, device=features.device)
     logprobs = torch.empty_like(logits[:, 0, 0])
-    launch_for_policy(
-        f"categorical_act_{DTYPES[features.dtype]}",
-        features,
-        CORES.constants["ACT_THREADS"] * n_lanes,
+    operation, n_threads = kernel("categorical_act", features.dtype), MAX_CHOICES * n_lanes
+    launch(
+        *(CORES, operation, features.device, n_threads),
         features=features,
         weight=weight,
         bias=bias,
@@ -167,10 +158,8 @@ def terms(logits: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, to
         actions: (rows, A) int64.
     """
     logprobs, entropies = logits.new_empty(2, len(logits))
-    launch_for_policy(
-        "categorical_terms",
-        logits,
-        len(logits),
+    launch(
+        *(CORES, "categorical_terms", logits.device, len(logits)),
         **_rows(logits, actions),
         logprobs=logprobs,
         entropies=entropies,
@@ -186,10 +175,8 @@ def terms_backward(
 ) -> torch.Tensor:
     """Returns the gradient of `terms`' logits."""
     d_logits = torch.empty_like(logits)
-    launch_for_policy(
-        "categorical_terms_backward",
-        logits,
-        len(logits),
+    launch(
+        *(CORES, "categorical_terms_backward", logits.device, len(logits)),
         **_rows(logits, actions),
         d_logprobs=d_logprobs,
         d_entropies=d_entropies,
@@ -203,12 +190,3 @@ def _rows(logits, actions):
     return dict(
         logits=logits, actions=actions, n_rows=n_rows, n_agents=n_agents, n_choices=n_choices
     )
-
-
-def launch_for_policy(operation, tensor, n_threads, n_blocks_y=1, block=BLOCK, **fields):
-    """Launches an operation for one policy on a tensor's GPU."""
-    values = addresses(fields)
-    pack = getattr(CORES.params, CORES.cuda_operations[operation])
-    if n_threads and n_blocks_y:
-        n_blocks = -(-n_threads // block), n_blocks_y
-        launch_blocks(CORES, operation, pack(**values), tensor.device, n_blocks, block)

@@ -6,7 +6,8 @@ four elements. Gates are before activation. Gates, outputs, hidden states and th
 the compute dtype, cells are float32, resets are bool. Each function writes to its last arguments.
 """
 
-from megastep.agents.networks.kernels.program import run
+from megastep.agents.networks.kernels.program import CORES, kernel, n_threads, sizes
+from megastep.kernels.build.launch import launch
 
 
 def start(reset, last_output, last_cell, hidden, cell):
@@ -19,10 +20,9 @@ def start(reset, last_output, last_cell, hidden, cell):
         hidden: (B, W), written.
         cell: (B, W), written.
     """
-    run(
-        "lstm_start",
-        hidden.dtype,
-        hidden,
+    launch(
+        *(CORES, kernel("lstm_start", hidden.dtype), hidden.device, n_threads(hidden)),
+        **sizes(hidden),
         reset=reset,
         last_output=last_output,
         last_cell=last_cell,
@@ -40,10 +40,9 @@ def join(reset, x, last_output, joined):
         last_output: (B, W) float32.
         joined: (B, 2 W), written.
     """
-    run(
-        "lstm_join",
-        x.dtype,
-        last_output,
+    launch(
+        *(CORES, kernel("lstm_join", x.dtype), last_output.device, n_threads(last_output)),
+        **sizes(last_output),
         reset=reset,
         x=x,
         last_output=last_output,
@@ -63,10 +62,9 @@ def act(gates, reset, last_cell, residual, output, next_output, next_cell):
         next_output: (B, W) float32, written: the same numbers without the residual.
         next_cell: (B, W), written.
     """
-    run(
-        "lstm_act",
-        gates.dtype,
-        last_cell,
+    launch(
+        *(CORES, kernel("lstm_act", gates.dtype), last_cell.device, n_threads(last_cell)),
+        **sizes(last_cell),
         gates=gates,
         reset=reset,
         last_cell=last_cell,
@@ -89,10 +87,9 @@ def forward(gates, cell, next_reset, output, next_hidden, next_cell):
         next_hidden: (B, W), written; None without a next step.
         next_cell: (B, W), written.
     """
-    run(
-        "lstm_forward",
-        gates.dtype,
-        cell,
+    launch(
+        *(CORES, kernel("lstm_forward", gates.dtype), cell.device, n_threads(cell)),
+        **sizes(cell),
         gates=gates,
         cell=cell,
         next_reset=next_reset,
@@ -104,10 +101,9 @@ def forward(gates, cell, next_reset, output, next_hidden, next_cell):
 
 def backward(gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell):
     """Computes the gradients of `forward`'s gates and cell from those of its outputs."""
-    run(
-        "lstm_backward",
-        gates.dtype,
-        cell,
+    launch(
+        *(CORES, kernel("lstm_backward", gates.dtype), cell.device, n_threads(cell)),
+        **sizes(cell),
         gates=gates,
         cell=cell,
         next_reset=next_reset,

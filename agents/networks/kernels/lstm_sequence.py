@@ -10,13 +10,12 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import CUDA_FLAGS
-from megastep.kernels.build.launch import addresses, launch_blocks
-from megastep.kernels.build.program import Program
+from megastep.kernels.build.launch import Blocks, launch
+from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
 # Lambdas with type parameters are device code only if everything is.
 PROGRAM = Program(
-    Path(__file__).parent / "clusters", (*CUDA_FLAGS, "--device-as-default-execution-space")
+    Path(__file__).parent / "clusters", (*FAST_CUDA_FLAGS, "--device-as-default-execution-space")
 )
 WIDTH = 256
 MIN_STEPS = 2  # for one step, loading the weights takes longer than the products
@@ -71,9 +70,8 @@ def forward(gates, weight, reset, output, cell, needs_backward, residual=None):
             gates.new_empty(*lead, _LANES // 8, _THREADS, 8),
             cell.new_empty(*lead, _LANES // 8, _THREADS, 2),
         )
-    _launch(
-        "forward",
-        n_clusters,
+    launch(
+        *_where("forward", gates.device, n_clusters),
         gates=gates,
         weight=weight,
         reset=reset,
@@ -88,6 +86,8 @@ def forward(gates, weight, reset, output, cell, needs_backward, residual=None):
         saved_cells=saved[1],
         n_steps=n_steps,
         n_lanes=n_lanes,
+        n_policies=1,
+        n_clusters=n_clusters,
     )
     return outputs, hiddens, after, last_cell, saved
 
@@ -112,9 +112,8 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
     d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * WIDTH)
     d_bias = saved_cells.new_empty(n_clusters, 4 * WIDTH)
     d_last_output, d_last_cell = (saved_cells.new_empty(n_lanes, WIDTH) for _ in range(2))
-    _launch(
-        "backward",
-        n_clusters,
+    launch(
+        *_where("backward", weight.device, n_clusters),
         weight=weight.T.contiguous(),
         reset=reset,
         saved_gates=saved_gates,
@@ -127,20 +126,14 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
         d_last_cell=d_last_cell,
         n_steps=n_steps,
         n_lanes=n_lanes,
+        n_policies=1,
+        n_clusters=n_clusters,
     )
     return d_gates, sum_rows(d_bias), d_last_output, d_last_cell
 
 
-def _launch(direction, n_clusters, **fields):
-    kernel = f"lstm_sequence_{direction}_{WIDTH}"
-    pack = getattr(PROGRAM.params, PROGRAM.cuda_operations[kernel])
-    values = addresses(fields)
-    launch_blocks(
-        PROGRAM,
-        kernel,
-        pack(**values, n_policies=1, n_clusters=n_clusters),
-        fields["weight"].device,
-        (_RANKS * n_clusters, 1),
-        _THREADS,
-        PROGRAM.constants[f"{direction.upper()}_MEMORY"],
-    )
+def _where(direction, device, n_clusters):
+    """Returns the arguments of a launch but its fields."""
+    shared = PROGRAM.constants[f"{direction.upper()}_MEMORY"]
+    blocks = Blocks(_RANKS * n_clusters, threads=_THREADS, shared=shared)
+    return PROGRAM, f"lstm_sequence_{direction}_{WIDTH}", device, blocks

@@ -7,8 +7,14 @@ bool.
 """
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import run, units_per_thread
-from megastep.kernels.build.launch import BLOCK
+from megastep.agents.networks.kernels.program import (
+    CORES,
+    kernel,
+    n_threads,
+    sizes,
+    units_per_thread,
+)
+from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
 _LARGEST_BLOCK = 256  # threads, of `backward`
 _MANY_BLOCKS = 128  # about one per multiprocessor
@@ -21,10 +27,10 @@ def forward(gates, reset, start, residual, states, outputs, last):
         residual: (T, B, W), added to the outputs. None: nothing is.
         states: the outputs without the residual. None: not wanted.
     """
-    run(
-        "mingru_step" if len(gates) == 1 else "mingru_forward",
-        gates.dtype,
-        start,
+    operation = "mingru_step" if len(gates) == 1 else "mingru_forward"
+    launch(
+        *(CORES, kernel(operation, gates.dtype), start.device, n_threads(start)),
+        **sizes(start),
         gates=gates,
         reset=reset,
         start=start,
@@ -54,12 +60,10 @@ def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d
     adds_lanes = per_lane <= _LARGEST_BLOCK
     block = per_block * per_lane if adds_lanes else BLOCK
     d_biases = start.new_empty(-(-n_lanes // per_block), gates.shape[-1])
-    run(
-        "mingru_backward",
-        gates.dtype,
-        start,
-        block=block,
-        shared=4 * n_units * block,
+    blocks = Blocks(-(-n_threads(start) // block), threads=block, shared=4 * n_units * block)
+    launch(
+        *(CORES, kernel("mingru_backward", gates.dtype), start.device, blocks),
+        **sizes(start),
         gates=gates,
         reset=reset,
         start=start,

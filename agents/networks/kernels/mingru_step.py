@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
-from megastep.agents.networks.kernels.program import CUDA_FLAGS, aligned
-from megastep.kernels.build.launch import addresses, launch_blocks
-from megastep.kernels.build.program import Program
+from megastep.agents.networks.kernels.program import aligned
+from megastep.kernels.build.launch import Blocks, launch
+from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
-PROGRAM = Program(Path(__file__).parent / "acting", CUDA_FLAGS)
+PROGRAM = Program(Path(__file__).parent / "acting", FAST_CUDA_FLAGS)
 _LANES, _UNITS, _PARTS, _THREADS = (
     PROGRAM.constants[f"STEP_{name}"] for name in "LANES UNITS PARTS THREADS".split()
 )
@@ -53,8 +53,9 @@ def forward(
     """
     x, start = aligned(x), aligned(start)
     outputs, last = torch.empty_like(x), torch.empty_like(start)
+    width = x.shape[-1]
     launch(
-        1,
+        *(PROGRAM, f"mingru_step_{width}", x.device, blocks(len(start), width)),
         x=x,
         weight=aligned(weight),
         bias=aligned(bias),
@@ -68,21 +69,10 @@ def forward(
     return outputs, last
 
 
-def launch(n_policies: int, **fields) -> None:
-    """Launches the kernel.
-
-    Args:
-        n_policies: P.
-        fields: the fields of its struct. A tensor stands for its address.
-    """
-    x, n_lanes = fields["x"], fields["n_lanes"]
-    width = x.shape[-1]
-    values = addresses(fields)
-    packed = PROGRAM.params.MingruStepParams(**values)
-    n_blocks = -(-n_lanes // _LANES) * width // _UNITS, n_policies
-    if n_lanes:
-        shared = _shared(width)
-        launch_blocks(PROGRAM, f"mingru_step_{width}", packed, x.device, n_blocks, _THREADS, shared)
+def blocks(n_lanes: int, width: int, n_policies: int = 1) -> Blocks:
+    """Returns the blocks that step all lanes of each policy."""
+    n_blocks = -(-n_lanes // _LANES) * width // _UNITS
+    return Blocks(n_blocks, n_policies, _THREADS, _shared(width))
 
 
 def _shared(width):

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 import torch
 
-from megastep.agents.networks.kernels.layers import launch_for_policy
 from megastep.agents.networks.kernels.program import CORES
+from megastep.kernels.build.launch import Blocks, launch
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
 MAX_ARRAYS = CORES.constants["MASKED_ARRAYS"]
 _THREADS = CORES.constants["MASKED_THREADS"]
+_MOMENTS_THREADS = CORES.constants["MOMENTS_THREADS"]
 
 
 def moments(
@@ -28,23 +29,19 @@ def moments(
     total, device = sum(n_statistics), leaves[0].device
     results = torch.empty(2 * total, device=device)
     n_counted = torch.empty((), dtype=torch.int64, device=device)
-    threads = CORES.constants["MOMENTS_THREADS"]
     packed = [
         CORES.params.IntakeLeafParams(
-            values=leaf.data_ptr(),
-            mean=0,
-            scale=0,
+            values=leaf,
+            mean=None,
+            scale=None,
             n_features=leaf.shape[1],
             group=leaf.shape[1] // n,
             is_half=int(leaf.dtype == torch.float16),
         )
         for leaf, n in zip(leaves, n_statistics, strict=True)
     ]
-    launch_for_policy(
-        "moments",
-        results,
-        total * threads,
-        block=threads,
+    launch(
+        *(CORES, "moments", device, Blocks(total, threads=_MOMENTS_THREADS)),
         leaves=b"".join(packed),
         is_counted=is_counted.contiguous(),
         moments=results,
@@ -71,21 +68,19 @@ def add_moments(norms: list, all_moments: list, is_counted: torch.Tensor | None 
         kept += [mean, variance, n_counted]  # until the launch
         packed.append(
             CORES.params.RunningNormParams(
-                mean=norm.mean.data_ptr(),
-                scale=norm.scale.data_ptr(),
-                count=norm.count.data_ptr(),
-                new_mean=mean.data_ptr(),
-                new_variance=variance.data_ptr(),
-                n_counted=n_counted.data_ptr(),
+                mean=norm.mean,
+                scale=norm.scale,
+                count=norm.count,
+                new_mean=mean,
+                new_variance=variance,
+                n_counted=n_counted,
                 n=mean.numel(),
                 min_scale=norm.min_scale,
             )
         )
-    threads = CORES.constants["MOMENTS_THREADS"]
-    n_threads = threads * len(packed)
-    launch_for_policy(
-        *("add_moments", norms[0].mean, n_threads),
-        block=threads,
+    blocks = Blocks(len(packed), threads=_MOMENTS_THREADS)
+    launch(
+        *(CORES, "add_moments", norms[0].mean.device, blocks),
         norms=b"".join(packed),
         is_counted=is_counted,
     )
@@ -105,19 +100,17 @@ def masked_moments(
     parts = tensor.new_empty(len(arrays), n_parts, 3)
     moments = tensor.new_empty(len(arrays), 2)
     n_valid = torch.empty((), dtype=torch.int64, device=tensor.device)
-    pack, shape = CORES.params.MaskedArrayParams, dict(n_blocks_y=len(arrays), block=_THREADS)
-    launch_for_policy(
-        *("masked_parts", tensor, n_parts * _THREADS),
-        **shape,
-        arrays=b"".join(pack(values=array.data_ptr()) for array in arrays),
+    pack = CORES.params.MaskedArrayParams
+    launch(
+        *(CORES, "masked_parts", tensor.device, Blocks(n_parts, len(arrays), _THREADS)),
+        arrays=b"".join(pack(values=array) for array in arrays),
         valid=valid,
         parts=parts,
         n=n_numbers,
         n_arrays=len(arrays),
     )
-    launch_for_policy(
-        *("masked_moments", tensor, _THREADS),
-        **shape,
+    launch(
+        *(CORES, "masked_moments", tensor.device, Blocks(1, len(arrays), _THREADS)),
         parts=parts,
         moments=moments,
         n_valid=n_valid,
@@ -139,9 +132,12 @@ def normalise_masked(
         variance: () float32.
     """
     normalised = torch.empty_like(x)
-    statistics = dict(mean=mean, variance=variance)
-    fields = dict(values=x, valid=valid, **statistics, normalised=normalised, n=x.numel())
-    launch_for_policy("normalise_masked", x, x.numel(), **fields)
+    launch(
+        *(CORES, "normalise_masked", x.device, x.numel()),
+        **dict(values=x, valid=valid, mean=mean, variance=variance),
+        normalised=normalised,
+        n=x.numel(),
+    )
     return normalised
 
 
@@ -155,9 +151,8 @@ def add_returns(output, moments: tuple, is_counted: torch.Tensor | None, min_rat
         min_rate: smallest weight of the moments.
     """
     n_valid, mean, variance = moments
-    launch_for_policy(
-        *("add_returns", output.mean, _THREADS),
-        block=_THREADS,
+    launch(
+        *(CORES, "add_returns", output.mean.device, Blocks(1, threads=_THREADS)),
         weight=output.linear.weight,
         bias=output.linear.bias,
         mean=output.mean,

@@ -1,7 +1,7 @@
 // Reading and writing float32 and bfloat16 numbers, several at once, and the gates' activations.
 #pragma once
 
-#define DEVICE static __device__ __forceinline__
+#include "common/dependent_launch.h"
 
 // The upper half of a float. Not cuda_bf16.h, so NVRTC needs no include folder.
 struct Bfloat16 {

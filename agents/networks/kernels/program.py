@@ -1,4 +1,4 @@
-"""The networks' kernels as one program for the CPU and the GPU, and their launch."""
+"""The networks' kernels as one program for the CPU and the GPU."""
 
 import functools
 from pathlib import Path
@@ -6,24 +6,14 @@ from pathlib import Path
 import torch
 
 from megastep.arrdict import arrdict
-from megastep.engine.devices import threads
 from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError, cpu
-from megastep.kernels.build.launch import (
-    BLOCK,
-    addresses,
-    check_n_threads,
-    launch,
-    launch_blocks,
-)
 from megastep.kernels.build.program import Program
 
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
-# Unlike in the engine, no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
-CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
+# Unlike in the engine, no bits have to agree: fused multiply-adds.
 CPU_FLAGS = tuple(flag.replace("contract=off", "contract=fast") for flag in program.CPU_FLAGS)
-CPU = torch.device("cpu")
-CORES = Program(Path(__file__).parent, CUDA_FLAGS, CPU_FLAGS)
+CORES = Program(Path(__file__).parent, program.FAST_CUDA_FLAGS, CPU_FLAGS)
 
 
 def units_per_thread(width: int) -> int:
@@ -31,43 +21,29 @@ def units_per_thread(width: int) -> int:
     return 1 if width % 4 else 4
 
 
-def run(
-    operation: str,
-    dtype: torch.dtype,
-    state: torch.Tensor,
-    block: int = BLOCK,
-    shared: int = 0,
-    **fields,
-) -> None:
-    """Launches an operation for all lanes and units of a state.
-
-    Args:
-        operation: its name without the dtype, such as `lstm_start`.
-        dtype: in which it computes.
-        state: (B, W).
-        block: threads of a block.
-        shared: dynamic shared memory in bytes per block.
-        fields: the other fields of its struct. A tensor stands for its address, None for null.
+def kernel(operation: str, dtype: torch.dtype) -> str:
+    """Returns the name of the kernel that does an operation, such as `lstm_start`, in a dtype.
 
     Raises:
-        EngineError: if there is no kernel for `dtype`.
+        EngineError: if there is none.
     """
     if dtype not in DTYPES:
         raise EngineError(
             f"The recurrent cores' kernels compute in float32 or bfloat16, not in {dtype}: choose "
             f"one of them for autocast."
         )
+    return f"{operation}_{DTYPES[dtype]}"
+
+
+def sizes(state: torch.Tensor) -> dict[str, int]:
+    """Returns the fields of a struct about the size of a state (B, W)."""
     n_lanes, width = state.shape
-    n_units = units_per_thread(width)
-    kernel = f"{operation}_{DTYPES[dtype]}"
-    pack = getattr(CORES.params, CORES.cuda_operations[kernel])
-    values = addresses(fields)
-    packed = pack(**values, n_lanes=n_lanes, width=width, n_units=n_units)
-    n_threads = n_lanes * width // n_units
-    check_n_threads(operation, n_threads, state.device)
-    n_blocks = -(-n_threads // block)
-    if n_blocks:
-        launch_blocks(CORES, kernel, packed, state.device, (n_blocks, 1), block, shared)
+    return dict(n_lanes=n_lanes, width=width, n_units=units_per_thread(width))
+
+
+def n_threads(state: torch.Tensor) -> int:
+    """Returns how many threads handle all lanes and units of a state (B, W)."""
+    return state.numel() // units_per_thread(state.shape[1])
 
 
 @functools.cache
@@ -77,19 +53,6 @@ def is_built_for_cpu() -> bool:
         return bool(cpu(CORES))
     except EngineError:
         return False
-
-
-def run_on_cpu(operation: str, **fields) -> None:
-    """Runs an operation of a `.cpp` file with as many threads as the engine has.
-
-    Args:
-        operation: its name.
-        fields: the fields of its struct but `n_threads`. A tensor stands for its address.
-    """
-    pack = getattr(CORES.params, CORES.cpu_operations[operation])
-    values = addresses(fields)
-    packed = pack(**values, n_threads=threads())
-    launch(CORES, operation, packed, CPU, 0)
 
 
 def aligned(tensor: torch.Tensor) -> torch.Tensor:

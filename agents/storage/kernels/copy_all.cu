@@ -4,8 +4,6 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
-
 constexpr unsigned int BLOCK_BYTES = 16 * BLOCK * COPY_WORDS;
 
 static_assert(sizeof(CopyAllParams::copies) == MAX_COPIES * sizeof(CopyParams));

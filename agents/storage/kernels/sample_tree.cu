@@ -1,9 +1,6 @@
 // Draws indices from a sum tree in proportion to their priorities, one warp per index, from the
 // highest level down.
-#include "common/dependent_launch.h"
 #include "sum_tree.h"
-
-#define KERNEL extern "C" __global__ void
 
 KERNEL sample_tree(SampleTreeParams p) {
     wait_for_previous();

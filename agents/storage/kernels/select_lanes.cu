@@ -5,8 +5,6 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
-
 static_assert(sizeof(SelectLanesParams::tensors) == MAX_SELECTED * sizeof(SelectParams));
 
 template <class Word>

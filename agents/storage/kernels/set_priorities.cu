@@ -1,9 +1,6 @@
 // Changes priorities in a sum tree and the sums above them, in one block: there are a few thousand,
 // and each level waits for the one below.
-#include "common/dependent_launch.h"
 #include "sum_tree.h"
-
-#define KERNEL extern "C" __global__ void
 
 KERNEL set_tree(SetTreeParams p) {
     wait_for_previous();

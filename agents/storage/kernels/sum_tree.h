@@ -1,12 +1,13 @@
 // The sum tree on a GPU: a block of 32 children is what a warp reads at once.
 #pragma once
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "constants.h"
 #include "params.h"
 
 // The number of the child of a block whose part of the total holds `rest`, from which the children
 // before it are subtracted. Of the whole warp, each thread with its child's sum.
-static __device__ __forceinline__ int find_child(double sum, double& rest) {
+DEVICE int find_child(double sum, double& rest) {
     int lane = threadIdx.x % WARP;
     double sums = sum;  // up to this child
     for (int step = 1; step < WARP; step *= 2) {
@@ -23,8 +24,8 @@ static __device__ __forceinline__ int find_child(double sum, double& rest) {
 
 // Replaces priorities at index (n). Of several values for one index, the largest stays. For one
 // block of threads; values (n) were written by these threads, each those that it handles here.
-static __device__ __forceinline__ void set_values(const SumTreeParams& tree, const long long* index,
-                                                  const double* values, int n) {
+DEVICE void set_values(const SumTreeParams& tree, const long long* index, const double* values,
+                       int n) {
     double* priorities = tree.levels[0].sums;
     for (int i = threadIdx.x; i < n; i += blockDim.x)
         priorities[index[i]] = 0.;

@@ -75,7 +75,8 @@ class Bot:
             for name, shape in shapes.items()
         )
         reset, lanes = reset.contiguous(), (n_lanes,)
-        packed = PROGRAM.params.BotParams(
+        launch(
+            *(PROGRAM, "bot", device, WARP * n_lanes),
             rgb=rgb,
             depth=depth,
             imu=imu,
@@ -84,12 +85,11 @@ class Bot:
                 name: checks.address(f"state.{name}", before[name], lanes, dtype, device)
                 for name, dtype in _STATE.items()
             },
-            actions=actions.data_ptr(),
-            **{f"next_{name}": after[name].data_ptr() for name in _STATE},
+            actions=actions,
+            **{f"next_{name}": after[name] for name in _STATE},
             slope=math.tan(math.radians(self.fov / 2)),
             n_lanes=n_lanes,
             n_pixels=n_pixels,
             n_threads=threads(),
         )
-        launch(PROGRAM, "bot", packed, device, threads=WARP * n_lanes)
         return arrdict(actions=actions), after

@@ -132,7 +132,8 @@ def deathmatch_step(
             torch.empty((n_lanes, 1, privileged_size(a)), device=device) if privileged else None
         ),
     )
-    packed = PROGRAM.params.DeathmatchStepParams(
+    launch(
+        *(PROGRAM, "deathmatch_step", device, n),
         centre_line=checks.address(
             "view.centre_line", view.centre_line, lanes, torch.int32, device
         ),
@@ -142,7 +143,7 @@ def deathmatch_step(
         tally=checks.address("tally", tally, (TALLY_ROWS, n_lanes), torch.float32, device),
         ages=checks.address("ages", ages, (n_lanes,), torch.int32, device),
         ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
-        **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
+        **out._asdict(),
         **not_negative,
         **rewards,
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
@@ -152,5 +153,4 @@ def deathmatch_step(
         n_model=len(scenery.model),
         n_threads=threads(),
     )
-    launch(PROGRAM, "deathmatch_step", packed, device, threads=n)
     return out

@@ -90,7 +90,8 @@ def explorer_step(
     tables = dict(runs=0, run_starts=0, n_visible=0)
     if coverage or privileged:
         tables = checks.instance("runs", runs, TexelRuns).addresses(scenery, n_words)
-    packed = PROGRAM.params.ExplorerStepParams(
+    launch(
+        *(PROGRAM, "explorer_step", device, n_lanes * WARP if privileged else n_lanes),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         newly_seen=checks.address("newly_seen", newly_seen, lanes, torch.int32, device),
@@ -100,12 +101,10 @@ def explorer_step(
         limits=checks.address("limits", limits, (n_lanes,), torch.int32, device),
         ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
         error_flag=error_flag_address(scenery, agents),
-        **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
+        **out._asdict(),
         n_words=n_words,
         patience=checks.integer("patience", patience, 1, 2**31 - 1),
         texels_per_point=TEXELS_PER_POINT,
     )
-    n_threads = n_lanes * WARP if privileged else n_lanes
-    launch(PROGRAM, "explorer_step", packed, device, threads=n_threads)
     check_on_cpu(agents)
     return out

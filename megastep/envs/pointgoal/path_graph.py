@@ -11,7 +11,7 @@ import torch
 
 from megastep.engine.devices import threads
 from megastep.envs.pointgoal.program import PROGRAM
-from megastep.kernels.build.launch import BLOCK, addresses, launch
+from megastep.kernels.build.launch import BLOCK, launch
 
 __all__ = ["CELL", "MAX_GOALS", "PathGraph"]
 
@@ -25,7 +25,6 @@ MAX_GOALS, GROUP, KEPT, N_SCRATCH = (
 GROUP_SIDE = 1.5  # metres: walls with their middles in one square are neighbours
 STEP = 5e-3  # metres from a corner where it is tested if a path can turn there
 TURN = 0.026  # radians of that turn
-_NO_LINKS = dict(targets=0, metres=0)
 
 
 class PathGraph:
@@ -91,7 +90,7 @@ class PathGraph:
         inradius = INFLATION * self.radius + 2 * SLACK
         circumradius = inradius / np.cos(np.pi / SIDES)
         return PROGRAM.params.HomesParams(
-            **{name: tensor.data_ptr() for name, tensor in self.tensors.items()},
+            **self.tensors,
             n_groups=self.n_groups,
             n_corners=len(self.corner_homes),
             n_homes=len(self.geometries),
@@ -99,12 +98,6 @@ class PathGraph:
             clearance=inradius - SLACK,
             rebate=(circumradius - inradius) * 2 * np.pi / SIDES,
         )
-
-    def _launch(self, operation, params, n_threads, **values):
-        """Launches an operation. Values that are tensors are passed by address."""
-        packed = addresses(values)
-        struct = getattr(PROGRAM.params, params)(homes=self._params(), **packed)
-        launch(PROGRAM, operation, struct, self.device, threads=n_threads)
 
     # ---- The visibility graph ----
 
@@ -141,10 +134,9 @@ class PathGraph:
         its number (P,) int32; at most `most`.
         """
         clearances = torch.empty(len(points), device=self.device)
-        self._launch(
-            "clearances",
-            "ClearancesParams",
-            len(points),
+        launch(
+            *(PROGRAM, "clearances", self.device, len(points)),
+            homes=self._params(),
             points=points.float().contiguous(),
             home_index=home,
             clearances=clearances,
@@ -160,10 +152,11 @@ class PathGraph:
         v, device = len(self.corner_homes), self.device
         counts, tangent = torch.empty((2, v), dtype=torch.int32, device=device)
         kept = torch.empty((v, KEPT), dtype=torch.int32, device=device)
-        always = dict(corner_homes=self.corner_homes, tangent=tangent, kept=kept)
-        self._launch(
-            "corner_links", "CornerLinksParams", v, **always, starts=0, counts=counts, **_NO_LINKS
+        always = dict(
+            homes=self._params(), corner_homes=self.corner_homes, tangent=tangent, kept=kept
         )
+        where = PROGRAM, "corner_links", device, v
+        launch(*where, **always, counts=counts, starts=None, targets=None, metres=None)
         ends = counts.cumsum(0, dtype=torch.int32)
         n_links = int(ends[-1]) if v else 0
         links = dict(
@@ -171,7 +164,7 @@ class PathGraph:
             targets=torch.empty(n_links, dtype=torch.int32, device=device),
             metres=torch.empty(n_links, device=device),
         )
-        self._launch("corner_links", "CornerLinksParams", v, **always, counts=0, **links)
+        launch(*where, **always, counts=None, **links)
         return links
 
     # ---- Shortest paths ----
@@ -211,10 +204,9 @@ class PathGraph:
             return torch.cat([rows[d] for d in range(len(counts)) for rows in by_home])
         goals = self.tensor(goals, np.float32)
         distances = torch.empty((len(self.corner_homes), MAX_GOALS), device=self.device)
-        self._launch(
-            "corner_distances",
-            "CornerDistancesParams",
-            BLOCK * len(counts),
+        launch(
+            *(PROGRAM, "corner_distances", self.device, BLOCK * len(counts)),
+            homes=self._params(),
             goals=goals,
             distances=distances,
             n_goals=n_goals,
@@ -223,13 +215,12 @@ class PathGraph:
         n_points = int(counts.sum())
         lengths = torch.empty(n_points * n_goals, device=self.device)
         n_scratch = N_SCRATCH * len(self.corner_homes) if self.device.type == "cpu" else 0
-        self._launch(
-            "path_lengths",
-            "PathLengthsParams",
-            n_points,
+        launch(
+            *(PROGRAM, "path_lengths", self.device, n_points),
+            homes=self._params(),
             goals=goals,
             distances=distances,
-            points=0 if points is None else points,
+            points=points,
             widths=self.tensor(self.shapes[:, 1], np.int32),
             point_starts=self.tensor(self._starts(counts), np.int32),
             lengths=lengths,

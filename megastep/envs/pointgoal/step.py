@@ -108,7 +108,8 @@ def pointgoal_step(
         goal_obs=torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device),
         privileged=privileged_out,
     )
-    packed = PROGRAM.params.PointgoalStepParams(
+    launch(
+        *(PROGRAM, "pointgoal_step", device, n_lanes),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         free=0 if free is None else checks.address("free", free, lanes, torch.float32, device),
@@ -122,7 +123,7 @@ def pointgoal_step(
         ages=checks.address("ages", ages, (n_lanes,), torch.int32, device),
         ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
         error_flag=error_flag_address(scenery, agents),
-        **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
+        **out._asdict(),
         **seed_params(seed),
         per_cell=1 / goals.cell,
         reach=reach,
@@ -131,6 +132,5 @@ def pointgoal_step(
         n_goals=goals.n_goals,
         n_spawns=goals.n_spawns,
     )
-    launch(PROGRAM, "pointgoal_step", packed, device, threads=n_lanes)
     check_on_cpu(agents)
     return out

@@ -83,15 +83,16 @@ def pong_step(
     speed = checks.number("tracker_speed", tracker_speed, -math.inf, PIXELS[1], "cells per step")
     if speed < 0:
         raise ValueError(f"tracker_speed must be at least 0 cells per step, not {speed:g}")
-    packed = PROGRAM.params.PongStepParams(
+    launch(
+        *(PROGRAM, "pong_step", device, n),
         games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, device),
         actions=checks.address("actions", actions, (n_lanes, 1), torch.int64, device),
-        reward=reward.data_ptr(),
-        reset=flags[0].data_ptr(),
-        terminal=flags[1].data_ptr(),
-        truncated=flags[2].data_ptr(),
-        points_won=points_won.data_ptr(),
-        features=0 if features is None else features.data_ptr(),
+        reward=reward,
+        reset=flags[0],
+        terminal=flags[1],
+        truncated=flags[2],
+        points_won=points_won,
+        features=features,
         pixels=pixels_at,
         error_flag=checks.address("error_flag", error_flag, (1,), torch.int32, device),
         **seed_params(seed),
@@ -103,6 +104,5 @@ def pong_step(
         tracker_speed=round(CELL * speed),
         n_threads=threads(),
     )
-    launch(PROGRAM, "pong_step", packed, device, threads=n)
     check_flag_on_cpu(error_flag)
     return PongStep(reward, *flags, points_won, features)

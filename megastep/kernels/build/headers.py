@@ -11,6 +11,7 @@ Three kinds of declarations are recognised:
 import re
 import struct
 from collections.abc import Callable, Mapping
+from typing import Any
 
 __all__ = ["constants", "early_operations", "operations", "packer", "struct_fields"]
 
@@ -24,6 +25,18 @@ OPERATION = re.compile(
 WAITS = re.compile(r"\s*\{\s*wait_for_previous\(\)\s*;")  # what follows an OPERATION
 STRUCT = re.compile(r"^struct (\w+Params) \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)(?:\[(\d+)\])?")
+#: The source of a function of {field: value} that packs a struct.
+PACKED = """
+def packed(values):
+    if len(values) == len(names):
+        try:
+            return pack({})
+        except KeyError:
+            pass
+    for field in sorted(names ^ values.keys()):
+        problem = "needs the field" if field in names else "has no field"
+        raise TypeError(f"{{name}} {{problem}} '{{field}}'")
+"""
 
 Fields = list[tuple[str, str]]  # (name, format of the module struct)
 
@@ -72,16 +85,21 @@ def _holds_pointer(fields):
     return any("P" in kind for _, kind in fields)
 
 
-def builder(name: str, fields: Fields) -> Callable[..., bytes]:
-    """Returns a function ``name`` of keyword arguments, one per field, that packs the struct.
+def builder(name: str, fields: Fields) -> Callable[[Mapping[str, Any]], bytes]:
+    """Returns a function of {field: value} that packs the struct ``name``.
 
-    All fields must be given: Python itself names one that is missing or misspelt. An array is the
-    joined bytes of its structs; those that are missing at its end are zeros.
+    A pointer is a tensor, an address, or None for null. An array is the joined bytes of its
+    structs; those that are missing at its end are zeros.
+
+    The function raises a TypeError unless it gets each field, and no other.
     """
-    names = ", ".join(field for field, _ in fields)
-    function = eval(f"lambda *, {names}: pack({names})", {"pack": packer(fields).pack})
-    function.__name__ = function.__qualname__ = name
-    return function
+    address = "x if (x := values[{!r}]).__class__ is int else 0 if x is None else x.data_ptr()"
+    items = [
+        address.format(field) if kind == "P" else f"values[{field!r}]" for field, kind in fields
+    ]
+    scope = dict(name=name, names=dict(fields).keys(), pack=packer(fields).pack)
+    exec(PACKED.format(", ".join(items)), scope)  # a loop over the fields would slow launches down
+    return scope["packed"]
 
 
 def constants(sources: Mapping[str, str]) -> dict[str, int | float]:

@@ -1,12 +1,14 @@
 """A folder of kernels as a program for the CPU and the GPU."""
 
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 from megastep.kernels.build import headers
 
-__all__ = ["CPU_FLAGS", "CUDA_FLAGS", "KERNELS", "Program"]
+__all__ = ["CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "Program"]
 
 #: The folder of the engine's kernels. Its headers in ``common/`` are for all programs.
 KERNELS = Path(__file__).parents[1]
@@ -33,6 +35,8 @@ CUDA_FLAGS = (
     "--ftz=false",
     "--generate-line-info",
 )
+#: NVRTC's flags where no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
+FAST_CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
 
 
 class Program:
@@ -50,10 +54,11 @@ class Program:
         cpu_flags: the C++ compiler's flags.
 
     Attributes:
-        params: a function for each struct; ``params.RenderParams(res=64, ...)`` packs one. All
-            fields are required keyword arguments. A pointer is a tensor's address, or 0 for null.
         constants: {name: number} from ``constants.h``, the folder's and the common one.
-        sizes: {struct: bytes}.
+        packers: {struct: function of {field: value} that packs one}, as
+            :func:`~megastep.kernels.build.headers.builder` returns it.
+        params: a function for each struct; ``params.RowParams(n=64, ...)`` packs one that is a
+            field of another.
         cpu_operations: {operation: struct} of the ``.cpp`` files.
         cuda_operations: {operation: struct} of the ``.cu`` files.
         early_operations: those that a GPU may start before the previous kernel has ended: their
@@ -67,15 +72,24 @@ class Program:
         cpu_flags: tuple[str, ...] = CPU_FLAGS,
     ):
         self.folder, self.cuda_flags, self.cpu_flags = Path(folder), cuda_flags, cpu_flags
-        structs = headers.struct_fields(self.sources(".h"))
-        self.params = SimpleNamespace(
-            **{name: headers.builder(name, fields) for name, fields in structs.items()}
-        )
-        self.sizes = {name: headers.packer(fields).size for name, fields in structs.items()}
-        self.constants = headers.constants(self.sources(".h"))
 
     def __repr__(self):
         return f"Program({str(self.folder)!r})"
+
+    @cached_property
+    def constants(self) -> dict[str, int | float]:
+        return headers.constants(self.sources(".h"))
+
+    @cached_property
+    def packers(self) -> dict[str, Callable[[Mapping[str, Any]], bytes]]:
+        structs = headers.struct_fields(self.sources(".h"))
+        return {name: headers.builder(name, fields) for name, fields in structs.items()}
+
+    @cached_property
+    def params(self) -> SimpleNamespace:
+        return SimpleNamespace(
+            **{name: partial(_pack, packer) for name, packer in self.packers.items()}
+        )
 
     @cached_property
     def cpu_operations(self) -> dict[str, str]:
@@ -97,3 +111,7 @@ class Program:
         files = {f"common/{path.name}": path for path in sorted((KERNELS / "common").iterdir())}
         files |= {path.name: path for path in sorted(self.folder.iterdir())}
         return {name: path.read_text() for name, path in files.items() if path.suffix in suffixes}
+
+
+def _pack(packer, /, **fields):
+    return packer(fields)

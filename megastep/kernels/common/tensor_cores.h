@@ -1,7 +1,6 @@
 // Matrix products on tensor cores, asynchronous copies, and clusters of blocks (Hopper and later).
 #pragma once
-
-#define DEVICE static __device__ __forceinline__
+#include "common/dependent_launch.h"
 
 // ---- Numbers ----
 

@@ -18,7 +18,6 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
 // Blocks of a multiprocessor, as many as its shared memory holds: two leave a thread 128 registers.
 #define BOUNDS(n_blocks) __launch_bounds__(STEP_THREADS, n_blocks)
 

@@ -17,7 +17,6 @@
 #include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
 
-#define KERNEL extern "C" __global__ void
 // Blocks of a cluster. One block per multiprocessor, which leaves a thread 255 registers.
 #define BOUNDS(n_blocks) __cluster_dims__(n_blocks, 1, 1) __launch_bounds__(THREADS, 1)
 

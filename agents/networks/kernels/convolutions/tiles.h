@@ -5,7 +5,6 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
 // Blocks of a multiprocessor: two leave a thread 255 registers.
 #define BOUNDS(n_blocks) __launch_bounds__(THREADS, n_blocks)
 

@@ -6,7 +6,6 @@
 #include "constants.h"
 #include "params.h"
 
-#define KERNEL extern "C" __global__ void
 #define BOUNDS(n_threads) __launch_bounds__(n_threads)
 
 KERNEL episodes(EpisodesParams p) {

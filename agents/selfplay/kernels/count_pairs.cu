@@ -1,10 +1,6 @@
 // Adds up rewards, and counts the pairs of agents that a step decides: one thread per environment.
-#include "common/constants.h"
 #include "common/dependent_launch.h"
-#include "constants.h"
 #include "params.h"
-
-#define KERNEL extern "C" __global__ void
 
 KERNEL count_pairs(CountPairsParams p) {
     wait_for_previous();

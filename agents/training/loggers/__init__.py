@@ -1,0 +1,120 @@
+"""Loggers of a run: JSON lines always, and those that were chosen, each in a file of its own here.
+
+`metrics.jsonl` holds only what the seed determines, so two runs of one configuration write the same
+bytes. Rates and times are in `perf.jsonl`. After start-up no failure of a logger stops a run.
+
+A file `mlflow.py` here with a class `MLflow` is `logger=mlflow`. `megastep.agents.types.Logger`
+says what it needs.
+"""
+
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from megastep.agents.runs.json_lines import JsonLines, truncate_after
+from megastep.agents.types import Logger
+
+
+class LoggerError(RuntimeError):
+    """The metrics of a run cannot be written. The message names the cure."""
+
+
+class Loggers:
+    """All loggers of one run.
+
+    A file of JSON lines that cannot be written is warned about once, and the next report tries
+    again. Any other logger is dropped with a warning when it cannot be made or fails.
+
+    Args:
+        folder: the run folder.
+        step: environment steps at which a resumed run starts. Later lines are removed.
+        others: functions that make loggers beside the JSON lines, by the loggers' names.
+
+    Raises:
+        LoggerError: the files cannot be written. They are unchanged.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        step: int = 0,
+        others: Mapping[str, Callable[[], Logger]] | None = None,
+    ):
+        folder = Path(folder)
+        paths = folder / "metrics.jsonl", folder / "perf.jsonl"
+        try:
+            for path in paths:
+                truncate_after(path, step)
+            self.metrics, self.perf = (JsonLines(path) for path in paths)
+        except OSError as error:
+            raise LoggerError(
+                f"The metrics in {folder} cannot be written ({error.strerror}) and are unchanged. "
+                "Free some space or get write access, then start again"
+            ) from error
+        self.others = {}
+        for name, make in (others or {}).items():
+            try:
+                self.others[name] = make()
+            except Exception as error:
+                warnings.warn(f"logger={name} skipped: {first_line(error)}", stacklevel=2)
+
+    def write(
+        self, step: int, metrics: dict[str, float | str] | None, perf: dict[str, float]
+    ) -> None:
+        """Writes one report after `step` environment steps.
+
+        Args:
+            metrics: name -> number or string, determined by the seed. None: only `perf` is written.
+            perf: name -> number, such as times and rates.
+        """
+        if metrics is not None:
+            self._call_lines(self.metrics, "write", step, metrics)
+        self._call_lines(self.perf, "write", step, perf)
+        self._call_others("write", step, {**(metrics or {}), **perf})
+
+    def sync(self) -> None:
+        """Flushes the metrics to disk. Raises OSError if they cannot be written."""
+        self.metrics.file.sync()
+
+    def close(self) -> None:
+        for lines in self.metrics, self.perf:
+            self._call_lines(lines, "close")
+        self._call_others("close")
+
+    def _call_lines(self, lines, method, *args):
+        try:
+            getattr(lines, method)(*args)
+        except Exception as error:
+            if not getattr(lines, "has_warned", False):
+                lines.has_warned = True
+                text = f"{lines.path} cannot be written ({first_line(error)}); the run goes on"
+                warnings.warn(text, stacklevel=3)
+
+    def _call_others(self, method, *args):
+        for name, logger in list(self.others.items()):
+            try:
+                getattr(logger, method)(*args)
+            except Exception as error:
+                del self.others[name]
+                text = f"logger={name} failed and is dropped ({first_line(error)})"
+                warnings.warn(text, stacklevel=3)
+
+
+class NoLogger:
+    """Writes nothing, as on ranks other than 0."""
+
+    def write(
+        self, step: int, metrics: dict[str, float | str] | None, perf: dict[str, float]
+    ) -> None:
+        pass
+
+    def sync(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def first_line(error: Exception) -> str:
+    """Returns the first line of an error's message, or its class's name."""
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -1,0 +1,79 @@
+"""Weights & Biases, an optional package."""
+
+import importlib
+import os
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal
+
+from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.training.loggers import first_line
+
+#: Seconds that Weights & Biases may take to start before the run goes on without it.
+TIMEOUT = 20
+
+
+class Wandb:
+    """Logs to Weights & Biases, online or offline. Never asks for a key on the terminal.
+
+    The run's id is stored in its folder, so a resumed run continues the same Weights & Biases run.
+
+    Args:
+        folder: the run folder.
+        run_name, config, project, group: as `wandb.init` takes them. A sweep sets the group to
+            the name of its folder, unless one is given.
+        mode: `offline` keeps the run in its folder; `wandb sync` uploads it later.
+
+    Raises:
+        RuntimeError: wandb is not installed, has no key, or did not start.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        run_name: str,
+        config: dict[str, Any],
+        project: str = "megastep",
+        mode: Literal["online", "offline"] = "online",
+        group: str | None = None,
+    ):
+        os.environ.setdefault("WANDB_SILENT", "true")
+        try:
+            wandb = importlib.import_module("wandb")
+        except ImportError:
+            raise RuntimeError("wandb is not installed; pip install wandb") from None
+        if mode == "online" and not self._has_key(wandb):
+            raise RuntimeError(
+                "it has no key here. Run `wandb login`, or use "
+                "logger.wandb.mode=offline, which needs none"
+            )
+        id_file = folder / "wandb-id.txt"
+        try:
+            self.run = wandb.init(
+                project=project,
+                mode=mode,
+                name=run_name,
+                group=group,
+                config=config,
+                dir=str(folder),
+                id=id_file.read_text() if id_file.exists() else None,
+                resume="allow",
+                settings=wandb.Settings(init_timeout=TIMEOUT, silent=True, console="off"),
+            )
+            write_atomically(id_file, self.run.id.encode())
+        except Exception as error:  # wandb raises its own errors, the network's and the system's
+            raise RuntimeError(f"it did not start ({first_line(error)})") from None
+
+    @staticmethod
+    def _has_key(wandb: ModuleType) -> bool:
+        """Returns True if a key is in the environment or a file. Does not prompt for one."""
+        try:
+            return bool(os.environ.get("WANDB_API_KEY") or wandb.login(prompt=False))
+        except TypeError:  # older versions of wandb have no such argument
+            return bool(wandb.api.api_key)
+
+    def write(self, step: int, values: dict[str, float | str]) -> None:
+        self.run.log({"samples": step, **values}, step=step)
+
+    def close(self) -> None:
+        self.run.finish()

@@ -1,0 +1,190 @@
+"""A run's NaN or infinity, met again by the command that its warning names."""
+
+import os
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+
+from megastep import spaces
+from megastep.agents.cli import train
+from megastep.agents.runs import checkpoint
+from megastep.arrdict import arrdict
+
+T, N, A = 8, 4, 2
+UPDATE = T * N * A
+FAULT = 4 * T + 3  # a step of the fifth update
+
+
+class Walks:
+    """Agents walk along a line by their action and by chance. At step `FAULT` those that are far
+    from the start earn a huge number made of their place.
+
+    Args:
+        resumable: as in an environment's contract.
+        opaque: it has something that checkpoints cannot reach.
+    """
+
+    obs_space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 3)
+    n_agents = A
+
+    def __init__(self, n_envs, device="cpu", seed=1, resumable=True, opaque=False):
+        self.n_envs, self.device, self.resumable = n_envs, torch.device(device), resumable
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.opaque = iter(range(99)) if opaque else None
+        self.clock = torch.zeros((), dtype=torch.int64, device=device)
+        self.places = torch.zeros(n_envs * A, device=device)
+
+    def reset(self):
+        self.clock.zero_()
+        self.places.zero_()
+        return self._world(is_first=True)
+
+    def step(self, decision):
+        self.clock.add_(1)
+        noise = torch.rand(len(self.places), generator=self.generator, device=self.device)
+        self.places.add_(decision["actions"][:, 0] - 1 + noise)
+        return self._world(is_first=False)
+
+    def _world(self, is_first):
+        reset = torch.full_like(self.places, is_first, dtype=torch.bool)
+        is_bad = (self.clock == FAULT) & (self.places > 15)
+        reward = torch.where(is_bad, 1e13 * self.places, 0.0)
+        obs, never = self.places[:, None, None] / 100, torch.zeros_like(reset)
+        return arrdict(obs=obs, reward=reward, reset=reset, terminal=never, truncated=never)
+
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+TINY = [f"env={__name__}:Walks", f"env.n_envs={N}", "preset=cpu", f"learner.n_steps={T}"]
+TINY += ["agent.width=8", f"samples={12 * UPDATE}", "folder=run"]
+PPO = ["learner.n_minibatches=2"]
+R2D2 = ["learner=r2d2", "learner.gradient_steps=2", "learner.replay.burn_in=4"]
+R2D2 += ["learner.replay.capacity=2000"]
+OPPONENTS = [*PPO, "opponents.past=0.5", "opponents.snapshots=1", "opponents.every=2"]
+EVERY_UPDATE = "checkpoint_seconds=1e-9"
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def met(capsys, *words):
+    """Trains. Returns the number and what is said after it, in the warning and at the end."""
+    assert train.main([*words]) == 1
+    *_, warning, sentence = capsys.readouterr().err.splitlines()
+    number, hint = warning.removeprefix("warning: ").split("; its rollout was skipped")
+    assert number.startswith("reward of lane") and f" at step {FAULT}" in number
+    assert sentence.startswith(f"train.py: {number}. All else") and sentence.endswith(hint)
+    return number, hint
+
+
+def files_of_run():
+    """Returns the content of the run's files, without the checkpoint that is kept."""
+    paths = [path for path in Path("run").rglob("*") if path.is_file()]
+    return {path: path.read_bytes() for path in paths if path.parts[1] != "nonfinite"}
+
+
+def updates_in(folder):
+    """Returns the updates before each of a run's checkpoints."""
+    paths = checkpoint.list_checkpoints(f"{folder}/checkpoints")
+    return [checkpoint.load_latest(path, None).numbers["updates"] for path in paths]
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(
+    "more",
+    [PPO, OPPONENTS, [*PPO, "learner=vtrace", "learner.lag=1"], R2D2],
+    ids=["ppo", "opponents", "lag", "r2d2"],
+)
+def test_a_resumed_run_meets_it_again(more, device, capsys):
+    """Later checkpoints have replaced the one before it by then; the run stays as it is."""
+    number, hint = met(capsys, *TINY, *more, EVERY_UPDATE, f"device={device}")
+    before = files_of_run()
+    assert updates_in("run/nonfinite") == [4] and min(updates_in("run")) > 5
+    assert hint == ". To see it again: python train.py resume=run/nonfinite"
+    again, _ = met(capsys, *shlex.split(hint)[-1:])
+    assert again == number and files_of_run() == before
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("more", [PPO, OPPONENTS], ids=["ppo", "opponents"])
+def test_a_repeated_run_meets_it_again_where_nothing_was_saved_before(more, device, capsys):
+    number, hint = met(capsys, *TINY, *more, f"device={device}")
+    assert hint == ". To see it again, once this run has ended: python train.py rerun=run"
+    again, _ = met(capsys, "rerun=run", "folder=again")
+    assert again == number and not Path("run/nonfinite").exists()
+
+
+def test_learning_rates_of_a_clock_are_kept(capsys):
+    words = [*TINY, *PPO, EVERY_UPDATE, "learner.anneal=seconds", "seconds=60", "learner.lr=0.1"]
+    number, hint = met(capsys, *words)
+    again, _ = met(capsys, *shlex.split(hint)[-1:])
+    assert again == number
+
+
+def test_a_budget_that_was_extended_is_part_of_the_command(capsys):
+    words = [*TINY, *PPO, f"samples={2 * UPDATE}"]
+    assert train.main(words) == 0
+    number, hint = met(capsys, "resume=run", f"samples={12 * UPDATE}")
+    assert hint.endswith(f" resume=run/nonfinite samples={12 * UPDATE}")
+    again, _ = met(capsys, *shlex.split(hint)[-2:])
+    assert again == number
+
+
+def test_the_learning_rate_of_another_clock_cannot_be_repeated(capsys):
+    words = ["learner.anneal=seconds", "seconds=60"]
+    assert train.main([*TINY, *PPO, f"samples={2 * UPDATE}", *words]) == 0
+    _, hint = met(capsys, "resume=run", f"samples={12 * UPDATE}", "seconds=70")
+    clause = "the learning rate has followed another clock since the last one"
+    assert hint == f". Checkpoints cannot repeat it, as {clause}"
+
+
+@pytest.mark.parametrize(
+    "word, clause",
+    [
+        ("env.resumable=false", "they do not hold Walks"),
+        ("env.opaque=true", "they cannot hold opaque (range_iterator) of the environment"),
+    ],
+)
+def test_what_checkpoints_do_not_hold_is_named(word, clause, capsys):
+    number, hint = met(capsys, *TINY, *PPO, EVERY_UPDATE, word)
+    how = ". To try from the start, once this run has ended: python train.py rerun=run"
+    assert hint == f". Checkpoints cannot repeat it, as {clause}{how}"
+    again, _ = met(capsys, "rerun=run", "folder=again")
+    assert again == number
+
+
+def test_a_replay_buffer_that_was_not_saved_is_named(capsys, monkeypatch):
+    monkeypatch.setattr("megastep.agents.runs.saver.SMALL_REPLAY", 0)
+    _, hint = met(capsys, *TINY, *R2D2, EVERY_UPDATE)
+    assert "as they lack episodes or the replay buffer. To try from the start" in hint
+
+
+def test_a_checkpoint_that_cannot_be_kept_ends_no_run(capsys, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("shutil.copytree", full)
+    _, hint = met(capsys, *TINY, *PPO, EVERY_UPDATE)
+    assert hint.startswith(". The checkpoint before it could not be kept ([Errno 28] No space")
+    assert not Path("run/nonfinite").exists()
+
+
+def test_files_are_copied_where_they_cannot_have_two_names(capsys, monkeypatch):
+    def link(source, target, real=os.link):
+        if "nonfinite" in str(target):
+            raise PermissionError
+        real(source, target)
+
+    monkeypatch.setattr(os, "link", link)
+    number, hint = met(capsys, *TINY, *PPO, EVERY_UPDATE)
+    again, _ = met(capsys, *shlex.split(hint)[-1:])
+    assert again == number
+
+
+def test_a_policy_that_diverges_is_not_repeated_without_a_checkpoint(capsys):
+    words = ["learner.lr=1e3", "learner.max_grad_norm=1e6", "learner.entropy_coef=0"]
+    assert train.main([*TINY, *PPO, *words, f"samples={60 * UPDATE}"]) == 1
+    assert "rerun" not in capsys.readouterr().err

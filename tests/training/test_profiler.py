@@ -1,0 +1,93 @@
+"""Profiles: a trace and a table of some updates, which change nothing that a run logs or learns."""
+
+import gzip
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from megastep.agents.cli import train
+from megastep.agents.training.profiler import N_SKIPPED, Profiler
+from tests.helpers import ranks, tiny
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={12 * tiny.UPDATE}", "log_every=2"]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def table_of(folder):
+    """Returns the first line of a profile, and the first numbers of each row."""
+    text = Path(folder, "profile.md").read_text()
+    rows = re.findall(r"^\| (.+?) +\| ([\d.e+]+) ", text, re.M)
+    return text.partition("\n")[0], {name: float(number) for name, number in rows}
+
+
+def events_of(folder):
+    return json.loads(gzip.open(Path(folder, "profile.json.gz")).read())["traceEvents"]
+
+
+@pytest.mark.parametrize("learner", ["ppo", "vtrace"])
+@pytest.mark.parametrize("device", DEVICES)
+def test_profiled_run_has_a_trace_a_table_and_the_same_metrics(device, learner, capsys):
+    words = [*WORDS, f"device={device}", f"learner={learner}"]
+    assert train.main([*words, "folder=run", "profile=4"]) == 0
+    output = capsys.readouterr()
+    assert "Profile: run/profile.md" in output.out and not output.err
+    assert train.main([*words, "folder=plain"]) == 0
+    metrics = [Path(run, "metrics.jsonl").read_bytes() for run in ("run", "plain")]
+    assert metrics[0] == metrics[1] and not list(Path("plain").glob("profile*"))
+    head, numbers = table_of("run")
+    assert head.startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 4} on {device}")
+    assert min(numbers[phase] for phase in ("collect", "update", "rest")) > 0
+    ranges = [event for event in events_of("run") if event.get("cat") == "user_annotation"]
+    names = [event["name"] for event in ranges]
+    assert [names.count(phase) for phase in ("collect", "update", "rest")] == [4, 4, 4]
+    if device == "cuda":
+        kernels = {event["name"] for event in events_of("run") if event.get("cat") == "kernel"}
+        assert any("render" in name or "raster" in name for name in kernels), "of the graph"
+
+
+def test_run_that_ends_early_has_a_profile_of_fewer_updates(capsys):
+    assert train.main([*WORDS, "folder=run", "profile=1000"]) == 0
+    assert table_of("run")[0].startswith(f"Updates {N_SKIPPED + 1} to 12 on cpu")
+
+
+def test_operations_are_counted_per_update(tmp_path):
+    profiler, matrix = Profiler(tmp_path, 2, torch.device("cpu")), torch.rand(200, 200)
+    for _ in range(N_SKIPPED + 5):
+        profiler.start("collect")
+        for _ in range(3):
+            torch.mm(matrix, matrix)
+        profiler.start("update")
+        profiler.start("rest")
+    head, numbers = table_of(tmp_path)
+    assert head.startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 2}")
+    assert numbers["aten::mm"] == 3 and profiler.path == tmp_path / "profile.md"
+
+
+@pytest.mark.parametrize("method", ["start", "stop", "export_chrome_trace"])
+def test_profile_that_cannot_be_made_ends_no_run(method, monkeypatch, capsys):
+    def fail(*_):
+        raise RuntimeError("CUPTI is in use\nby another")
+
+    monkeypatch.setattr(torch.profiler.profile, method, fail)
+    assert train.main([*WORDS, "folder=run", "profile=4"]) == 0
+    output = capsys.readouterr()
+    assert output.err == "warning: The profile could not be made: CUPTI is in use\n"
+    assert "Profile" not in output.out and not Path("run/profile.md").exists()
+
+
+@pytest.mark.slow
+def test_only_rank_0_is_profiled():
+    for process in ranks.train(*WORDS, "folder=run", "profile=2"):
+        assert not process.stderr.strip()
+    assert sorted(path.name for path in Path("run").glob("profile*")) == [
+        "profile.json.gz",
+        "profile.md",
+    ]
