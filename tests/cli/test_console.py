@@ -51,3 +51,9 @@ def test_table_of_sections():
         ["other", "2.5", "25.0 %"],
         ["iteration", "10", "100.0 %"],
     ]
+
+
+@pytest.mark.parametrize("cell", ["[csv,wandb]", "[red]", ":smile:"])
+def test_table_shows_cells_as_they_are(cell):
+    for is_markdown in (False, True):
+        assert cell in console.table(["key"], [[cell]], is_markdown)
