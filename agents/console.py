@@ -102,7 +102,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool 
     grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
     for row in rows:
         grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
-    Console(file=text, width=10_000, force_terminal=False, color_system=None).print(grid)
+    plain = dict(markup=False, emoji=False, color_system=None)
+    Console(file=text, width=10_000, force_terminal=False, **plain).print(grid)
     return text.getvalue().strip()
 
 

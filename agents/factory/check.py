@@ -89,8 +89,17 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
     return f"did you mean {keys[near[0]]}?" if near else "--cfg job prints all keys"
 
 
+#: Keys of earlier versions, with what took their place.
+GONE = {
+    "preset": "values follow device=cpu or device=cuda, and what you type wins",
+    "nonfinite_replay": "a NaN is met again by resuming, with the command that is printed",
+}
+
+
 def _unknown(path: list[str], keys: list[str]) -> str:
     group, leaf = path[0], path[-1]
+    if group in GONE:
+        return f"no such key; {GONE[group]}"
     for member, name in components.members(group).items() if group in settings.IMPORTED else ():
         if path[1:] == [leaf] and leaf in settings.kind_of(group, name).__pydantic_fields__:
             return f"no such key here; {group}={member} has it"

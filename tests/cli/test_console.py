@@ -38,3 +38,9 @@ def test_dumb_terminal_gets_plain_lines(monkeypatch, kind):
 def test_tiny_terminal_gets_a_bar(monkeypatch):
     text = shown(monkeypatch, "xterm")
     assert "\x1b[" in text and text.isascii()
+
+
+@pytest.mark.parametrize("cell", ["[csv,wandb]", "[red]", ":smile:"])
+def test_table_shows_cells_as_they_are(cell):
+    for is_markdown in (False, True):
+        assert cell in console.table(["key"], [[cell]], is_markdown)

@@ -56,7 +56,7 @@ class Walks:
 
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
-TINY = [f"env={__name__}:Walks", f"env.n_envs={N}", "preset=cpu", f"learner.n_steps={T}"]
+TINY = [f"env={__name__}:Walks", f"env.n_envs={N}", f"learner.n_steps={T}"]
 TINY += ["agent.width=8", f"samples={12 * UPDATE}", "folder=run"]
 PPO = ["learner.n_minibatches=2"]
 R2D2 = ["learner=r2d2", "learner.gradient_steps=2", "learner.replay.burn_in=4"]
