@@ -81,7 +81,7 @@ def compositions():
                     text = (CONFIGS / group / f"{member}.yaml").read_text()
                     chosen |= dict(re.findall(r"override /(\w+): (\w+)", text))
                 chosen |= {group: member} if group in groups else {}
-                files = ["train", *(f"{g}/{m}" for g, m in chosen.items() if m)]
+                files = ["train", *(f"{g}/{m}" for g, m in chosen.items() if m and g != "logger")]
                 yield [one for file in files for one in layers(file, (device, chosen["learner"]))]
 
 
