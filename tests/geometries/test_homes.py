@@ -27,7 +27,7 @@ from megastep.geometries.homes import (
     walls,
 )
 from megastep.geometries.homes.portable_generator import PortableGenerator
-from scripts import check_homes, compare_homes, make_homes, show_homes
+from scripts import check_homes, make_homes, show_homes
 
 matplotlib.use("Agg")
 
@@ -612,24 +612,7 @@ def test_make_homes_prints_statistics(monkeypatch, capsys):
 
 
 def test_show_homes_draws_every_home():
-    figure = show_homes.sheet(range(3))
+    figure = show_homes.sheet_of_homes(range(3))
     assert [ax.get_title()[:7] for ax in figure.axes] == ["home 0:", "home 1:", "home 2:", "", ""]
     assert len(figure.axes[1].collections[0].get_segments()) == len(homes.generate(1).walls)
     matplotlib.pyplot.close(figure)
-
-
-def test_gaps_are_doors(generated):
-    """Some recesses of walls look like doors too."""
-    for g in generated[:10]:
-        widths = np.round(compare_homes.gaps(g), 2).tolist()
-        for width in np.round(g.doors, 2):
-            widths.remove(width)
-        assert len(widths) <= 3
-
-
-def test_compare_homes_prints_a_table(capsys):
-    compare_homes.main(["--count", "3", "homes", "maze,size=3,corridor=1.5", "box,width=4"])
-    head, _, walls, rooms, area, *_ = capsys.readouterr().out.splitlines()
-    assert head.endswith("| `homes` | `maze,size=3,corridor=1.5` | `box,width=4` |")
-    assert walls.endswith("| 4 / 4 / 4 / 4 / 4 |") and rooms.endswith("| 1 / 1 / 1 / 1 / 1 |")
-    assert area.endswith("| 16 / 16 / 16 / 16 / 16 |")
