@@ -144,7 +144,9 @@ def recorder(request, monkeypatch):
     if request.param == "cpu":
         run = request.getfixturevalue("cuda_on_cpu")
         run.install(monkeypatch)
-        gpu = SimpleNamespace(major=9, multi_processor_count=2, shared_memory_per_block_optin=2**20)
+        sizes = dict.fromkeys(("block_optin", "multiprocessor"), 2**20)
+        sizes = {f"shared_memory_per_{name}": size for name, size in sizes.items()}
+        gpu = SimpleNamespace(major=9, multi_processor_count=2, **sizes)
         monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
         monkeypatch.setattr(torch.Tensor, "is_cuda", True)
     recorder = Recorder(run)
