@@ -101,11 +101,7 @@ class Stack(nn.ModuleList):
         return arrdict({str(i): core.initial(n_lanes, device) for i, core in enumerate(self)})
 
     def forward(
-        self,
-        x: torch.Tensor,
-        reset: torch.Tensor,
-        state: arrdict,
-        is_residual: bool = False,
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence, as the head of this file says."""
         total, after = None, arrdict()

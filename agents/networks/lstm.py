@@ -232,11 +232,7 @@ class LSTM(nn.Module):
         )
 
     def forward(
-        self,
-        x: torch.Tensor,
-        reset: torch.Tensor,
-        state: arrdict,
-        is_residual: bool = False,
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
         compute dtype on a GPU and float32 on a CPU. ValueError if shapes or devices do not fit.

@@ -125,8 +125,7 @@ class _Sequence(torch.autograd.Function):
         # torch.addmm would copy d_outputs, and a gradient must not change in place
         d_residual = torch.empty_like(x) if ctx.is_residual else None
         d_bias = _recurrence(x).backward(
-            *(gates, reset, start, states, d_outputs, d_last),
-            *(d_gates, d_start, d_residual),
+            *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
         )
         flat = d_gates.flatten(0, 1)
         if d_residual is None:
@@ -159,11 +158,7 @@ class MinGRU(nn.Module):
         return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
 
     def forward(
-        self,
-        x: torch.Tensor,
-        reset: torch.Tensor,
-        state: arrdict,
-        is_residual: bool = False,
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
         compute dtype. ValueError if shapes or devices do not fit.

@@ -82,11 +82,7 @@ TASKS = {
         packages=("gymnasium", "box2d"),
     ),
     "MiniGrid-DoorKey-6x6-v0": Task(
-        "experiment=minigrid",
-        200_000,
-        0.9,
-        seeds=SEEDS[:1],
-        packages=("gymnasium", "minigrid"),
+        "experiment=minigrid", 200_000, 0.9, seeds=SEEDS[:1], packages=("gymnasium", "minigrid")
     ),
     "popgym-RepeatPreviousEasy-v0": _popgym("RepeatPreviousEasy"),
     "popgym-CountRecallEasy-v0": _popgym("CountRecallEasy"),

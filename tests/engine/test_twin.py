@@ -179,11 +179,7 @@ def test_near_limit_is_a_circle(angle):
 def test_first_of_equal_lines_is_hit():
     assert raycast(torch.cat([WALL_AT_3 + t([1, 0]), WALL_AT_3, WALL_AT_3]))[
         "indices"
-    ].tolist() == [
-        1,
-        1,
-        1,
-    ]
+    ].tolist() == [1, 1, 1]
 
 
 def test_degenerate_lines_are_invisible():

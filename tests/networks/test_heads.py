@@ -236,10 +236,7 @@ def test_zero_features_have_a_gradient():
         (lambda: heads.intake("images", WIDTH), "observation space itself = 'images'"),
         (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), "observation space x = 3"),
         (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
-        (
-            lambda: heads.intake(IMAGE, WIDTH, "resnet"),
-            "'resnet'.*cnn, conv, linear, module:Class",
-        ),
+        (lambda: heads.intake(IMAGE, WIDTH, "resnet"), "'resnet'.*cnn, conv, linear, module:Class"),
         (lambda: heads.output(VECTOR, WIDTH), "MultiContinuous or dicts of them"),
         (lambda: heads.output(arrdict(), WIDTH), "MultiContinuous or dicts of them"),
     ],

@@ -116,8 +116,7 @@ class Explorer(SceneryEnv):
             self.runs = TexelRuns(self.core.scenery, self.visible)
         if privileged:
             self.privileged_space = dotdict(
-                episode=spaces.MultiVector(1, N_EPISODE),
-                unseen=spaces.MultiVector(1, N_BINS),
+                episode=spaces.MultiVector(1, N_EPISODE), unseen=spaces.MultiVector(1, N_BINS)
             )
 
     def reset(self) -> arrdict:
