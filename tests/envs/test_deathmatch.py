@@ -288,9 +288,8 @@ def test_agent_at_the_centre_of_a_view_is_hit_each_step(device):
         assert world.reward.tolist() == [1, -1]
         assert ring.health == pytest.approx([1, 1 - 0.1 * step])
         health_obs = world.obs.health[:, 0].tolist()
-        assert health_obs[0] == [1, 1, 0] and health_obs[1] == pytest.approx(
-            [1 - 0.1 * step, 0, 1], abs=1e-3
-        )
+        assert health_obs[0] == [1, 1, 0]
+        assert health_obs[1] == pytest.approx([1 - 0.1 * step, 0, 1], abs=1e-3)
 
 
 def test_walls_block_hits(device):

@@ -111,9 +111,8 @@ def test_shapes_of_logits_and_actions():
     assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
     torch.testing.assert_close(logits.movement.exp().sum(-1), torch.ones(6, 2))
     actions = output.sample(logits)
-    assert (
-        actions.movement.shape == actions.fire.shape == (6, 2) and actions.fire.dtype == torch.int64
-    )
+    assert actions.movement.shape == actions.fire.shape == (6, 2)
+    assert actions.fire.dtype == torch.int64
     assert output.logprob(logits, actions).shape == output.entropy(logits).shape == (6,)
 
 
@@ -273,9 +272,8 @@ def test_normalises_images_per_channel_and_vectors_per_number():
 
     # the second call has weight 1/2: mean (6 + 10) / 2, mean square (37 + 100) / 2
     update(intake, arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
-    assert imu_norm.mean[0, 0].item() == 8 and imu_norm.scale[0, 0].item() == pytest.approx(
-        (137 / 2 - 64) ** 0.5
-    )
+    assert imu_norm.mean[0, 0].item() == 8
+    assert imu_norm.scale[0, 0].item() == pytest.approx((137 / 2 - 64) ** 0.5)
 
 
 def test_statistics_are_saved_with_weights():
