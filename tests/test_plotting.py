@@ -80,10 +80,8 @@ def test_screen_is_gamma_encoded_and_drawn_left_to_right():
 
 
 def test_observations_are_channels_first_with_one_panel_per_agent():
-    rgb, depth = (
-        np.random.default_rng(1).random((2, 3, 1, 8)),
-        np.linspace(0, 1, 8).reshape(1, 1, 1, 8),
-    )
+    rgb = np.random.default_rng(1).random((2, 3, 1, 8))
+    depth = np.linspace(0, 1, 8).reshape(1, 1, 1, 8)
     axes = plotting.plot_images({"rgb": rgb, "depth": depth})
     assert [[ax.get_title("left") for ax in row] for row in axes] == [
         ["rgb 0", "rgb 1"],

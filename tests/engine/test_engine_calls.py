@@ -367,11 +367,9 @@ def test_memory_of_a_gpu_includes_what_pytorch_caches(monkeypatch):
 def test_no_operation_synchronises():
     homes = sample("homes", 3)
     core = cuda.Core(scene.scenery(homes, 2, n_envs=6, device="cuda"), res=64)
-    spawn, seen, mask = (
-        RandomSpawns(homes, core, resample=True),
-        seen_of(core),
-        core.agent_full(True),
-    )
+    spawn = RandomSpawns(homes, core, resample=True)
+    seen = seen_of(core)
+    mask = core.agent_full(True)
     moves = torch.zeros((7, 3), device="cuda")
     actions = torch.zeros((6, 2), dtype=torch.long, device="cuda")
 

@@ -147,10 +147,8 @@ def test_contacts():
 
 def test_walls_that_meet_fill_their_corner():
     """Walls 10 cm thick along x = 400 up to y = 250, and from there to the right."""
-    upright, level = (
-        openings.Contact(0, 400, 0, 250, 0, 1),
-        openings.Contact(1, 250, 400, 700, 1, 2),
-    )
+    upright = openings.Contact(0, 400, 0, 250, 0, 1)
+    level = openings.Contact(1, 250, 400, 700, 1, 2)
     rectangles = walls.solids([upright, level], walls.depths({}, thickness=10))
     assert rectangles == [(395, 0, 405, 255), (395, 245, 700, 255)]
 

@@ -10,11 +10,9 @@ from megastep import spaces
 from megastep.agents.networks import encoders, heads, intake_cpu, running_norm
 from megastep.arrdict import arrdict
 
-IMAGE, DEPTH, VECTOR = (
-    spaces.MultiImage(2, 3, 1, 16),
-    spaces.MultiImage(2, 1, 1, 16),
-    spaces.MultiVector(2, 5),
-)
+IMAGE = spaces.MultiImage(2, 3, 1, 16)
+DEPTH = spaces.MultiImage(2, 1, 1, 16)
+VECTOR = spaces.MultiVector(2, 5)
 TREE = arrdict(eyes=arrdict(rgb=IMAGE, d=DEPTH), imu=VECTOR, team=spaces.MultiDiscrete(2, 4))
 MOVES = arrdict(movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2, 2))
 WIDTH = 24
