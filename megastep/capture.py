@@ -309,10 +309,7 @@ def capture(
         text = str(error).partition("\n")[0]
         if not (text and isinstance(error, RuntimeError)):
             text = f"{type(error).__name__} {text}".rstrip()
-        warnings.warn(
-            f"running without a CUDA graph, slower: {text}{_line(error)}",
-            stacklevel=2,
-        )
+        warnings.warn(f"running without a CUDA graph, slower: {text}{_line(error)}", stacklevel=2)
         return function
 
 

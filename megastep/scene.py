@@ -12,15 +12,7 @@ from megastep.engine import checks
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
 
-__all__ = [
-    "TEXEL",
-    "agent_model",
-    "display",
-    "scenery",
-    "spread",
-    "texel_widths",
-    "wall_textures",
-]
+__all__ = ["TEXEL", "agent_model", "display", "scenery", "spread", "texel_widths", "wall_textures"]
 
 TEXEL = 0.05  # metres per texel
 STRIPE = (0.4, 2.0)  # metres, min and max of the period of a wall's stripes

@@ -68,10 +68,7 @@ WANTED = {
 }
 BOUNDS = {"ge": "at least {:,}", "gt": "more than {:,}", "le": "at most {:,}", "lt": "below {:,}"}
 OUTSIDE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")
-LENGTHS = {
-    "too_short": "at least {min_length}",
-    "too_long": "at most {max_length}",
-}
+LENGTHS = {"too_short": "at least {min_length}", "too_long": "at most {max_length}"}
 RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and below {:,}"}
 
 

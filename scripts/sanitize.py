@@ -29,6 +29,7 @@ from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.engine import movement, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
+from megastep.types import n_lanes
 
 
 def out_of_range(c, spawn):
@@ -51,9 +52,10 @@ def out_of_range(c, spawn):
             raise AssertionError("a bad layout was not flagged")
 
 
-def step(env, n_lanes, action):
+def step(env, action):
     """Steps an environment. On the CPU an action out of range raises at once."""
-    actions = torch.full((n_lanes, *env.action_space.shape), action, device=env.device)
+    shape = n_lanes(env), *env.action_space.shape
+    actions = torch.full(shape, action, device=env.device)
     with contextlib.suppress(engine.EngineError):
         env.step(arrdict.arrdict(actions=actions))
 
@@ -82,34 +84,25 @@ def run_all(device):
             )
             engine.render(c.scenery, c.agents)
         out_of_range(c, spawn)
-    as_trained_everywhere = dict(device=device, resample=True, privileged=True)
-    as_trained = dict(as_trained_everywhere, patience=1)
-    for env in (
-        envs.Explorer(7, homes, device=device),
-        envs.Explorer(7, homes, **as_trained),
-        envs.Minimal(7, homes, device=device),
-    ):
-        env.reset()
-        for action in range(7):
-            step(env, 7, action)
-    env = envs.Explorer(7, homes, device=device, control="continuous")
-    env.reset()
-    for number in (0.5, -2.0, math.inf, math.nan):
-        step(env, 7, number)
+    everywhere = dict(device=device, resample=True, privileged=True)
+    seven, deaths, points = range(7), (*range(7), 7) * 5, (*range(3), 7) * 20
+    continuous = envs.Explorer(7, homes, device=device, control="continuous")
+    cases = [
+        (envs.Explorer(7, homes, device=device), seven),
+        (envs.Explorer(7, homes, **everywhere, patience=1), seven),
+        (envs.Minimal(7, homes, device=device), seven),
+        (continuous, (0.5, -2.0, math.inf, math.nan)),
+        (envs.PointGoal(7, homes, **everywhere, cameras=[0, 180]), seven),
+    ]
     for n_agents in (2, 16):
-        env = envs.Deathmatch(7, homes, n_agents=n_agents, device=device, damage=1, privileged=True)
-        env.reset()
-        for action in (*range(7), 7) * 5:
-            step(env, 7 * n_agents, action)
+        settings = dict(n_agents=n_agents, damage=1, privileged=True)
+        cases.append((envs.Deathmatch(7, homes, device=device, **settings), deaths))
     for settings in (dict(), dict(self_play=True), dict(pixels=True, points=2)):
-        env = envs.Pong(67, device=device, **settings)
+        cases.append((envs.Pong(67, device=device, **settings), points))
+    for env, actions in cases:
         env.reset()
-        for action in (*range(3), 7) * 20:
-            step(env, 67 * env.n_agents, action)
-    env = envs.PointGoal(7, homes, **as_trained_everywhere, cameras=[0, 180])
-    env.reset()
-    for action in range(7):
-        step(env, 7, action)
+        for action in actions:
+            step(env, action)
     if device == "cuda":
         torch.cuda.synchronize()
 

@@ -90,7 +90,7 @@ OWN_USERS = {
         "agents/storage/copies.py",
         "agents/storage/replay_kernels.py",
         "agents/training/episode_stats.py",
-    ),
+    )
 }
 # The files that may import these packages, directly or through importlib, as glob patterns.
 OUTSIDE_USERS = {

@@ -72,24 +72,16 @@ def test_screen_is_gamma_encoded_and_drawn_left_to_right():
     screen = np.zeros((1, 1, 64, 3), np.float32)
     screen[0, 0, 0] = [0.2140411, 1, 0]
     axes = plotting.plot_images({"rgb": screen}, transpose=True, aspect=0.1)
-    assert (
-        axes.shape == (1, 1)
-        and axes[0, 0].get_title("left") == "rgb"
-        and axes[0, 0].get_box_aspect() == 0.1
-    )
+    assert axes.shape == (1, 1) and axes[0, 0].get_title("left") == "rgb"
+    assert axes[0, 0].get_box_aspect() == 0.1
     shown = axes[0, 0].images[0].get_array()
-    assert (
-        shown.shape == (1, 64, 3)
-        and np.allclose(shown[0, 0], [0.5, 1, 0], atol=1e-6)
-        and (shown[0, 1:] == 0).all()
-    )
+    assert shown.shape == (1, 64, 3) and np.allclose(shown[0, 0], [0.5, 1, 0], atol=1e-6)
+    assert (shown[0, 1:] == 0).all()
 
 
 def test_observations_are_channels_first_with_one_panel_per_agent():
-    rgb, depth = (
-        np.random.default_rng(1).random((2, 3, 1, 8)),
-        np.linspace(0, 1, 8).reshape(1, 1, 1, 8),
-    )
+    rgb = np.random.default_rng(1).random((2, 3, 1, 8))
+    depth = np.linspace(0, 1, 8).reshape(1, 1, 1, 8)
     axes = plotting.plot_images({"rgb": rgb, "depth": depth})
     assert [[ax.get_title("left") for ax in row] for row in axes] == [
         ["rgb 0", "rgb 1"],
@@ -250,11 +242,8 @@ def test_panels_do_not_overlap_and_are_unknown_to_pyplot():
     assert pyplot.get_fignums() == [] and len(strips) == 3 and plan.get_title() == "a title"
     bottoms = [ax.get_position().y0 for ax in (plan, *strips)]
     tops = [ax.get_position().y1 for ax in (plan, *strips)]
-    assert (
-        all(top < bottom for top, bottom in zip(tops[1:], bottoms))
-        and bottoms[-1] > 0
-        and tops[0] < 1
-    )
+    assert all(top < bottom for top, bottom in zip(tops[1:], bottoms)) and bottoms[-1] > 0
+    assert tops[0] < 1
     height, width, channels = plotting.rasterise(figure).shape
     assert (width, channels) == (600, 3) and abs(height - 100 * figure.get_figheight()) < 1
 
@@ -263,9 +252,8 @@ def test_rasterise_keeps_a_pyplot_figure_open():
     from matplotlib import pyplot
 
     figure = pyplot.figure(figsize=(2, 1), dpi=50, facecolor="r")
-    assert (plotting.rasterise(figure) == [255, 0, 0]).all() and plotting.rasterise(
-        figure
-    ).shape == (50, 100, 3)
+    assert (plotting.rasterise(figure) == [255, 0, 0]).all()
+    assert plotting.rasterise(figure).shape == (50, 100, 3)
     assert pyplot.fignum_exists(figure.number)
 
 

@@ -103,9 +103,8 @@ def test_file_is_h264_in_yuv420p_at_the_given_fps(tmp_path):
     with av.open(str(encoder.save(tmp_path / "new" / "video.mp4"))) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt, stream.frames) == ("h264", "yuv420p", 25)
-        assert (
-            float(stream.average_rate) == 12.5 and float(stream.duration * stream.time_base) == 2.0
-        )
+        assert float(stream.average_rate) == 12.5
+        assert float(stream.duration * stream.time_base) == 2.0
     assert os.listdir(tmp_path / "new") == ["video.mp4"]
 
 
@@ -185,8 +184,7 @@ def test_bound_method_draws_in_this_process_with_a_warning(tmp_path):
 
     env, open_before = Env(), pyplot.get_fignums()
     with pytest.warns(
-        UserWarning,
-        match="plot_state is a method of a Env object.*this process",
+        UserWarning, match="plot_state is a method of a Env object.*this process"
     ) as warned:
         encoder = record(env.plot_state, [arrdict(xs=torch.arange(i)) for i in range(3)])
     assert len(warned) == 1 and warned[0].filename == __file__
@@ -404,9 +402,7 @@ with recording.ParallelEncoder(Env.plot_state, n_workers=2) as encoder:
 def test_workers_end_with_a_killed_parent(tmp_path):
     root = os.path.dirname(os.path.dirname(recording.__file__))
     process = subprocess.Popen(
-        [sys.executable, "-c", LEFT_BEHIND],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": root},
+        [sys.executable, "-c", LEFT_BEHIND], cwd=tmp_path, env={**os.environ, "PYTHONPATH": root}
     )
     wait_until(lambda: len(os.listdir(tmp_path)) == 2, process)
     process.kill()

@@ -52,11 +52,9 @@ def test_sizes_are_positive_integers(bad):
 
 # ---- Trees of spaces ----
 
-RGB, SPEED, HANDS = (
-    spaces.MultiImage(1, 3, 1, 8),
-    spaces.MultiVector(1, 2),
-    spaces.MultiDiscrete(2, 4),
-)
+RGB = spaces.MultiImage(1, 3, 1, 8)
+SPEED = spaces.MultiVector(1, 2)
+HANDS = spaces.MultiDiscrete(2, 4)
 TREE = dotdict(rgb=RGB, body=dotdict(speed=SPEED, hands=HANDS), nothing=dotdict())
 
 

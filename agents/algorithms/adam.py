@@ -90,10 +90,7 @@ class Adam:
 
     @torch.no_grad()
     def step(
-        self,
-        is_taken: torch.Tensor,
-        grad_norm: torch.Tensor | None = None,
-        max_norm: float = 0.0,
+        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0
     ) -> None:
         """Takes one step.
 

@@ -10,12 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.learner import (
-    Coefficient,
-    Fraction,
-    GradientLearner,
-    Positive,
-)
+from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
 from megastep.agents.algorithms.masked_stats import pooled_normalise
 from megastep.agents.algorithms.order import random_order
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss

@@ -110,10 +110,8 @@ class _FusedLoss(torch.autograd.Function):
     def forward(ctx, q, target_q, batch, settings):
         n_rows, n_sequences, n_agents, n_choices = q.shape
         n_blocks = -(-n_sequences // _SEQUENCES)
-        d_q, values = (
-            torch.empty_like(q, memory_format=torch.contiguous_format),
-            q.new_empty(n_rows, n_sequences),
-        )
+        d_q = torch.empty_like(q, memory_format=torch.contiguous_format)
+        values = q.new_empty(n_rows, n_sequences)
         priorities = q.new_empty(n_sequences)
         sums, metrics = q.new_empty(n_blocks, _N_SUMS), q.new_empty(_N_METRICS)
         names = *_ENDS, "actions", "starts", "learns", "weight", "age"

@@ -13,12 +13,7 @@ import torch
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.learner import (
-    Coefficient,
-    Fraction,
-    GradientLearner,
-    Positive,
-)
+from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
 from megastep.agents.algorithms.masked_stats import (
     effective_sample_size,
     explained_variance,

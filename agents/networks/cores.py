@@ -6,7 +6,7 @@ A core is a module `Core(width)` with two methods:
   (B, ...) float32 tensors.
 - `forward(x, reset, state)` unrolls over x (T, B, W) from a hidden state. It clears a lane's state
   before each step where reset (T, B) is true, and returns outputs (T, B, W) and the state after the
-  last step.
+  last step. With `is_residual`, LSTM and minGRU add x to the outputs.
 
 T time, B lanes, W width.
 """
@@ -101,11 +101,7 @@ class Stack(nn.ModuleList):
         return arrdict({str(i): core.initial(n_lanes, device) for i, core in enumerate(self)})
 
     def forward(
-        self,
-        x: torch.Tensor,
-        reset: torch.Tensor,
-        state: arrdict,
-        is_residual: bool = False,
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence, as the head of this file says."""
         total, after = None, arrdict()

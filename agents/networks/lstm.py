@@ -232,26 +232,10 @@ class LSTM(nn.Module):
         )
 
     def forward(
-        self,
-        x: torch.Tensor,
-        reset: torch.Tensor,
-        state: arrdict,
-        is_residual: bool = False,
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
-        """Unrolls over a sequence.
-
-        Args:
-            x: (T, B, W).
-            reset: (T, B) bool; clears a lane's hidden state before the step.
-            state: hidden state before the sequence.
-            is_residual: adds x to the outputs.
-
-        Returns:
-            outputs (T, B, W), in the compute dtype on a GPU and float32 on a CPU, and the hidden
-            state after the sequence.
-
-        Raises:
-            ValueError: if shapes or devices do not fit.
+        """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
+        compute dtype on a GPU and float32 on a CPU. ValueError if shapes or devices do not fit.
         """
         check_shapes(x, reset, state, ("output", "cell"))
         if len(x) == 1 and x.is_cuda and not torch.is_grad_enabled():

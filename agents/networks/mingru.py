@@ -125,8 +125,7 @@ class _Sequence(torch.autograd.Function):
         # torch.addmm would copy d_outputs, and a gradient must not change in place
         d_residual = torch.empty_like(x) if ctx.is_residual else None
         d_bias = _recurrence(x).backward(
-            *(gates, reset, start, states, d_outputs, d_last),
-            *(d_gates, d_start, d_residual),
+            *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
         )
         flat = d_gates.flatten(0, 1)
         if d_residual is None:
@@ -159,25 +158,10 @@ class MinGRU(nn.Module):
         return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
 
     def forward(
-        self,
-        x: torch.Tensor,
-        reset: torch.Tensor,
-        state: arrdict,
-        is_residual: bool = False,
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
-        """Unrolls over a sequence.
-
-        Args:
-            x: (T, B, W).
-            reset: (T, B) bool; clears a lane's hidden state before the step.
-            state: hidden state before the sequence.
-            is_residual: adds x to the outputs.
-
-        Returns:
-            outputs (T, B, W) in the compute dtype, and the hidden state after the sequence.
-
-        Raises:
-            ValueError: if shapes or devices do not fit.
+        """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
+        compute dtype. ValueError if shapes or devices do not fit.
         """
         check_shapes(x, reset, state, ("output",))
         x, start = x.to(compute_dtype(self.input.weight)), state["output"].float()

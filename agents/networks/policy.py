@@ -190,11 +190,7 @@ class Policy(nn.Module):
 
     @torch.no_grad()
     def warm_up(
-        self,
-        obs: Tree,
-        reset: torch.Tensor,
-        state: arrdict,
-        lanes: torch.Tensor | None = None,
+        self, obs: Tree, reset: torch.Tensor, state: arrdict, lanes: torch.Tensor | None = None
     ) -> arrdict:
         """Returns the hidden state after a sequence, without gradients; see `unroll`."""
         with self.compute_dtype():
@@ -298,10 +294,7 @@ class Policy(nn.Module):
         return actor.requires_grad_(False)
 
     def update_stats(
-        self,
-        obs: Tree,
-        privileged: Tree | None = None,
-        is_counted: torch.Tensor | bool = True,
+        self, obs: Tree, privileged: Tree | None = None, is_counted: torch.Tensor | bool = True
     ) -> None:
         """Adds observations to the running statistics of the actor's and the critic's intake, those
         of all ranks together.
@@ -314,10 +307,7 @@ class Policy(nn.Module):
         self.add_moments(pool_moments(*self.moments(obs, privileged, is_counted)))
 
     def moments(
-        self,
-        obs: Tree,
-        privileged: Tree | None = None,
-        is_counted: torch.Tensor | bool = True,
+        self, obs: Tree, privileged: Tree | None = None, is_counted: torch.Tensor | bool = True
     ) -> list[Moments]:
         """Returns the moments of this rank's observations, for `pool_moments` and `add_moments`.
 

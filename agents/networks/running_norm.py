@@ -100,9 +100,7 @@ def moments_of(
 
 @torch.no_grad()
 def add_moments(
-    norms: Sequence[RunningNorm],
-    moments: Sequence[Moments],
-    is_counted: torch.Tensor | None = None,
+    norms: Sequence[RunningNorm], moments: Sequence[Moments], is_counted: torch.Tensor | None = None
 ) -> None:
     """Does `RunningNorm.add` for each norm; on a GPU in one kernel for up to `MAX_LEAVES`.
 
@@ -129,10 +127,7 @@ def _is_readable(leaf):
 
 
 def mix_moments(
-    norm: nn.Module,
-    mean: torch.Tensor,
-    variance: torch.Tensor,
-    rate: torch.Tensor,
+    norm: nn.Module, mean: torch.Tensor, variance: torch.Tensor, rate: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns mean and scale of a mixture: the norm's moments with weight 1 - rate, `mean` and
     `variance` with weight rate.

@@ -10,12 +10,7 @@ import torch
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
 from megastep.engine.devices import n_resident_threads
-from megastep.engine.launch_params import (
-    error_flag_address,
-    lanes_of,
-    scenery_params,
-    state_params,
-)
+from megastep.engine.launch_params import error_flag_address, lanes_of, scenery_params, state_params
 from megastep.engine.outputs import Physics
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import ENGINE, launch

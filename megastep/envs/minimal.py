@@ -64,13 +64,8 @@ class Minimal(SceneryEnv):
         longest: Annotated[int, Field(ge=1, le=10**6)] = 256,
     ):
         geometries = [toys.box()] if geometries is None else spread(geometries, n_envs)
-        self.core = Core(
-            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
-            res=res,
-            fov=fov,
-            fps=fps,
-            seed=seed,
-        )
+        homes = scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device)
+        self.core = Core(homes, res, fov, fps, seed=seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.spawner = modules.RandomSpawns(geometries, self.core)
         self.movement = modules.SimpleMovement(self.core)

@@ -9,10 +9,7 @@ from timing import graph_seconds_per_call, lap_seconds, measurement, rate, secon
 
 from megastep import capture, engine, envs
 
-N_ENVS = {
-    "cuda": (1024, 2048, 4096, 8192, 16_384, 65_536, 262_144, 1_048_576),
-    "cpu": (1024, 8192),
-}
+N_ENVS = {"cuda": (1024, 2048, 4096, 8192, 16_384, 65_536, 262_144, 1_048_576), "cpu": (1024, 8192)}
 N_ENVS_IN_ROLLOUTS = {"cuda": (1024, 4096, 8192, 16_384), "cpu": (1024,)}
 N_ARENAS = {"cuda": (1024, 8192, 65_536), "cpu": (1024,)}  # homes of four agents each
 #: What a plain step leaves out because it is only read in training and evaluation, by environment.

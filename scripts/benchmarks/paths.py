@@ -5,5 +5,3 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 LAB = ROOT / "docs" / "lab"
 RECORDS = LAB / "benchmarks.jsonl"
-PONG_RECORDS = LAB / "pong.jsonl"
-PONG_CHART = LAB / "pong.svg"

@@ -24,12 +24,11 @@ from pathlib import Path
 import plain_evaluation
 import torch
 from paths import ROOT
-from training_runs import evaluate, learning_curve
+from training_runs import evaluate, learning_curve, thinned
 
 SEEDS = 1, 2, 3
 EPISODES = 100  # of an evaluation
 EVALUATION_SEED = 1000  # times the seed of training, so that runs share no episode
-MAX_CURVE_POINTS = 50
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,11 +81,7 @@ TASKS = {
         packages=("gymnasium", "box2d"),
     ),
     "MiniGrid-DoorKey-6x6-v0": Task(
-        "experiment=minigrid",
-        200_000,
-        0.9,
-        seeds=SEEDS[:1],
-        packages=("gymnasium", "minigrid"),
+        "experiment=minigrid", 200_000, 0.9, seeds=SEEDS[:1], packages=("gymnasium", "minigrid")
     ),
     "popgym-RepeatPreviousEasy-v0": _popgym("RepeatPreviousEasy"),
     "popgym-CountRecallEasy-v0": _popgym("CountRecallEasy"),
@@ -204,8 +199,7 @@ def measured(run: Run, device: torch.device) -> dict | None:
         row |= dict(value=evaluated["return"], episodes=evaluated["lanes"])
         returns = plain_evaluation.returns(run.folder, EPISODES, seed)
         row["plain"] = statistics.mean(returns)
-    stride = -(-len(curve) // MAX_CURVE_POINTS)
-    return row | dict(curve=[[round(s, 2), n, round(v, 4)] for s, n, v in curve[::stride]])
+    return row | dict(curve=thinned(curve, 4))
 
 
 def _window(folder, samples):

@@ -73,11 +73,8 @@ def machine(device: torch.device) -> dict:
         cpuinfo = Path("/proc/cpuinfo")
         text = cpuinfo.read_text() if cpuinfo.exists() else ""
         models = re.findall(r"model name\s*: (.*)", text) or ["unknown"]
-        name, driver, cuda = (
-            f"CPU, {torch.get_num_threads()} threads of {models[0].strip()}",
-            None,
-            None,
-        )
+        name = f"CPU, {torch.get_num_threads()} threads of {models[0].strip()}"
+        driver, cuda = None, None
     return dict(on=name, driver=driver, torch=torch.__version__, cuda=cuda)
 
 

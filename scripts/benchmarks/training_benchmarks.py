@@ -45,10 +45,7 @@ RECIPES = {
         SUITE,
     ),
     **{
-        f"{name}, trained in {place}": (
-            f"{overrides} {homes} geometry.n=2000 seconds=60",
-            SUITE,
-        )
+        f"{name}, trained in {place}": (f"{overrides} {homes} geometry.n=2000 seconds=60", SUITE)
         for name, overrides in AGENTS.items()
         for place, homes in TRAINED_IN.items()
     },

@@ -125,11 +125,13 @@ def training_rate(what: str, curve: list[CurvePoint]) -> dict:
         (samples - samples_before) / (seconds - seconds_before) / 1e6
         for (seconds_before, samples_before, _), (seconds, samples, _) in itertools.pairwise(curve)
     ]
+    return measurement(f"{what}, median rate", "M/s", rates) | dict(curve=thinned(curve, 3))
+
+
+def thinned(curve: list[CurvePoint], digits: int) -> list[list[float]]:
+    """Returns at most MAX_CURVE_POINTS points of a curve, with so many digits of the metric."""
     stride = -(-len(curve) // MAX_CURVE_POINTS)
-    thinned = [
-        [round(seconds, 2), samples, round(value, 3)] for seconds, samples, value in curve[::stride]
-    ]
-    return measurement(f"{what}, median rate", "M/s", rates) | dict(curve=thinned)
+    return [[round(s, 2), n, round(value, digits)] for s, n, value in curve[::stride]]
 
 
 def metric_mean(what: str, row: dict, metric: str) -> dict:

@@ -173,11 +173,7 @@ def learn(settings, policy, optimizer, rollout):
     policy.update_stats(last.obs, last.get("privileged"), rollout.learns[-1])
     kl = masked_mean(ratio - 1 - log_ratio, valid)
     return dict(
-        policy=policy_loss,
-        value=value_loss,
-        entropy=entropy,
-        kl=kl,
-        explained_variance=explained,
+        policy=policy_loss, value=value_loss, entropy=entropy, kl=kl, explained_variance=explained
     )
 
 

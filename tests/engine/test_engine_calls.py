@@ -78,20 +78,14 @@ def test_environments_share_layouts(device):
     scenery = scene.scenery([toys.box(), toys.column()], n_agents=1, n_envs=6, device=device)
     assert scenery.layout.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.layouts) == 2
     lines, textures, baked = scenery.lines, scenery.textures, scenery.baked
-    assert (
-        len(lines) == 6
-        and torch.equal(lines[1], lines[3])
-        and torch.equal(lines.vals[lines.starts[2] : lines.ends[2]], lines[2])
-    )
+    assert len(lines) == 6 and torch.equal(lines[1], lines[3])
+    assert torch.equal(lines.vals[lines.starts[2] : lines.ends[2]], lines[2])
     assert len(textures) == len(lines.vals) == len(baked) and torch.equal(lines[-1], lines[5])
     wall = int(lines.starts[3]) + 8  # after the agent's eight
-    assert torch.equal(textures[wall], textures[int(lines.starts[1]) + 8]) and len(
-        baked[wall]
-    ) == len(textures[wall])
-    assert (
-        torch.equal(textures.vals[textures.inverse == wall], textures[wall])
-        and len(lines[1:3]) == 2
-    )
+    assert torch.equal(textures[wall], textures[int(lines.starts[1]) + 8])
+    assert len(baked[wall]) == len(textures[wall])
+    assert torch.equal(textures.vals[textures.inverse == wall], textures[wall])
+    assert len(lines[1:3]) == 2
 
 
 def test_uniform_matches_published_philox_vectors(device):
@@ -373,11 +367,9 @@ def test_memory_of_a_gpu_includes_what_pytorch_caches(monkeypatch):
 def test_no_operation_synchronises():
     homes = sample("homes", 3)
     core = cuda.Core(scene.scenery(homes, 2, n_envs=6, device="cuda"), res=64)
-    spawn, seen, mask = (
-        RandomSpawns(homes, core, resample=True),
-        seen_of(core),
-        core.agent_full(True),
-    )
+    spawn = RandomSpawns(homes, core, resample=True)
+    seen = seen_of(core)
+    mask = core.agent_full(True)
     moves = torch.zeros((7, 3), device="cuda")
     actions = torch.zeros((6, 2), dtype=torch.long, device="cuda")
 

@@ -154,11 +154,8 @@ def test_hidden_walls():
 def test_rays_without_a_hit():
     wall, light, white, one = t([[9, 9], [9, 10]]), t([5, 5, 1]), t([1, 1, 1]), torch.tensor([1])
     seen = twin.render(NO_LINES, wall, light, white, one, t([1, 1]), t(180), res=2, fov=60)
-    assert (
-        (seen["indices"] == -1).all()
-        and (seen["distances"] == math.inf).all()
-        and (seen["screen"] == 0).all()
-    )
+    assert (seen["indices"] == -1).all() and (seen["distances"] == math.inf).all()
+    assert (seen["screen"] == 0).all()
     assert seen["locations"].isnan().all() and seen["dots"].isnan().all()
 
 
@@ -179,11 +176,7 @@ def test_near_limit_is_a_circle(angle):
 def test_first_of_equal_lines_is_hit():
     assert raycast(torch.cat([WALL_AT_3 + t([1, 0]), WALL_AT_3, WALL_AT_3]))[
         "indices"
-    ].tolist() == [
-        1,
-        1,
-        1,
-    ]
+    ].tolist() == [1, 1, 1]
 
 
 def test_degenerate_lines_are_invisible():
@@ -419,9 +412,8 @@ def test_random_environments_are_seeded():
     assert torch.equal(same.lines, again.lines) and torch.equal(same.velocity, again.velocity)
     assert not torch.equal(same.angles, other.angles)
     assert int(same.line_widths.sum()) == len(same.lines) == len(same.texture_widths)
-    assert int(same.texels().sum()) == len(same.textures) and int(same.light_widths.sum()) == len(
-        same.lights
-    )
+    assert int(same.texels().sum()) == len(same.textures)
+    assert int(same.light_widths.sum()) == len(same.lights)
 
 
 def test_random_environments_have_degenerate_cases():

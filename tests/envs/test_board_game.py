@@ -94,10 +94,8 @@ def test_a_board_game_is_trained_evaluated_and_recorded(folder, capsys):
     assert evaluate.main(["run=run", "episodes=30", "device=cpu"]) == 0
     path = folder / f"run/evaluations/board-test-{rows[-1]['samples']}.json"
     table = json.loads(path.read_text())
-    assert (
-        table["title"].startswith("board: 30 episodes, after ")
-        and table["rows"][0]["homes"] is None
-    )
+    assert table["title"].startswith("board: 30 episodes, after ")
+    assert table["rows"][0]["homes"] is None
     trained, random = (row["metrics"]["right"] for row in table["rows"])
     assert trained["lower"] > 0.8 > 0.5 > random["upper"] > random["mean"] > random["lower"] > 0.1
     output = capsys.readouterr().out

@@ -4,6 +4,7 @@ actions.
 
 import pytest
 import torch
+from test_deathmatch import Ring
 
 from megastep import arrdict, capture, contract, envs, toys
 from megastep.agents.selfplay.bots import RandomActions
@@ -18,14 +19,9 @@ AHEAD = (2.0, 3.5, 0.0)
 
 
 def ring(device, *poses, **settings):
-    """A Deathmatch in a box from 1 to 6 with agents at (x, y, degrees), and the first world."""
-    env = envs.Deathmatch(1, [toys.box()], n_agents=len(poses), device=device, **settings)
-    env.reset()
-    poses = torch.tensor(poses, device=env.device)
-    agents = env.core.agents
-    agents.positions[0], agents.angles[0] = poses[:, :2], poses[:, 2]
-    nobody = arrdict.arrdict(actions=torch.zeros((len(poses), 1), dtype=int, device=env.device))
-    return env, env.step(nobody)
+    """An environment with agents at (x, y, degrees) in a box from 1 to 6, and its first world."""
+    ring = Ring(device, *poses, **settings)
+    return ring.env, ring.step()
 
 
 def first_actions(device, *poses):

@@ -16,7 +16,6 @@ from megastep.geometries import sample
 from tests.helpers.synchronisation import no_synchronisation
 
 GPU = torch.cuda.is_available()
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 # Settings that let episodes end within a test.
 SHORT = {
     "minimal": dict(shortest=3, longest=9),
@@ -55,13 +54,6 @@ SHORT = {
 
 #: The slow tests have all settings, the fast ones those of each environment's first line.
 FIRST = [name if "," not in name else pytest.param(name, marks=pytest.mark.slow) for name in SHORT]
-
-
-@pytest.fixture(params=DEVICES)
-def device(request):
-    if request.param == "cuda" and not GPU:
-        pytest.skip("needs a GPU")
-    return request.param
 
 
 def make(name, device="cpu", n_envs=12, seed=1, **settings):
@@ -160,6 +152,15 @@ def test_decision_after_the_end_of_an_episode_is_ignored(name):
         worlds = [a.step(decision), b.step(other)]
         assert contract.same(*worlds)
     assert n_ignored
+
+
+@pytest.mark.parametrize("name", ["explorer", "deathmatch", "pointgoal"])
+def test_privileged_changes_nothing_else(name, device):
+    plain, more = make(name, device), make(name, device, privileged=True)
+    assert plain.privileged_space is None
+    for a, b in zip(contract.rollout(plain, 30), contract.rollout(more, 30), strict=True):
+        del b["privileged"]
+        assert contract.same(a, b)
 
 
 @pytest.mark.parametrize("name", FIRST)

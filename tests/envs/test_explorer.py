@@ -195,17 +195,6 @@ def test_only_visible_unseen_texels_count(device):
     assert not counts_of(c, seen.fill_(-1), visible.fill_(-1)).any()
 
 
-def test_privileged_changes_nothing_else(device):
-    plain, extended = (
-        contract.rollout(explorer(device, privileged=privileged), 40)
-        for privileged in (False, True)
-    )
-    assert all("privileged" not in world for world in plain)
-    assert explorer(device).privileged_space is None
-    for a, b in zip(plain, extended, strict=True):
-        assert contract.same(a, arrdict({k: v for k, v in b.items() if k != "privileged"}))
-
-
 def test_explorers_visible_texels():
     env = explorer("cpu")
     expected = modules.visible_texels(env.core.scenery, env.spawner.points)

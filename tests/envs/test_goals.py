@@ -21,15 +21,7 @@ from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
 from megastep.geometries import sample
 from tests.helpers.outputs import Poison
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 CELL = 0.1
-
-
-@pytest.fixture(params=DEVICES)
-def device(request):
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs a GPU")
-    return request.param
 
 
 @pytest.fixture

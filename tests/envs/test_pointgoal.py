@@ -8,15 +8,7 @@ from test_geodesics import room
 from megastep import arrdict, contract, envs
 from megastep.geometries import sample
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 FORWARD, LEFT = 3, 1
-
-
-@pytest.fixture(params=DEVICES)
-def device(request):
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs a GPU")
-    return request.param
 
 
 def make_env(device="cpu", n_envs=4, geometries=None, **settings):

@@ -27,7 +27,7 @@ from megastep.geometries.homes import (
     walls,
 )
 from megastep.geometries.homes.portable_generator import PortableGenerator
-from scripts import check_homes, compare_homes, make_homes, show_homes
+from scripts import check_homes, make_homes, show_homes
 
 matplotlib.use("Agg")
 
@@ -147,10 +147,8 @@ def test_contacts():
 
 def test_walls_that_meet_fill_their_corner():
     """Walls 10 cm thick along x = 400 up to y = 250, and from there to the right."""
-    upright, level = (
-        openings.Contact(0, 400, 0, 250, 0, 1),
-        openings.Contact(1, 250, 400, 700, 1, 2),
-    )
+    upright = openings.Contact(0, 400, 0, 250, 0, 1)
+    level = openings.Contact(1, 250, 400, 700, 1, 2)
     rectangles = walls.solids([upright, level], walls.depths({}, thickness=10))
     assert rectangles == [(395, 0, 405, 255), (395, 245, 700, 255)]
 
@@ -612,24 +610,7 @@ def test_make_homes_prints_statistics(monkeypatch, capsys):
 
 
 def test_show_homes_draws_every_home():
-    figure = show_homes.sheet(range(3))
+    figure = show_homes.sheet_of_homes(range(3))
     assert [ax.get_title()[:7] for ax in figure.axes] == ["home 0:", "home 1:", "home 2:", "", ""]
     assert len(figure.axes[1].collections[0].get_segments()) == len(homes.generate(1).walls)
     matplotlib.pyplot.close(figure)
-
-
-def test_gaps_are_doors(generated):
-    """Some recesses of walls look like doors too."""
-    for g in generated[:10]:
-        widths = np.round(compare_homes.gaps(g), 2).tolist()
-        for width in np.round(g.doors, 2):
-            widths.remove(width)
-        assert len(widths) <= 3
-
-
-def test_compare_homes_prints_a_table(capsys):
-    compare_homes.main(["--count", "3", "homes", "maze,size=3,corridor=1.5", "box,width=4"])
-    head, _, walls, rooms, area, *_ = capsys.readouterr().out.splitlines()
-    assert head.endswith("| `homes` | `maze,size=3,corridor=1.5` | `box,width=4` |")
-    assert walls.endswith("| 4 / 4 / 4 / 4 / 4 |") and rooms.endswith("| 1 / 1 / 1 / 1 / 1 |")
-    assert area.endswith("| 16 / 16 / 16 / 16 / 16 |")

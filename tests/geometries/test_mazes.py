@@ -19,7 +19,7 @@ from megastep.engine.agents import AGENT_RADIUS
 from megastep.geometries import homes, mazes, sample
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from megastep.modules.spawning import CLEARANCE, spawn_points
-from scripts import check_homes, show_mazes
+from scripts import check_homes, show_homes
 
 matplotlib.use("Agg")
 
@@ -340,8 +340,8 @@ def test_two_thousand_mazes_take_seconds():
     assert time.process_time() - start < 20  # seconds, ten times what one core takes
 
 
-def test_show_mazes_draws_every_maze():
-    figure = show_mazes.sheet(size=3)
+def test_show_homes_draws_every_maze():
+    figure = show_homes.sheet_of_mazes(size=3)
     titles = [ax.get_title() for ax in figure.axes]
     assert len(titles) == 12 and titles[0].startswith("maze 0, braid 0: ")
     assert all(": 0 dead ends" in title for title in titles[8:])

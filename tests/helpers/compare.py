@@ -125,10 +125,8 @@ def check_hits(report, env, ours, lines, positions, directions, radius):
     axes = "agent", "camera", "ray"
     report.add("indices", env, torch.where(allowed, 0.0, math.inf), 1.0, ours["indices"], law, axes)
 
-    along, length = (
-        (lines[:, 1] - lines[:, 0])[index],
-        (lines[:, 1] - lines[:, 0]).norm(dim=-1)[index],
-    )
+    along = (lines[:, 1] - lines[:, 0])[index]
+    length = (lines[:, 1] - lines[:, 0]).norm(dim=-1)[index]
     dot = (directions * along).sum(-1) / (directions.norm(dim=-1) * length + twin.DOT_GUARD)
     shaky = COORDINATE_SLACK * lines.abs().max() / length.clamp(min=1e-12)
     distance = pick(distance)

@@ -1,5 +1,5 @@
 """Twins of Pong: one game in plain Python, and many games in NumPy. The kernel is compared with
-both on every bit, and `scripts/benchmarks/pong_chart.py` compares their speed.
+both on every bit.
 
 Positions and speeds are integers, 256 per cell. N games, S sides that act, B = N S lanes.
 """

@@ -134,10 +134,8 @@ class Walk:
             kind == 0, (self.random() < 0.5).float(), torch.where(kind == 1, foot, self.random())
         )
         self.target = a + u[..., None] * along
-        sign, slant = (
-            2 * self.pick(2)[..., None] - 1,
-            self.slants[self.pick(len(self.slants))][..., None],
-        )
+        sign = 2 * self.pick(2)[..., None] - 1
+        slant = self.slants[self.pick(len(self.slants))][..., None]
         self.grazing = sign * along + slant * torch.stack([-along[..., 1], along[..., 0]], -1)
         # 0: anywhere, 1 and 2: along the wall, else: to the target
         self.mode = self.pick(8)[..., None]

@@ -54,10 +54,8 @@ def test_draws_where_masked_and_repeats_by_seed():
 
 def test_all_points_are_drawn_and_none_is_a_spawn_point():
     c = core_of([toys.box()], n_envs=2000)
-    free_points, spawner = (
-        modules.FreePoints([toys.box()], c),
-        modules.RandomSpawns([toys.box()], c),
-    )
+    free_points = modules.FreePoints([toys.box()], c)
+    spawner = modules.RandomSpawns([toys.box()], c)
     drawn = free_points(c.env_full(True))[:, 0].unique(dim=0)
     assert len(drawn) == len(free_points.points[0].unique(dim=0)) == 128
     assert torch.cdist(drawn, spawner.points[0]).min() > 1e-6

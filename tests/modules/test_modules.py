@@ -226,11 +226,7 @@ def test_points_are_repeated_where_few_fit():
 
 
 @pytest.mark.parametrize(
-    "n_agents, message",
-    [
-        (1, "no point .*0.16 m"),
-        (9, "no room for 9 agents .*0.26 m"),
-    ],
+    "n_agents, message", [(1, "no point .*0.16 m"), (9, "no room for 9 agents .*0.26 m")]
 )
 def test_a_geometry_without_space_is_refused(n_agents, message):
     g = toys.box(1)

@@ -6,15 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from megastep.agents.networks.kernels.conv import (
-    PROGRAM,
-    backward_kernel,
-    conv_backward,
-    is_supported,
-    n_outputs,
-)
-from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.kernels.build.launch import launch
+from megastep.agents.networks.kernels.conv import conv_backward, is_supported, n_outputs
 
 DEVICE = "cuda"
 BF16 = torch.bfloat16
@@ -166,40 +158,6 @@ def test_no_rows():
 def test_same_bits_twice():
     inputs = make_inputs(20_011, 3, 128)
     assert_same(conv_backward(*inputs), conv_backward(*inputs))
-
-
-@pytest.mark.cuda
-def test_policies():
-    """Each policy's gradients are those that it has alone: a block has a tile in both cases."""
-    n_policies, n_rows, n_channels, n_columns, n_blocks = 3, 50, 3, 128, 4
-    alone = [make_inputs(n_rows, n_channels, n_columns) for _ in range(n_policies)]
-    alone = [[each.roll(7 * i, 0) * (1 + i) for each in alone[i]] for i in range(n_policies)]
-    d_features, features, rows, first_weight, first_bias, second_weight = (
-        torch.stack(arrays) for arrays in zip(*alone, strict=True)
-    )
-    sizes = [F * n_channels * 8, F, F * F * 4, F]
-    sums = torch.full((n_policies, n_blocks, sum(sizes)), torch.nan, device=DEVICE)
-    kernel, blocks, shared_sizes = backward_kernel(n_channels, n_columns, n_blocks, n_policies)
-    launch(
-        *(PROGRAM, kernel, rows.device, blocks),
-        d_features=d_features,
-        features=features,
-        rows=rows,
-        first_weight=first_weight,
-        first_bias=first_bias,
-        second_weight=second_weight,
-        sums=sums,
-        n_rows=n_rows,
-        n_channels=n_channels,
-        n_columns=n_columns,
-        d_stride=d_features.stride(1),
-        feature_stride=features.stride(1),
-        row_stride=rows.stride(1),
-        **shared_sizes,
-    )
-    for i in range(n_policies):
-        expected = torch.cat([each.flatten() for each in conv_backward(*alone[i])])
-        assert torch.equal(sum_rows(sums[i]), expected), i
 
 
 @pytest.mark.cuda

@@ -20,12 +20,12 @@ each_core = pytest.mark.parametrize("name", CORES)
 each_depth = pytest.mark.parametrize("layers", [1, 2])
 
 
-def case(name, layers, device="cpu", n_steps=T):
+def case(name, layers, device="cpu", n_steps=T, width=W):
     """Returns a core, inputs (T, B, W), resets (T, B) and a nonzero hidden state."""
     torch.manual_seed(0)
-    core = make_core(name, W, layers)
+    core = make_core(name, width, layers)
     state = core.initial(B).map(torch.randn_like)
-    x, reset = torch.randn(n_steps, B, W), torch.rand(n_steps, B) < 0.3
+    x, reset = torch.randn(n_steps, B, width), torch.rand(n_steps, B) < 0.3
     return core.to(device), x.to(device), reset.to(device), state.map(lambda s: s.to(device))
 
 
@@ -161,9 +161,10 @@ def test_stack_has_residual_connections(name):
 
 @each_depth
 @each_core
-def test_residual_connection_around_core(name, layers, device):
+@pytest.mark.parametrize("width", [W, 7, 256])  # of kernels on a CPU, of none, and on a GPU
+def test_residual_connection_around_core(name, layers, device, width):
     """Also its gradients, and in steps without them."""
-    core, x, reset, state = case(name, layers, device)
+    core, x, reset, state = case(name, layers, device, width=width)
     x.requires_grad_()
     inputs, weights = [x, *core.parameters()], torch.randn_like(x)
     results = []

@@ -10,11 +10,9 @@ from megastep import spaces
 from megastep.agents.networks import encoders, heads, intake_cpu, running_norm
 from megastep.arrdict import arrdict
 
-IMAGE, DEPTH, VECTOR = (
-    spaces.MultiImage(2, 3, 1, 16),
-    spaces.MultiImage(2, 1, 1, 16),
-    spaces.MultiVector(2, 5),
-)
+IMAGE = spaces.MultiImage(2, 3, 1, 16)
+DEPTH = spaces.MultiImage(2, 1, 1, 16)
+VECTOR = spaces.MultiVector(2, 5)
 TREE = arrdict(eyes=arrdict(rgb=IMAGE, d=DEPTH), imu=VECTOR, team=spaces.MultiDiscrete(2, 4))
 MOVES = arrdict(movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2, 2))
 WIDTH = 24
@@ -111,9 +109,8 @@ def test_shapes_of_logits_and_actions():
     assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
     torch.testing.assert_close(logits.movement.exp().sum(-1), torch.ones(6, 2))
     actions = output.sample(logits)
-    assert (
-        actions.movement.shape == actions.fire.shape == (6, 2) and actions.fire.dtype == torch.int64
-    )
+    assert actions.movement.shape == actions.fire.shape == (6, 2)
+    assert actions.fire.dtype == torch.int64
     assert output.logprob(logits, actions).shape == output.entropy(logits).shape == (6,)
 
 
@@ -236,10 +233,7 @@ def test_zero_features_have_a_gradient():
         (lambda: heads.intake("images", WIDTH), "observation space itself = 'images'"),
         (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), "observation space x = 3"),
         (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
-        (
-            lambda: heads.intake(IMAGE, WIDTH, "resnet"),
-            "'resnet'.*cnn, conv, linear, module:Class",
-        ),
+        (lambda: heads.intake(IMAGE, WIDTH, "resnet"), "'resnet'.*cnn, conv, linear, module:Class"),
         (lambda: heads.output(VECTOR, WIDTH), "MultiContinuous or dicts of them"),
         (lambda: heads.output(arrdict(), WIDTH), "MultiContinuous or dicts of them"),
     ],
@@ -276,9 +270,8 @@ def test_normalises_images_per_channel_and_vectors_per_number():
 
     # the second call has weight 1/2: mean (6 + 10) / 2, mean square (37 + 100) / 2
     update(intake, arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
-    assert imu_norm.mean[0, 0].item() == 8 and imu_norm.scale[0, 0].item() == pytest.approx(
-        (137 / 2 - 64) ** 0.5
-    )
+    assert imu_norm.mean[0, 0].item() == 8
+    assert imu_norm.scale[0, 0].item() == pytest.approx((137 / 2 - 64) ** 0.5)
 
 
 def test_statistics_are_saved_with_weights():

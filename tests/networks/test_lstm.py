@@ -430,37 +430,6 @@ def test_widths_that_kernels_do_not_take_use_pytorch():
     assert output.isfinite().all()
 
 
-@pytest.mark.parametrize(
-    "device, width",
-    [
-        ("cpu", 16),
-        ("cpu", 7),
-        *[pytest.param("cuda", w, marks=pytest.mark.cuda) for w in (256, 16)],
-    ],
-)
-def test_residual_is_added_to_outputs_only(device, width):
-    """Outputs, the state and the gradients of both, also when acting."""
-    torch.manual_seed(0)
-    lstm = LSTM(width).to(device)
-    x = torch.randn(5, 33, width, device=device, requires_grad=True)
-    reset = torch.rand(5, 33, device=device) < 0.3
-    state = arrdict({key: torch.randn(33, width, device=device) for key in ("output", "cell")})
-    results = []
-    for is_residual in (True, False):
-        with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
-            outputs, after = lstm(x, reset, state, is_residual)
-            outputs = outputs if is_residual else x.to(outputs.dtype) + outputs
-            loss = outputs.float().square().sum() + after.output.sum() + after.cell.sum()
-            grads = torch.autograd.grad(loss, [x, *lstm.parameters()])
-            with torch.no_grad():
-                acted, acted_after = lstm(x[:1], reset[:1], state, is_residual)
-            acted = acted if is_residual else x[:1].to(acted.dtype) + acted
-        leaves = [outputs, after.output, after.cell, *grads]
-        leaves += [acted, acted_after.output, acted_after.cell]
-        results.append([leaf.detach().float().cpu() for leaf in leaves])
-    assert_close(range(len(results[0])), *results, 2e-2 if device == "cuda" else 1e-5)
-
-
 @pytest.mark.cuda
 def test_sequence_saves_nothing_without_autograd(monkeypatch):
     lstm, saved = LSTM(256).cuda(), []

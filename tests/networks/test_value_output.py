@@ -37,9 +37,8 @@ def test_constant_returns_do_not_divide_by_zero():
     value = ValueOutput(WIDTH)
     for _ in range(5):
         value.update_stats(torch.zeros(64), VALID)
-    assert (
-        value.scale.item() == pytest.approx(1e-3) and value(torch.randn(8, WIDTH)).isfinite().all()
-    )
+    assert value.scale.item() == pytest.approx(1e-3)
+    assert value(torch.randn(8, WIDTH)).isfinite().all()
 
 
 def test_values_are_float32_under_autocast():

@@ -80,9 +80,8 @@ def test_image_installs_packages_by_hash_and_runs_without_root():
             command = command.replace("${TORCH}", args["TORCH"])
             assert "--require-hashes" in command or command.split()[-1] == "."
     (user,) = (rest for name, rest in LINES if name == "USER")
-    assert user != "root" and names.index("USER") > max(
-        i for i, n in enumerate(names) if n == "RUN"
-    )
+    assert user != "root"
+    assert names.index("USER") > max(i for i, n in enumerate(names) if n == "RUN")
     assert ["VOLUME", '["/megastep/runs", "/cache"]'] in LINES
 
 

@@ -168,10 +168,7 @@ def terms(logits: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, to
 
 
 def terms_backward(
-    logits: torch.Tensor,
-    actions: torch.Tensor,
-    d_logprobs: torch.Tensor,
-    d_entropies: torch.Tensor,
+    logits: torch.Tensor, actions: torch.Tensor, d_logprobs: torch.Tensor, d_entropies: torch.Tensor
 ) -> torch.Tensor:
     """Returns the gradient of `terms`' logits."""
     d_logits = torch.empty_like(logits)

@@ -17,12 +17,7 @@ from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.envs.common import SceneryEnv
 from megastep.envs.deathmatch.bot import Bot
-from megastep.envs.deathmatch.step import (
-    MAX_AGENTS,
-    TALLY_ROWS,
-    deathmatch_step,
-    privileged_size,
-)
+from megastep.envs.deathmatch.step import MAX_AGENTS, TALLY_ROWS, deathmatch_step, privileged_size
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 

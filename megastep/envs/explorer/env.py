@@ -92,14 +92,8 @@ class Explorer(SceneryEnv):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
         geometries = geometries if resample else spread(geometries, n_envs)
-        self.core = Core(
-            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
-            res,
-            fov,
-            fps,
-            cameras,
-            seed,
-        )
+        homes = scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device)
+        self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.patience, self.has_metrics = subsample, patience, metrics
         self.spawner = modules.RandomSpawns(geometries, self.core, resample=resample)
@@ -122,8 +116,7 @@ class Explorer(SceneryEnv):
             self.runs = TexelRuns(self.core.scenery, self.visible)
         if privileged:
             self.privileged_space = dotdict(
-                episode=spaces.MultiVector(1, N_EPISODE),
-                unseen=spaces.MultiVector(1, N_BINS),
+                episode=spaces.MultiVector(1, N_EPISODE), unseen=spaces.MultiVector(1, N_BINS)
             )
 
     def reset(self) -> arrdict:

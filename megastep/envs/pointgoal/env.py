@@ -109,14 +109,8 @@ class PointGoal(SceneryEnv):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
         geometries = geometries if resample else spread(geometries, n_envs)
-        self.core = Core(
-            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
-            res,
-            fov,
-            fps,
-            cameras,
-            seed,
-        )
+        homes = scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device)
+        self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
         self.rules = dict(bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH)
