@@ -105,6 +105,8 @@ def test_no_config_value_is_unused_or_repeated():
 def test_settings_round_trip():
     cfg = compose("env=minimal", "samples=1e6")
     assert check(Train, as_tree(cfg)) == cfg
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        cfg.seed = 2
 
 
 @pytest.mark.parametrize("group", ["env", "geometry", "learner", "curriculum", "agent"])
@@ -308,7 +310,7 @@ def test_contradicting_settings():
         ("env.res=1025", "env.res", "1025 is out of range: allowed is from 1 to 1,024"),
         ("env.fov=180", "env.fov", "180 is out of range: allowed is above 0 and below 180"),
         ("seconds=inf", "seconds", "inf is out of range: allowed is more than 0"),
-        ("samples=.inf", "samples", "out of range"),
+        ("samples=.inf", "samples", "expected an integer, got '.inf'"),
         ("env.cameras=[]", "env.cameras", "a list of 0 is out of range: allowed is at least 1"),
         ("env.n_envs=2", "learner.n_minibatches", "2"),
         ("learner.anneal=samples", "learner.anneal", "samples="),
@@ -382,6 +384,11 @@ def test_other_errors_are_named_beside_a_missing_run():
     with pytest.raises(ConfigErrors) as error:
         compose("seed=x", script="evaluate")
     assert {key for key, _ in error.value.errors} == {"run", "seed"}
+
+
+def test_a_video_without_a_key():
+    with pytest.raises(ConfigErrors, match="did you mean file=out.mp4"):
+        compose("out.mp4", script="record")
 
 
 def test_launcher_not_installed(monkeypatch):
