@@ -17,6 +17,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.utils import JobRuntime
 
 from megastep.agents.cli import blocks
+from megastep.agents.launch import train as launch_train
 from tests.helpers.in_this_process import InThisProcess
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -34,6 +35,26 @@ def pytest_collection_modifyitems(items):
 def device(request):
     """Each device in turn, for tests that hold on both."""
     return request.param
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Changes to an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def trainers(monkeypatch):
+    """The trainers that `train` makes during a test."""
+    made, make_trainer = [], launch_train.make_trainer
+
+    def remember(*arguments):
+        made.append(make_trainer(*arguments))
+        return made[-1]
+
+    monkeypatch.setattr(launch_train, "make_trainer", remember)
+    return made
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -25,16 +25,17 @@ ROOT = pathlib.Path(__file__).parents[2]
 
 
 @pytest.fixture
-def stopped(tmp_path, monkeypatch):
-    """A run of 64 samples in 2.5 seconds that was stopped: its budgets, and its folder's name."""
+def stopped(here):
+    """Saves a run of 64 samples in 2.5 seconds, with these words and then other settings. Returns
+    its folder's name.
+    """
 
-    def stop(*words):
+    def stop(*words, **changes):
         state = dict(samples=64, updates=2, seconds=2.5)
-        config = {"train": as_tree(settings(*TINY, *words)), "spaces": {}}
-        checkpoint.save(tmp_path / "run/checkpoints", 64, state, config)
+        config = {"train": as_tree(settings(*TINY, *words)) | changes, "spaces": {}}
+        checkpoint.save("run/checkpoints", 64, state, config)
         return "run"
 
-    monkeypatch.chdir(tmp_path)
     return stop
 
 
@@ -138,12 +139,7 @@ def test_errors_need_no_pytorch(stopped):
 # ---- Loggers of runs ----
 
 WANDB = {"name": "wandb", "project": "p", "mode": "offline", "group": None}
-
-
-def save_with(logger):
-    """Saves the run `run` with another value of the setting `logger`."""
-    config = {"train": as_tree(settings(*TINY)) | {"logger": logger}, "spaces": {}}
-    checkpoint.save("run/checkpoints", 64, dict(samples=64, updates=2, seconds=2.5), config)
+WANDB_ONLINE = WANDB | {"mode": "online"}
 
 
 @pytest.mark.parametrize(
@@ -151,36 +147,27 @@ def save_with(logger):
     [
         ({"name": "none"}, [], {"tensorboard": {}}),
         (WANDB, [], {"tensorboard": {}, "wandb": {**WANDB}}),
-        (
-            WANDB,
-            ["logger.wandb.mode=online"],
-            {"tensorboard": {}, "wandb": WANDB | {"mode": "online"}},
-        ),
+        (WANDB, ["logger.wandb.mode=online"], {"tensorboard": {}, "wandb": WANDB_ONLINE}),
         (WANDB, ["logger=none"], {}),
         ({"name": "none"}, ["logger=csv"], {"csv": {}}),
         ({}, [], {}),
     ],
 )
-def test_run_with_the_keys_of_a_single_logger_is_resumed(
-    tmp_path, monkeypatch, logger, words, expected
-):
-    monkeypatch.chdir(tmp_path)
-    save_with(logger)
+def test_run_with_the_keys_of_a_single_logger_is_resumed(stopped, logger, words, expected):
+    stopped(logger=logger)
     chosen = as_tree(settings("resume=run", *words))["logger"]
     paths = {label: {"name": path} for label, path in loggers().items()}
     assert chosen == {label: keys | paths[label] for label, keys in expected.items()}
 
 
-def test_logger_that_a_resumed_run_does_not_have(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    save_with({"name": "none"})
+def test_logger_that_a_resumed_run_does_not_have(stopped):
+    stopped(logger={"name": "none"})
     with pytest.raises(ConfigErrors, match="logger.wandb: is not chosen; add logger=wandb"):
         settings("resume=run", "logger.wandb.mode=offline")
 
 
-def test_evaluation_needs_no_logger(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    save_with({"gone": {"name": "gone:Gone", "uri": "x"}})
+def test_evaluation_needs_no_logger(stopped):
+    stopped(logger={"gone": {"name": "gone:Gone", "uri": "x"}})
     loaded = folders.load_checkpoint(pathlib.Path("run"), trust=True)
     assert factory.config_of(loaded).logger == {}
     with pytest.raises(ConfigErrors, match="logger.gone: gone:Gone cannot be imported"):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pathlib
 import signal
 import subprocess
 import sys
@@ -13,30 +12,9 @@ import torch
 from megastep.agents.cli import train
 from megastep.agents.runs import checkpoint, folders
 from tests.helpers import tiny
-from tests.helpers.processes import HUNG, wait_until
+from tests.helpers.processes import HUNG, ROOT, finished, start, wait_until
 
-ROOT = pathlib.Path(__file__).parents[2]
 TINY = [*tiny.TINY, "checkpoint_seconds=0.2"]
-
-
-def start(script, *arguments, cwd, **environment):
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / f"{script}.py"), *arguments],
-        cwd=cwd,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, **environment},
-        # where the tests themselves run under nohup
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
-    )
-
-
-def finished(script, *arguments, cwd, **environment):
-    """Runs a script. Returns (exit code, stdout, stderr)."""
-    process = start(script, *arguments, cwd=cwd, **environment)
-    out, err = process.communicate(timeout=HUNG)
-    return process.returncode, out, err
 
 
 @pytest.mark.slow
@@ -65,14 +43,8 @@ def test_missing_gpu(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_missing_compiler(tmp_path):
-    code, _, err = finished(
-        "train",
-        *TINY,
-        cwd=tmp_path,
-        CXX="/nonexistent",
-        XDG_CACHE_HOME=str(tmp_path / "cache"),
-        MEGASTEP_CACHE=str(tmp_path / "cache"),
-    )
+    caches = dict.fromkeys(("XDG_CACHE_HOME", "MEGASTEP_CACHE"), str(tmp_path / "cache"))
+    code, _, err = finished("train", *TINY, cwd=tmp_path, CXX="/nonexistent", **caches)
     assert code == 2 and "compiler" in err and len(err.splitlines()) == 1
     assert not any(tmp_path.glob("runs/*"))
 
@@ -98,10 +70,7 @@ def test_same_seed_in_two_processes(tmp_path):
 
 def test_run_folder_lock_and_closed_terminal(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    process, metrics = (
-        start("train", *TINY, "folder=run", cwd=tmp_path),
-        tmp_path / "run/metrics.jsonl",
-    )
+    process, metrics = start("train", *TINY, "folder=run"), tmp_path / "run/metrics.jsonl"
     wait_until(lambda: metrics.exists() and metrics.stat().st_size, process)
     wait_until(lambda: any((tmp_path / "run" / "checkpoints").glob("step_*")), process)
     assert train.main(["resume=run"]) == 2
@@ -119,19 +88,13 @@ def test_run_folder_lock_and_closed_terminal(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "redirected",
-    [
-        "{command} | true",
-        "{command} >/dev/full 2>/dev/full",
-        "{command} >&- 2>&-",
-        "{command} <&- | head -1 >/dev/full",
-    ],
+    "redirection", ["| true", ">/dev/full 2>/dev/full", ">&- 2>&-", "<&- | head -1 >/dev/full"]
 )
-def test_run_continues_without_output(tmp_path, redirected):
+def test_run_continues_without_output(tmp_path, redirection):
     overrides = [*TINY, "samples=64", "folder=run", "finish.evaluate=true", "finish.episodes=4"]
     command = f"{{ {sys.executable} {ROOT / 'train.py'} {' '.join(overrides)}; echo $? >code; }}"
     subprocess.run(
-        ["bash", "-c", redirected.format(command=command)],
+        ["bash", "-c", f"{command} {redirection}"],
         cwd=tmp_path,
         timeout=HUNG,
         env={**os.environ, "TERM": "dumb"},

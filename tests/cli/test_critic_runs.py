@@ -8,25 +8,12 @@ from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.runs import checkpoint
 from megastep.envs.explorer import env as explorer_env
 from tests.cli.test_train import configured
+from tests.helpers import tiny
+from tests.helpers.weights import of_run as weights
 
-EXPLORER = [
-    "env=explorer",
-    "geometry=box",
-    "env.n_envs=4",
-    "env.res=8",
-    "env.patience=3",
-    "learner.n_steps=8",
-    "learner.n_minibatches=2",
-    "agent.width=8",
-    "device=cpu",
-    "log_every=1",
-]
-UPDATE = 4 * 8  # samples
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
+EXPLORER = ["env=explorer", *tiny.TINY[1:], "env.patience=3", "log_every=1"]
+UPDATE = tiny.UPDATE
 
 
 def trained(*overrides):
@@ -45,11 +32,6 @@ def refuse_privileged(monkeypatch):
     monkeypatch.setattr(explorer_env, "explorer_step", plain_step)
 
 
-def weights(run):
-    return checkpoint.load_latest(run / "checkpoints").state["policy"]
-
-
-@pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize("critic", ["asymmetric", "plain"])
 def test_train_resume_evaluate_record_and_init(critic, monkeypatch):
     run = trained(f"samples={2 * UPDATE}", f"agent.critic={critic}")
@@ -68,7 +50,6 @@ def test_train_resume_evaluate_record_and_init(critic, monkeypatch):
     assert record.main([f"run={run}", "steps=1", "device=cpu"]) == 0
 
 
-@pytest.mark.usefixtures("folder")
 def test_plain_critic_does_not_compute_privileged(monkeypatch):
     refuse_privileged(monkeypatch)
     trained("samples=1", "agent.critic=plain")
@@ -76,7 +57,6 @@ def test_plain_critic_does_not_compute_privileged(monkeypatch):
         trained("samples=1", "agent.critic=asymmetric")
 
 
-@pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize("saved, chosen", [("asymmetric", "plain"), ("plain", "asymmetric")])
 def test_init_refuses_other_kind_of_critic(saved, chosen):
     run = trained("samples=1", f"agent.critic={saved}")
@@ -84,12 +64,9 @@ def test_init_refuses_other_kind_of_critic(saved, chosen):
         trained("samples=1", f"init={run}", f"agent.critic={chosen}")
 
 
-@pytest.mark.usefixtures("folder")
 def test_init_allows_any_critic_without_privileged_space():
-    shape = "env=minimal", "env.n_envs=4", "env.res=8"
-    minimal = [word for word in EXPLORER if not word.startswith("env")] + [*shape, "samples=1"]
-    run = train.run(configured("agent.critic=asymmetric", tiny=minimal))
-    train.run(configured(f"init={run}", "agent.critic=plain", tiny=minimal))
+    run = train.run(configured("agent.critic=asymmetric", "samples=1", tiny=tiny.TINY))
+    train.run(configured(f"init={run}", "agent.critic=plain", "samples=1", tiny=tiny.TINY))
 
 
 @pytest.mark.parametrize(

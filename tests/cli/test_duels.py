@@ -225,6 +225,7 @@ def test_ratings_of_draws():
 
 # ---- The scripts ----
 
+HIGH = "tests.helpers.games:High"
 PONG = [
     *("env=pong", "env.self_play=true", "env.n_envs=8", "agent.width=8"),
     *("agent.core=none", "learner.n_steps=16", "learner.n_minibatches=2", "device=cpu"),
@@ -265,18 +266,13 @@ def test_snapshots_are_spread_over_the_budget(here):
 
 
 def test_evaluate_against(here, capsys):
-    names = f"a/snapshots/step_{2 * UPDATE},b,random,bot,tests.helpers.games:High"
+    names = f"a/snapshots/step_{2 * UPDATE},b,random,bot,{HIGH}"
     assert evaluate.main(["run=a", f"against={names}", "episodes=20", "device=cpu"]) == 0
     (path,) = (here / "a" / "evaluations").glob("duels-*.json")
     result = json.loads(path.read_text())
     overall = [row for row in result["rows"] if "role" not in row]
-    assert [row["against"] for row in overall] == [
-        f"a, {2 * UPDATE:,} samples",
-        f"b, {UPDATE:,} samples",
-        "random",
-        "bot",
-        "tests.helpers.games:High",
-    ]
+    runs = [f"a, {2 * UPDATE:,} samples", f"b, {UPDATE:,} samples"]
+    assert [row["against"] for row in overall] == [*runs, "random", "bot", HIGH]
     for i, row in enumerate(overall):
         assert row["duels"] == row["wins"] + row["draws"] + row["losses"] == 20
         assert row["lower"] <= row["won"] <= row["upper"] and row["homes"] is None
@@ -294,16 +290,12 @@ def test_evaluate_against(here, capsys):
 
 
 def test_evaluate_ratings(here, capsys):
-    assert (
-        evaluate.main(["run=a", "ratings=true", "against=random", "episodes=8", "device=cpu"]) == 0
-    )
+    words = "ratings=true", "against=random", "episodes=8", "device=cpu"
+    assert evaluate.main(["run=a", *words]) == 0
     with open(here / "a" / "ratings.csv") as file:
         rows = list(csv.DictReader(file))
-    assert [row["player"] for row in rows] == [
-        f"{2 * UPDATE:,} samples",
-        f"{4 * UPDATE:,} samples",
-        "random",
-    ]
+    names = [f"{n * UPDATE:,} samples" for n in (2, 4)]
+    assert [row["player"] for row in rows] == [*names, "random"]
     assert [row["samples"] for row in rows] == [str(2 * UPDATE), str(4 * UPDATE), ""]
     assert all(row["duels"] == "16" for row in rows)
     assert "rating" in capsys.readouterr().out
@@ -317,15 +309,11 @@ def test_record_against(here, capsys, monkeypatch):
         drawn.append((env, policy))
         return place
 
-    assert record.main(["run=a", "against=b", "steps=2", "file=c.png", "device=cpu"]) == 0
+    words = "run=a", "steps=2", "file=c.png", "device=cpu"
+    assert record.main([*words, "against=b"]) == 0
     assert (here / "c.png").exists()
     monkeypatch.setattr(recording, "film", film)
-    assert (
-        record.main(
-            ["run=a", "against=tests.helpers.games:High", "steps=2", "file=c.png", "device=cpu"]
-        )
-        == 0
-    )
+    assert record.main([*words, f"against={HIGH}"]) == 0
     ((env, lineup),) = drawn
     assert env.n_envs == 1 and lineup.sizes == [1, 1] and lineup.lanes.tolist() == [0, 1]
     assert type(lineup.policies[1]).__name__ == "High"
@@ -393,12 +381,13 @@ def test_ratings_need_two_checkpoints(here, capsys):
     assert "train with snapshots=8" in capsys.readouterr().err
 
 
+MATRIX = ["env=tests.helpers.games:Matrix", "env.n_envs=4", *PONG[3:], "samples=1", "folder=run"]
+
+
 def test_duel_homes_and_slots(tmp_path, monkeypatch):
     """Three agents learn, two duel. Of 40 duels, each of 7 homes gets two from each slot."""
     monkeypatch.chdir(tmp_path)
-    words = ["env=tests.helpers.games:Matrix", "env.n_agents=3", "env.n_envs=4", "geometry=homes"]
-    options = ["geometry.n=7", "samples=1", "folder=run", *PONG[3:]]
-    train.run(configured(*words, *options, tiny=[]))
+    train.run(configured("env.n_agents=3", "geometry=homes", "geometry.n=7", tiny=MATRIX))
     played, real = [], duels.play
 
     def play(env, *rest, **options):
@@ -406,10 +395,8 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
         return played[-1][1]
 
     monkeypatch.setattr(duels, "play", play)
-    assert (
-        evaluate.main(["run=run", "against=tests.helpers.games:High", "episodes=40", "device=cpu"])
-        == 0
-    )
+    words = f"against={HIGH}", "episodes=40", "device=cpu"
+    assert evaluate.main(["run=run", *words]) == 0
     ((env, result),) = played
     assert (env.n_envs, env.n_agents) == (28, 2)
     counts = torch.stack([result.homes, result.slots.int()], 1).unique(dim=0, return_counts=True)[1]
@@ -422,9 +409,7 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
 
 def test_duels_in_each_source_of_a_suite(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=box"]
-    options = ["samples=1", "folder=run", *PONG[3:]]
-    train.run(configured(*words, *options, tiny=[]))
+    train.run(configured("env.n_agents=2", "geometry=box", tiny=MATRIX))
     parts = "geometry.parts={dense: {source: homes, n: 3, density: 1.5}, maze: {n: 2, size: 3}}"
     words = ["run=run", "geometry=suite", parts, "episodes=12", "device=cpu"]
     assert evaluate.main([*words, "against=[tests.helpers.games:High,random]"]) == 0

@@ -14,7 +14,7 @@ from megastep.agents import factory
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing, statistics, tables
-from megastep.agents.runs import scores
+from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.bots import RandomActions
 from megastep.arrdict import arrdict
 from megastep.geometries import files, sample
@@ -112,16 +112,9 @@ def test_summaries_by_role():
 
 def test_nonfinite_metric_is_left_out_of_its_mean():
     """Of `laps`, a half has no number; of `falls`, no episode has one."""
-    ones = torch.ones(4)
     laps = torch.tensor([2.0, torch.nan, 4.0, torch.inf])
-    episodes = arrdict(
-        returns=ones,
-        lengths=ones,
-        done=ones > 0,
-        learns=ones > 0,
-        metrics=arrdict(laps=laps, falls=ones * torch.nan),
-        envs=torch.arange(4),
-    )
+    metrics = arrdict(laps=laps, falls=laps * torch.nan)
+    episodes = episodes_of(torch.ones(4), torch.arange(4), metrics=metrics)
     with pytest.warns(UserWarning, match="metrics.laps was not finite at the end of 2 of 4 episo"):
         (row,) = statistics.summaries(episodes)
     assert row["metrics"]["laps"]["mean"] == 3 and row["metrics"]["laps"]["lower"] >= 2
@@ -131,14 +124,8 @@ def test_nonfinite_metric_is_left_out_of_its_mean():
 def test_agents_of_one_environment_are_one_sample():
     """Two agents with equal returns: half as many samples as episodes."""
     alike = torch.arange(100.0).repeat_interleave(2)
-    episodes = arrdict(
-        returns=alike,
-        lengths=alike,
-        done=alike >= 0,
-        learns=alike >= 0,
-        metrics=arrdict(laps=alike),
-        envs=torch.arange(100).repeat_interleave(2),
-    )
+    envs = torch.arange(100).repeat_interleave(2)
+    episodes = episodes_of(alike, envs, metrics=arrdict(laps=alike))
     (row,) = statistics.summaries(episodes)
     expected = statistics.interval(np.arange(100.0), np.arange(100))
     assert (row["return"], row["lower"], row["upper"]) == pytest.approx(expected)
@@ -151,10 +138,8 @@ def test_metrics_average_over_finished_episodes():
     env = Teams(20, False)
     random = RandomActions(env.action_space)
     (row,) = statistics.summaries(playing.first_episodes(env, random, max_steps=10))
-    assert (
-        row["unfinished"] == 40 - 7
-        and row["metrics"]["age"]["mean"] == (1 + 2 + 4 + 5 + 7 + 8 + 10) / 7
-    )
+    assert row["unfinished"] == 40 - 7
+    assert row["metrics"]["age"]["mean"] == (1 + 2 + 4 + 5 + 7 + 8 + 10) / 7
     (row,) = statistics.summaries(playing.first_episodes(env, random, max_steps=0))
     assert row["metrics"]["age"] == dict(mean=None, lower=None, upper=None)
     shown = tables.cells({"agent": "a", **row})
@@ -181,12 +166,37 @@ def test_table_row_with_metrics():
 def test_random_actions_are_uniform():
     space = {"move": spaces.MultiDiscrete(2, 7), "fire": spaces.MultiDiscrete(1, 2)}
     policy = RandomActions(arrdict(space))
-    decision, _ = policy(
-        None, policy.initial(10_000, "cpu"), generator=torch.Generator().manual_seed(1)
-    )
+    generator = torch.Generator().manual_seed(1)
+    decision, _ = policy(None, policy.initial(10_000, "cpu"), generator=generator)
     assert decision.actions.move.shape == (10_000, 2) and decision.actions.fire.shape == (10_000, 1)
     shares = torch.bincount(decision.actions.move.flatten(), minlength=7) / 20_000
     assert shares.sub(1 / 7).abs().max() < 0.015  # six standard errors
+
+
+EXPLORER = [
+    *("env=explorer", "env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1"),
+    *("agent.width=8", "learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"),
+]
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """The environment and the episodes of each evaluation."""
+    played, first_episodes = [], playing.first_episodes
+
+    def spied(env, *args):
+        played.append((env, first_episodes(env, *args)))
+        return played[-1][1]
+
+    monkeypatch.setattr(playing, "first_episodes", spied)
+    return played
+
+
+def episodes_of(returns, envs, **others):
+    """Returns finished episodes of one step."""
+    ones = torch.ones(len(returns))
+    flags = dict(done=ones > 0, learns=ones > 0)
+    return arrdict(returns=returns, lengths=ones, envs=envs, **flags, **others)
 
 
 def lanes_of_homes(sizes, random):
@@ -235,17 +245,6 @@ def test_agents_of_one_environment_share_its_home():
     assert episodes.homes.tolist() == [7, 7, 8, 8, 7, 7]
 
 
-def test_interval_of_normal_samples():
-    values = np.random.default_rng(1).normal(5, 2, 400)
-    mean, lower, upper = statistics.interval(values, np.arange(400))
-    assert mean == pytest.approx(values.mean())
-    # 2 / sqrt(400) = 0.1 is the standard error; the interval is 1.96 of it to each side, within the
-    # bootstrap's noise
-    assert mean - lower == pytest.approx(0.196, abs=0.03) and upper - mean == pytest.approx(
-        0.196, abs=0.03
-    )
-
-
 def test_lanes_of_one_home_are_one_sample():
     homes = np.random.default_rng(1).normal(0, 1, 50)
     alone = statistics.interval(homes, np.arange(50))
@@ -255,17 +254,11 @@ def test_lanes_of_one_home_are_one_sample():
 
 @pytest.mark.parametrize("groups", [None, np.zeros(400)])
 def test_interval_without_homes(groups):
+    """It is 1.96 standard errors to each side, within the bootstrap's noise."""
     mean, lower, upper = statistics.interval([0.0, 1.0] * 200, groups)
-    assert mean == 0.5 and upper - lower == pytest.approx(4 * 0.5 / 20, rel=0.15)
-
-
-def test_interval_over_episodes():
-    env = Counting(400, False)
-    episodes = playing.first_episodes(env, RandomActions(env.action_space))
-    (row,) = statistics.summaries(episodes)
-    assert "homes" not in episodes and row["homes"] is None
-    error = np.std(np.arange(1, 401)) / 20
-    assert row["upper"] - row["lower"] == pytest.approx(2 * 1.96 * error, rel=0.1)
+    error = 0.5 / 20
+    assert mean == 0.5 and upper - mean == pytest.approx(1.96 * error, rel=0.15)
+    assert mean - lower == pytest.approx(1.96 * error, rel=0.15)
 
 
 def test_interval_weighs_homes_by_lanes():
@@ -307,19 +300,12 @@ def test_evaluate_prints_and_writes_a_table(trained, capsys):
     result = json.loads(written.read_text())
     first, second = result["rows"]
     assert (first["agent"], second["agent"]) == ("trained", "random")
-    assert (
-        first["lanes"] == 6
-        and first["homes"] == 1
-        and first["return"] == 0
-        and 5 <= first["length"] <= 9
-    )
+    assert (first["lanes"], first["homes"], first["return"]) == (6, 1, 0)
+    assert 5 <= first["length"] <= 9
     assert result["checkpoint"].endswith("step_32") and result["evaluation"]["split"] == "test"
+    title = "minimal: 6 episodes in 1 home, geometry=box, split=test, after 32 samples (step_32)"
     for text in (capsys.readouterr().out, written.with_suffix(".md").read_text()):
-        assert "95 % interval" in text and "random" in text
-        assert (
-            "minimal: 6 episodes in 1 home, geometry=box, split=test, after 32 samples (step_32), "
-            "seed 1" in text
-        )
+        assert "95 % interval" in text and "random" in text and f"{title}, seed 1" in text
     row = dict(evaluated=0.0, lower=0.0, upper=0.0)
     assert scores.outcome(written) == dict(score=0.0, **row)
     assert row.items() <= scores.outcome(trained).items()
@@ -335,23 +321,14 @@ def test_evaluate_is_reproducible(trained):
     words = ["run=x", "geometry=bench", "geometry.n=3"]
     bench = settings(*words, script="evaluate").geometry
     assert lengths() == lengths() != lengths(seed=2)
-    written = evaluate.run(
-        configured(
-            run=str(trained / "checkpoints" / "step_32"),
-            geometry=bench,
-            baseline=False,
-            greedy=True,
-        )
-    )
+    path = str(trained / "checkpoints" / "step_32")
+    written = evaluate.run(configured(run=path, geometry=bench, baseline=False, greedy=True))
     result = json.loads(written.read_text())
     assert [(row["agent"], row["homes"]) for row in result["rows"]] == [("trained, greedy", 3)]
     evaluate.run(configured(run=str(trained), split="training", baseline=False))
     names = {path.name for path in (trained / "evaluations").iterdir()}
-    assert names == {
-        f"{name}.{kind}"
-        for name in ("box-test-32", "box-training-32", "bench-test-32-greedy")
-        for kind in ("json", "md")
-    }
+    tables = "box-test-32", "box-training-32", "bench-test-32-greedy"
+    assert names == {f"{name}.{kind}" for name in tables for kind in ("json", "md")}
 
 
 def test_evaluate_in_homes_from_a_file(trained, tmp_path):
@@ -367,22 +344,11 @@ def test_evaluate_in_homes_from_a_file(trained, tmp_path):
     assert result["rows"][0]["homes"] == 3
 
 
-def test_metrics_of_each_part_of_a_mix(tmp_path, monkeypatch, capsys):
+def test_metrics_of_each_part_of_a_mix(here, played, capsys):
     """Of six episodes in three homes each, those in homes 1 and 4 are in a maze."""
-    monkeypatch.chdir(tmp_path)
     house = "{source: megastep.geometries.sources:bench, n: 1}"
     words = ["geometry=mixed", f"geometry.parts={{homes: 1, maze: 1, house: {house}}}"]
-    words += ["env=explorer", "env.n_envs=4", "env.patience=1", "env.res=4"]
-    words += ["env.subsample=1", "agent.width=8", "learner.n_steps=8"]
-    words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
-    seen, first_episodes = [], playing.first_episodes
-
-    def spied(env, *args):
-        seen.append(first_episodes(env, *args))
-        return seen[-1]
-
-    monkeypatch.setattr(playing, "first_episodes", spied)
-    written = evaluate.run(configured(run=str(train.run(settings(*words))), episodes=6))
+    written = evaluate.run(configured(run=str(train.run(settings(*EXPLORER, *words))), episodes=6))
     assert written.name.startswith("mixed-test-")
     rows = json.loads(written.read_text())["rows"]
     sources = [None, "homes", "maze", "house"]
@@ -391,9 +357,10 @@ def test_metrics_of_each_part_of_a_mix(tmp_path, monkeypatch, capsys):
     ]
     every, _, maze, house = rows[:4]
     assert (every["lanes"], maze["lanes"], maze["homes"]) == (6, 2, 1)
+    (_, episodes), _ = played
     for row, lanes in (maze, [1, 4]), (house, [2, 5]):
-        assert row["return"] == pytest.approx(seen[0].returns[lanes].mean().item())
-        for name, values in seen[0].metrics.items():
+        assert row["return"] == pytest.approx(episodes.returns[lanes].mean().item())
+        for name, values in episodes.metrics.items():
             assert row["metrics"][name]["mean"] == pytest.approx(values[lanes].mean().item())
     assert "trained, in maze" in capsys.readouterr().out
 
@@ -439,13 +406,9 @@ def test_a_row_is_scored_by_what_compares_between_homes():
 
 
 @pytest.fixture
-def explorer(tmp_path, monkeypatch):
+def explorer(here):
     """A run of an explorer."""
-    monkeypatch.chdir(tmp_path)
-    words = ["env=explorer", "geometry=box", "env.n_envs=4", "env.patience=1"]
-    words += ["env.res=4", "env.subsample=1", "agent.width=8", "learner.n_steps=8"]
-    words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
-    return train.run(settings(*words))
+    return train.run(settings(*EXPLORER, "geometry=box"))
 
 
 def test_suite_evaluates_each_source_by_itself(explorer, capsys):
@@ -486,8 +449,7 @@ def test_suite_of_imported_plans(explorer, tmp_path):
 
 
 @pytest.mark.parametrize("geometry", ["suite", "maze"])
-def test_a_geometry_that_the_environment_does_not_take_is_refused(tmp_path, monkeypatch, geometry):
-    monkeypatch.chdir(tmp_path)
+def test_a_geometry_that_the_environment_does_not_take_is_refused(here, geometry):
     pong = ["env=pong", "env.n_envs=4", "learner.n_steps=8", "agent.width=8"]
     run = train.run(settings(*pong, "learner.n_minibatches=2", "device=cpu", "samples=1"))
     typed = settings("run=x", f"geometry={geometry}", script="evaluate").geometry
@@ -500,24 +462,14 @@ def test_a_geometry_that_the_environment_does_not_take_is_refused(tmp_path, monk
     assert not (run / "evaluations").exists() and not (run / "video.mp4").exists()
 
 
-def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
+def test_evaluate_keeps_lanes_in_one_home(here, played):
     """Ten lanes in four homes: three, three, two and two."""
-    monkeypatch.chdir(tmp_path)
-    shape = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
-    learner = ["learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"]
     homes = ["geometry=bench", "geometry.n=4", "env.resample=true"]
-    run = train.run(settings("env=explorer", *homes, *shape, *learner))
-    seen = {}
-
-    def spied(env, *args):
-        seen["env"], seen["episodes"] = env, first_episodes(env, *args)
-        return seen["episodes"]
-
-    first_episodes = playing.first_episodes
-    monkeypatch.setattr(playing, "first_episodes", spied)
+    run = train.run(settings(*EXPLORER, *homes))
     evaluate.run(configured(run=str(run), split="all", episodes=10, baseline=False))
-    assert seen["episodes"].homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
-    assert torch.equal(seen["env"].core.scenery.layout, seen["episodes"].homes)
+    ((env, episodes),) = played
+    assert episodes.homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
+    assert torch.equal(env.core.scenery.layout, episodes.homes)
 
 
 class Homeless(envs.Minimal):
@@ -526,10 +478,8 @@ class Homeless(envs.Minimal):
     layout = None
 
 
-def test_environment_without_a_layout_is_warned_of(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = ["env=test_evaluate:Homeless", *TINY[1:], "folder=run"]
-    train.run(settings(*words))
+def test_environment_without_a_layout_is_warned_of(here, capsys):
+    train.run(settings("env=test_evaluate:Homeless", *TINY[1:], "folder=run"))
     homes = settings("run=x", "geometry=homes", "geometry.n=3", script="evaluate").geometry
     written = evaluate.run(configured(run="run", geometry=homes, baseline=False))
     result = json.loads(written.read_text())
@@ -540,19 +490,12 @@ def test_environment_without_a_layout_is_warned_of(tmp_path, monkeypatch, capsys
     assert "layout" not in capsys.readouterr().err, "the box is one home"
 
 
-def test_few_episodes_are_spread_over_all_homes(trained, monkeypatch):
-    lists = []
-
-    def first_episodes(env, *args):
-        lists.append(env)
-        return real(env, *args)
-
-    real = playing.first_episodes
-    monkeypatch.setattr(playing, "first_episodes", first_episodes)
+def test_few_episodes_are_spread_over_all_homes(trained, played, monkeypatch):
     homes = sample("bench", 40)
     monkeypatch.setattr(factory, "homes", lambda *_: homes)
     evaluate.run(configured(run=str(trained), episodes=2, baseline=False))
-    layouts = lists[0].core.scenery.layouts
+    ((env, _),) = played
+    layouts = env.core.scenery.layouts
     expected = scene.scenery([homes[0], homes[20]], device="cpu").layouts
     assert torch.equal(layouts.lines.vals, expected.lines.vals)
 
@@ -566,17 +509,8 @@ def test_unwritable_table(trained, monkeypatch, tmp_path):
 
 
 def test_evaluate_refuses_another_environment(trained, tmp_path):
-    from megastep.agents.runs import checkpoint
-
     loaded = checkpoint.load_latest(trained / "checkpoints")
     loaded.config["train"]["env"]["res"] = 16
     checkpoint.save(tmp_path / "checkpoints", 32, loaded.state, loaded.config)
     with pytest.raises(UserError, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
         evaluate.run(configured(run=str(tmp_path)))
-
-
-def test_evaluate_without_a_run(tmp_path, capsys):
-    assert evaluate.main([f"run={tmp_path}"]) == 2
-    assert "is no run" in capsys.readouterr().err
-    assert evaluate.main([]) == 2
-    assert "run:" in capsys.readouterr().err

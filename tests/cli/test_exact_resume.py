@@ -15,10 +15,10 @@ from megastep.agents.cli import entry, train
 from megastep.agents.runs import annealing, checkpoint, json_lines
 from megastep.agents.storage.collector import Collector
 from megastep.arrdict import arrdict
-from tests.cli.test_cli import start
 from tests.helpers import tiny
-from tests.helpers.processes import HUNG
+from tests.helpers.processes import HUNG, start
 
+pytestmark = pytest.mark.usefixtures("here")
 SELF_PLAY = ["opponents.past=0.5", "opponents.snapshots=2", "opponents.every=3"]
 REPLAY = ["learner.replay.capacity=200"]
 SMALL = ["geometry=box", "env.n_envs=4", "agent.width=8", "learner.n_steps=8", "device=cpu"]
@@ -158,12 +158,6 @@ def differences(one, other, path=""):
 
 def run(*words):
     assert train.main([*words]) == 0
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.mark.parametrize(
@@ -331,10 +325,8 @@ def test_run_of_before_a_learner_had_some_settings_resumes_bit_for_bit(here, cap
 def test_inspect(here, capsys):
     run(*tiny.TINY, "samples=64", "folder=run", "log_every=1")
     capsys.readouterr()
-    assert (
-        entry.run_command("inspect", ["rum"]) == 2
-        and "did you mean run?" in capsys.readouterr().err
-    )
+    assert entry.run_command("inspect", ["rum"]) == 2
+    assert "did you mean run?" in capsys.readouterr().err
     assert entry.run_command("inspect", ["latest"]) == 0
     out = capsys.readouterr().out
     assert "step_64: intact, format 7" in out and "updates 2" in out

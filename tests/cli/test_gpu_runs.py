@@ -12,11 +12,11 @@ import torch
 from megastep import capture
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.launch import train as launch_train
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.training import loggers
 from megastep.agents.training.trainer import Trainer
 from tests.helpers import tiny
+from tests.helpers.weights import of_run as weights
 
 pytestmark = pytest.mark.cuda
 
@@ -27,10 +27,6 @@ STOPPED = 6 * UPDATE
 
 def rows(folder):
     return json_lines.read(folder / "metrics.jsonl")
-
-
-def weights(folder):
-    return checkpoint.load_latest(folder / "checkpoints").state["policy"]
 
 
 def train_until_interrupted(folder, *words):
@@ -58,19 +54,6 @@ def stopped_once(tmp_path_factory):
 def stopped(stopped_once, tmp_path):
     """A copy of one interrupted run, for a test to continue."""
     return shutil.copytree(stopped_once, tmp_path / "stopped")
-
-
-@pytest.fixture
-def trainers(monkeypatch):
-    """The trainers trainers_made during a test."""
-    trainers_made, real = [], launch_train.make_trainer
-
-    def make_trainer(*arguments):
-        trainers_made.append(real(*arguments))
-        return trainers_made[-1]
-
-    monkeypatch.setattr(launch_train, "make_trainer", make_trainer)
-    return trainers_made
 
 
 def is_captured(trainer):
@@ -139,12 +122,9 @@ def test_resume_on_another_device(stopped, capsys):
         assert checkpoint.load_latest(stopped / "checkpoints").step == samples
 
 
-def test_evaluate(stopped):
+def test_evaluate_and_record(stopped):
     assert evaluate.main([f"run={stopped}", "episodes=16", "device=cuda"]) == 0
     assert list(stopped.glob("evaluations/*.json"))
-
-
-def test_record(stopped):
     assert record.main([f"run={stopped}", "steps=3", "device=cuda"]) == 0
     assert (stopped / "video.mp4").stat().st_size > 1000
 

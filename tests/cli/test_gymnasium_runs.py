@@ -11,16 +11,11 @@ from megastep.agents.runs import json_lines
 from tests.helpers import tiny
 
 pytest.importorskip("gymnasium")
+pytestmark = pytest.mark.usefixtures("here")
 WORDS = [
     *("env=gymnasium", "device=cpu", "env.n_envs=4", "agent.width=8"),
     *("learner.n_steps=8", "learner.n_minibatches=2", "samples=64", "log_every=1"),
 ]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])

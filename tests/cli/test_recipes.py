@@ -19,8 +19,9 @@ TABLE = json.loads((Path(__file__).parents[1] / "data/settings.json").read_text(
 #: Keys that are not in it.
 ABSENT = ("nonfinite_replay", "logger.", "profile")
 #: Rows that are compared at every change.
-FEW = ["cpu env=explorer learner=ppo", "cuda env=gymnasium learner=ppo"]
-FEW += ["cpu experiment=pong learner=ppo", "cuda experiment=deathmatch_anywhere learner=vtrace"]
+FEW = ["cpu env=explorer learner=ppo", "cpu experiment=pong learner=ppo"]
+FEW += ["cuda env=explorer learner=ppo", "cuda env=gymnasium learner=ppo"]
+FEW += ["cuda experiment=deathmatch_anywhere learner=vtrace"]
 FEW += ["cuda experiment=pointgoal learner=r2d2"]
 
 

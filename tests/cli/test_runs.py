@@ -17,15 +17,9 @@ from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import UserError
 from megastep.agents.runs import folders
 from megastep.agents.runs.folders import locked
-from tests.helpers.processes import HUNG
+from tests.helpers.processes import HUNG, ROOT, in_threads
 
-ROOT = pathlib.Path(__file__).parents[2]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def run(name):
@@ -43,17 +37,8 @@ def test_make_numbers_taken_names():
 
 def test_make_from_many_threads():
     for round in range(20):
-        made, start = [], threading.Barrier(8)
-
-        def launch(name=f"runs/{round}", made=made, start=start):
-            start.wait()
-            made.append(folders.make(pathlib.Path(name)))
-
-        threads = [threading.Thread(target=launch) for _ in range(8)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        made = []
+        in_threads(lambda made=made, n=round: made.append(folders.make(pathlib.Path(f"runs/{n}"))))
         assert len(set(made)) == 8 and all(path.is_dir() for path in made)
 
 
@@ -193,10 +178,9 @@ def test_file_system_without_locks(here, monkeypatch, capsys):
 
 
 def test_lock_refuses_all_but_one(here):
-    inside, refused, start, decided = [], [], threading.Barrier(8), threading.Event()
+    inside, refused, decided = [], [], threading.Event()
 
     def work():
-        start.wait()
         try:
             with locked(here):
                 inside.append(1)
@@ -206,11 +190,7 @@ def test_lock_refuses_all_but_one(here):
             if len(refused) == 7:
                 decided.set()
 
-    threads = [threading.Thread(target=work) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(work)
     assert (len(inside), len(refused)) == (1, 7) and not (here / "lock").exists()
 
 
@@ -228,9 +208,5 @@ def test_lock_excludes_threads(here):
             except UserError:
                 pass
 
-    threads = [threading.Thread(target=work) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(work)
     assert set(most) == {1} and not (here / "lock").exists()

@@ -21,9 +21,8 @@ from megastep.agents.runs import checkpoint, checkpoint_format, folders, provena
 from megastep.agents.storage.collector import Collector
 from megastep.agents.training import loggers
 from tests.helpers import tiny
-from tests.helpers.processes import HUNG, wait_until
+from tests.helpers.processes import HUNG, ROOT, start, wait_until
 
-ROOT = pathlib.Path(__file__).parents[2]
 TINY = [*tiny.TINY, "log_every=1"]
 UPDATE = tiny.UPDATE
 WHOLE = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=3"]
@@ -134,9 +133,8 @@ def saving(monkeypatch, number):
 @pytest.mark.parametrize("moment, number", pairs([collecting, reporting, saving]))
 def test_signal_while_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
-    assert (
-        train.main([*TINY, "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
-    )
+    words = "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"
+    assert train.main([*TINY, *words]) == 128 + number
     step = checkpoint.load_latest(here / "run" / "checkpoints").step
     if moment is saving:  # while the second checkpoint is written, any number of updates go by
         assert step >= 2 * UPDATE and step % UPDATE == 0
@@ -233,17 +231,6 @@ def test_second_signal_quits(here, number):
     assert [json.loads(row)["updates"] for row in rows] == [1, 2, 3, 4]
 
 
-def launched(*arguments, script="train", **environment):
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / f"{script}.py"), *arguments],
-        env={**os.environ, **environment},
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
-
-
 def is_caught(process, number):
     """Returns True if a process handles a signal."""
     status = pathlib.Path(f"/proc/{process.pid}/status").read_text()
@@ -253,7 +240,7 @@ def is_caught(process, number):
 
 @pytest.mark.parametrize("number", ONE_SIGNAL)
 def test_signal_during_imports(here, number):
-    process = launched(*TINY, "samples=1e9")
+    process = start("train", *TINY, "samples=1e9")
     wait_until(lambda: is_caught(process, signal.SIGTERM) and is_caught(process, number), process)
     process.send_signal(number)
     out, err = process.communicate(timeout=HUNG)
@@ -270,7 +257,9 @@ def test_ctrl_c_while_compiling(here):
     compiler.write_text("\n".join(lines) + "\n")
     compiler.chmod(0o755)
     cache = str(here / "cache")
-    process = launched(*TINY, "samples=1e9", "folder=run", CXX=str(compiler), MEGASTEP_CACHE=cache)
+    process = start(
+        "train", *TINY, "samples=1e9", "folder=run", CXX=str(compiler), MEGASTEP_CACHE=cache
+    )
     _, err = process.communicate(timeout=HUNG)
     assert (process.returncode, err) == (130, "train.py: stopped by SIGINT\n")
     assert not (here / "run").exists()
@@ -281,7 +270,7 @@ def test_ctrl_c_while_compiling(here):
 def test_signal_of_the_terminal_while_filming(here, number):
     """The signal reaches this process, its workers and their resource tracker."""
     filming = ["finish.record=true", "finish.steps=5000"]
-    process = launched(*TINY, f"samples={UPDATE}", "folder=run", *filming)
+    process = start("train", *TINY, f"samples={UPDATE}", "folder=run", *filming)
     children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
     wait_until(lambda: len(children.read_text().split()) > 1, process)
     os.killpg(process.pid, number)
@@ -293,9 +282,8 @@ def at_any_moment(here, seed):
     """Sends a signal to a run at a random time, and checks what always holds."""
     draw = random.Random(seed)
     number, folder = draw.choice(SIGNALS), here / str(seed)
-    process = launched(
-        *TINY, f"samples={8 * UPDATE}", "checkpoint_seconds=1e-9", f"folder={folder}", *WHOLE
-    )
+    words = f"samples={8 * UPDATE}", "checkpoint_seconds=1e-9", f"folder={folder}", *WHOLE
+    process = start("train", *TINY, *words)
     time.sleep(draw.uniform(0.1, 12))
     if draw.random() < 0.5:
         os.killpg(process.pid, number)  # as a terminal does: workers get it, too
@@ -307,9 +295,7 @@ def at_any_moment(here, seed):
         assert not folder.exists() or "Filmed" in out, case
         return
     assert process.returncode in (0, 128 + number), case
-    assert not {"Traceback", "could not", "cannot", "warning"} & set(
-        err.replace(":", "").split()
-    ), case
+    assert not {"Traceback", "cannot", "warning"} & {*err.replace(":", "").split()}, case
     if folder.exists() and "Training on" in out:
         steps = [p.name for p in (folder / "checkpoints").glob("*")]
         assert not any("tmp" in name for name in steps), case

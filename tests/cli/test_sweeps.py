@@ -9,10 +9,10 @@ import os
 import pathlib
 import pickle
 import signal
-import subprocess
 import sys
 import tempfile
 import time
+from types import SimpleNamespace
 
 import cloudpickle
 import pytest
@@ -27,60 +27,37 @@ from megastep.agents.factory.settings import kind_of
 from megastep.agents.launch import places
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import folders, scores
-from tests.helpers.processes import HUNG, is_running, wait_until
+from tests.helpers import tiny
+from tests.helpers.processes import HUNG, ROOT, finished, is_running, start, wait_until
 
-ROOT = pathlib.Path(__file__).parents[2]
 PAYER = '''
 import os
 
 import torch
 
-from megastep import arrdict, spaces
+from megastep.envs import Minimal
 
 
-class Payer:
+class Payer(Minimal):
     """Episodes of four steps with reward `pay` each; the constructor fails for some moods."""
 
-    n_agents, fps = 1, 5.0
-    action_space, obs_space = spaces.MultiDiscrete(1, 2), spaces.MultiVector(1, 2)
-
-    def __init__(self, n_envs: int, *, device=None, pay: float = 1.0, mood: str = "fine"):
+    def __init__(self, *args, pay: float = 1.0, mood: str = "fine", **settings):
         if mood == "cross":
             raise RuntimeError("by chance")
         if mood == "dead":
             os._exit(3)
         if mood == "lost" and os.environ.get("RANK") == "1":
             os.kill(os.getpid(), 9)
-        self.n_envs, self.device, self.pay = n_envs, torch.device(device or "cpu"), pay
-        self.age = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
-
-    def reset(self):
-        return self._world(torch.ones_like(self.age, dtype=torch.bool))
+        super().__init__(*args, shortest=4, longest=4, **settings)
+        self.pay = pay
 
     def step(self, decision):
-        return self._world(self.age >= 4)
-
-    def _world(self, reset):
-        self.age.add_(1).masked_fill_(reset, 0)
-        obs = torch.zeros(self.n_envs, 1, 2, device=self.device)
-        reward = torch.full_like(self.age, self.pay, dtype=torch.float32).masked_fill(reset, 0.0)
-        terminal = torch.zeros_like(reset)
-        flags = dict(reset=reset, terminal=terminal, truncated=self.age >= 4)
-        return arrdict.arrdict(obs=obs, reward=reward, **flags)
-
-    def check(self):
-        pass
+        world = super().step(decision)
+        world["reward"] = torch.full_like(world.reward, self.pay).masked_fill(world.reset, 0.0)
+        return world
 '''
-UPDATE = 4 * 8  # samples
-SMALL = [
-    "env=payer:Payer",
-    "env.n_envs=4",
-    "learner.n_steps=8",
-    "learner.n_minibatches=2",
-    "agent.width=8",
-    "device=cpu",
-    "log_every=1",
-]
+UPDATE = tiny.UPDATE
+SMALL = ["env=payer:Payer", *tiny.TINY[1:], "log_every=1"]
 SHORT = [*SMALL, f"samples={2 * UPDATE}"]
 
 
@@ -104,23 +81,6 @@ def rows(folder):
     """Returns the rows of sweep.csv."""
     with open(pathlib.Path(folder) / "sweep.csv") as file:
         return list(csv.DictReader(file))
-
-
-def start(*words, **environment):
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / "train.py"), *words],
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-    )
-
-
-def finished(*words):
-    """Runs train.py. Returns (exit code, stdout, stderr)."""
-    process = start(*words)
-    out, err = process.communicate(timeout=HUNG)
-    return process.returncode, out, err
 
 
 # ---- Hydra's own launcher and sweeper ----
@@ -201,19 +161,12 @@ def test_table_stands_while_jobs_run(here, monkeypatch):
 @pytest.mark.slow
 def test_sweeps_in_the_same_second(here, monkeypatch):
     monkeypatch.setattr(train, "run", lambda cfg: None)
-    monkeypatch.setattr(
-        "hydra.core.utils.datetime", type("Clock", (), {"now": staticmethod(lambda: NOON)})
-    )
+    noon = SimpleNamespace(strftime=lambda pattern: "noon")
+    monkeypatch.setattr("hydra.core.utils.datetime", SimpleNamespace(now=lambda: noon))
     for _ in range(2):
         assert train.main([*SHORT, "-m", "seed=1,2"]) == 0
     assert sorted(path.name for path in (here / "sweeps").iterdir()) == ["noon", "noon-2"]
     assert len(list((here / "sweeps").glob("*/0_seed=1"))) == 2
-
-
-class NOON:
-    @staticmethod
-    def strftime(pattern):
-        return "noon"
 
 
 def test_job_refuses_a_used_folder(here):
@@ -262,12 +215,17 @@ def test_wandb_group_of_a_sweep(here, monkeypatch):
 
 # ---- Other launchers and sweepers ----
 
+JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
+
+
+def n_learning(here):
+    return sum(path.stat().st_size > 0 for path in here.glob("mine/*/metrics.jsonl"))
+
 
 @pytest.mark.slow
 def test_joblib(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
-    code, out, err = finished(*SHORT, "-m", "env.pay=1,2", *words)
+    code, out, err = finished("train", *SHORT, "-m", "env.pay=1,2", *JOBLIB)
     assert code == 0 and "Traceback" not in err, err
     assert [(row["env.pay"], float(row["score"])) for row in rows("mine")] == [("1", 4), ("2", 8)]
     records = [json.loads(path.read_text()) for path in (here / "mine/.jobs").glob("*/*.json")]
@@ -278,13 +236,9 @@ def test_joblib(here):
 @pytest.mark.slow
 def test_signal_saves_jobs_in_other_processes(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
-    process = start(*SMALL, "samples=1e12", "-m", "seed=1,2,3", *words)
+    process = start("train", *SMALL, "samples=1e12", "-m", "seed=1,2,3", *JOBLIB)
 
-    def n_learning():
-        return sum(path.stat().st_size > 0 for path in here.glob("mine/*/metrics.jsonl"))
-
-    wait_until(lambda: n_learning() == 2, process)
+    wait_until(lambda: n_learning(here) == 2, process)
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=HUNG)
     assert process.returncode == 143 and err.splitlines()[-1] == "train.py: stopped by SIGTERM"
@@ -303,26 +257,11 @@ def test_optuna_maximises_and_skips_failed_trials(here):
     assert len(table) == 4 and (here / "study.db").exists()
     assert code == (1 if any(row["state"] != "done" for row in table) else 0)
     scores = [float(row["score"]) for row in table if row["score"]]
-    assert scores and all(
-        float(row["score"]) == pytest.approx(4 * float(row["env.pay"]), rel=1e-5)
-        for row in table
-        if row["score"]
-    )
+    paid = [4 * float(row["env.pay"]) for row in table if row["score"]]
+    assert scores and scores == pytest.approx(paid, rel=1e-5)
     best = yaml.safe_load((here / "mine/optimization_results.yaml").read_text())
     assert best["best_value"] == max(scores)
     assert set(best["best_params"]) == {"env.pay", "env.mood"}
-
-
-@pytest.mark.slow
-def test_submitit(here):
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    code, _, err = finished(
-        *SHORT, "-m", "env.pay=2", "hydra/launcher=submitit_local", "hydra.sweep.dir=mine"
-    )
-    assert code == 0, err
-    (row,) = rows("mine")
-    assert (row["state"], float(row["score"])) == ("done", 8)
-    assert list((here / "mine/.submitit").rglob("*_log.out"))
 
 
 @pytest.mark.slow
@@ -330,22 +269,20 @@ def test_submitit_job_of_two_ranks(here):
     """One rank of a job fails: the other jobs and the table stand."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     words = ["ranks=2", "env.mood=lost,fine", "hydra/launcher=submitit_local"]
-    code, _, err = finished(*SHORT, "-m", *words, "hydra.sweep.dir=mine")
+    code, _, err = finished("train", *SHORT, "-m", *words, "hydra.sweep.dir=mine")
     lost, fine = rows("mine")
     assert code == 1 and "Traceback" not in err, err
     assert lost["state"].startswith("FAILED: rank 1 on ")
     assert (fine["state"], float(fine["score"])) == ("done", 4)
     lines = (here / "mine/1_env.mood=fine/metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["samples"] for line in lines] == [2 * UPDATE]  # of both ranks
-
-
-JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
+    assert list((here / "mine/.submitit").rglob("*_log.out"))
 
 
 @pytest.mark.slow
 def test_job_that_ends_its_process_leaves_the_others(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    code, _, err = finished(*SHORT, "-m", "env.mood=dead,fine", *JOBLIB)
+    code, _, err = finished("train", *SHORT, "-m", "env.mood=dead,fine", *JOBLIB)
     assert code == 1 and f"Job 0 {sweeps.LOST}" in err and "Traceback" not in err
     assert [row["state"] for row in rows("mine")] == [sweeps.LOST, "done"]
 
@@ -360,15 +297,14 @@ def children(process):
 @pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
 def test_kill_9(here, victim):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    process = start(*SMALL, "seconds=8", "checkpoint_seconds=1", "-m", "seed=1,2,3", *JOBLIB)
+    process = start(
+        "train", *SMALL, "seconds=8", "checkpoint_seconds=1", "-m", "seed=1,2,3", *JOBLIB
+    )
 
     def jobs():
         return [json.loads(path.read_text()) for path in here.glob("mine/.jobs/*/*.json")]
 
-    def n_learning():
-        return sum(path.stat().st_size > 0 for path in here.glob("mine/*/metrics.jsonl"))
-
-    wait_until(lambda: n_learning() == 2, process)
+    wait_until(lambda: n_learning(here) == 2, process)
     pids = {"worker": children(process), "sweep": [process.pid]}
     pids["job"] = [job["process"] for job in jobs()]
     os.kill(pids[victim][-1], signal.SIGKILL)  # the first child is a tracker

@@ -11,6 +11,7 @@ N environments, A agents, D layouts.
 
 import json
 import math
+import operator
 import sys
 from types import SimpleNamespace
 
@@ -94,14 +95,8 @@ def not_tensors(good):
 
 def wrong_tensors(good):
     """Tensors that are not contiguous, or differ in dtype, shape or device."""
-    for dtype in (
-        torch.float64,
-        torch.float16,
-        torch.float32,
-        torch.int64,
-        torch.int32,
-        torch.bool,
-    ):
+    for name in ("float64", "float16", "float32", "int64", "int32", "bool"):
+        dtype = getattr(torch, name)
         if dtype != good.dtype:
             yield f"of {dtype}", good.to(dtype)
     yield "an axis more", good[None]
@@ -196,6 +191,14 @@ def integers(min, max=None):
     return wrong
 
 
+def seeds(good):
+    return [*integers(0)(good)][:6]
+
+
+def limits(good):
+    return integers(1, 2**31 - 1)(1)
+
+
 def numbers(*more):
     def wrong(good):
         yield from [("None", None), ("a string", "1"), ("NaN", math.nan), ("infinite", math.inf)]
@@ -206,12 +209,7 @@ def numbers(*more):
 
 
 def flags(good):
-    yield from [
-        ("a string", "yes"),
-        ("two", torch.ones(2)),
-        ("a list", []),
-        ("two numbers", (0, 1)),
-    ]
+    yield from [("a string", "yes"), ("two", torch.ones(2)), ("a list", []), ("numbers", (0, 1))]
 
 
 def objects(good):
@@ -256,74 +254,46 @@ def operations(f):
             seen=tensors,
             clear_mask=optional_tensors,
             max_depth=numbers(0, -1),
-            imu=flags,
-            rgb=flags,
-            depth=flags,
-            centre_line=flags,
-            agent_ray=flags,
+            **dict.fromkeys(("imu", "rgb", "depth", "centre_line", "agent_ray"), flags),
         ),
     )
     yield (
         engine.spawn,
         dict(
-            both,
-            mask=f.mask,
-            points=f.points,
-            counts=f.counts,
-            seed=1,
-            resample=True,
-            point_index=f.counts,
-            cumulative=f.cumulative,
+            both, mask=f.mask, points=f.points, counts=f.counts, seed=1, resample=True,
+            point_index=f.counts, cumulative=f.cumulative,
         ),
         dict(
             OPERANDS,
-            mask=tensors,
-            points=tensors,
-            counts=tensors,
-            seed=lambda good: [*integers(0)(good)][:6],
+            **dict.fromkeys(("mask", "points", "counts"), tensors),
+            seed=seeds,
             resample=flags,
             hidden=flags,
-            point_index=optional_tensors,
-            cumulative=optional_tensors,
+            **dict.fromkeys(("point_index", "cumulative"), optional_tensors),
         ),
-    )
+    )  # fmt: skip
     yield (
         pointgoal_step,
         dict(
-            both,
-            goals=f.goals,
-            goal_index=f.numbers,
-            progress=f.progress,
-            ages=f.ages,
-            ended=f.ended,
-            n_draws=f.numbers,
-            spawn_index=f.counts,
-            free=f.free,
-            seed=1,
+            both, goals=f.goals, goal_index=f.numbers, progress=f.progress, ages=f.ages,
+            ended=f.ended, n_draws=f.numbers, spawn_index=f.counts, free=f.free, seed=1,
         ),
         dict(
             OPERANDS,
             goals=objects,
-            goal_index=tensors,
-            progress=tensors,
-            ages=tensors,
-            ended=tensors,
-            n_draws=tensors,
+            **dict.fromkeys(("goal_index", "progress", "ages", "ended", "n_draws"), tensors),
             spawn_index=tensors,
             free=optional_tensors,
-            seed=lambda good: [*integers(0)(good)][:6],
-            reach=numbers(),
-            bonus=numbers(),
-            cost=numbers(),
-            walk_cost=numbers(),
-            limit=lambda good: integers(1, 2**31 - 1)(1),
+            seed=seeds,
+            **dict.fromkeys(("reach", "bonus", "cost", "walk_cost"), numbers()),
+            limit=limits,
             privileged=flags,
         ),
-    )
+    )  # fmt: skip
     yield (
         engine.uniform,
         dict(counts=f.counts.view(-1), mask=f.mask.view(-1), seed=1, out=f.out),
-        dict(counts=tensors, mask=tensors, seed=lambda g: [*integers(0)(g)][:6], out=tensors),
+        dict(counts=tensors, mask=tensors, seed=seeds, out=tensors),
     )
     yield (
         explorer_step,
@@ -335,7 +305,7 @@ def operations(f):
             OPERANDS,
             runs=objects,
             **dict.fromkeys(("newly_seen", "seen", "ages", "limits", "ended"), tensors),
-            patience=lambda good: integers(1, 2**31 - 1)(1),
+            patience=limits,
             coverage=flags,
             privileged=flags,
         ),
@@ -345,13 +315,12 @@ def operations(f):
         pong_step,
         dict(games=f.games, actions=f.actions, error_flag=f.error_flag, seed=1, pixels=f.pixels),
         dict(
-            games=tensors,
-            actions=tensors,
+            **dict.fromkeys(("games", "actions"), tensors),
             error_flag=lambda good: [c for c in tensors(good) if c[0] != "not contiguous"],
-            seed=lambda good: [*integers(0)(2)][:6],
+            seed=seeds,
             restart=flags,
-            points=lambda good: integers(1, 2**31 - 1)(1),
-            limit=lambda good: integers(1, 2**31 - 1)(1),
+            points=limits,
+            limit=limits,
             tracker_speed=numbers(-0.1, 40),
             pixels=optional_tensors,
         ),
@@ -371,7 +340,7 @@ def operations(f):
             ),
             **dict.fromkeys(("hit_reward", "wound_cost", "kill_reward", "death_cost"), numbers()),
             aim_reward=numbers(),
-            limit=lambda good: integers(1, 2**31 - 1)(1),
+            limit=limits,
             privileged=flags,
         ),
     )  # fmt: skip
@@ -386,45 +355,30 @@ def operations(f):
 
 def constructors(f):
     model, widths = f.scenery.model.clone(), f.scenery.model_texels.diff()
-    layouts = dict(
-        lines=f.layouts.lines,
-        textures=f.layouts.textures,
-        lights=f.layouts.lights,
-        agent_textures=f.layouts.agent_textures,
-        device=f.device,
-    )
+    names = "lines", "textures", "lights", "agent_textures"
+    layouts = {name: getattr(f.layouts, name) for name in names} | dict(device=f.device)
     device = lambda good: [("a string", "tpu"), ("a half", 0.5), ("a list", [])]  # noqa: E731
     parts = dict(lines=raggeds, textures=raggeds, lights=raggeds, device=device)
     yield Layouts, layouts, dict(parts, agent_textures=arrays)
     yield (
         Scenery.of_layouts,
         dict(
-            n_agents=A,
-            layouts=f.layouts,
-            model=model,
-            model_widths=widths,
+            n_agents=A, layouts=f.layouts, model=model, model_widths=widths,
             layout=f.scenery.layout.clone(),
         ),
         dict(
-            n_agents=integers(0),
-            layouts=objects,
-            model=arrays,
-            model_widths=ids,
+            n_agents=integers(0), layouts=objects, model=arrays, model_widths=ids,
             layout=lambda good: [*ids(good), ("the next", good + D)],
         ),
-    )
+    )  # fmt: skip
     yield (
         Scenery,
         dict(
-            n_agents=A,
-            lights=f.scenery.lights,
-            lines=f.scenery.lines,
-            textures=f.scenery.textures,
-            model=model,
-            device=f.device,
+            n_agents=A, lights=f.scenery.lights, lines=f.scenery.lines,
+            textures=f.scenery.textures, model=model, device=f.device,
         ),
         dict(parts, n_agents=integers(0), model=arrays),
-    )
+    )  # fmt: skip
     yield (
         engine.Agents,
         dict(
@@ -480,24 +434,13 @@ CALLS = {
 }
 STATE = "positions", "angles", "velocity", "angvelocity"
 SETTINGS = dict(res=10**6, fov=0.0, fps=0.0, radius=-1.0)
-BUFFERS = {
-    "layout": lambda f: f.scenery.layout,
-    "agent_lines": lambda f: f.scenery.agent_lines,
-    "agent_light": lambda f: f.scenery.agent_light,
-    "model": lambda f: f.scenery.model,
-    "model_texels": lambda f: f.scenery.model_texels,
-    "texels": lambda f: f.layouts.texels,
-    "agent_textures": lambda f: f.layouts.agent_textures,
-    "wall_starts": lambda f: f.layouts.wall_starts,
-    "texel_starts": lambda f: f.layouts.texel_starts,
-    "light_starts": lambda f: f.layouts.light_starts,
-    "box_starts": lambda f: f.layouts.box_starts,
-    "lines": lambda f: f.layouts.lines.vals,
-    "lights": lambda f: f.layouts.lights.vals,
-    "yaws": lambda f: f.agents.yaws,
-    "ray_lengths": lambda f: f.agents.ray_lengths,
-    "error_flag": lambda f: f.agents.error_flag,
-}
+OF_SCENERY = "layout", "agent_lines", "agent_light", "model", "model_texels"
+OF_LAYOUTS = "texels", "agent_textures", "wall_starts", "texel_starts", "light_starts", "box_starts"
+BUFFERS = {name: operator.attrgetter(f"scenery.{name}") for name in OF_SCENERY}
+BUFFERS |= {name: operator.attrgetter(f"layouts.{name}") for name in OF_LAYOUTS}
+BUFFERS |= {name: operator.attrgetter(f"layouts.{name}.vals") for name in ("lines", "lights")}
+OF_AGENTS = "yaws", "ray_lengths", "error_flag"
+BUFFERS |= {name: operator.attrgetter(f"agents.{name}") for name in OF_AGENTS}
 
 
 def replacements(device):
@@ -510,7 +453,7 @@ def replacements(device):
                     yield f"{call}, agents.{name} {label}", name, _set("agents", name, value, call)
     for name, value in SETTINGS.items():
         yield f"agents.{name} = {value}", name, _set("agents", name, value, "render")
-    for name in ("yaws", "ray_lengths", "error_flag"):
+    for name in OF_AGENTS:
         yield f"agents.{name} = None", name, _set("agents", name, None, "render")
     for owner in ("scenery", "layouts"):
         for name in vars(getattr(f, owner)):
@@ -561,28 +504,20 @@ def resizings(device):
 
 
 def others(device):
-    yield (
-        "observe without seen",
-        "clear_mask",
-        lambda f: engine.observe(f.scenery, f.agents, clear_mask=f.mask),
-    )
-    yield (
-        "subsample no divisor",
-        "subsample",
-        lambda f: engine.observe(f.scenery, f.agents, subsample=3),
-    )
-    yield (
-        "too few points",
-        "points",
-        lambda f: engine.spawn(
-            f.scenery, f.agents, f.mask, f.points[:, :1].contiguous(), f.counts, 1
-        ),
-    )
-    yield (
-        "agents of fewer environments",
-        "positions",
-        lambda f: engine.render(f.scenery, engine.Agents(N - 1, A, device=f.device)),
-    )
+    def spawn(f, points):
+        engine.spawn(f.scenery, f.agents, f.mask, points, f.counts, 1)
+
+    def observe(**settings):
+        return lambda f: engine.observe(f.scenery, f.agents, **settings)
+
+    def of_fewer(f):
+        engine.render(f.scenery, engine.Agents(N - 1, A, device=f.device))
+
+    mask = torch.ones((N, A), dtype=torch.bool, device=device)
+    yield "observe without seen", "clear_mask", observe(clear_mask=mask)
+    yield "subsample no divisor", "subsample", observe(subsample=3)
+    yield "too few points", "points", lambda f: spawn(f, f.points[:, :1].contiguous())
+    yield "agents of fewer environments", "positions", of_fewer
     for name in ("lines", "lights", "textures", "baked"):
         yield f"scenery.{name}[99]", "99", lambda f, name=name: getattr(f.scenery, name)[999]
         yield f"scenery.{name}['a']", "str", lambda f, name=name: getattr(f.scenery, name)["a"]
@@ -590,11 +525,8 @@ def others(device):
     yield "device None", "device", lambda f: engine.device(None)
     yield "Core of no scenery", "scenery", lambda f: cuda.Core(None)
     for name, value in dict(res=0, fov=200.0, fps=-1.0, cameras=[], seed=0.5).items():
-        yield (
-            f"Core({name}={value})",
-            "camera" if name == "cameras" else name,
-            lambda f, name=name, value=value: cuda.Core(f.scenery, **{name: value}),
-        )
+        make = lambda f, name=name, value=value: cuda.Core(f.scenery, **{name: value})  # noqa: E731
+        yield f"Core({name}={value})", "camera" if name == "cameras" else name, make
 
 
 def wrong_arguments(device):

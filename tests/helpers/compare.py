@@ -46,15 +46,8 @@ class Report:
             )
 
     def within(self, field, env, ours, lower, upper, tolerance, axes):
-        self.add(
-            field,
-            env,
-            torch.maximum(lower - ours, ours - upper).clamp(min=0),
-            tolerance,
-            ours,
-            lower,
-            axes,
-        )
+        error = torch.maximum(lower - ours, ours - upper).clamp(min=0)
+        self.add(field, env, error, tolerance, ours, lower, axes)
 
     def check(self):
         """Raises AssertionError if a field exceeds its tolerance. Returns {field: worst error /
@@ -126,7 +119,7 @@ def check_hits(report, env, ours, lines, positions, directions, radius):
     report.add("indices", env, torch.where(allowed, 0.0, math.inf), 1.0, ours["indices"], law, axes)
 
     along = (lines[:, 1] - lines[:, 0])[index]
-    length = (lines[:, 1] - lines[:, 0]).norm(dim=-1)[index]
+    length = along.norm(dim=-1)
     dot = (directions * along).sum(-1) / (directions.norm(dim=-1) * length + twin.DOT_GUARD)
     shaky = COORDINATE_SLACK * lines.abs().max() / length.clamp(min=1e-12)
     distance = pick(distance)
@@ -137,15 +130,8 @@ def check_hits(report, env, ours, lines, positions, directions, radius):
     ):
         mine = ours[field]
         unseen = torch.where(mine.isnan() if math.isnan(blank) else mine == blank, 0.0, math.inf)
-        report.add(
-            field,
-            env,
-            torch.where(hit, (mine - law).abs(), unseen),
-            torch.where(hit, tolerance, 1.0),
-            mine,
-            torch.where(hit, law, blank),
-            axes,
-        )
+        error, law = torch.where(hit, (mine - law).abs(), unseen), torch.where(hit, law, blank)
+        report.add(field, env, error, torch.where(hit, tolerance, 1.0), mine, law, axes)
 
 
 def check_render(ours, envs, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.RADIUS):
@@ -161,25 +147,12 @@ def check_render(ours, envs, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.R
         shape = (envs.n_agents, len(cameras), res)
         mine = {k: ours[k][e].reshape(shape) for k in ("indices", "locations", "dots", "distances")}
         lines = torch.cat([twin.agent_lines(w["model"], w["positions"], w["angles"]), w["walls"]])
-        check_hits(
-            report,
-            e,
-            mine,
-            lines,
-            w["positions"],
-            twin.rays(w["angles"], cameras, res, fov),
-            radius,
-        )
-        drawn = dict(
-            mine,
-            indices=mine["indices"].clamp(max=len(lines) - 1),
-            locations=mine["locations"].nan_to_num(),
-            dots=mine["dots"].nan_to_num(),
-        )
-        lower, upper = (
-            twin.shade(drawn, w["textures"], w["widths"], light)
-            for light in light_bracket(w, lines)
-        )
+        directions = twin.rays(w["angles"], cameras, res, fov)
+        check_hits(report, e, mine, lines, w["positions"], directions, radius)
+        drawn = {name: values.nan_to_num() for name, values in mine.items()}
+        drawn["indices"] = mine["indices"].clamp(max=len(lines) - 1)
+        bracket = light_bracket(w, lines)
+        lower, upper = (twin.shade(drawn, w["textures"], w["widths"], light) for light in bracket)
         axes = "agent", "camera", "ray", "colour"
         report.within("screen", e, ours["screen"][e].reshape(*shape, 3), lower, upper, SCREEN, axes)
     return report.check()
@@ -188,14 +161,9 @@ def check_render(ours, envs, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.R
 def light_bracket(w, lines):
     """Bounds (T,), (T,) on the light of the texels of an environment's lines."""
     points = twin.texel_positions(lines, w["widths"])
-    slack = (
-        1e-6
-        + COORDINATE_SLACK * lines.abs().max()
-        + ANGLE_SLACK * (lines.amax((0, 1)) - lines.amin((0, 1))).max()
-    )
-    return twin.light_at(points, w["walls"], w["lights"], slack), twin.light_at(
-        points, w["walls"], w["lights"], -slack
-    )
+    extent = (lines.amax((0, 1)) - lines.amin((0, 1))).max()
+    slack = 1e-6 + COORDINATE_SLACK * lines.abs().max() + ANGLE_SLACK * extent
+    return [twin.light_at(points, w["walls"], w["lights"], each) for each in (slack, -slack)]
 
 
 def check_baked(baked, envs, static_only=True):
@@ -233,15 +201,9 @@ def check_physics(ours, envs, *, fps=10.0, radius=twin.RADIUS):
         )
         report.within("progress", e, mine["progress"], lower, upper, FRACTION, ("agent",))
         arrived = w["positions"] + mine["progress"][:, None] * step
-        report.add(
-            "positions",
-            e,
-            (mine["positions"] - arrived).abs(),
-            slack + FASTER * step.norm(dim=-1, keepdim=True),
-            mine["positions"],
-            arrived,
-            ("agent", "axis"),
-        )
+        error, axes = (mine["positions"] - arrived).abs(), ("agent", "axis")
+        tolerance = slack + FASTER * step.norm(dim=-1, keepdim=True)
+        report.add("positions", e, error, tolerance, mine["positions"], arrived, axes)
         turned = twin.wrapped(w["angles"] + mine["progress"] * w["angvelocity"] / fps)
         inside = (mine["angles"] >= -180) & (mine["angles"] < 180)
         error = torch.where(inside, twin.wrapped(mine["angles"] - turned).abs(), math.inf)
@@ -312,21 +274,12 @@ def golden_errors(case, ours):
         apart = (ours["positions"] - right["positions"]).norm(dim=-1)
         fraction("positions", ~(apart <= 0.005 + 0.004 * step)[judged], 0.005)
         turned = 1e-4 + 2e-3 * (envs.angvelocity.double() / settings["fps"]).abs()
-        fraction(
-            "angles",
-            ~(twin.wrapped(ours["angles"] - right["angles"]).abs() <= turned)[judged],
-            0.005,
-        )
-        fraction(
-            "velocity",
-            ~((ours["velocity"] - right["velocity"]).abs().amax(-1) <= 1e-5)[judged],
-            0.005,
-        )
-        fraction(
-            "angvelocity",
-            ~((ours["angvelocity"] - right["angvelocity"]).abs() <= 1e-4)[judged],
-            0.005,
-        )
+        off = twin.wrapped(ours["angles"] - right["angles"]).abs()
+        fraction("angles", ~(off <= turned)[judged], 0.005)
+        off = (ours["velocity"] - right["velocity"]).abs().amax(-1)
+        fraction("velocity", ~(off <= 1e-5)[judged], 0.005)
+        off = (ours["angvelocity"] - right["angvelocity"]).abs()
+        fraction("angvelocity", ~(off <= 1e-4)[judged], 0.005)
     return errors
 
 

@@ -22,33 +22,16 @@ TRY = 0.01  # m: distance that a stopped agent tries to get away
 LEAVES = 0.001  # m: minimum distance that counts as getting away
 # m: a wall this deep within the radius is no rounding error; RADIUS and BODY differ by 1e-4
 SUNK = 1e-5
-SETTINGS = [
-    (1, 1),
-    (1, 100),
-    (3, 30),
-    (10, 1),
-    (10, 100),
-    (30, 10),
-    (60, 100),
-    (200, 1),
-    (200, 100),
-]  # fps, accel
+# fps, accel
+SETTINGS = [(1, 1), (1, 100), (3, 30), (10, 1), (10, 100), (30, 10), (60, 100)]
+SETTINGS += [(200, 1), (200, 100)]
 
 
 # ---- Walkers ----
 
 COUNTED = "steps", "collisions", "crossings", "sunk"
-RECORDED = (
-    "x before",
-    "y before",
-    "x after",
-    "y after",
-    "velocity x",
-    "velocity y",
-    "angle",
-    "action",
-    "step",
-)
+RECORDED = "x before", "y before", "x after", "y after", "velocity x", "velocity y"
+RECORDED += "angle", "action", "step"
 
 
 class Walk:

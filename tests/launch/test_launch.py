@@ -17,9 +17,10 @@ from megastep.agents.launch.endings import Ending
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from tests.helpers import tiny
-from tests.helpers.processes import is_running, wait_until
+from tests.helpers.processes import is_running, start, wait_until
 from tests.helpers.ranks import HUNG, ROOT
 
+pytestmark = pytest.mark.usefixtures("here")
 TINY = [*tiny.TINY, "log_every=1", "folder=run"]
 UPDATE = 2 * tiny.UPDATE
 ON_GPUS = [*tiny.ON_GPU, "folder=run"]
@@ -28,12 +29,6 @@ TWO_GPUS = [
     pytest.mark.cuda,
     pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs"),
 ]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 # ---- The settings ----
@@ -187,20 +182,13 @@ def test_ranks_share_the_cores_that_they_may_use(here, monkeypatch):
 
 
 @contextlib.contextmanager
-def started(here, *words, script=ROOT / "train.py", base=TINY, **env):
+def started(here, *words, base=TINY, **env):
     """Starts two ranks of the run that the words of `base` and `words` say. A context, at whose end
     none is left.
     """
     (here / "tmp").mkdir(exist_ok=True)
-    env = os.environ | {"TMPDIR": str(here / "tmp")} | env
-    process = subprocess.Popen(
-        [sys.executable, str(script), *base, "ranks=2", *words],
-        env=env,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
+    env = dict(TMPDIR=str(here / "tmp")) | env
+    process = start("train", *base, "ranks=2", *words, **env)
     try:
         yield process
     finally:
@@ -319,7 +307,8 @@ def test_restart(here):
 @pytest.mark.slow
 def test_ranks_end_with_the_process_that_launched_them(here):
     with started(here) as run:
-        wait_for_checkpoint_or_start(here, run)
+        wait_until(lambda: (here / "run" / "metrics.jsonl").exists(), run)
+        time.sleep(1)
         pids = [pid_of(here, n) for n in range(2)]
         run.kill()
         deadline = time.monotonic() + 30
@@ -327,11 +316,6 @@ def test_ranks_end_with_the_process_that_launched_them(here):
             time.sleep(0.1)
         assert not any(map(is_running, pids))
     assert checkpoint.load_latest(here / "run" / "checkpoints").step > 0
-
-
-def wait_for_checkpoint_or_start(here, process):
-    wait_until(lambda: (here / "run" / "metrics.jsonl").exists(), process)
-    time.sleep(1)
 
 
 STUCK = """

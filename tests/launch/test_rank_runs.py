@@ -212,19 +212,13 @@ class Copy:
 
 def learning_curves(n_envs):
     """Returns the mean returns of each report of three runs with other seeds."""
-    words = ["env=tests.distributed.test_rank_runs:Copy", "device=cpu"]
-    words += [
-        "agent.width=16",
-        f"env.n_envs={n_envs}",
-        "learner.n_steps=8",
-        "learner.lr=3e-3",
-        "log_every=5",
-    ]
-    words += ["samples=10240", "learner.n_minibatches=2", "desync=false", *NO_FINISH]
+    words = ["env=tests.launch.test_rank_runs:Copy", "device=cpu"]
+    words += ["agent.width=16", f"env.n_envs={n_envs}", "learner.n_steps=8", "learner.lr=3e-3"]
+    words += ["log_every=5", "samples=10240", "learner.n_minibatches=2", "desync=false"]
     curves = []
     for seed in (1, 2, 3):
         folder = f"copy-{n_envs}-{seed}"
-        trained(*words, f"seed={seed}", f"folder={folder}")
+        trained(*words, *NO_FINISH, f"seed={seed}", f"folder={folder}")
         rows = json_lines.read(f"{folder}/metrics.jsonl")
         curves.append([row["episode/return"] for row in rows])
     return curves

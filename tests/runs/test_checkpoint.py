@@ -2,7 +2,6 @@
 really killed.
 """
 
-import errno
 import hashlib
 import itertools
 import json
@@ -55,19 +54,12 @@ def test_load_returns_what_was_saved(folder):
     assert loaded.state == {"samples": 30, "rate": 0.5, "none": None, "list": [1, 2]}
 
 
-def test_versions_that_a_run_was_made_with_are_saved(tmp_path):
-    checkpoint.save(tmp_path, 1, state(1), CONFIG, made_with={"torch": "2.0", "threads": 2})
-    assert checkpoint.load_latest(tmp_path).made_with == {"torch": "2.0", "threads": 2}
-
-
-def test_load_one_checkpoint_by_path(folder):
-    assert checkpoint.load_latest(folder / "step_10").step == 10
-
-
 def test_checkpoints_are_sorted_by_number(tmp_path):
     for n in (9, 20, 100):
-        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=9)
+        made_with = {"torch": "2.0", "threads": n}
+        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=9, made_with=made_with)
     assert names(tmp_path) == ["step_9", "step_20", "step_100"]
+    assert checkpoint.load_latest(tmp_path).made_with == {"torch": "2.0", "threads": 100}
 
 
 @pytest.mark.parametrize("fraction", [0, 0.1, 0.5, 0.99])
@@ -81,13 +73,10 @@ def test_truncated_file_is_named_and_the_previous_checkpoint_used(folder, file, 
 
 @pytest.mark.parametrize("file", ["manifest.json", "config.json"])
 def test_deeply_nested_file_is_damaged(folder, file):
-    path, brackets = folder / "step_30", 200_000 * b"["
-    (path / file).write_bytes(brackets)
+    path = folder / "step_30"
+    (path / file).write_bytes(200_000 * b"[")
     if file == "config.json":
-        manifest = json.loads((path / "manifest.json").read_bytes())
-        del manifest["sha256"]
-        manifest["files"][file]["sha256"] = hashlib.sha256(brackets).hexdigest()
-        (path / "manifest.json").write_bytes(checkpoint_format.sealed(manifest))
+        seal_file(path / file)
     with pytest.warns(UserWarning, match=f"step_30 is damaged: {file}.*using step_20"):
         assert checkpoint.load_latest(folder).step == 20
 
@@ -116,25 +105,15 @@ def test_every_flipped_bit_is_detected(folder, file, every):
     assert checkpoint.load_latest(folder).step == 30
 
 
-def test_newest_intact_checkpoint_is_used_when_several_are_damaged(folder):
-    for n in (20, 30):
+def test_error_if_every_checkpoint_is_damaged(folder):
+    for n in (30, 20):
         os.truncate(folder / f"step_{n}" / "state.pt", 100)
     with pytest.warns(UserWarning) as warnings:
         assert checkpoint.load_latest(folder).step == 10
     assert len(warnings) == 2
-
-
-def test_error_if_every_checkpoint_is_damaged(folder):
-    for n in (10, 20, 30):
-        os.truncate(folder / f"step_{n}" / "state.pt", 100)
+    os.truncate(folder / "step_10" / "state.pt", 100)
     with pytest.raises(CheckpointError, match="Every checkpoint.*step_30.*step_20.*step_10"):
         checkpoint.load_latest(folder)
-
-
-def test_damaged_checkpoint_by_path_is_an_error(folder):
-    os.truncate(folder / "step_30" / "state.pt", 100)
-    with pytest.raises(CheckpointError, match="step_30"):
-        checkpoint.load_latest(folder / "step_30")
 
 
 def test_error_if_there_is_no_checkpoint(tmp_path):
@@ -159,36 +138,36 @@ class Payload:
 def test_code_in_a_checkpoint_is_refused_and_does_not_run(folder, tmp_path, write):
     mark, path = tmp_path / "ran", folder / "step_30" / "state.pt"
     write({"weights": Payload(mark)}, path)
-    manifest = json.loads((path.parent / "manifest.json").read_text())
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    manifest["files"]["state.pt"]["sha256"] = digest
-    seal(path.parent, manifest)
+    seal_file(path)
     with pytest.warns(UserWarning, match="step_30 is refused"):
         assert checkpoint.load_latest(folder).step == 20
     assert not mark.exists()
 
 
-def seal(path, manifest):
-    """Writes a manifest with a valid digest."""
-    manifest.pop("sha256")
+def seal(path, **changes):
+    """Writes other values into a checkpoint's manifest, with a valid digest."""
+    manifest = json.loads((path / "manifest.json").read_text()) | changes
+    del manifest["sha256"]
     (path / "manifest.json").write_bytes(checkpoint_format.sealed(manifest))
 
 
-def with_format(path, version):
-    manifest = json.loads((path / "manifest.json").read_text())
-    seal(path, {**manifest, "format": version})
+def seal_file(path):
+    """Writes the digest of a file into its checkpoint's manifest."""
+    files = json.loads((path.parent / "manifest.json").read_text())["files"]
+    files[path.name]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    seal(path.parent, files=files)
 
 
 @pytest.mark.parametrize("version, commit", [(4, "e9908db"), (1, "e17fabe")])
 def test_earlier_format_names_the_commit_that_reads_it(folder, version, commit):
-    with_format(folder / "step_30", version)
+    seal(folder / "step_30", format=version)
     with pytest.raises(CheckpointError, match=rf"step_30 .*\(format {version}\).*{commit}"):
         checkpoint.load_latest(folder)
 
 
 @pytest.mark.parametrize("version", [0, checkpoint_format.FORMAT + 1, "7"])
 def test_unknown_format_is_refused_and_not_skipped(folder, version):
-    with_format(folder / "step_30", version)
+    seal(folder / "step_30", format=version)
     with pytest.raises(CheckpointError, match=f"step_30 has format {version}.*Update megastep"):
         checkpoint.load_latest(folder)
 
@@ -231,11 +210,8 @@ def test_same_step_can_be_saved_repeatedly(folder):
     for n in (31, 32, 33):
         checkpoint.save(folder, 30, state(n), CONFIG, keep_checkpoints=3)
         assert checkpoint.load_latest(folder).state["samples"] == n
-        assert [checkpoint.step_of(path) for path in checkpoint.list_checkpoints(folder)] == [
-            10,
-            20,
-            30,
-        ]
+        steps = [checkpoint.step_of(path) for path in checkpoint.list_checkpoints(folder)]
+        assert steps == [10, 20, 30]
     assert len(list(folder.iterdir())) == 3
 
 
@@ -255,12 +231,8 @@ class Killed(BaseException):
 def test_kill_between_any_two_file_operations_leaves_an_intact_checkpoint(
     tmp_path, step, n_old, monkeypatch
 ):
-    operations = [
-        (os, "replace"),
-        (os, "mkdir"),
-        (shutil, "rmtree"),
-        (checkpoint_format, "_write_file"),
-    ]
+    operations = [(os, "replace"), (os, "mkdir"), (shutil, "rmtree")]
+    operations.append((checkpoint_format, "_write_file"))
     for n in itertools.count():
         folder = tmp_path / str(n)
         for old in (10, 20, 30)[-n_old:]:
@@ -341,10 +313,7 @@ print(newest, *sorted(os.listdir(folder)))
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("steps", ["new", pytest.param("again", marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "kills",
-    [5, pytest.param(40, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("kills", [5, pytest.param(40, marks=pytest.mark.slow)])
 def test_kill_9_at_random_leaves_the_newest_checkpoint_intact(tmp_path, kills, steps):
     process = subprocess.run(
         [sys.executable, "-W", "error", "-c", SAVES_UNTIL_KILLED, tmp_path, str(kills), steps],
@@ -397,17 +366,6 @@ def test_same_step_can_be_set_aside_twice(folder):
     checkpoint.save(folder, 30, state(31), CONFIG, keep_checkpoints=3)
     checkpoint.set_aside_after(folder, 20)
     assert names(folder) == ["step_10", "step_20"]
-
-
-def test_full_disk_leaves_existing_checkpoints(folder, monkeypatch):
-    def write(path, *_):
-        path.write_bytes(b"half")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(checkpoint_format, "_write_file", write)
-    with pytest.raises(OSError, match="No space left"):
-        checkpoint.save(folder, 40, state(40), CONFIG)
-    assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]
 
 
 def test_save_works_again_after_a_full_disk(folder):

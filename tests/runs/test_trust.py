@@ -2,12 +2,12 @@
 
 import json
 import stat
-import threading
 import warnings
 
 import pytest
 
 from megastep.agents.runs import trust
+from tests.helpers.processes import in_threads
 
 
 def config(name="rover:Rover", **more):
@@ -56,17 +56,8 @@ def test_signature_is_of_one_user_and_one_configuration(home, monkeypatch):
 
 
 def test_key_is_private_and_made_once(home):
-    signatures, start = set(), threading.Barrier(8)
-
-    def sign():
-        start.wait()
-        signatures.add(trust.sign(config()))
-
-    threads = [threading.Thread(target=sign) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    signatures = set()
+    in_threads(lambda: signatures.add(trust.sign(config())))
     (folder,) = home.iterdir()
     (key,) = folder.iterdir()
     assert len(signatures) == 1 and len(key.read_bytes()) == 32

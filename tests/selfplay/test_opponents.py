@@ -11,7 +11,6 @@ from torch.utils._pytree import tree_leaves
 from megastep import contract, envs, toys
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
-from megastep.agents.runs import checkpoint
 from megastep.agents.runs.saver import Saver
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.selfplay.slots import score_pairs
@@ -20,6 +19,8 @@ from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
 from tests.helpers.games import Always, High, Matrix, Middle
+from tests.helpers.logged import Rows
+from tests.helpers.weights import copied, same
 
 
 def policy_of(env, seed=1, width=8, **options):
@@ -30,14 +31,6 @@ def make_opponents(n_envs=16, n_agents=2, env=None, policy=None, **options):
     env = env or Matrix(n_envs, n_agents)
     options = {**dict(past=0.5, bot=0.25, scripted=High(), snapshots=2, every=3), **options}
     return Opponents(env, policy or policy_of(env), **options)
-
-
-def same(a, b):
-    return all(torch.equal(a[name], b[name]) for name in a)
-
-
-def copied(module):
-    return {name: value.clone() for name, value in module.state_dict().items()}
 
 
 # ---- Lanes and actions ----
@@ -199,21 +192,7 @@ def trainer_of(folder, env, samples, seed=1, **options):
     if options:
         env = Opponents(env, policy, seed=seed, **options)
     learner = PPO(policy, n_steps=4, n_minibatches=2, lr=1e-2, seed=seed)
-    rows = []
-
-    class Rows:
-        @staticmethod
-        def write(samples, metrics, perf):
-            rows.append({"samples": samples, **metrics})
-
-        @staticmethod
-        def sync():
-            pass
-
-    saver = Saver(folder, {})
-    run = Trainer(env, policy, learner, Rows, saver, Budget(samples))
-    run.rows = rows
-    return run
+    return Trainer(env, policy, learner, Rows(), Saver(folder, {}), Budget(samples))
 
 
 class Rigged(Matrix):
@@ -319,7 +298,7 @@ def test_policy_learns_to_beat_its_opponents(tmp_path, options):
     assert (run.rollout.actions == 2).float().mean() > 0.95
     (kind,) = run.env.matchups
     key = f"episode/won/{kind}"
-    won = [row[key] for row in run.rows if key in row]
+    won = [row[key] for row in run.logger if key in row]
     assert won[0] < 0.9 and max(won) > 0.95
 
 
@@ -374,24 +353,6 @@ def test_actor_is_the_policy_without_critic_and_gradients():
         for player in (policy, actor)
     )
     assert torch.equal(ours.logits, theirs.logits) and torch.equal(ours.actions, theirs.actions)
-
-
-def test_resumed_run_has_the_same_snapshots_and_continues_the_same(tmp_path):
-    options = dict(past=0.5, bot=0.25, scripted=High(), snapshots=2, every=2)
-    first = trainer_of(tmp_path, Matrix(16), 5 * 4 * 20, **options)
-    first.train()
-    again = trainer_of(tmp_path, Matrix(16), 9 * 4 * 20, seed=2, **options)
-    again.load_state_dict(checkpoint.load_latest(tmp_path).state)
-    for ours, theirs in zip(again.opponents.snapshots, first.opponents.snapshots, strict=True):
-        assert same(ours.state_dict(), theirs.state_dict())
-    for run in (first, again):
-        for _ in range(4):
-            run.rollout = run.collect()
-            run.update()
-    assert same(first.policy.state_dict(), again.policy.state_dict())
-    for ours, theirs in zip(again.opponents.snapshots, first.opponents.snapshots, strict=True):
-        assert same(ours.state_dict(), theirs.state_dict())
-    assert first.opponents.pop_win_rates() == again.opponents.pop_win_rates()
 
 
 # ---- Wins ----
@@ -502,7 +463,7 @@ def test_means_by_role_and_matchup(tmp_path):
     env = Matrix(16, roles=("left", "right"))
     run = trainer_of(tmp_path, env, 4 * 4 * 20, past=0.5, bot=0.25, scripted=High(), snapshots=2)
     run.train()
-    row = run.rows[0]
+    row = run.logger[0]
     for name in ("left", "right", "now", "past", "bot"):
         assert row[f"episode/points/{name}"] == row[f"episode/return/{name}"]
     assert row["episode/return/bot"] == -1, "the bot always chooses the highest number"

@@ -7,7 +7,6 @@ import torch
 
 from megastep import capture
 from megastep.agents.cli import evaluate, train
-from megastep.agents.launch import train as launch_train
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.engine import devices
 from megastep.envs.pong.step import CELL
@@ -16,30 +15,16 @@ from tests.cli.test_train import configured
 from tests.helpers import pages
 from tests.helpers.games import Always
 from tests.helpers.tiny import settings
+from tests.helpers.weights import same
 
-FRACTIONS = [
-    "opponents.past=0.5",
-    "opponents.bot=0.25",
-    "opponents.snapshots=2",
-    "opponents.every=2",
-]
-OPPOSED = [*PONG, *FRACTIONS, "opponents.bot_class=tests.helpers.games:High", "env.limit=5"]
+OPPOSED = [*PONG, "opponents.past=0.5", "opponents.bot=0.25", "opponents.snapshots=2"]
+OPPOSED += ["opponents.every=2", "opponents.bot_class=tests.helpers.games:High", "env.limit=5"]
 #: Samples of an update: two environments with two learning lanes, six with one.
 OPPOSED_UPDATE = 10 * 16
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def saved_snapshots(folder):
     return checkpoint.load_latest(folder / "checkpoints").state["opponents"]["snapshots"]
-
-
-def same(a, b):
-    return all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_commands_and_code_of_the_page_work(here, monkeypatch):
@@ -83,12 +68,8 @@ class Configured(Always):
 
 
 def test_bot_gets_the_settings_its_constructor_takes(here):
-    words = [
-        f"samples={OPPOSED_UPDATE}",
-        "env.points=2",
-        "opponents.bot_class=test_self_play:Configured",
-    ]
-    folder = train.run(configured(*words, tiny=OPPOSED))
+    words = "env.points=2", "opponents.bot_class=test_self_play:Configured"
+    folder = train.run(configured(f"samples={OPPOSED_UPDATE}", *words, tiny=OPPOSED))
     assert evaluate.main([f"run={folder}", "against=bot", "episodes=2", "device=cpu"]) == 0
 
 
@@ -99,18 +80,6 @@ def test_run_without_opponents_has_none_of_their_state_or_metrics(here):
     matchups = "/now", "/past", "/bot"
     assert not any(name.endswith(matchups) or name.startswith("episode/won") for name in rows[-1])
     assert "opponents" not in checkpoint.load_latest(folder / "checkpoints").state
-
-
-def test_resumed_run_has_the_same_snapshots(here):
-    folder = train.run(configured(f"samples={2 * OPPOSED_UPDATE}", tiny=OPPOSED))
-    saved = saved_snapshots(folder)
-    assert not same(saved["0"], saved["1"]), "the first was refreshed after two updates"
-    train.run(configured(f"resume={folder}", f"samples={3 * OPPOSED_UPDATE}", tiny=[]))
-    after = saved_snapshots(folder)
-    assert all(same(after[name], saved[name]) for name in saved)
-    train.run(configured(f"resume={folder}", f"samples={4 * OPPOSED_UPDATE}", tiny=[]))
-    later = saved_snapshots(folder)
-    assert same(later["0"], saved["0"]) and not same(later["1"], saved["1"])
 
 
 def test_init_weights_are_the_first_snapshots(here):
@@ -171,15 +140,8 @@ def test_snapshots_that_do_not_fit_say_how_many_would(here, capsys, monkeypatch)
     assert "4 snapshots" in error and "at most 3 fit" in error
 
 
-def test_snapshots_act_with_their_current_weights(here, monkeypatch, device):
+def test_snapshots_act_with_their_current_weights(here, trainers, device):
     """On a GPU in CUDA graphs from the second rollout on, each on a stream of its own."""
-    trainers, real = [], launch_train.make_trainer
-
-    def make_trainer(*args):
-        trainers.append(real(*args))
-        return trainers[-1]
-
-    monkeypatch.setattr(launch_train, "make_trainer", make_trainer)
     tiny = [word for word in OPPOSED if not word.startswith(("device", "agent.core", "env."))]
     tiny += ["env.self_play=true", "env.n_envs=64", f"device={device}"]
     folder = train.run(configured(f"samples={12 * 8 * OPPOSED_UPDATE}", tiny=tiny))

@@ -48,17 +48,33 @@ def cases(to):
     return cases, n_plain
 
 
+def check_copies(ours, theirs):
+    """Compares buffers, with what lies around the targets, with those of `Tensor.copy_`."""
+    copy_all([(target, source) for _, target, source in ours])
+    for _, target, source in theirs:
+        target.copy_(source)
+    for i, ((buffer, _, _), (expected, _, _)) in enumerate(zip(ours, theirs, strict=True)):
+        assert torch.equal(buffer.cpu(), expected.cpu()), i
+
+
+def test_kernels_do_what_copy_and_indexing_do(to_gpu):
+    check_copies(*(some[:n_plain] for some, n_plain in map(cases, (to_gpu, torch.Tensor.cpu))))
+    lanes = torch.randperm(50, generator=torch.Generator().manual_seed(1))[:20]
+    shapes = (3, 50, 16), (3, 50, 1), (3, 50, 3, 2)
+    tensors = [numbers(shape, dtype, torch.Tensor.cpu, 1) for shape in shapes for dtype in DTYPES]
+    selected = select_lanes([to_gpu(tensor) for tensor in tensors], to_gpu(lanes))
+    for tensor, ours in zip(tensors, selected, strict=True):
+        assert torch.equal(ours.cpu(), tensor[:, lanes])
+
+
 def test_copies_what_copy_does(device, monkeypatch):
     launches, launch = [], copies.launch
     monkeypatch.setattr(
         copies, "launch", lambda *args, **fields: launches.append(args) or launch(*args, **fields)
     )
     (ours, n_plain), (theirs, _) = (cases(on(device)) for _ in range(2))
-    copy_all([(target, source) for _, target, source in ours])
-    for _, target, source in theirs:
-        target.copy_(source)
-    for i, ((buffer, _, _), (expected, _, _)) in enumerate(zip(ours, theirs, strict=True)):
-        assert torch.equal(buffer, expected), i
+    check_copies(ours, theirs)
+    copy_all([])
     n_launches = -(-n_plain // copies._MAX_COPIES) if device == "cuda" else 0
     assert n_plain > 2 * copies._MAX_COPIES and len(launches) == n_launches
 
@@ -120,31 +136,6 @@ def test_selects_lanes_in_every_step(device, n_selected):
     selected = select_lanes(tensors, lanes)
     for i, (tensor, ours) in enumerate(zip(tensors, selected, strict=True)):
         assert torch.equal(ours, tensor[:, lanes]), i
-
-
-def test_a_gpu_selects_what_indexing_does(to_gpu):
-    lanes = torch.randperm(50, generator=torch.Generator().manual_seed(1))[:20]
-    tensors = [
-        numbers((3, 50, *rest), dtype, torch.Tensor.cpu, seed=i)
-        for rest in ((16,), (1,), (3, 2))
-        for i, dtype in enumerate(DTYPES)
-    ]
-    selected = select_lanes([to_gpu(tensor) for tensor in tensors], to_gpu(lanes))
-    for tensor, ours in zip(tensors, selected, strict=True):
-        assert torch.equal(ours.cpu(), tensor[:, lanes])
-
-
-def test_a_gpu_copies_what_copy_does(to_gpu):
-    """What lies around a target stays."""
-    (ours, n_plain), (theirs, _) = cases(to_gpu), cases(torch.Tensor.cpu)
-    copy_all([(target, source) for _, target, source in ours[:n_plain]])
-    for (buffer, _, _), (expected, target, source) in zip(ours[:n_plain], theirs, strict=False):
-        target.copy_(source)
-        assert torch.equal(buffer.cpu(), expected)
-
-
-def test_nothing_to_copy():
-    copy_all([])
 
 
 @pytest.mark.cuda

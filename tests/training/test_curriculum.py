@@ -9,7 +9,6 @@ import torch
 from megastep import envs, spaces, toys
 from megastep.agents.algorithms.returns import gae
 from megastep.agents.cli import train
-from megastep.agents.launch import train as launch_train
 from megastep.agents.runs import json_lines
 from megastep.agents.storage.rollout import Rollout
 from megastep.agents.training.curriculum import PLR, SFL
@@ -19,9 +18,12 @@ from tests.helpers.synchronisation import no_synchronisation
 
 LEARNER = SimpleNamespace(gamma=0.9, lambda_=0.8)
 SMALL = [
-    *("device=cpu", "geometry=bench", "geometry.n=4", "env.n_envs=4", "env.res=8"),
-    *("agent.width=8", "learner.n_steps=8", "learner.n_minibatches=2", "samples=64"),
+    *("device=cpu", "env.n_envs=4", "env.res=8", "agent.width=8", "learner.n_steps=8"),
+    *("learner.n_minibatches=2", "log_every=1"),
 ]
+BENCH = ["geometry=bench", "geometry.n=4", "samples=64"]
+MIX = ["geometry=mixed", "geometry.parts={bench: 2, maze: 2}", "samples=640"]
+POINTGOAL = ["env=pointgoal", "env.limit=5"]
 
 
 class Homes:
@@ -266,12 +268,9 @@ def test_a_round_of_deathmatch_ends_all_episodes_at_once():
 # ---- Runs ----
 
 
-def test_run_logs_outcomes_by_source(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = [*SMALL, "env=pointgoal", "env.limit=5", "log_every=1", "curriculum=sfl"]
-    words[2:4] = ["geometry=mixed", "geometry.parts={bench: 3, maze: 1}"]
-    words.append("samples=320")
-    assert train.main([*words, "folder=run"]) == 0
+def test_run_logs_outcomes_by_source(here):
+    words = "geometry=mixed", "geometry.parts={bench: 3, maze: 1}", "curriculum=sfl", "samples=320"
+    assert train.main([*SMALL, *POINTGOAL, *words, "folder=run"]) == 0
     row = json_lines.read("run/metrics.jsonl")[-1]
     shares = [row[f"curriculum/drawn/{source}"] for source in ("bench", "maze")]
     assert sum(shares) == pytest.approx(1) and row["curriculum/fewest_episodes"] >= 1
@@ -282,19 +281,16 @@ def test_run_logs_outcomes_by_source(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "words",
     [
-        ["env=pointgoal", "env.limit=5"],
-        ["env=pointgoal", "env.limit=5", "learner=vtrace", "learner.lag=1"],
-        ["env=pointgoal", "env.limit=5", "env.resample=false", "env.n_envs=2"],
+        POINTGOAL,
+        [*POINTGOAL, "learner=vtrace", "learner.lag=1"],
+        [*POINTGOAL, "env.resample=false", "env.n_envs=2"],
         ["env=deathmatch", "env.n_agents=2", "env.limit=5", "opponents.bot=0.5"],
     ],
     ids=["ppo", "lag", "fewer environments than homes", "opponents"],
 )
-def test_run_in_a_mix_logs_episodes_by_source(words, tmp_path, monkeypatch):
+def test_run_in_a_mix_logs_episodes_by_source(words, here):
     """Also without a curriculum. Every episode is one of its source's."""
-    monkeypatch.chdir(tmp_path)
-    common = [*SMALL[:1], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[3:-1]]
-    common += ["log_every=4", "desync=false"]
-    assert train.main([*common, *words, "samples=640", "folder=run"]) == 0
+    assert train.main([*SMALL, *MIX, *words, "log_every=4", "desync=false", "folder=run"]) == 0
     row = json_lines.read("run/metrics.jsonl")[-1]
     names = [f"episode/{{}}/{source}" for source in ("bench", "maze")]
     counts = [row[name.format("count")] for name in names]
@@ -307,26 +303,19 @@ def test_run_in_a_mix_logs_episodes_by_source(words, tmp_path, monkeypatch):
             assert mean == pytest.approx(row[f"episode/{key}"])
 
 
-def test_statistics_by_source_are_exact_under_resume(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = [*SMALL[:1], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[3:-1]]
-    words += ["env=pointgoal", "env.limit=5", "log_every=3"]
-    words += ["learner.anneal=never"]
-    assert train.main([*words, "samples=640", "folder=whole"]) == 0
+def test_statistics_by_source_are_exact_under_resume(here):
+    words = [*SMALL, *POINTGOAL, *MIX, "log_every=3", "learner.anneal=never"]
+    assert train.main([*words, "folder=whole"]) == 0
     assert train.main([*words, "samples=256", "folder=cut"]) == 0
     assert train.main(["resume=cut", "samples=640"]) == 0
     whole, cut = (json_lines.read(f"{name}/metrics.jsonl") for name in ("whole", "cut"))
     assert cut == whole and "episode/spl/maze" in cut[-1]
 
 
-def test_without_a_curriculum_nothing_is_stored_or_logged(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    made, make_trainer = [], launch_train.make_trainer
-    monkeypatch.setattr(
-        launch_train, "make_trainer", lambda *args: made.append(make_trainer(*args)) or made[0]
-    )
-    assert train.main([*SMALL, "env=pointgoal", "env.limit=5", "folder=run"]) == 0
-    assert made[0].rollout.layouts is None and made[0].env.spawner.cumulative is None
+def test_without_a_curriculum_nothing_is_stored_or_logged(here, trainers):
+    assert train.main([*SMALL, *BENCH, *POINTGOAL, "log_every=2", "folder=run"]) == 0
+    (made,) = trainers
+    assert made.rollout.layouts is None and made.env.spawner.cumulative is None
     (row,) = json_lines.read("run/metrics.jsonl")
     assert not [key for key in row if key.startswith("curriculum")]
 
@@ -349,13 +338,12 @@ def test_without_a_curriculum_nothing_is_stored_or_logged(tmp_path, monkeypatch)
     ],
     ids=lambda value: value if isinstance(value, str) else None,
 )
-def test_bad_input_is_one_sentence(tmp_path, monkeypatch, capsys, words, text):
-    monkeypatch.chdir(tmp_path)
-    small = [word for word in SMALL if not word.startswith(("geometry", "env.res"))]
+def test_bad_input_is_one_sentence(here, capsys, words, text):
+    small = [word for word in SMALL if not word.startswith("env.res")]
     has_homes = not {"geometry=box", "env=tests.cli.test_exact_resume:Steered"} & {*words}
-    homes = SMALL[1:3] if has_homes else []
+    homes = BENCH if has_homes else []
     chosen = [] if any(word.startswith("curriculum=") for word in words) else ["curriculum=sfl"]
     assert train.main([*small, *homes, *words, *chosen, "folder=run"]) == 2
     error = capsys.readouterr().err
     assert text in error and "Traceback" not in error
-    assert not (tmp_path / "run").exists()
+    assert not (here / "run").exists()

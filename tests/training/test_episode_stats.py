@@ -24,20 +24,17 @@ def slow_episodes(reward, reset, done, partial):
     return finished
 
 
+def named(stats, group=""):
+    """Returns the statistics of all episodes, or of a group's, as they are logged."""
+    return {f"episode/{name}{group}": value for name, value in stats.items()}
+
+
 def test_two_steps_and_an_end_are_an_episode_of_length_two():
     episodes = EpisodeStats(1, "cpu")
-    reset, done = (
-        torch.tensor([[False], [False], [True], [False]]),
-        torch.tensor([[False], [True], [False], [False]]),
-    )
+    reset = torch.tensor([[False], [False], [True], [False]])
+    done = torch.tensor([[False], [True], [False], [False]])
     episodes.add(torch.tensor([[1.0], [2.0], [0.0], [5.0]]), reset, done)
-    stats = {
-        "episode/count": 1,
-        "episode/window": 1,
-        "episode/return": 3.0,
-        "episode/length": 2.0,
-        "episode/return_std": 0.0,
-    }
+    stats = named({"count": 1, "window": 1, "return": 3.0, "length": 2.0, "return_std": 0.0})
     assert episodes.pop() == stats
     assert episodes.returns.tolist() == [5.0] and episodes.lengths.tolist() == [1.0]
     assert episodes.pop() == {**stats, "episode/count": 0}
@@ -62,12 +59,10 @@ def test_episodes_across_rollouts_match_slow_count():
     assert stats["episode/count"] == len(finished) > 20
     assert stats["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
     assert stats["episode/return_std"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
-    assert stats["episode/length"] == pytest.approx(
-        sum(length for _, length in finished) / len(finished)
-    )
-    assert episodes.returns.tolist() == pytest.approx(
-        [partial[lane][0] for lane in range(n_lanes)], rel=1e-6
-    )
+    mean_length = sum(length for _, length in finished) / len(finished)
+    assert stats["episode/length"] == pytest.approx(mean_length)
+    totals = [partial[lane][0] for lane in range(n_lanes)]
+    assert episodes.returns.tolist() == pytest.approx(totals, rel=1e-6)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
@@ -92,28 +87,14 @@ def test_metrics_are_read_at_episode_ends_and_split_by_role():
     metrics = dict(laps=laps, falls=torch.ones(2, 6))
     episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
     stats = episodes.pop()
+    names = "count", "window", "return", "length", "laps", "falls"
+    every = 4, 4, (1 + 7 + 9 + 11) / 4, 7 / 4, 10 * (1 + 5 + 6 + 7) / 4, 1
     assert stats == {
-        "episode/count": 4,
-        "episode/window": 4,
-        "episode/return": (1 + 7 + 9 + 11) / 4,
-        "episode/length": 7 / 4,
-        "episode/laps": 10 * (1 + 5 + 6 + 7) / 4,
-        "episode/falls": 1,
-        "episode/return_std": pytest.approx(14**0.5),
-        "episode/count/leader": 2,
-        "episode/window/leader": 2,
-        "episode/return/leader": (1 + 7) / 2,
-        "episode/length/leader": 3 / 2,
-        "episode/laps/leader": 30,
-        "episode/falls/leader": 1,
-        "episode/count/follower": 2,
-        "episode/window/follower": 2,
-        "episode/return/follower": (9 + 11) / 2,
-        "episode/length/follower": 2,
-        "episode/laps/follower": 65,
-        "episode/falls/follower": 1,
+        **named(dict(zip(names, every), return_std=pytest.approx(14**0.5))),
+        **named(dict(zip(names, (2, 2, (1 + 7) / 2, 3 / 2, 30, 1))), "/leader"),
+        **named(dict(zip(names, (2, 2, (9 + 11) / 2, 2, 65, 1))), "/follower"),
     }
-    names = ("count", "window", "return", "length", "laps", "falls", "return_std")
+    names += ("return_std",)
     assert list(stats)[:7] == [f"episode/{name}" for name in names]
     done[:] = False
     done[1, 0] = True
@@ -164,14 +145,8 @@ def test_only_episodes_of_learning_lanes_count():
     for reward in (1.0, 5.0):
         rewards = torch.tensor([[reward, torch.nan]])
         episodes.add(rewards, none, done, learns, dict(laps=rewards))
-    assert episodes.pop() == {
-        "episode/count": 2,
-        "episode/window": 2,
-        "episode/return": 3,
-        "episode/length": 1,
-        "episode/laps": 3,
-        "episode/return_std": 2,
-    }
+    expected = {"count": 2, "window": 2, "return": 3, "length": 1, "laps": 3, "return_std": 2}
+    assert episodes.pop() == named(expected)
     assert not episodes.returns.any(), "the lane that does not learn is cleared too"
 
 
@@ -256,11 +231,7 @@ def test_metric_is_only_read_where_an_episode_counts():
 
 def test_sums_are_restored_only_for_the_same_metrics():
     done, none = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.bool)
-    first, same, other = (
-        EpisodeStats(2, "cpu", ["a"]),
-        EpisodeStats(2, "cpu", ["a"]),
-        EpisodeStats(2, "cpu"),
-    )
+    first, same, other = (EpisodeStats(2, "cpu", names) for names in (["a"], ["a"], []))
     first.add(torch.ones(1, 2), none, done, metrics=dict(a=torch.ones(1, 2)))
     for episodes in (same, other):
         episodes.load_state_dict(first.state_dict())

@@ -57,21 +57,16 @@ def lines(n, **values):
     return "".join(json.dumps({"samples": i, **values}) + "\n" for i in range(n)).encode()
 
 
-def test_truncate_keeps_the_bytes_up_to_the_step(tmp_path):
+def test_truncate_keeps_the_bytes_up_to_the_step_and_a_file_without_later_lines(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(lines(9, rate=0.1, none=None))
     json_lines.truncate_after(path, 4)
     assert path.read_bytes() == lines(5, rate=0.1, none=None)
-    assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
-
-
-def test_truncate_does_not_rewrite_a_file_without_later_lines(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_bytes(lines(5))
     inode = path.stat().st_ino
     json_lines.truncate_after(path, 4)
-    assert path.stat().st_ino == inode and path.read_bytes() == lines(5)
+    assert path.stat().st_ino == inode and path.read_bytes() == lines(5, rate=0.1, none=None)
     json_lines.truncate_after(tmp_path / "absent.jsonl", 4)
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
 
 
 @pytest.mark.parametrize(
@@ -195,9 +190,8 @@ def fake_wandb(monkeypatch, key="key", init=None, log=None):
     """Replaces the package by one that logs to a list, or fails as `init` and `log` do."""
     logged = []
     namespace = types.SimpleNamespace
-    run = namespace(
-        log=log or (lambda values, step: logged.append((step, values))), finish=lambda: None
-    )
+    log = log or (lambda values, step: logged.append((step, values)))
+    run = namespace(log=log, finish=lambda: None)
 
     def started(**options):
         module.options.append(options)
@@ -241,10 +235,7 @@ def test_resumed_run_continues_its_wandb_run(tmp_path, monkeypatch):
     [
         (dict(key=None), "no key"),
         (dict(init=failing), "did not start.*the network is unreachable.$"),
-        (
-            dict(log=failing),
-            "logger=wandb failed.*the network is unreachable.$",
-        ),
+        (dict(log=failing), "logger=wandb failed.*the network is unreachable.$"),
     ],
 )
 def test_wandb_failure_is_one_warning(tmp_path, monkeypatch, fault, message):
@@ -293,18 +284,10 @@ def test_curves_are_drawn_from_the_files(tmp_path):
 def test_curves_are_those_that_the_rows_have():
     """A learner without entropy has a panel for each loss that it does have."""
     none = {"samples": 1, "episode/count": 0, "loss/td": None, "updates": 1, "anneal": "never"}
-    row = {
-        "samples": 2,
-        "episode/count": 3,
-        "episode/window": 5,
-        "episode/return": 1.0,
-        "episode/coverage": 0.5,
-        "episode/return_std": 0.1,
-        "episode/count/left": 1,
-        "episode/return/left": 3.0,
-        "episode/won/past": 0.25,
-        "loss/td": 7.0,
-    }
+    episodes = {"count": 3, "window": 5, "return": 1.0, "coverage": 0.5, "return_std": 0.1}
+    episodes |= {"count/left": 1, "return/left": 3.0, "won/past": 0.25}
+    row = {f"episode/{name}": value for name, value in episodes.items()}
+    row |= {"samples": 2, "loss/td": 7.0}
     perf = [{"samples": 1, "perf/seconds": 0.0}, {"samples": 2, "perf/rate": 9.0}]
     assert panels_of([none, row], perf) == {
         "return": {"all": [(2, 1.0)], "left": [(2, 3.0)]},
@@ -351,6 +334,5 @@ def test_real_wandb_without_a_network_is_one_warning(tmp_path, key, message):
 @pytest.mark.slow
 def test_real_wandb_writes_an_offline_run(tmp_path):
     assert not logged_with_real_wandb(tmp_path, "offline")
-    assert [
-        path.stat().st_size > 1000 for path in tmp_path.glob("wandb/offline-run-*/*.wandb")
-    ] == [True]
+    (path,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
+    assert path.stat().st_size > 1000

@@ -12,13 +12,9 @@ from megastep.agents.cli import train
 from megastep.agents.training.profiler import N_SKIPPED, Profiler
 from tests.helpers import ranks, tiny
 
+pytestmark = pytest.mark.usefixtures("here")
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={12 * tiny.UPDATE}", "log_every=2"]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 def table_of(folder):

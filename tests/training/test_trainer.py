@@ -21,7 +21,9 @@ from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from megastep.agents.training.trainer import MAX_AHEAD, Trainer
 from megastep.agents.types import CollectorOptions, with_defaults
 from megastep.arrdict import arrdict
+from tests.helpers.logged import Rows
 from tests.helpers.synchronisation import no_synchronisation
+from tests.helpers.weights import copied, same
 
 B, T, UPDATE = 6, 4, 24  # lanes, steps of a rollout, samples of an update
 
@@ -63,16 +65,6 @@ class Numbers:
         self.n_checks += 1
 
 
-class Rows(list):
-    """A logger that keeps metrics in a list."""
-
-    def write(self, samples, metrics, perf):
-        self.append({"samples": samples, **metrics})
-
-    def sync(self):
-        pass
-
-
 class Pairs(Numbers):
     """The same lanes as three environments of a leader and a follower. The follower's episodes end
     one step later. The metric `age` is ten times the length.
@@ -102,14 +94,6 @@ def make_trainer(folder, faults=(), samples=None, every=1, lr=1e-3, env=None, **
 
 def always(name, lane, value, n=1000):
     return {(name, step, lane): value for step in range(1, n)}
-
-
-def copied(module):
-    return {name: value.clone() for name, value in module.state_dict().items()}
-
-
-def same(a, b):
-    return all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_trainer_collects_updates_logs_and_saves(tmp_path):
@@ -519,23 +503,17 @@ def test_divergence_ends_the_run_and_keeps_the_last_good_checkpoint(tmp_path, lr
 
 
 @pytest.mark.parametrize(
-    "path, corrupt",
+    "path, leaf",
     [
-        ("policy.critic.output.scale", lambda run: run.policy.critic.output.scale.fill_(torch.nan)),
-        (
-            "policy.intake.norms.0.mean",
-            lambda run: run.policy.intake.norms[0].mean.fill_(torch.inf),
-        ),
-        (
-            "learner.optimizer.squares.0",
-            lambda run: run.learner.optimizer.squares[0].fill_(torch.inf),
-        ),
+        ("policy.critic.output.scale", lambda run: run.policy.critic.output.scale),
+        ("policy.intake.norms.0.mean", lambda run: run.policy.intake.norms[0].mean),
+        ("learner.optimizer.squares.0", lambda run: run.learner.optimizer.squares[0]),
     ],
 )
-def test_nonfinite_state_is_never_saved(tmp_path, path, corrupt):
+def test_nonfinite_state_is_never_saved(tmp_path, path, leaf):
     run = make_trainer(tmp_path)
     run.train(lambda: run.updates == 1)
-    corrupt(run)
+    leaf(run).fill_(torch.inf)
     run.updates += 1
     with pytest.raises(NonFiniteError, match=f"{path} is not finite"):
         run.save_checkpoint()
