@@ -59,6 +59,13 @@ SHARED = {
     "megastep.spaces",
     "megastep.types",
 }
+# Bots walk in homes, by the truth about them.
+BOTS = "megastep.agents.selfplay.bots"
+SHARED_WITH_BOTS = SHARED | {
+    "megastep.engine",
+    "megastep.envs.pointgoal.path_graph",
+    "megastep.modules.movement",
+}
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
 # environments, writes videos and starts processes.
 UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained")
@@ -267,9 +274,11 @@ def environments_are_independent(graph):
 
 def learner_knows_trees_and_spaces_only(graph):
     for name, target in edges(graph, is_agents):
-        is_upper = part_of(name, "megastep.agents") in UPPER_ROOMS
+        shared = SHARED_WITH_BOTS if is_below(name, BOTS) else SHARED
+        if part_of(name, "megastep.agents") in UPPER_ROOMS:
+            shared = SHARED_WITH_UPPER_ROOMS
         launches = matches(name, OWN_USERS["megastep.kernels.build.launch"])
-        allowed = is_agents(target) or target in (SHARED_WITH_UPPER_ROOMS if is_upper else SHARED)
+        allowed = is_agents(target) or target in shared
         # the number of CPU threads is the engine's
         of_launches = is_below(target, "megastep.kernels.build") or target == THREADS
         if not allowed and not (launches and of_launches):

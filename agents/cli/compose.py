@@ -28,6 +28,7 @@ from megastep.agents.cli import blocks
 from megastep.agents.cli.scripts import Script
 from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory import check, components, settings
+from megastep.agents.selfplay.bots import BOTS
 from megastep.settings import closest
 
 #: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
@@ -180,7 +181,7 @@ class Composer:
         with suppress(*HYDRA_ERRORS):  # in files, which are named when they are composed
             groups = [group for group, members in self.groups().items() if word in members]
         keys = ["file"] * word.endswith((".mp4", ".png"))
-        keys += ["against"] * (word in ("bot", "random") or ":" in word)
+        keys += ["against"] * (word in ("bot", *BOTS) or ":" in word)
         keys += ["run"]
         keys += ["resume"] * (word == "latest" or "/" in word)
         keys = groups + [key for key in keys if key in names]

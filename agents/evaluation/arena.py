@@ -12,6 +12,7 @@ from megastep.agents.evaluation import duels, ratings, statistics, suite, tables
 from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
+from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.slots import rotating_slots
 from megastep.types import optional
 
@@ -50,8 +51,8 @@ def find_player(
 
     Args:
         name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
-            import path, `random`, or `bot`, which is the run's `opponents.bot_class`, or else the
-            environment's own bot.
+            import path, one of `BOTS`, or `bot`, which is the run's `opponents.bot_class`, or else
+            the environment's own bot.
         trust: import what a run that another user made names.
 
     Raises:
@@ -64,7 +65,7 @@ def find_player(
         )
     if name == "bot":
         name = factory.config_of(run).opponents.bot_class or name
-    if name in ("bot", "random") or (":" in name and not Path(name).exists()):
+    if name in ("bot", *BOTS) or (":" in name and not Path(name).exists()):
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
 
@@ -99,6 +100,10 @@ class Arena:
         env = settings.changed(env, n_envs=len(self.share.envs))
         where |= dict(geometries=[homes[home] for home in self.share.homes], seed=self.seed)
         self.env, self.sample = factory.construct(env, **where), sample
+        self.others = [
+            player._replace(policy=factory.in_env(player.policy, env, self.env))
+            for player in self.others
+        ]
         slots = rotating_slots(self.share.n_envs, n_agents, self.env.device)
         self.slots = slots[[*self.share.envs]]
         self.place, self.env_settings = tables.place(env, geometry, homes, cfg.split), env

@@ -11,7 +11,7 @@ from megastep.agents.evaluation import arena, playing, statistics, suite, tables
 from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
-from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import optional
 
 

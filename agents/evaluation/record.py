@@ -12,7 +12,7 @@ from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import arena, duels
 from megastep.agents.factory import settings
 from megastep.agents.runs import folders
-from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.bots.random import RandomActions
 
 #: Where random actions are filmed unless geometry= says otherwise.
 HOMES = "megastep.geometries.sources:homes"

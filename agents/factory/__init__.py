@@ -16,6 +16,7 @@ _FUNCTIONS = (
     "construct",
     "errors",
     "homes",
+    "in_env",
     "layout_sources",
     "load_weights",
     "make_bot",

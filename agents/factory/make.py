@@ -25,7 +25,7 @@ from megastep.agents.factory.settings import (
 )
 from megastep.agents.networks.policy import TRAINING_ONLY, Policy
 from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
-from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import loggers
 from megastep.agents.types import LearnerOptions, with_defaults
@@ -238,6 +238,7 @@ def make_opponents(
     if not (cfg.opponents.past or cfg.opponents.bot):
         return None
     bot = make_bot(cfg.opponents.bot_class, cfg.env, sample) if cfg.opponents.bot else None
+    bot = in_env(bot, cfg.env, env)
     with errors():
         if cfg.opponents.past:
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
@@ -249,20 +250,18 @@ def make_opponents(
 def make_bot(name: str | None, settings: Env, env: Any) -> Any:
     """Returns a policy that needs no weights.
 
-    It is given the environment's settings that it takes, such as `fov`, and takes one step in
-    `env`.
+    It is given the environment's settings that it takes, such as `fov`, and the environment if it
+    takes `env`. It takes one step in `env`.
 
     Args:
-        name: `random`, the import path of a class, or None, the class that is `env.bot`.
+        name: one of `BOTS`, the import path of a class, or None, the class that is `env.bot`.
 
     Raises:
         UserError: if there is no such class, or it cannot play there.
     """
-    if name == "random":
-        return RandomActions(env.action_space)
     where = type(env).__name__
     with errors():
-        constructor = optional(env, "bot") if name is None else import_object(name)
+        constructor = import_object(BOTS.get(name, name)) if name else optional(env, "bot")
     if constructor is None:
         raise UserError(
             f"{where} has no bot of its own; name a policy, in training with "
@@ -276,10 +275,16 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
 
     # a policy may do whatever, where it was not made for
     with user_errors(f"{name} cannot play in {where}; name one made for it: ", (Exception,)):
-        bot = construct(settings, constructor)
+        bot = construct(settings, constructor, env=env, action_space=env.action_space)
         decision, _ = bot(env.reset(), bot.initial(n_lanes(env), env.device))
         spaces.map(check_actions, env.action_space, decision["actions"])
     return bot
+
+
+def in_env(bot: Any, settings: Env, env: Any) -> Any:
+    """Returns the bot for another environment of the same settings: a new one if it takes `env`."""
+    takes_env = "env" in inspect.signature(type(bot)).parameters
+    return construct(settings, type(bot), env=env) if takes_env else bot
 
 
 def config_of(loaded: checkpoint.Checkpoint) -> Train:

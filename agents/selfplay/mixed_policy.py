@@ -23,7 +23,8 @@ class MixedPolicy:
     network does not fill the GPU.
 
     Args:
-        policies: the policies.
+        policies: the policies. Of one with the method `in_lanes(lanes)`, what that returns plays:
+            it needs to know its lanes.
         lanes: the lanes of each policy, int64 (m,).
 
     Attributes:
@@ -32,7 +33,10 @@ class MixedPolicy:
     """
 
     def __init__(self, policies: Sequence[PolicyLike], lanes: Sequence[torch.Tensor]):
-        self.policies = list(policies)
+        self.policies = [
+            policy.in_lanes(own) if hasattr(policy, "in_lanes") else policy
+            for policy, own in zip(policies, lanes, strict=True)
+        ]
         self.sizes = [len(policy_lanes) for policy_lanes in lanes]
         self.lanes = torch.cat(list(lanes))
         self.order = self.lanes.argsort()

@@ -15,7 +15,7 @@ from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing, statistics, tables
 from megastep.agents.runs import checkpoint, scores
-from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from megastep.geometries import files, sample
 from tests.helpers import tiny

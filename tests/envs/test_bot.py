@@ -7,7 +7,7 @@ import torch
 from test_deathmatch import Ring
 
 from megastep import arrdict, capture, contract, envs, toys
-from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.pong import Tracker
 from megastep.geometries import sample

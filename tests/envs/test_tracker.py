@@ -6,7 +6,7 @@ import torch
 from megastep import envs, spaces
 from megastep.agents.evaluation import duels
 from megastep.agents.evaluation.playing import first_episodes
-from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.envs.pong import Tracker
 
 ACTIONS = spaces.MultiDiscrete(1, 3)

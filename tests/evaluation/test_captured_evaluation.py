@@ -14,7 +14,7 @@ import torch
 from megastep import envs, spaces
 from megastep.agents.evaluation import duels, playing
 from megastep.agents.networks.policy import Policy
-from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from megastep.capture import Captured, Graph
 from megastep.geometries import sample

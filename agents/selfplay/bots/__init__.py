@@ -1,3 +1,14 @@
-"""Policies that play or walk without learning."""
+"""Bots: what can play or walk without learning.
 
-from megastep.agents.selfplay.bots.random_actions import RandomActions as RandomActions
+Each is a policy (:class:`megastep.types.Policy`). All but random actions know the truth about the
+environment that they are made for, such as its floor plans and their own pose, so they are
+opponents and baselines, not competitors.
+"""
+
+#: Import paths by the short names that `against=` and `opponents.bot_class=` take.
+BOTS = {
+    "explorer": "megastep.agents.selfplay.bots.explorer:Explorer",
+    "hunter": "megastep.agents.selfplay.bots.hunter:Hunter",
+    "random": "megastep.agents.selfplay.bots.random:RandomActions",
+    "walker": "megastep.agents.selfplay.bots.walker:Walker",
+}

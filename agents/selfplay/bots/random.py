@@ -1,4 +1,4 @@
-"""Random actions, the baseline of every policy."""
+"""Random actions. B lanes."""
 
 from collections.abc import Mapping
 

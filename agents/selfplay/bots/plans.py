@@ -1,0 +1,244 @@
+"""What bots know of floor plans: where an agent fits, and how long the ways are.
+
+D layouts, P plans, M nodes of all plans, L targets per plan, K exits per
+node, n lanes.
+
+A plan is divided into squares of 0.3 m. The spot of a square that is furthest from walls is a node,
+if an agent fits there. Ways lead from nodes to targets: landmarks, the nodes of 4 x 4 squares that
+are furthest from walls, or the goals of PointGoal.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch.nn.functional import pad
+
+from megastep import engine
+from megastep.dotdict import dotdict
+from megastep.envs.pointgoal.path_graph import MAX_GOALS, PathGraph
+
+CELL = 0.05  # metres, of the grid of clearances
+SQUARE, BLOCK = 6, 4  # cells per side of a square, squares per side of a landmark's block
+CLEAR = 0.005  # metres between walls and an agent on a node
+MOST = 0.5  # metres; clearances beyond are not told apart
+LEVELS = 255 / MOST  # of clearances, per metre
+AT_ONCE = 16  # plans that are surveyed together
+#: Squares from a node's to those where it has exits.
+EXITS = [(x, y) for x in range(-2, 3) for y in range(-2, 3)]
+EXITS += [(2 * x, 2 * y) for x, y in EXITS if max(abs(x), abs(y)) == 2]
+N_SAMPLES = 17  # points of a straight way that are tested for room, the furthest of 2.4 m
+TIGHT = 0.035  # metres that a straight way may be nearer to a wall than an agent: half a cell
+WIDE, NARROW = 0.08, 3.0  # metres beside an agent that a way is better for, each worth as many
+BLOCKED = 1e3  # metres that a wall in the way is worth
+
+
+class Plans:
+    """Clearances and shortest paths in the layouts of a scenery. Constant.
+
+    Args:
+        scenery: the scenery.
+        spawns: (D, S, 2) metres, where agents begin. Nodes can be reached from there.
+        radius: of the agents, in metres.
+        goals: (D, L, 2) metres, the targets. Default: landmarks.
+
+    Attributes:
+        of_layout: (D,) int64, the plan of each layout; layouts with the same walls share one.
+        nodes: (M, 2) float32 metres.
+        exits: (M, K) int32, nodes near each.
+        metres: (M, K) float16, lengths of the straight ways there, as `straight` has them.
+        targets: (P, L, 2) float32 metres.
+        lengths: (M, L) float16, metres from each node to each target of its plan by the shortest
+            path; infinite where there is none.
+
+    Raises:
+        ValueError: a layout has no walls.
+        EngineError: they do not fit into memory.
+    """
+
+    # in slots, so that neither checkpoints nor CUDA graphs copy what never changes
+    __slots__ = (
+        *("lengths", "nodes", "of_layout", "targets"),
+        *("beside", "exits", "metres"),
+        *("_clearances", "_corners", "_origins", "_radius", "_squares"),
+    )
+
+    def __init__(
+        self,
+        scenery: engine.Scenery,
+        spawns: torch.Tensor,
+        radius: float,
+        goals: torch.Tensor | None = None,
+    ):
+        device, lines = scenery.device, scenery.layouts.lines
+        walls = [lines[d].cpu().numpy() for d in range(len(lines))]
+        if not all(map(len, walls)):
+            raise ValueError("it walks in homes with walls, and a geometry here has none")
+        keys = [part.tobytes() for part in walls]
+        if goals is not None:
+            keys = [key + part.cpu().numpy().tobytes() for key, part in zip(keys, goals)]
+        homes = {key: dotdict(walls=walls[d], id=d) for d, key in enumerate(keys)}
+        # a graph takes as many points of each home, so homes of a size together
+        homes = dict(sorted(homes.items(), key=lambda pair: np.prod(np.ptp(pair[1].walls, (0, 1)))))
+        numbers = {key: number for number, key in enumerate(homes)}
+        self.of_layout = torch.tensor([numbers[key] for key in keys], device=device)
+        homes, surveys = [*homes.values()], []
+        for first in range(0, len(homes), AT_ONCE):
+            chunk = homes[first : first + AT_ONCE]
+            ids = [home.id for home in chunk]
+            targets = None if goals is None else [*goals[ids]]
+            surveys += _surveys(chunk, [*spawns[ids, :MAX_GOALS]], radius, targets)
+            n_bytes = max(s.lengths.nbytes + s.clearances.nbytes for s in surveys)
+            engine.fit(len(homes) - len(surveys), n_bytes, device, "floor plans of bots")
+        firsts = torch.tensor([0] + [len(s.nodes) for s in surveys]).cumsum(0).tolist()
+        numbered = list(zip(surveys, firsts))
+        self.nodes = torch.cat([s.nodes for s in surveys])
+        self.targets = _stack([s.targets for s in surveys], 0)
+        width = self.targets.shape[1]
+        self.lengths = torch.cat(
+            [pad(s.lengths, (0, width - s.lengths.shape[1]), value=torch.inf) for s in surveys]
+        )
+        squares = [torch.where(s.squares < 0, -1, s.squares + first) for s, first in numbered]
+        self._squares = _stack(squares, -1)
+        self._clearances = _stack([s.clearances for s in surveys], 0)
+        self._origins, self._radius = torch.stack([s.origin for s in surveys]), radius
+        offsets = CELL * SQUARE * torch.tensor(EXITS, dtype=torch.float32, device=device)
+        corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
+        self._corners = torch.tensor(corners, dtype=torch.float32, device=device)
+        self.beside = offsets[[max(map(abs, pair)) < 2 for pair in EXITS]]
+        exits = [self._exits(plan, s.nodes, offsets) for plan, s in enumerate(surveys)]
+        self.exits, self.metres = map(torch.cat, zip(*exits))
+
+    def _exits(self, plan, nodes, offsets):
+        """Returns the nodes (m, K) int32 near the nodes of a plan (m, 2), and the lengths (m, K)
+        float16 of the straight ways there.
+        """
+        plan = torch.full((len(nodes),), plan, device=nodes.device)
+        exits = self.around(plan, nodes[:, None] + offsets)
+        metres = self.straight(plan, nodes, self.nodes[exits])
+        return exits.int().clamp(min=0), torch.where(exits < 0, torch.inf, metres).half()
+
+    def clearances(self, plan: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Returns the metres (n, ...) to the nearest wall from points (n, ..., 2) of plans (n,), in
+        steps of 5 cm, at most half a metre.
+        """
+        levels = self._at(self._clearances, plan, points, CELL)
+        return levels.float() / LEVELS
+
+    def straight(self, plan: torch.Tensor, start: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+        """Returns the lengths (n, K) of straight ways from points (n, 2) to others (n, K, 2), more
+        if they are narrow, and more than `BLOCKED` if there is a wall.
+        """
+        share = torch.linspace(0, 1, N_SAMPLES + 1, device=start.device)[1:, None]
+        offsets = ends - start[:, None]
+        points = start[:, None, None] + share * offsets[:, :, None]
+        room = self.clearances(plan, points).amin(-1) - self._radius
+        lengths = offsets.norm(dim=-1) + NARROW * (WIDE - room).clamp(min=0)
+        return lengths + BLOCKED * (room < -TIGHT)
+
+    def smooth_clearances(self, plan: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Returns clearances that are interpolated between the centres of cells."""
+        corner = points - CELL / 2
+        origin = self._origins[plan].view(-1, *[1] * (points.ndim - 2), 2)
+        share = ((corner - origin) / CELL).frac()[..., None, :]
+        weights = torch.where(self._corners > 0, share, 1 - share).prod(-1)
+        beside = corner[..., None, :] + CELL * self._corners
+        return (weights * self.clearances(plan, beside)).sum(-1)
+
+    def around(self, plan: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Returns the nodes (n, ...) in the squares of points (n, ..., 2), -1 if there is none."""
+        return self._at(self._squares, plan, points, CELL * SQUARE)
+
+    def _at(self, grids, plan, points, size):
+        shape = len(plan), *[1] * (points.ndim - 2)
+        place = (points - self._origins[plan].view(*shape, 2)) / size
+        column, row = place.long().unbind(-1)
+        height, width = grids.shape[1:]
+        row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
+        return grids.view(-1)[(plan.view(shape) * height + row) * width + column]
+
+
+def _stack(tensors: Sequence[torch.Tensor], value: int) -> torch.Tensor:
+    """Returns tensors of different sizes, padded at their ends by a value, as one."""
+    size = torch.tensor([tensor.shape for tensor in tensors]).amax(0).tolist()
+    ends = [[(0, n - m) for n, m in zip(size, tensor.shape)] for tensor in tensors]
+    flat = [[k for pair in reversed(end) for k in pair] for end in ends]
+    return torch.stack([pad(t, end, value=value) for t, end in zip(tensors, flat)])
+
+
+def _surveys(homes, spawns, radius, targets):
+    """Returns the parts of each home's plan: origin (2,), clearances (H, W) uint8, squares (h, w)
+    int64, nodes (m, 2), targets (l, 2) and lengths (m, l). Nodes are numbered from 0.
+
+    A node can be reached from one of the spawn points (S, 2) of the home.
+    """
+    device = spawns[0].device
+    graph = PathGraph(homes, radius, device)
+    origins = torch.as_tensor(graph.origins)
+    surveys = [_survey(graph, d, device) for d in range(len(homes))]
+    lengths = _lengths(graph, origins, spawns, [s.spots for s in surveys])
+    for survey, from_spawns in zip(surveys, lengths):
+        is_node = survey.fits.clone()
+        is_node[survey.fits] = from_spawns.isfinite().any(1)
+        squares = torch.where(is_node, is_node.flatten().cumsum(0).view(is_node.shape) - 1, -1)
+        room, square = _best(torch.where(is_node, survey.room, 0.0), BLOCK)
+        nodes = survey.spots[from_spawns.isfinite().any(1)]
+        landmarks = nodes[squares.flatten()[square[room > 0]]]
+        survey |= dict(squares=squares, nodes=nodes, targets=landmarks)
+    if targets is not None:
+        surveys = [survey | dict(targets=part) for survey, part in zip(surveys, targets)]
+    tables = _lengths(graph, origins, [s.targets for s in surveys], [s.nodes for s in surveys])
+    for survey, table in zip(surveys, tables):
+        survey["lengths"] = table.half()
+    return surveys
+
+
+def _survey(graph, d, device):
+    """Returns origin and clearances of a home's plan, and of its squares the clearance (h, w) of
+    the spot furthest from walls, whether an agent fits there (h, w), and those spots (m, 2).
+    """
+    walls, side = graph.geometries[d].walls, CELL * SQUARE
+    low, high = walls.min((0, 1)) - side, walls.max((0, 1))  # the first squares are outside
+    columns, rows = BLOCK * (np.ceil((high - low) / side / BLOCK).astype(int) + 1)
+    x, y = (CELL * (np.arange(SQUARE * n) + 0.5) for n in (columns, rows))
+    points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) + low
+    points = torch.tensor(points, dtype=torch.float32, device=device)
+    home = torch.full((len(points),), d, dtype=torch.int32, device=device)
+    relative = points - torch.as_tensor(graph.origins[d], device=device)
+    clearances = graph.clearances(relative, home, MOST).view(SQUARE * rows, SQUARE * columns)
+    room, spot = _best(clearances, SQUARE)
+    fits = room > graph.radius + CLEAR
+    return dotdict(
+        origin=torch.tensor(low, dtype=torch.float32, device=device),
+        clearances=(clearances * LEVELS).to(torch.uint8),
+        room=room,
+        fits=fits,
+        spots=points[spot[fits]],
+    )
+
+
+def _best(values, side):
+    """Returns the highest of the values (H, W) in each square of `side` x `side`, (h, w), and its
+    flat index.
+    """
+    rows, columns = (n // side for n in values.shape)
+    parts = values.view(rows, side, columns, side).transpose(1, 2).reshape(rows, columns, -1)
+    highest, index = parts.max(-1)
+    row = torch.arange(rows, device=values.device)[:, None] * side + index // side
+    column = torch.arange(columns, device=values.device) * side + index % side
+    return highest, row * values.shape[1] + column
+
+
+def _lengths(graph, origins, goals, points):
+    """Returns the lengths of the shortest paths, (k, g) for each home, from points (k, 2) to goals
+    (g, 2). A graph takes equally many of each home, so the last ones are repeated.
+    """
+
+    def of_all(parts):
+        most = max(map(len, parts))
+        index = [torch.arange(most).clamp(max=len(part) - 1) for part in parts]
+        parts = [part.cpu()[i] - origin for part, i, origin in zip(parts, index, origins)]
+        return torch.stack(parts).numpy()
+
+    tables = graph.lengths(of_all(goals), of_all(points))
+    return [table[: len(g), : len(p)].T for table, g, p in zip(tables, goals, points)]
