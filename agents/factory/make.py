@@ -237,8 +237,9 @@ def make_opponents(
     shares = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot):
         return None
-    bot = make_bot(cfg.opponents.bot_class, cfg.env, sample) if cfg.opponents.bot else None
-    bot = in_env(bot, cfg.env, env)
+    bot = None
+    if cfg.opponents.bot:
+        bot = in_env(make_bot(cfg.opponents.bot_class, cfg.env, sample), cfg.env, env)
     with errors():
         if cfg.opponents.past:
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())

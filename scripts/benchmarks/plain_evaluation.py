@@ -11,6 +11,7 @@ import torch
 
 from megastep import arrdict
 from megastep.agents import factory
+from megastep.agents.factory import settings
 from megastep.agents.runs import folders
 from megastep.imports import import_object
 
@@ -22,13 +23,13 @@ def returns(run: Path, n_episodes: int, seed: int) -> list[float]:
     import gymnasium
 
     loaded = folders.load_checkpoint(folders.find(str(run)), False, torch.device("cpu"))
-    settings = factory.config_of(loaded)
-    sample = factory.construct(settings.changed(settings.env, n_envs=1), device="cpu", seed=seed)
-    policy = factory.make_policy(settings.agent, sample)
+    trained = factory.config_of(loaded)
+    sample = factory.construct(settings.changed(trained.env, n_envs=1), device="cpu", seed=seed)
+    policy = factory.make_policy(trained.agent, sample)
     policy = factory.load_weights(policy, sample, loaded)
-    package, _, name = settings.env.id.rpartition(":")
-    env = gymnasium.make(f"{package}:{name}" if package else name, **(settings.env.kwargs or {}))
-    for wrapper in settings.env.wrappers or ():
+    package, _, name = trained.env.id.rpartition(":")
+    env = gymnasium.make(f"{package}:{name}" if package else name, **(trained.env.kwargs or {}))
+    for wrapper in trained.env.wrappers or ():
         env = import_object(wrapper)(env)
     actions, results = env.action_space, []
     for episode in range(n_episodes):

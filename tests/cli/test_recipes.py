@@ -33,6 +33,12 @@ def row(name):
     return {k: v for k, v in base.items() if k not in entry.get("without", ())} | entry["set"]
 
 
+@pytest.fixture(autouse=True)
+def without_a_gpu(monkeypatch):
+    """Has `device=auto` be the CPU."""
+    monkeypatch.setattr("megastep.agents.launch.gpu.is_available", lambda: False)
+
+
 @pytest.fixture
 def on(monkeypatch):
     """A function that pretends that there is a GPU, or none, and returns the settings of words."""

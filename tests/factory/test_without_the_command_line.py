@@ -2,8 +2,11 @@
 line.
 """
 
+import os
 import subprocess
 import sys
+
+from tests.helpers.pages import ROOT
 
 NOTEBOOK = """
 import sys
@@ -40,4 +43,11 @@ assert not [name for name in sys.modules if name.startswith(unwanted)]
 
 
 def test_a_notebook_imports_neither_hydra_nor_the_command_line(tmp_path):
-    subprocess.run([sys.executable, "-c", NOTEBOOK], cwd=tmp_path, check=True, timeout=300)
+    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    subprocess.run(
+        [sys.executable, "-c", NOTEBOOK],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": paths},
+        check=True,
+        timeout=300,
+    )
