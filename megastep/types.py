@@ -59,7 +59,8 @@ class Env(Protocol):
             Returns the cumulative weights, (D,) int32 on the device, which a curriculum changes in
             place. Default: none, there are no layouts to draw.
         bot: class of a scripted policy for this environment, whose arguments are settings of the
-            environment. It plays as ``opponents.bot`` and ``against=bot``. Default: none.
+            environment, or `env`, the environment itself. It plays as ``opponents.bot`` and
+            ``against=bot``. Default: none.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``. Default: None, there is none.
         close(): ends what it started, such as processes. Called after training. Default: none.

@@ -225,8 +225,8 @@ The most common words:
   greedy=true          the most likely actions instead of sampled ones
   episodes=256         fewer episodes
   baseline=false       no row for random actions
-  against=RUN,bot      duels instead: with other runs or checkpoints, the scripted policy, random
-                       actions, or an import path
+  against=RUN,bot      duels instead: with other runs or checkpoints, the environment's bot, hunter,
+                       explorer, walker, random, or an import path
   ratings=true         ratings of the run's snapshots, by duels of each with each"""
 RECORD_HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
 
@@ -234,7 +234,7 @@ The most common words:
   run=RUN          a run folder, one of its checkpoints, latest, or a pretrained agent
   env=explorer     random actions in an environment, without a run
   steps=400        frames
-  against=RUN      its duel with another run's agent, `bot`, or an import path, in one home
+  against=RUN      its duel with another run's agent, a bot, or an import path, in one home
   home=3           another of the unseen homes; split=training: one it was trained in
   file=out.mp4     this file, overwritten if it exists; out.png: the last frame only. Otherwise
                    video.mp4 in the run folder, or video-2.mp4, ... if there is one"""

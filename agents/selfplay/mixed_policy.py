@@ -23,8 +23,8 @@ class MixedPolicy:
     network does not fill the GPU.
 
     Args:
-        policies: the policies. Of one with the method `in_lanes(lanes)`, what that returns plays:
-            it needs to know its lanes.
+        policies: the policies. A bot that reads the environment has the method `in_lanes(lanes)`,
+            which returns one that plays in its lanes.
         lanes: the lanes of each policy, int64 (m,).
 
     Attributes:

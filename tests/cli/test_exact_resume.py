@@ -55,6 +55,7 @@ CASES = {
         *(*SELF_PLAY, "curriculum=sfl"),
     ],
     "opponents": [*FIGHT, *SELF_PLAY, "opponents.bot=0.25"],
+    "hunter": [*FIGHT, "opponents.bot=0.5", "opponents.bot_class=hunter"],
     "pong": [*PONG, "learner.n_minibatches=2"],
     "continuous": [
         *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[2:], "learner=vtrace"),

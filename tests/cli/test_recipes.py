@@ -36,7 +36,7 @@ def row(name):
 @pytest.fixture(autouse=True)
 def without_a_gpu(monkeypatch):
     """Has `device=auto` be the CPU."""
-    monkeypatch.setattr("megastep.agents.launch.gpu.is_available", lambda: False)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
 
 
 @pytest.fixture

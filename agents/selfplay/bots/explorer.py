@@ -39,10 +39,10 @@ class Explorer:
         """Returns the initial state: landmarks `seen` (n, L) bool, and (n,) int64 each, the
         `target` and steps of `patience` with it.
         """
-        zeros = torch.zeros(n_lanes, dtype=torch.int64, device=device)
+        target, patience = torch.zeros(2, n_lanes, dtype=torch.int64, device=device).unbind()
         n_landmarks = self.steering.plans.targets.shape[1]
         seen = torch.zeros(n_lanes, n_landmarks, dtype=torch.bool, device=device)
-        return arrdict(seen=seen, target=zeros, patience=zeros)
+        return arrdict(seen=seen, target=target, patience=patience)
 
     def __call__(
         self,

@@ -8,8 +8,6 @@ if an agent fits there. Ways lead from nodes to targets: landmarks, the nodes of
 are furthest from walls, or the goals of PointGoal.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch.nn.functional import pad
@@ -27,7 +25,7 @@ AT_ONCE = 16  # plans that are surveyed together
 #: Squares from a node's to those where it has exits.
 EXITS = [(x, y) for x in range(-2, 3) for y in range(-2, 3)]
 EXITS += [(2 * x, 2 * y) for x, y in EXITS if max(abs(x), abs(y)) == 2]
-N_SAMPLES = 17  # points of a straight way that are tested for room, the furthest of 2.4 m
+FAR, NEAR = 17, 6  # points of a straight way of 2.4 m or 0.9 m that are tested for room
 TIGHT = 0.035  # metres that a straight way may be nearer to a wall than an agent: half a cell
 WIDE, NARROW = 0.08, 3.0  # metres beside an agent that a way is better for, each worth as many
 BLOCKED = 1e3  # metres that a wall in the way is worth
@@ -53,13 +51,11 @@ class Plans:
 
     Raises:
         ValueError: a layout has no walls.
-        EngineError: they do not fit into memory.
     """
 
     # in slots, so that neither checkpoints nor CUDA graphs copy what never changes
     __slots__ = (
-        *("lengths", "nodes", "of_layout", "targets"),
-        *("beside", "exits", "metres"),
+        *("beside", "exits", "lengths", "metres", "nodes", "of_layout", "targets"),
         *("_clearances", "_corners", "_origins", "_radius", "_squares"),
     )
 
@@ -77,36 +73,31 @@ class Plans:
         keys = [part.tobytes() for part in walls]
         if goals is not None:
             keys = [key + part.cpu().numpy().tobytes() for key, part in zip(keys, goals)]
-        homes = {key: dotdict(walls=walls[d], id=d) for d, key in enumerate(keys)}
         # a graph takes as many points of each home, so homes of a size together
-        homes = dict(sorted(homes.items(), key=lambda pair: np.prod(np.ptp(pair[1].walls, (0, 1)))))
-        numbers = {key: number for number, key in enumerate(homes)}
+        layouts = sorted(dict(zip(keys, range(len(keys)))).values(), key=lambda d: _area(walls[d]))
+        numbers = {keys[d]: number for number, d in enumerate(layouts)}
         self.of_layout = torch.tensor([numbers[key] for key in keys], device=device)
-        homes, surveys = [*homes.values()], []
-        for first in range(0, len(homes), AT_ONCE):
-            chunk = homes[first : first + AT_ONCE]
-            ids = [home.id for home in chunk]
-            targets = None if goals is None else [*goals[ids]]
-            surveys += _surveys(chunk, [*spawns[ids, :MAX_GOALS]], radius, targets)
-            n_bytes = max(s.lengths.nbytes + s.clearances.nbytes for s in surveys)
-            engine.fit(len(homes) - len(surveys), n_bytes, device, "floor plans of bots")
-        firsts = torch.tensor([0] + [len(s.nodes) for s in surveys]).cumsum(0).tolist()
-        numbered = list(zip(surveys, firsts))
-        self.nodes = torch.cat([s.nodes for s in surveys])
-        self.targets = _stack([s.targets for s in surveys], 0)
+        surveys = []
+        for first in range(0, len(layouts), AT_ONCE):
+            chunk = layouts[first : first + AT_ONCE]
+            graph = PathGraph([dotdict(walls=walls[d], id=d) for d in chunk], radius, device)
+            targets = None if goals is None else [*goals[chunk]]
+            surveys += _surveys(graph, [*spawns[chunk, :MAX_GOALS]], targets)
+        origins, clearances, squares, nodes, targets, lengths = zip(*surveys)
+        self.nodes, self._radius = torch.cat(nodes), radius
+        firsts = np.cumsum([0, *map(len, nodes)]).tolist()
+        squares = [torch.where(s < 0, -1, s + first) for s, first in zip(squares, firsts)]
+        self._origins, self._clearances = torch.stack(origins), _stack(clearances)
+        self._squares, self.targets = _stack(squares, -1), _stack(targets)
         width = self.targets.shape[1]
         self.lengths = torch.cat(
-            [pad(s.lengths, (0, width - s.lengths.shape[1]), value=torch.inf) for s in surveys]
+            [pad(part, (0, width - part.shape[1]), value=torch.inf) for part in lengths]
         )
-        squares = [torch.where(s.squares < 0, -1, s.squares + first) for s, first in numbered]
-        self._squares = _stack(squares, -1)
-        self._clearances = _stack([s.clearances for s in surveys], 0)
-        self._origins, self._radius = torch.stack([s.origin for s in surveys]), radius
-        offsets = CELL * SQUARE * torch.tensor(EXITS, dtype=torch.float32, device=device)
-        corners = [(0, 0), (0, 1), (1, 0), (1, 1)]
-        self._corners = torch.tensor(corners, dtype=torch.float32, device=device)
+        on = dict(dtype=torch.float32, device=device)
+        self._corners = torch.tensor([(0, 0), (0, 1), (1, 0), (1, 1)], **on)
+        offsets = CELL * SQUARE * torch.tensor(EXITS, **on)
         self.beside = offsets[[max(map(abs, pair)) < 2 for pair in EXITS]]
-        exits = [self._exits(plan, s.nodes, offsets) for plan, s in enumerate(surveys)]
+        exits = [self._exits(plan, part, offsets) for plan, part in enumerate(nodes)]
         self.exits, self.metres = map(torch.cat, zip(*exits))
 
     def _exits(self, plan, nodes, offsets):
@@ -125,11 +116,13 @@ class Plans:
         levels = self._at(self._clearances, plan, points, CELL)
         return levels.float() / LEVELS
 
-    def straight(self, plan: torch.Tensor, start: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
+    def straight(
+        self, plan: torch.Tensor, start: torch.Tensor, ends: torch.Tensor, n_samples: int = FAR
+    ) -> torch.Tensor:
         """Returns the lengths (n, K) of straight ways from points (n, 2) to others (n, K, 2), more
         if they are narrow, and more than `BLOCKED` if there is a wall.
         """
-        share = torch.linspace(0, 1, N_SAMPLES + 1, device=start.device)[1:, None]
+        share = torch.linspace(0, 1, n_samples + 1, device=start.device)[1:, None]
         offsets = ends - start[:, None]
         points = start[:, None, None] + share * offsets[:, :, None]
         room = self.clearances(plan, points).amin(-1) - self._radius
@@ -158,63 +151,54 @@ class Plans:
         return grids.view(-1)[(plan.view(shape) * height + row) * width + column]
 
 
-def _stack(tensors: Sequence[torch.Tensor], value: int) -> torch.Tensor:
-    """Returns tensors of different sizes, padded at their ends by a value, as one."""
-    size = torch.tensor([tensor.shape for tensor in tensors]).amax(0).tolist()
-    ends = [[(0, n - m) for n, m in zip(size, tensor.shape)] for tensor in tensors]
-    flat = [[k for pair in reversed(end) for k in pair] for end in ends]
-    return torch.stack([pad(t, end, value=value) for t, end in zip(tensors, flat)])
+def _area(walls):
+    return np.prod(np.ptp(walls, (0, 1)))
 
 
-def _surveys(homes, spawns, radius, targets):
-    """Returns the parts of each home's plan: origin (2,), clearances (H, W) uint8, squares (h, w)
-    int64, nodes (m, 2), targets (l, 2) and lengths (m, l). Nodes are numbered from 0.
+def _stack(tensors, value=0):
+    """Returns tensors (h, w) of different sizes, padded at their ends by a value, as one."""
+    height, width = np.max([tensor.shape for tensor in tensors], 0).tolist()
+    ends = [(0, width - tensor.shape[1], 0, height - len(tensor)) for tensor in tensors]
+    return torch.stack([pad(tensor, end, value=value) for tensor, end in zip(tensors, ends)])
+
+
+def _surveys(graph, spawns, targets):
+    """Returns for each home of a graph origin (2,), clearances (H, W) uint8, squares (h, w) int64,
+    nodes (m, 2), targets (l, 2) and lengths (m, l). Nodes are numbered from 0.
 
     A node can be reached from one of the spawn points (S, 2) of the home.
     """
-    device = spawns[0].device
-    graph = PathGraph(homes, radius, device)
-    origins = torch.as_tensor(graph.origins)
-    surveys = [_survey(graph, d, device) for d in range(len(homes))]
-    lengths = _lengths(graph, origins, spawns, [s.spots for s in surveys])
-    for survey, from_spawns in zip(surveys, lengths):
-        is_node = survey.fits.clone()
-        is_node[survey.fits] = from_spawns.isfinite().any(1)
-        squares = torch.where(is_node, is_node.flatten().cumsum(0).view(is_node.shape) - 1, -1)
-        room, square = _best(torch.where(is_node, survey.room, 0.0), BLOCK)
-        nodes = survey.spots[from_spawns.isfinite().any(1)]
-        landmarks = nodes[squares.flatten()[square[room > 0]]]
-        survey |= dict(squares=squares, nodes=nodes, targets=landmarks)
-    if targets is not None:
-        surveys = [survey | dict(targets=part) for survey, part in zip(surveys, targets)]
-    tables = _lengths(graph, origins, [s.targets for s in surveys], [s.nodes for s in surveys])
-    for survey, table in zip(surveys, tables):
-        survey["lengths"] = table.half()
-    return surveys
+    grids, landmarks = [_grid(graph, d) for d in range(len(graph.geometries))], []
+    spots = [points[fits] for _, _, _, fits, points in grids]
+    reached = [part.isfinite().any(1) for part in _lengths(graph, spawns, spots)]
+    nodes, all_squares = [part[is_node] for part, is_node in zip(spots, reached)], []
+    for (_, _, room, fits, points), is_reached in zip(grids, reached):
+        is_node = fits.masked_scatter(fits, is_reached)
+        squares = is_node.flatten().cumsum(0).view(fits.shape) - 1
+        all_squares.append(squares.masked_fill(~is_node, -1))
+        room, square = _best(room.masked_fill(~is_node, 0), BLOCK)
+        landmarks.append(points.view(-1, 2)[square[room > 0]])
+    targets = landmarks if targets is None else targets
+    lengths = [part.half() for part in _lengths(graph, targets, nodes)]
+    origins, clearances = ([grid[i] for grid in grids] for i in (0, 1))
+    return [*zip(origins, clearances, all_squares, nodes, targets, lengths)]
 
 
-def _survey(graph, d, device):
-    """Returns origin and clearances of a home's plan, and of its squares the clearance (h, w) of
-    the spot furthest from walls, whether an agent fits there (h, w), and those spots (m, 2).
+def _grid(graph, d):
+    """Returns origin and clearances of a home's plan, and of its squares the spot furthest from
+    walls: its clearance (h, w), whether an agent fits there (h, w), and where it is (h, w, 2).
     """
-    walls, side = graph.geometries[d].walls, CELL * SQUARE
+    walls, side, device = graph.geometries[d].walls, CELL * SQUARE, graph.device
     low, high = walls.min((0, 1)) - side, walls.max((0, 1))  # the first squares are outside
     columns, rows = BLOCK * (np.ceil((high - low) / side / BLOCK).astype(int) + 1)
     x, y = (CELL * (np.arange(SQUARE * n) + 0.5) for n in (columns, rows))
-    points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) + low
-    points = torch.tensor(points, dtype=torch.float32, device=device)
+    points = graph.tensor(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) + low, np.float32)
     home = torch.full((len(points),), d, dtype=torch.int32, device=device)
-    relative = points - torch.as_tensor(graph.origins[d], device=device)
+    relative = points - graph.tensor(graph.origins[d], np.float32)
     clearances = graph.clearances(relative, home, MOST).view(SQUARE * rows, SQUARE * columns)
     room, spot = _best(clearances, SQUARE)
-    fits = room > graph.radius + CLEAR
-    return dotdict(
-        origin=torch.tensor(low, dtype=torch.float32, device=device),
-        clearances=(clearances * LEVELS).to(torch.uint8),
-        room=room,
-        fits=fits,
-        spots=points[spot[fits]],
-    )
+    levels = (clearances * LEVELS).to(torch.uint8)
+    return graph.tensor(low, np.float32), levels, room, room > graph.radius + CLEAR, points[spot]
 
 
 def _best(values, side):
@@ -229,16 +213,15 @@ def _best(values, side):
     return highest, row * values.shape[1] + column
 
 
-def _lengths(graph, origins, goals, points):
+def _lengths(graph, goals, points):
     """Returns the lengths of the shortest paths, (k, g) for each home, from points (k, 2) to goals
     (g, 2). A graph takes equally many of each home, so the last ones are repeated.
     """
 
     def of_all(parts):
         most = max(map(len, parts))
-        index = [torch.arange(most).clamp(max=len(part) - 1) for part in parts]
-        parts = [part.cpu()[i] - origin for part, i, origin in zip(parts, index, origins)]
-        return torch.stack(parts).numpy()
+        parts = [part.cpu()[torch.arange(most).clamp(max=len(part) - 1)] for part in parts]
+        return torch.stack(parts).numpy() - graph.origins[:, None]
 
     tables = graph.lengths(of_all(goals), of_all(points))
     return [table[: len(g), : len(p)].T for table, g, p in zip(tables, goals, points)]

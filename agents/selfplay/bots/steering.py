@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from megastep import spaces
-from megastep.agents.selfplay.bots.plans import Plans
+from megastep.agents.selfplay.bots.plans import NEAR, Plans
 from megastep.arrdict import arrdict
 from megastep.modules.movement import to_global
 from megastep.types import n_lanes
@@ -20,7 +20,7 @@ DETOUR = 100.0  # metres that this is worth
 AT_NODE = 0.1  # metres within which an agent has reached a node
 TOUCH = 0.01  # metres to a wall that may have stopped an agent
 GAIN = 3.2  # of the share of its speed that an agent loses per step: 4/s with momentum
-AHEAD = (0.1, 0.2)  # seconds of coasting for which an agent looks out for walls
+AHEAD = (0.02, 0.1, 0.2)  # seconds of coasting for which an agent looks out for walls
 KEPT = (0.004, 100.0), (0.02, 10.0)  # metres kept from walls, and m/s that each less is worth
 HORIZON = 0.3  # seconds ahead to turn for
 SLACK, OFF = 10.0, 8.0  # degrees off that do not matter; degrees more that weigh as 1 m/s
@@ -86,7 +86,7 @@ class Steering:
     def near(self, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the nodes (n, k) around lanes, and the lengths (n, k) of straight ways there."""
         nodes = self.plans.around(pose.plan, pose.position[:, None] + self.plans.beside)
-        metres = self.plans.straight(pose.plan, pose.position, self.plans.nodes[nodes])
+        metres = self.plans.straight(pose.plan, pose.position, self.plans.nodes[nodes], NEAR)
         return nodes.clamp(min=0), torch.where(nodes < 0, torch.inf, metres)
 
     def lengths(self, near: tuple) -> torch.Tensor:
@@ -161,5 +161,5 @@ class Steering:
         cost = cost + turning * (error - slack).clamp(min=0) / OFF
         here = self.plans.smooth_clearances(pose.plan, pose.position)
         is_stopped = (pose.velocity == 0).all(1) & (here < agents.radius + TOUCH)
-        cost = torch.where(is_stopped[:, None], -room.sum(1), cost)
+        cost = torch.where(is_stopped[:, None], -room[:, 0], cost)
         return arrdict(actions=self.actions[cost.argmin(1)].unsqueeze(1))

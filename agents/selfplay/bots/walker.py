@@ -37,8 +37,8 @@ class Walker:
         """Returns the initial state, (n,) each: the target's number, and steps until it is given
         up.
         """
-        zeros = torch.zeros(n_lanes, dtype=torch.int64, device=device)
-        return arrdict(target=zeros, patience=zeros)
+        target, patience = torch.zeros(2, n_lanes, dtype=torch.int64, device=device).unbind()
+        return arrdict(target=target, patience=patience)
 
     def __call__(
         self,

@@ -1,0 +1,180 @@
+"""Bots: they walk, explore and win without learning."""
+
+import json
+import re
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from megastep import envs, toys
+from megastep.agents import factory
+from megastep.agents.cli import evaluate, train
+from megastep.agents.errors import UserError
+from megastep.agents.evaluation import duels
+from megastep.agents.evaluation.playing import first_episodes
+from megastep.agents.selfplay.bots import BOTS
+from megastep.agents.selfplay.bots.explorer import Explorer
+from megastep.agents.selfplay.bots.hunter import Hunter
+from megastep.agents.selfplay.bots.plans import Plans
+from megastep.agents.selfplay.bots.random import RandomActions
+from megastep.agents.selfplay.bots.walker import Walker
+from megastep.arrdict import arrdict
+from megastep.geometries import sample
+from megastep.modules.spawning import distances
+from tests.helpers.games import Matrix
+
+HOMES = sample("homes", 8, split="test", seed=1)
+DENSE = sample("homes", 8, split="test", seed=1, density=3.0)
+
+
+def play(env, bot, n_steps):
+    """Plays a bot in all lanes. Returns the last decision, state and world."""
+    world, generator = env.reset(), torch.Generator(env.device).manual_seed(1)
+    state = bot.initial(len(world.reset), env.device)
+    for _ in range(n_steps):
+        decision, state = bot(world, state, generator=generator)
+        world = env.step(decision)
+    return decision, state, world
+
+
+def test_agents_fit_on_nodes_and_ways_in_a_box_are_straight(device):
+    env = envs.Deathmatch(1, [toys.box()], n_agents=2, device=device)
+    plans = Plans(env.core.scenery, env.spawner.points, env.core.agents.radius)
+    nodes, targets = plans.nodes.cpu(), plans.targets[0].cpu()
+    assert (distances(nodes.numpy(), toys.box().walls) > env.core.agents.radius).all()
+    straight = torch.cdist(nodes, targets)
+    # in float16, 6 m are exact to 2 mm
+    torch.testing.assert_close(plans.lengths.cpu().float(), straight, atol=4e-3, rtol=0)
+
+
+@pytest.mark.parametrize("settings", [{}, dict(resample=True), dict(control="continuous")])
+def test_walker_reaches_goals(settings, device):
+    env = envs.PointGoal(64, HOMES, device=device, **settings)
+    metrics = first_episodes(env, Walker(env)).metrics
+    assert metrics.success.mean() >= 0.98
+    assert metrics.spl.mean() >= 0.9
+
+
+def test_walker_without_goals_walks_to_random_places(device):
+    env = envs.Deathmatch(8, DENSE, n_agents=2, device=device)
+    bot, metres = Walker(env), 0.0
+    world, state = env.reset(), bot.initial(16, device)
+    first = state["target"]
+    for _ in range(100):
+        decision, state = bot(world, state, generator=torch.Generator(device).manual_seed(1))
+        world = env.step(decision)
+        metres += env.core.agents.velocity.norm(dim=-1).mean() / env.fps
+    assert metres > 5  # in 10 s
+    assert (state["target"] != first).float().mean() > 0.5
+
+
+def test_explorer_sees_more_than_random_actions(device):
+    env = envs.Explorer(16, HOMES, patience=10_000, device=device)
+    seen = {}
+    for name, bot in dict(explorer=Explorer(env), random=RandomActions(env.action_space)).items():
+        play(env, bot, 200)
+        seen[name] = float(env.n_seen.float().mean())
+    assert seen["explorer"] > 1.5 * seen["random"], seen
+
+
+def test_explorer_begins_anew_in_another_home(device):
+    """The floor seen is that of the episode, also where the next episode is in another home."""
+    env = envs.Explorer(8, [HOMES[0], DENSE[1]], patience=20, resample=True, device=device)
+    bot, world = Explorer(env), env.reset()
+    state = bot.initial(8, device)
+    for _ in range(600):
+        before = state["seen"].sum(1)
+        decision, state = bot(world, state)
+        if world.reset.any() and (before[world.reset] > 20).all():
+            break
+        world = env.step(decision)
+    assert (state["seen"].sum(1)[world.reset] < before[world.reset]).all()
+
+
+def test_hunter_turns_to_an_agent_and_kills_it(device):
+    env = envs.Deathmatch(1, [toys.box()], n_agents=2, device=device)
+    hunter, world = Hunter(env), env.reset()
+    state = hunter.initial(2, device)
+    agents = env.core.agents
+    agents.positions[0] = torch.tensor([[2.0, 3.5], [5.0, 4.0]])
+    agents.angles[0] = torch.tensor([-20.0, 180.0])
+    still = torch.zeros(2, 1, dtype=torch.int64, device=device)
+    world = env.step(arrdict(actions=still))
+    for _ in range(60):
+        decision, state = hunter(world, state)
+        decision.actions[1] = 0
+        world = env.step(decision)
+        if world.terminal[1]:
+            break
+    assert world.terminal.tolist() == [False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("homes", [HOMES, DENSE], ids=["homes", "dense"])
+@pytest.mark.parametrize("opponent, least", [("bot", 0.6), ("random", 0.8)])
+def test_hunter_wins_duels(homes, opponent, least):
+    env = envs.Deathmatch(128, homes, n_agents=2, device="cpu")
+    random = RandomActions(env.action_space)
+    played = duels.play(env, Hunter(env), random if opponent == "random" else env.bot(env.core.fov))
+    (row,) = duels.summaries(played)
+    assert row["won"] > least and row["wins"] > 2 * row["losses"], row
+
+
+def test_bots_play_alike_in_some_lanes(device):
+    env = envs.Deathmatch(6, DENSE, n_agents=3, device=device)
+    lanes = torch.tensor([17, 0, 4, 9], device=device)
+    for kind in (Explorer, Hunter):
+        bot = kind(env)
+        decision, state, world = play(env, bot, 20)
+        all_decided, _ = bot(world, state)
+        some = [part.map(lambda leaf: leaf[lanes]) for part in (world, state)]
+        some_decided, _ = bot.in_lanes(lanes)(*some)
+        assert (some_decided.actions == all_decided.actions[lanes]).all()
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("kind", [Explorer, Hunter, Walker])
+def test_bots_never_synchronise(kind):
+    env = envs.Deathmatch(64, DENSE, n_agents=2, device="cuda")
+    bot, world = kind(env), env.reset()
+    state = bot.initial(128, env.device)
+    decision, state = bot(world, state)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        bot(env.step(decision), state)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+PONG = envs.Pong(2, self_play=True, device="cpu")
+
+
+@pytest.mark.parametrize(
+    "name, env, sentence",
+    [
+        *((n, PONG, f"{n} cannot play in Pong.*Pong has no core") for n in BOTS if n != "random"),
+        ("hunter", envs.PointGoal(1, HOMES[:1], device="cpu"), "observations d and health"),
+        ("explorer", Matrix(2), "explorer cannot play in Matrix"),
+        ("hunted", PONG, "hunted"),
+    ],
+)
+def test_refusals(name, env, sentence):
+    with pytest.raises(UserError, match=sentence) as error:
+        factory.make_bot(name, SimpleNamespace(), env)
+    assert "\n" not in str(error.value)
+
+
+def test_commands_take_bots_by_name(tmp_path, monkeypatch):
+    """Training against a bot that walks in other homes than those of the duels that follow."""
+    monkeypatch.chdir(tmp_path)
+    words = ["env=deathmatch", "env.n_agents=2", "env.n_envs=4", "geometry=homes", "geometry.n=4"]
+    words += ["agent.width=8", "learner.n_steps=8", "samples=1", "device=cpu"]
+    words += ["opponents.bot=0.5", "opponents.bot_class=hunter", "folder=run"]
+    assert train.main(words) == 0
+    words = ["run=run", "against=explorer,walker,bot,random", "episodes=4", "device=cpu"]
+    assert evaluate.main(words) == 0
+    (path,) = (tmp_path / "run" / "evaluations").glob("*.json")
+    rows = json.loads(path.read_text())["rows"]
+    assert [row["against"] for row in rows] == ["explorer", "walker", "hunter", "random"]
+    assert not re.search("nan", path.read_text(), re.IGNORECASE)
