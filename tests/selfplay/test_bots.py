@@ -168,7 +168,8 @@ def test_refusals(name, env, sentence):
 def test_commands_take_bots_by_name(tmp_path, monkeypatch):
     """Training against a bot that walks in other homes than those of the duels that follow."""
     monkeypatch.chdir(tmp_path)
-    words = ["env=deathmatch", "env.n_agents=2", "env.n_envs=4", "geometry=homes", "geometry.n=4"]
+    words = ["env=deathmatch", "env.n_agents=2", "env.n_envs=4", "env.limit=20"]
+    words += ["geometry=homes", "geometry.n=4"]
     words += ["agent.width=8", "learner.n_steps=8", "samples=1", "device=cpu"]
     words += ["opponents.bot=0.5", "opponents.bot_class=hunter", "folder=run"]
     assert train.main(words) == 0

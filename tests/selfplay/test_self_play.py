@@ -27,7 +27,7 @@ def saved_snapshots(folder):
     return checkpoint.load_latest(folder / "checkpoints").state["opponents"]["snapshots"]
 
 
-def test_commands_and_code_of_the_page_work(here, monkeypatch):
+def test_commands_and_code_of_the_page_work(here, monkeypatch, capsys):
     text = (pages.ROOT / "docs" / "self-play.md").read_text()
     commands = pages.commands(text)
     assert {script for script, _ in commands} == set(pages.MAINS)
@@ -36,7 +36,11 @@ def test_commands_and_code_of_the_page_work(here, monkeypatch):
             words = [re.sub("^against=(.*)", r"against=[\1]", word) for word in words]
         settings(*words, script=script.removesuffix(".py"))
     folder = train.run(configured("samples=1", tiny=PONG))
-    (here / "tracker.py").write_text(pages.code(text)[0])
+    walker, tracker = pages.code(text)
+    (here / "tracker.py").write_text(tracker)
+    capsys.readouterr()
+    exec(walker, {})
+    assert float(re.search(r"[0-9.]+", capsys.readouterr().out)[0]) > 0.9
     with pages.inside(here, monkeypatch):
         against = "against=tracker:Tracker,random"
         assert evaluate.main([f"run={folder}", against, "episodes=40", "device=cpu"]) == 0
