@@ -216,7 +216,7 @@ class Job:
         fixed = hydra.job.config.override_dirname.exclude_keys
         row = dict(
             number=number,
-            varied={key: value.strip("\"'") for key, _, value in pairs if key not in fixed},
+            varied={key: _unquoted(value) for key, _, value in pairs if key not in fixed},
             state=RUNNING,
             folder=hydra.runtime.output_dir,
         )
@@ -379,6 +379,11 @@ def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
     rows = [row | row["varied"] | {"job": row["number"]} for row in rows]
     csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
     write_atomically(folder / "sweep.csv", text.getvalue().encode())
+
+
+def _unquoted(value: str) -> str:
+    # as it was typed: Hydra puts a \ before what its grammar knows
+    return re.sub(r"\\([\\()\[\]{}:=, \t'\"])", r"\1", value.strip("\"'"))
 
 
 def _head(rows):

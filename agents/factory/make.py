@@ -1,5 +1,6 @@
 """Builds the objects of a run from its settings: device, homes, environment, policy, learner."""
 
+import copy
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -72,6 +73,8 @@ def construct(settings: Any, constructor: Callable | None = None, **arguments: A
             for key, value in vars(settings).items()
             if key in own or (key in taken and value != taken[key].default)
         }
+        # an environment may change a list that it is given, and the next one is to get it whole
+        values = {k: copy.deepcopy(v) if type(v) in (dict, list) else v for k, v in values.items()}
         values |= {key: value for key, value in arguments.items() if key in taken}
         try:
             return constructor(**values)

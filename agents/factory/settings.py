@@ -90,9 +90,27 @@ def kind_of(group: str, name: str) -> type:
         methods = METHODS.get(group, ()) if inspect.isclass(constructor) else ()
         if absent := [method for method in methods if not hasattr(constructor, method)]:
             raise ValueError(f"it has no method {absent[0]}")
-        return settings_of(constructor, **spec)
+        return settings_of(constructor, is_finite=False, **spec)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from error
+
+
+def as_typed(kind: type, tree: Any) -> Any:
+    """Returns the settings of a dataclass from nested dicts. A value has the type it was typed with,
+    unless an annotation asks for another: 1e6 counts as an integer, and a list as a tuple.
+
+    Raises:
+        ValidationError: of pydantic.
+    """
+    adapter = TypeAdapter(kind)
+    whole = json.loads(
+        json.dumps(tree, skipkeys=True, default=repr),  # bytes of a file, which `as_tree` refuses
+        parse_float=lambda text: int(float(text)) if float(text).is_integer() else float(text),
+    )
+    # in strict mode pydantic takes lists for tuples and strings for paths in JSON alone, whose keys
+    # are strings; otherwise it keeps keys, and takes "3" and true for numbers
+    adapter.validate_json(json.dumps(whole))
+    return adapter.validate_python(tree, strict=False)
 
 
 def _group(group: str) -> Any:
@@ -105,7 +123,7 @@ def _group(group: str) -> Any:
             raise ValueError(f"is a group of keys, got {value!r}")
         if "name" not in value:
             raise ValueError(f"its keys need a member: give {group}= as well")
-        return TypeAdapter(kind_of(group, str(value["name"]))).validate_json(json.dumps(value))
+        return as_typed(kind_of(group, str(value["name"])), value)
 
     return Annotated[Any, BeforeValidator(settings)]
 

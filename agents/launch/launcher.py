@@ -8,7 +8,6 @@ torchrun's agent runs in a thread: it would send a signal on and then give ranks
 """
 
 import contextlib
-import json
 import logging
 import os
 import shutil
@@ -25,7 +24,7 @@ from megastep.agents.errors import ConfigErrors, shortened
 from megastep.agents.factory import check, settings
 from megastep.agents.launch import gpu, signals
 from megastep.agents.launch.endings import Ending
-from megastep.agents.runs import folders
+from megastep.agents.runs import folders, typed_json
 
 #: The environment variable that has the job's folder, for ranks that this module started.
 JOB = "MEGASTEP_JOB"
@@ -114,7 +113,7 @@ class Job:
             prefix=console.prefix,
             parent=os.getpid(),
         )
-        (folder / SETTINGS).write_text(json.dumps(facts))
+        (folder / SETTINGS).write_text(typed_json.dumps(facts))
 
     def run_agent(self) -> None:
         """Runs torchrun's agent until all ranks have ended."""

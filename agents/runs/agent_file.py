@@ -4,7 +4,7 @@ The format is safetensors (https://github.com/huggingface/safetensors). The meta
 texts by name, holds
 
     format    of what follows, `FORMAT`
-    config    as config.json of a checkpoint, JSON
+    config    as config.json of a checkpoint, JSON (`typed_json`)
     facts     what made the agent, such as samples, seconds, command and commit, JSON
     tables    its evaluations: a list of {title, command, rows}, JSON
     sha256    of the bytes after the header, which are those of all tensors
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import safetensors
 
 from megastep.agents.errors import shortened
-from megastep.agents.runs import trust
+from megastep.agents.runs import trust, typed_json
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
 
@@ -71,7 +71,7 @@ def write(
     _, data = _split(save(arrays))
     metadata = {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
     for name, value in (("config", config), ("facts", dict(facts)), ("tables", [*tables])):
-        metadata[name] = json.dumps(value)
+        metadata[name] = typed_json.dumps(value)
     write_atomically(path, save(arrays, metadata))
 
 
@@ -130,7 +130,9 @@ def _read(path):
                 raise ValueError("its tensors do not match their SHA-256")
             if any(entry["dtype"] not in DTYPES for entry in entries.values()):
                 raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
-            metadata = {name: json.loads(texts[name]) for name in ("config", "facts", "tables")}
+            metadata = {
+                name: typed_json.loads(texts[name]) for name in ("config", "facts", "tables")
+            }
             if type(metadata["facts"]["samples"]) is not int:
                 raise ValueError("its number of samples is none")
             if not {"train", "spaces"} <= metadata["config"].keys():

@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from megastep.agents.runs import trust
+from megastep.agents.runs import trust, typed_json
 from megastep.agents.runs.atomic_files import sync_folder
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def write(
             files[name] = _write_file(path / name, functools.partial(torch.save, part), deadline)
         except _TooLate:
             (path / name).unlink()
-    text = json.dumps(config, indent=2).encode()
+    text = typed_json.dumps(config, indent=2).encode()
     files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
     files |= add_files(path)
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
@@ -259,7 +259,7 @@ def read(
         verify(path, manifest, [*parts, "config.json"])
     text = (path / "config.json").read_bytes()
     try:
-        config = json.loads(text)
+        config = typed_json.loads(text)
     except (ValueError, RecursionError):
         raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is no JSON") from None
     checkpoint = Checkpoint(
