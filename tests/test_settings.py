@@ -214,12 +214,11 @@ def test_values_are_kept_as_they_were_typed(tree):
     chosen = check(kind, tree)
     for name, value in tree.items():
         assert repr(getattr(chosen, name)) == repr(value)
-    saved = typed_json.loads(typed_json.dumps(as_tree(chosen)))
+    kept = as_tree(chosen)
+    saved = typed_json.loads(typed_json.dumps(kept))
     assert repr(check(kind, saved)) == repr(chosen) and (chosen.shape, chosen.pick) == ((2, 3), max)
-    json.loads(typed_json.dumps(as_tree(chosen)), parse_constant=pytest.fail)  # standard JSON
-    assert repr(yaml.safe_load(yaml.safe_dump(as_tree(chosen), sort_keys=False))) == repr(
-        as_tree(chosen)
-    )
+    json.loads(typed_json.dumps(kept), parse_constant=pytest.fail)  # standard JSON
+    assert repr(yaml.safe_load(yaml.safe_dump(kept, sort_keys=False))) == repr(kept)
 
 
 def test_annotations_decide_where_they_can():

@@ -280,7 +280,7 @@ def key_of(override: types.Override) -> str:
 
 
 def _text_of_a_key(config: DictConfig, key: str) -> str:
-    """Returns why a dotted key is refused, a part of which is the text of a number that is a key."""
+    """Returns why a key is refused a part of which looks like a number that is a key; else ""."""
     parts = key.split(".")
     for i, part in enumerate(parts):
         node = OmegaConf.select(config, ".".join(parts[:i])) if i else config

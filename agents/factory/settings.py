@@ -96,8 +96,8 @@ def kind_of(group: str, name: str) -> type:
 
 
 def as_typed(kind: type, tree: Any) -> Any:
-    """Returns the settings of a dataclass from nested dicts. A value has the type it was typed with,
-    unless an annotation asks for another: 1e6 counts as an integer, and a list as a tuple.
+    """Returns the settings of a dataclass from nested dicts. A value keeps the type that it was
+    typed with, unless an annotation asks for another: 1e6 counts as an integer, a list as a tuple.
 
     Raises:
         ValidationError: of pydantic.

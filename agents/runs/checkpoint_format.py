@@ -16,6 +16,7 @@ all; to evaluate needs `state.pt` alone. JSON is read without PyTorch.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -24,7 +25,7 @@ import os
 import pickle
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -53,6 +54,16 @@ class CheckpointError(RuntimeError):
 
 class DamagedCheckpoint(CheckpointError):
     """A checkpoint does not match its manifest. An earlier checkpoint may be intact."""
+
+
+class GoneCheckpoint(CheckpointError):
+    """A checkpoint was deleted before all of it was open, as its run has saved later ones."""
+
+    def __init__(self, path: Path):
+        super().__init__(
+            f"Checkpoint {path} is gone: a run deletes its earlier checkpoints as it saves later "
+            "ones; name the run's folder to get its newest"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,7 +247,8 @@ def sealed(manifest: dict[str, Any]) -> bytes:
 def read(
     path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
 ) -> Checkpoint:
-    """Loads a checkpoint.
+    """Loads a checkpoint. Opens what it reads at once, so that it is read to its end if the run
+    deletes it meanwhile.
 
     Args:
         device: where the tensors of `state.pt` go; None: verifies everything and loads no state.
@@ -245,6 +257,7 @@ def read(
 
     Raises:
         DamagedCheckpoint: a file is missing or damaged, or could run code when loaded.
+        GoneCheckpoint: it was deleted before everything was open.
         CheckpointError: another version of megastep wrote it.
     """
     manifest = read_manifest(path)
@@ -253,38 +266,39 @@ def read(
     if is_whole:
         parts += [rank_file(rank)] if rank else PARTS
         parts = [name for name in parts if name in manifest["files"]]
-    if device is None or (is_whole and rank == 0):
-        verify(path, manifest)
-    else:
-        verify(path, manifest, [*parts, "config.json"])
-    text = (path / "config.json").read_bytes()
-    try:
-        config = typed_json.loads(text)
-    except (ValueError, RecursionError):
-        raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is no JSON") from None
-    checkpoint = Checkpoint(
-        path,
-        manifest["step"],
-        manifest["numbers"],
-        config,
-        manifest.get("made_with", {}),
-        untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
-        n_ranks=n_ranks,
-    )
-    if device is None:
-        return checkpoint
-    state = {}
-    for name in parts:
-        state |= _load(path / name, device if name == "state.pt" else "cpu")
+    is_verified = device is None or (is_whole and rank == 0)
+    names = manifest["files"] if is_verified else [*parts, "config.json"]
+    with verified(path, manifest, names) as files:
+        text = files["config.json"].read()
+        try:
+            config = typed_json.loads(text)
+        except (ValueError, RecursionError):
+            problem = f"Checkpoint {path} is damaged: config.json is no JSON"
+            raise DamagedCheckpoint(problem) from None
+        checkpoint = Checkpoint(
+            path,
+            manifest["step"],
+            manifest["numbers"],
+            config,
+            manifest.get("made_with", {}),
+            untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
+            n_ranks=n_ranks,
+        )
+        if device is None:
+            return checkpoint
+        state = {}
+        for name in parts:
+            to = device if name == "state.pt" else "cpu"
+            state |= _load(path / name, files[name], to)
     return dataclasses.replace(checkpoint, state=_migrated(state, manifest))
 
 
-def _load(path, device):
-    """Returns the state in a file."""
+def _load(path, file, device):
+    """Returns the state in an open file."""
     import torch
 
     try:
-        return torch.load(path, map_location=device, weights_only=True)
+        return torch.load(file, map_location=device, weights_only=True)
     except pickle.UnpicklingError:
         raise DamagedCheckpoint(
             f"Checkpoint {path.parent} is refused: {path.name} holds more than tensors and "
@@ -328,29 +342,48 @@ def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
     return config
 
 
-def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = None) -> None:
-    """Compares files of a checkpoint, by default all, with the SHA-256 in its manifest.
+@contextlib.contextmanager
+def verified(
+    path: Path, manifest: dict[str, Any], names: Iterable[str]
+) -> Iterator[dict[str, BinaryIO]]:
+    """Opens files of a checkpoint and compares each with the SHA-256 in its manifest.
+
+    Yields:
+        The open files by name, each at its beginning.
 
     Raises: as `read`.
     """
-    for name in manifest["files"] if names is None else names:
-        try:
-            digest = _digest(path / name)
-        except OSError as error:
-            raise DamagedCheckpoint(
-                f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
-            ) from None
-        if digest != manifest["files"][name]["sha256"]:
-            raise DamagedCheckpoint(
-                f"Checkpoint {path} is damaged: {name} does not match the SHA-256 in its manifest"
-            )
+    with contextlib.ExitStack() as stack:
+        files = {}
+        for name in names:
+            with _readable(path, name):
+                files[name] = stack.enter_context(open(path / name, "rb"))
+        for name, file in files.items():
+            with _readable(path, name):
+                digest = _digest(file)
+            if digest != manifest["files"][name]["sha256"]:
+                problem = f"{name} does not match the SHA-256 in its manifest"
+                raise DamagedCheckpoint(f"Checkpoint {path} is damaged: {problem}")
+        yield files
 
 
-def _digest(path):
+@contextlib.contextmanager
+def _readable(path, name):
+    try:
+        yield
+    except OSError as error:
+        if not path.exists():
+            raise GoneCheckpoint(path) from None
+        raise DamagedCheckpoint(
+            f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
+        ) from None
+
+
+def _digest(file):
     digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
+    while chunk := file.read(_CHUNK):
+        digest.update(chunk)
+    file.seek(0)
     return digest.hexdigest()
 
 
@@ -371,6 +404,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
         others = {*manifest["files"]} - {"config.json", "state.pt", *PARTS}
         is_intact = all(map(_RANK_FILE.fullmatch, others))  # a planted one may name any file
     is_without_digest = version == 1 and "sha256" not in manifest
+    if not (is_intact or is_without_digest or path.exists()):
+        raise GoneCheckpoint(path)
     if not (is_intact or is_without_digest):
         raise DamagedCheckpoint(
             f"Checkpoint {path} is damaged: manifest.json cannot be read or does not match its own "

@@ -208,8 +208,8 @@ def resume_command(folder: Path, key: str = "resume") -> str:
 
 
 def checkpoints_of(path: Path) -> Path:
-    """A checkpoint, or the folder of a run's checkpoints."""
-    return path if (path / "manifest.json").exists() else path / "checkpoints"
+    """A checkpoint, which its run may have deleted, or the folder of a run's checkpoints."""
+    return path / "checkpoints" if (path / "checkpoints").exists() else path
 
 
 def folder_of(path: Path) -> Path:
