@@ -38,7 +38,7 @@ from megastep.agents.errors import ConfigErrors, UserError, shortened, user_erro
 from megastep.agents.factory import settings
 from megastep.agents.launch import places, rank, signals
 from megastep.agents.runs import folders, scores
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.runs.atomic_files import make_folders, write_atomically
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: Columns of the table beside the job and the keys that vary.
@@ -115,7 +115,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     with user_errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
             folder = folders.make(folder)  # another sweep may start in the same second
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folders(folder)
     options = SEARCH if config.runtime.choices["hydra/sweeper"] == "optuna" else {}
     options = options | {
         "hydra.job.name": composer.script.name,

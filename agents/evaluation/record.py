@@ -12,6 +12,7 @@ from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import arena, duels
 from megastep.agents.factory import settings
 from megastep.agents.runs import folders
+from megastep.agents.runs.atomic_files import make_folders, remove_folders
 from megastep.agents.selfplay.bots.random import RandomActions
 
 #: Where random actions are filmed unless geometry= says otherwise.
@@ -48,6 +49,9 @@ def run(cfg: settings.Record) -> Path:
         path = Path(cfg.file) if cfg.file else take_free_name(folder / "video.mp4")
         if not cfg.file:
             undo.callback(path.unlink, missing_ok=True)
+        else:
+            with user_errors(f"The video {path} could not be made: "):
+                undo.callback(remove_folders, make_folders(path.parent))
         # a video is the last thing that a run should fail for
         with user_errors(f"The video {path} could not be made: ", (Exception,)):
             recording.film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)

@@ -364,6 +364,9 @@ class Record(Played):
             "run": not (has_run or has_env)
             and "is missing; without a run, env=explorer records random actions",
             "env": has_run and has_env and "cannot be combined with run, which has its own",
+            "file": self.file is not None
+            and not self.file.endswith((".mp4", ".png"))
+            and f"{self.file!r} is neither a video, .mp4, nor its last frame, .png",
             "against": has_env
             and self.against is not None
             and "needs run=, the agent that plays against it",

@@ -100,7 +100,6 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
                 console.say(f"Training on {ranks} in {folder}")
             undo.pop_all()
-        resume = f"To continue: {folders.resume_command(folder)}"
         try:
             with (
                 signals.handled(rank.announce) as numbers,
@@ -120,7 +119,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             saved = running.saver.error or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
             reason = problem or str(error).partition("\n")[0].rstrip(".")
-            raise UserError(f"{reason}. {saved}. {resume}") from error
+            raise UserError(f"{reason}. {saved}. {folders.to_continue(folder)}") from error
         finally:
             if is_first:
                 with process_group.unhurried():
@@ -131,7 +130,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         ends = process_group.gather_objects((numbers[:1], running.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
-                signal, f"Stopped after {running.samples:,} samples. {resume}"
+                signal,
+                f"Stopped after {running.samples:,} samples. {folders.to_continue(folder)}",
             )
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)

@@ -16,6 +16,7 @@ from typing import Any
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
+from megastep.agents.runs.atomic_files import check_room, make_folders, remove_folders
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
@@ -37,12 +38,17 @@ def for_file(name: str) -> str:
 def make(path: Path) -> Path:
     """Makes a new folder and returns it; a taken name gets -2, -3, ..."""
     with user_errors(CANNOT.format(shortened(path))):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for number in itertools.count(1):
-            folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-            with contextlib.suppress(FileExistsError):  # another program may have just taken it
-                folder.mkdir()
-                return folder
+        check_room(path)
+        made = make_folders(path.parent)
+        try:
+            for number in itertools.count(1):
+                folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+                with contextlib.suppress(FileExistsError):  # another program may have just taken it
+                    folder.mkdir()
+                    return folder
+        except OSError:
+            remove_folders(made)
+            raise
 
 
 def new(name: str, folder: str | None = None) -> Path:
@@ -58,14 +64,18 @@ def new(name: str, folder: str | None = None) -> Path:
 def check_free(name: str | None) -> None:
     """Raises UserError if the folder of a new run is not empty, or cannot be read."""
     folder = Path(name or "")
+    if os.path.islink(folder) and not os.path.exists(folder):
+        target = os.readlink(folder)
+        raise UserError(f"{CANNOT.format(folder)}it is a link to {target}, which does not exist")
     with user_errors(CANNOT.format(shortened(folder))):
+        check_room(folder)
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
     # Hydra writes .hydra/ and a log before the job of a sweep starts
     if [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]:
-        raise UserError(
-            f"The run folder {folder} is not empty; choose another with folder=, or continue "
-            f"its run: {resume_command(folder)}"
-        )
+        text = f"The run folder {folder} is not empty; choose another with folder="
+        if checkpoint.list_checkpoints(folder / "checkpoints"):
+            text = f"{text}, or continue its run: {resume_command(folder)}"
+        raise UserError(text)
 
 
 @contextlib.contextmanager
@@ -205,6 +215,13 @@ def resume_command(folder: Path, key: str = "resume") -> str:
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
     return f"{package.command('train', 'python ')} {shlex.quote(f'{key}={name}')}"
+
+
+def to_continue(folder: Path) -> str:
+    """Returns a sentence on how a run that has ended goes on."""
+    if not checkpoint.list_checkpoints(folder / "checkpoints"):
+        return "It has no checkpoint, so it cannot be continued"
+    return f"To continue: {resume_command(folder)}"
 
 
 def checkpoints_of(path: Path) -> Path:

@@ -1,5 +1,7 @@
 """Parallel environments of PettingZoo: agents as lanes, and agents that are out before others."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -122,3 +124,6 @@ def test_trains_and_evaluates(tmp_path, monkeypatch):
     ]
     assert train.main([*words, "folder=run"]) == 0
     assert evaluate.main(["run=run", "episodes=4", "against=random"]) == 0
+    assert evaluate.main(["run=run", "episodes=30", "baseline=false"]) == 0
+    (path,) = (tmp_path / "run" / "evaluations").glob("[!d]*.json")
+    assert json.loads(path.read_text())["rows"][0]["lanes"] == 30, "of ten environments"

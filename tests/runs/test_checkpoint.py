@@ -403,7 +403,7 @@ def between_steps():
         for n in itertools.count():
             n_seen = -1
 
-            def look(frame, event, called):
+            def look(frame, event, called, n=n):
                 nonlocal n_seen
                 if event == "c_call" and called.__name__ in operations:
                     n_seen += 1
