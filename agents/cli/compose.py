@@ -46,6 +46,8 @@ OPEN = {
     key: OmegaConf.create({}, flags={"struct": False})
     for key in (*settings.IMPORTED, "agent", "opponents")
 }
+#: The learner whose blocks are tried first where none is typed.
+GUESS = "ppo"
 #: What Hydra raises for words that it cannot use.
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
 STORE = config_store.ConfigStore.instance()
@@ -253,7 +255,7 @@ class Composer:
     ) -> DictConfig:
         # with the blocks of what is typed, and once more if files choose another device or learner
         typed = dict(word.lstrip("+").split("=", 1) for word in groups if "=" in word)
-        blocks.apply(device or "auto", learner or typed.get("learner"))
+        blocks.apply(device or "auto", learner or typed.get("learner", GUESS))
         composed = functools.partial(hydra.compose, self.name, [*groups], return_hydra_config=True)
         config, before = composed(), dict(blocks.applied)
         device, name = device or config.get("device") or "auto", "learner.name"
