@@ -54,7 +54,7 @@ AGENT_PALETTE = (
 FRONT = "ff3020"
 
 
-def _linear(palette):
+def _linear(palette) -> np.ndarray:
     """Returns the linear light, (n, 3), of hexadecimal colours."""
     return gamma_decode(
         np.array([[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in palette])
@@ -78,7 +78,7 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
     return np.stack([corners, np.roll(corners, -1, 0)], 1)
 
 
-def _agent_textures(n_agents, model):
+def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
     """Returns the texels of an environment's agents, (K, 3), and the number of texels per line,
     (A M,). Agents have different colours (16, then they repeat) and a red front.
     """
@@ -108,7 +108,7 @@ def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray
     return np.concatenate([base, stripe]).astype(np.float32)[wall + n * striped]
 
 
-def _sort_along_z_curve(walls):
+def _sort_along_z_curve(walls) -> np.ndarray:
     """Sorts walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each group of 32 walls
     lies close together.
     """
@@ -119,7 +119,7 @@ def _sort_along_z_curve(walls):
     return walls[np.argsort(order, kind="stable")]
 
 
-def _part(geometries, name, shape):
+def _part(geometries, name, shape) -> list:
     """Returns one part of all geometries as arrays. Raises ValueError if one does not fit."""
     parts = []
     for i, g in enumerate(geometries):
@@ -140,7 +140,7 @@ def _part(geometries, name, shape):
     return parts
 
 
-def _first_layouts(n_envs, n_layouts):
+def _first_layouts(n_envs, n_layouts) -> torch.Tensor:
     """Returns the layout that each environment starts with, (N,) int64."""
     environments = torch.arange(n_envs)
     if n_envs < n_layouts:

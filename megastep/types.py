@@ -34,11 +34,11 @@ class World(Protocol):
     terminal: torch.Tensor  # (B,) bool: the episode ended here by its own rule
     truncated: torch.Tensor  # (B,) bool: a time limit ended the episode here
 
-    def __getitem__(self, key: str) -> Any: ...
+    def __getitem__(self, key: str) -> Tree: ...
 
     def __iter__(self) -> Iterator[str]: ...
 
-    def get(self, key: str, default: Any = None) -> Any: ...
+    def get(self, key: str, default: Tree = None) -> Tree: ...
 
 
 @runtime_checkable
@@ -77,9 +77,11 @@ class Env(Protocol):
 
     def reset(self) -> World:
         """Starts a new episode in every lane. Returns the first world."""
+        ...
 
     def step(self, decision: Mapping) -> World:
         """Takes one step by ``decision["actions"]``, (B, ...) per leaf of the action space."""
+        ...
 
 
 #: Optional attributes of an environment, with their defaults.
@@ -104,7 +106,7 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
-def optional(owner: Any, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
+def optional(owner: object, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
     """Returns an optional attribute of an environment, or its default.
 
     Args:
@@ -132,6 +134,7 @@ class PolicyLike(Protocol):
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> Tree:
         """Returns the hidden state of ``n_lanes`` lanes at the start of an episode."""
+        ...
 
     def __call__(
         self,
@@ -148,3 +151,4 @@ class PolicyLike(Protocol):
             sample: draw from the action distribution; otherwise take the most likely action.
             generator: random number generator of the draws.
         """
+        ...

@@ -57,7 +57,7 @@ class VectorProcesses:
         with workers.terminal_signals_blocked():
             for rows in self.rows:
                 pipe, far_end = multiprocessing.Pipe()
-                process = context.Process(
+                process = context.Process(  # pyright: ignore[reportAttributeAccessIssue]
                     target=_serve,
                     args=(far_end, make, rows.stop - rows.start),
                     daemon=True,
@@ -93,7 +93,7 @@ class VectorProcesses:
         """Ends the processes."""
         self._finalizer()
 
-    def _ask(self, command, arguments):
+    def _ask(self, command, arguments) -> list:
         """Returns the answer of each process to a command."""
         answers = []
         try:
@@ -124,7 +124,7 @@ def start_rendering(vector: Any) -> None:
         vector.render_mode = "rgb_array"
 
 
-def _serve(pipe, make, n_envs):
+def _serve(pipe, make, n_envs) -> None:
     """Answers commands until the pipe is closed, which it is when the other process ends."""
     with contextlib.suppress(EOFError, OSError):
         try:
@@ -145,7 +145,7 @@ def _serve(pipe, make, n_envs):
             pipe.send(traceback.format_exc())
 
 
-def _end(pipes, processes):
+def _end(pipes, processes) -> None:
     for pipe in pipes:
         pipe.close()
     for process in processes:
@@ -155,7 +155,7 @@ def _end(pipes, processes):
             process.join()
 
 
-def _write(to, rows, values):
+def _write(to, rows, values) -> None:
     """Copies the values of some environments into the batch of all."""
     if isinstance(to, dict):
         to, values = to.values(), values.values()
@@ -166,7 +166,7 @@ def _write(to, rows, values):
             _write(part, rows, value)
 
 
-def _read(batch, rows):
+def _read(batch, rows) -> object:
     """Returns the rows of a batch of actions."""
     if isinstance(batch, dict):
         return {key: _read(part, rows) for key, part in batch.items()}

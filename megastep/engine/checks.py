@@ -43,7 +43,7 @@ def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
     return number
 
 
-def _index(value):
+def _index(value) -> int | None:
     """Returns a value as an int, or None if it is none."""
     if isinstance(value, bool) or isinstance(value, torch.Tensor) and not _is_stored(value):
         return None
@@ -57,7 +57,7 @@ def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: 
     """Returns ``value`` as a float. ValueError unless ``min < value < max``."""
     plain = type(value) is float or type(value) is int
     real = plain or isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not real or not min < value < max:
+    if not real or not min < value < max:  # pyright: ignore[reportOperatorIssue]
         kind = f"a number of {unit}" if unit else "a number"
         range_ = f"between {min:g} and {max:g}" if max < math.inf else f"above {min:g}"
         range_ = range_ if min > -math.inf else "that is finite"
@@ -165,7 +165,7 @@ def integers(
     return tensor
 
 
-def _fits(tensor, shape):
+def _fits(tensor, shape) -> bool:
     return tensor.ndim == len(shape) and all(
         isinstance(size, str) or size == n for size, n in zip(shape, tensor.shape)
     )
@@ -181,7 +181,7 @@ def ragged(name: str, value: Any, shape: Sequence, device: Any) -> RaggedTorch:
     if not isinstance(value, Ragged) and not hasattr(value, "torchify"):
         raise TypeError(f"{name} must be a Ragged, but {_described(value)} was given")
     value = value.torchify()
-    return Ragged(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
+    return RaggedTorch(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
 
 
 def length(name: str, value: Any, axis: int = 0) -> int:
@@ -282,11 +282,11 @@ def vectors(name: str, value: Any, n_lanes: int, dim: int, device: torch.device)
     return value
 
 
-def _sizes(shape):
+def _sizes(shape) -> str:
     return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
 
 
-def _is_stored(tensor):
+def _is_stored(tensor) -> bool:
     """Returns True if a tensor has memory and lies inside its storage."""
     if tensor.layout is not torch.strided:
         return False
@@ -298,7 +298,7 @@ def _is_stored(tensor):
     return n_bytes <= tensor.untyped_storage().nbytes() or not tensor.numel()
 
 
-def _described(value):
+def _described(value) -> str:
     """Describes a value in a few words."""
     if isinstance(value, torch.Tensor):
         if value.layout is not torch.strided:

@@ -45,7 +45,7 @@ def device(name: str | torch.device = "auto") -> torch.device:
     return requested
 
 
-def _missing(count):
+def _missing(count) -> str:
     if count:
         return f"there are {count} GPUs"
     built = "" if torch.version.cuda else " and this PyTorch is built for the CPU only"

@@ -9,15 +9,18 @@ environment's agents, W walls and T texels of all layouts.
 """
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from megastep.engine import checks, views
 from megastep.engine.views import JoinedRagged
 from megastep.kernels.build.launch import ENGINE
-from megastep.ragged import Ragged
+from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor, SetOnce
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["Layouts", "Scenery"]
 
@@ -78,7 +81,7 @@ class Layouts(SetOnce):
         self._boxes = torch.empty((int(self.box_starts[-1]), 4), device=device)
         self.update_bounding_boxes()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.n_layouts
 
     @property
@@ -191,7 +194,7 @@ class Scenery(SetOnce):
         self._set(n_agents, layouts, model, model_widths, layout)
         return self
 
-    def _set(self, n_agents, layouts, model, model_widths, layout):
+    def _set(self, n_agents, layouts, model, model_widths, layout) -> None:
         device = layouts.texels.device
         model = checks.floats("model", model, ("M", 2, 2), device)
         n_lines, n_texels = n_agents * len(model), layouts.agent_textures.shape[1]
@@ -209,7 +212,7 @@ class Scenery(SetOnce):
         self.agent_light = torch.ones((self.n_envs, n_texels), device=device)
         self.reach = float(model.norm(dim=-1).max()) if len(model) else 0.0
 
-    def _stored(self):
+    def _stored(self) -> "Self":
         """Returns self. ValueError if the storage of a tensor that may be written was resized."""
         for name in ("layout", "agent_lines", "agent_light"):
             checks.stored(f"scenery.{name}", getattr(self, name))
@@ -266,26 +269,26 @@ class Scenery(SetOnce):
         )
 
 
-def _same(name, what, expected, actual):
+def _same(name, what, expected, actual) -> None:
     if expected != actual:
         raise ValueError(f"{name} must have {what}, so {expected}, but {actual} were given")
 
 
-def _widths(bounds):
+def _widths(bounds) -> list[int]:
     return [last - first for first, last in zip(bounds, bounds[1:])]
 
 
-def _fixed(name, tensor):
+def _fixed(name, tensor) -> torch.Tensor:
     return ReadOnlyTensor(
         tensor, f"{name} is read-only, because other tensors depend on it: make another Scenery"
     )
 
 
-def _of_fixed_widths(name, vals, widths):
-    return Ragged(vals, _fixed(f"{name}.widths", widths.clone()))
+def _of_fixed_widths(name, vals, widths) -> RaggedTorch:
+    return RaggedTorch(vals, _fixed(f"{name}.widths", widths.clone()))
 
 
-def _starts(name, widths):
+def _starts(name, widths) -> torch.Tensor:
     """Returns (n + 1,) int32, the start of each subarray and the end of the last one."""
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:

@@ -18,6 +18,7 @@ def images(view: engine.Observation) -> arrdict:
     tensors: an image has a row per camera.
     """
     rgb, d = view.rgb, view.depth
+    assert rgb is not None and d is not None
     if rgb.ndim == 4:  # one camera
         rgb, d = rgb.unsqueeze(2), d.unsqueeze(2)
     return arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2))

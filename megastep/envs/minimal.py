@@ -89,12 +89,13 @@ class Minimal(SceneryEnv):
         self.movement(decision)
         return self._world(self.lifecycle.start_ended())
 
-    def _world(self, reset):
+    def _world(self, reset) -> arrdict:
         self.spawner(reset)
         return arrdict(obs=self._rgb(), reward=self._reward.clone(), **self.lifecycle(reset))
 
-    def _rgb(self):
+    def _rgb(self) -> torch.Tensor:
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)
+        assert view.rgb is not None
         return view.rgb.view(self.n_envs, *self.obs_space.shape)
 
     def state(self, e: int = 0) -> arrdict:

@@ -36,7 +36,7 @@ SUITE = {  # the parts of `suite`
 }
 
 
-def _split_range(count, split):
+def _split_range(count, split) -> range:
     """Returns the indices of a split, as a range into a database of `count` geometries. A single
     geometry is in every split.
     """
@@ -48,7 +48,7 @@ def _split_range(count, split):
     }[split]
 
 
-def _draw_indices(count, n, split, seed):
+def _draw_indices(count, n, split, seed) -> list[int]:
     """Returns n indices into a database of `count`: a random permutation of the split, repeated."""
     members = _split_range(count, split)
     random = np.random.RandomState(seed % 2**32)  # numpy never changes what it draws
@@ -69,14 +69,14 @@ def column(
 
 
 @functools.lru_cache(maxsize=2)
-def _load(path, modified):
+def _load(path, modified) -> list[dotdict]:
     return npz.load(path)
 
 
 def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str) -> list[dotdict]:
     """Returns geometries from the `.npz` file at `path`. The last tenth of it is the test split."""
-    path = Path(path)
-    database = _load(path, path.stat().st_mtime_ns if path.exists() else 0)
+    file = Path(path)
+    database = _load(file, file.stat().st_mtime_ns if file.exists() else 0)
     return [database[i] for i in _draw_indices(len(database), n, split, seed)]
 
 
@@ -105,7 +105,7 @@ def homes(
 
 def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
     """Returns homes from the 512 dense ones on which the benchmarks run."""
-    return files(n, split, seed, path=BENCH)
+    return files(n, split, seed, path=str(BENCH))
 
 
 @checked

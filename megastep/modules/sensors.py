@@ -34,7 +34,7 @@ def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 
 
-def _plot_strips(name, state, axes, yaws):
+def _plot_strips(name, state, axes, yaws) -> np.ndarray:
     """Draws images (A, channels, C, R) as strips, one per agent, with a row per camera."""
     aspect = plotting.STRIP * np.shape(state)[-2]
     return plotting.plot_images({name: state}, aspect=aspect, axes=axes, yaws=yaws)

@@ -152,7 +152,7 @@ class Deathmatch(SceneryEnv):
             self.obs_space["sound"] = spaces.MultiVector(1, 3)
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
         self.privileged_space = spaces.MultiVector(1, n_privileged) if privileged else None
-        self.rules = dict(
+        self.rules: dict = dict(
             damage=damage,
             recovery=recovery / fps,
             drain=drain / fps,
@@ -170,9 +170,10 @@ class Deathmatch(SceneryEnv):
         engine.fit(n_envs, n_agents * bytes_per_lane, self.device)
         self.search_reward, self.seen = search_reward, None
         if search_reward:
-            on = dict(dtype=torch.int32, device=self.device)
-            self.seen = torch.zeros((n_envs, n_agents, words), **on)
-        n_lanes, on = n_envs * n_agents, dict(device=self.device)
+            shape = n_envs, n_agents, words
+            self.seen = torch.zeros(shape, dtype=torch.int32, device=self.device)
+        on: dict = dict(device=self.device)
+        n_lanes = n_envs * n_agents
         self.health = torch.ones(n_lanes, **on)
         self.tally = torch.zeros((TALLY_ROWS, n_lanes), **on)
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, **on)
@@ -202,7 +203,7 @@ class Deathmatch(SceneryEnv):
         self.movement(dict(actions=actions))
         return self._world()
 
-    def _world(self):
+    def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, renders, and lets the agents hit each other."""
         self.spawner(self.ended)
         view = self._view(**self._search_arguments())
@@ -219,6 +220,7 @@ class Deathmatch(SceneryEnv):
         )
         reward = step.reward
         if self.seen is not None:
+            assert view.newly_seen is not None
             search = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
             reward = reward + search.masked_fill_(step.reset, 0.0)
         truncated, metrics = step.truncated, step.metrics
@@ -238,11 +240,12 @@ class Deathmatch(SceneryEnv):
             world["privileged"] = step.privileged
         return world
 
-    def _end_rounds(self, step):
+    def _end_rounds(self, step) -> tuple[torch.Tensor, torch.Tensor]:
         """Ends every episode of the environments whose round is over, but not while one begins.
 
         Returns `truncated` and the metrics with those episodes in them.
         """
+        assert self.round_ages is not None
         shape = self.n_envs, self.n_agents
         over = self.round_ages.add_(1) >= self.rules["limit"]
         over &= ~step.reset.view(shape).any(1)
@@ -254,14 +257,14 @@ class Deathmatch(SceneryEnv):
         self.ended |= over
         return step.truncated | (over & ~step.terminal), metrics
 
-    def _search_arguments(self):
+    def _search_arguments(self) -> dict[str, torch.Tensor]:
         """The arguments of observe that count newly seen texels, if search_reward is not 0."""
         if self.seen is None:
             return {}
         starts = self.ended.view(self.n_envs, self.n_agents)
         return dict(seen=self.seen, clear_mask=starts)
 
-    def _view(self, **search):
+    def _view(self, **search) -> engine.Observation:
         return engine.observe(
             self.core.scenery,
             self.core.agents,
@@ -272,7 +275,7 @@ class Deathmatch(SceneryEnv):
             **search,
         )
 
-    def _images(self, view):
+    def _images(self, view) -> arrdict:
         """The images and the IMU of a view, by lane: (B, 1, ...)."""
         lanes = self.n_envs * self.n_agents
         return arrdict(
@@ -289,6 +292,7 @@ class Deathmatch(SceneryEnv):
         """
         lanes = slice(e * self.n_agents, (e + 1) * self.n_agents)
         view, n_model = self._view(), len(self.core.scenery.model)
+        assert view.centre_line is not None
         line = view.centre_line[e]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
         images = self._images(view)

@@ -133,11 +133,12 @@ class Explorer(SceneryEnv):
         self.movement(decision)
         return self._world()
 
-    def _world(self):
+    def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, renders, and computes rewards and flags."""
         ages, limits, ended = self.lifecycle.ages, self.lifecycle.limits, self.lifecycle.ended
         self.spawner(ended)
         obs, newly_seen = self._observation(seen=self.seen, clear_mask=ended[:, None])
+        assert newly_seen is not None
         step = explorer_step(
             self.core.scenery,
             self.core.agents,
@@ -169,7 +170,7 @@ class Explorer(SceneryEnv):
         """(B,) int32: texels seen this episode."""
         return self.lifecycle.limits - self.patience
 
-    def _observation(self, **bitmaps):
+    def _observation(self, **bitmaps) -> tuple[arrdict, torch.Tensor | None]:
         """Returns the observation and the number of newly seen texels, (N, 1) int32.
 
         Without ``bitmaps`` (arguments ``seen`` and ``clear_mask`` of ``engine.observe``) the number
@@ -190,7 +191,7 @@ class Explorer(SceneryEnv):
             lifecycle=self.lifecycle.state(e),
         )
 
-    def _seen_texels(self, e):
+    def _seen_texels(self, e) -> torch.Tensor:
         """(T,) bool: the wall texels of environment ``e`` that were seen this episode."""
         bits = (
             self.seen[e, 0, :, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1

@@ -4,10 +4,14 @@ import difflib
 import functools
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from megastep.imports import import_object, search_current_folder
 from megastep.vector_processes import VectorProcesses
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+    from gymnasium.vector import VectorEnv
 
 __all__ = ["vector_env"]
 
@@ -20,7 +24,7 @@ def vector_env(
     kwargs: Mapping[str, Any],
     wrappers: Sequence[str],
     vectorization: str,
-) -> Any:
+) -> "VectorEnv | VectorProcesses":
     """Returns a vector environment. The step after an episode's end resets it.
 
     Args are those of :class:`~megastep.envs.gymnasium.env.Gymnasium`.
@@ -34,20 +38,20 @@ def vector_env(
         raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
     spec = _spec(id)
     try:
-        wrappers = [import_object(name) for name in wrappers]
+        functions = [import_object(name) for name in wrappers]
     except ValueError as error:
         raise ValueError(f"env.wrappers: {error}") from None
     make = functools.partial(gymnasium.make_vec, spec)
     try:
         if vectorization == "own":
-            return _checked(id, _own(make, spec, wrappers, n_envs, kwargs))
+            return _checked(id, _own(make, spec, functions, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
         settings = {"disable_env_checker": True, **kwargs}
         make = functools.partial(
             make,
             vectorization_mode="sync",
             vector_kwargs={"copy": False},
-            wrappers=wrappers,
+            wrappers=functions,
             **settings,
         )
         return make(num_envs=n_envs) if vectorization == "sync" else VectorProcesses(make, n_envs)
@@ -62,7 +66,7 @@ def vector_env(
         ) from error
 
 
-def _spec(id):
+def _spec(id) -> "EnvSpec":
     """Returns the specification of an environment, whose package is imported if it names one."""
     import gymnasium
 
@@ -88,7 +92,7 @@ def _spec(id):
     return gymnasium.registry[name]
 
 
-def _own(make, spec, wrappers, n_envs, kwargs):
+def _own(make, spec, wrappers, n_envs, kwargs) -> "VectorEnv":
     if wrappers:
         raise ValueError(
             "env.wrappers go around single environments, which its own vector environment has "
@@ -99,7 +103,7 @@ def _own(make, spec, wrappers, n_envs, kwargs):
     return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs)
 
 
-def _checked(id, env):
+def _checked(id: str | None, env: "VectorEnv") -> "VectorEnv":
     from gymnasium.vector import AutoresetMode
 
     mode = env.metadata.get("autoreset_mode")
@@ -112,7 +116,7 @@ def _checked(id, env):
     return env
 
 
-def _line(error):
+def _line(error) -> str:
     """Returns the first line of an error, without what Gymnasium adds to it."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return line.partition(" was raised from the environment creator")[0]

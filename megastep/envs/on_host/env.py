@@ -41,7 +41,7 @@ class VectorizedEnv:
 
     def __init__(
         self,
-        id: str,
+        id: str | None,
         vector: Any,
         n_envs: int,
         n_agents: int,
@@ -49,7 +49,8 @@ class VectorizedEnv:
         device: torch.device | str | None,
     ):
         self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
-        self.device, self._seeds = engine.device(device), seeds
+        self.device = engine.device("auto" if device is None else device)
+        self._seeds = seeds
         self.fps = float(vector.metadata.get("render_fps") or 10)
         try:
             self.obs_space, self._read = observation(vector.single_observation_space)
@@ -105,7 +106,7 @@ class VectorizedEnv:
         """Returns the frame of a numpyified :meth:`state`."""
         return state.frame
 
-    def _world(self, obs, reward, terminated, truncated):
+    def _world(self, obs, reward, terminated, truncated) -> arrdict:
         """Returns the world after a step, in which lanes that had ended before it began again."""
         reset = self._ended.copy()
         terminal = terminated > reset

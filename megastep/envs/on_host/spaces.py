@@ -128,11 +128,11 @@ def actions(space: Any, path: str = "action") -> Conversion:
     )
 
 
-def _reshaped(shape, dtype, array):
+def _reshaped(shape, dtype, array) -> np.ndarray:
     return array.reshape(shape).astype(dtype)
 
 
-def _image(space):
+def _image(space) -> Conversion | None:
     """Returns the conversion of a Box that is an image, channels last or first; None if it is not.
 
     The rows and columns of an image tell which axis has its channels.
@@ -149,7 +149,7 @@ def _image(space):
     return None
 
 
-def _parts(space, conversion, path):
+def _parts(space, conversion, path) -> list[tuple[str, object, Space, Callable]]:
     """Returns [(name of ours, Gymnasium's key, space, function)] of a Dict or Tuple."""
     children = space.spaces if isinstance(space.spaces, Mapping) else dict(enumerate(space.spaces))
     return [
@@ -158,15 +158,15 @@ def _parts(space, conversion, path):
     ]
 
 
-def _tree(parts):
+def _tree(parts) -> dotdict:
     return dotdict({name: space for name, _, space, _ in parts})
 
 
-def _choices(names, sizes):
+def _choices(names, sizes) -> dotdict:
     return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)})
 
 
-def _identifiers(keys):
+def _identifiers(keys) -> list[str]:
     """Returns a name for each key: `a-b` becomes a_b, 0 becomes part_0, `type` becomes type_."""
     names = []
     for key in keys:
@@ -178,7 +178,7 @@ def _identifiers(keys):
     return names
 
 
-def _described(space):
+def _described(space) -> str:
     text = " ".join(str(space).split())
     is_short = type(space).__name__ == "Box" and len(text) <= 80
     return text if is_short else f"a {type(space).__name__}"

@@ -113,7 +113,9 @@ class PointGoal(SceneryEnv):
         self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
-        self.rules = dict(bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH)
+        self.rules: dict = dict(
+            bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH
+        )
         self.goals = goal_fields(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns
@@ -150,7 +152,7 @@ class PointGoal(SceneryEnv):
         """Takes one step with ``decision.actions``. Returns a world."""
         return self._world(self.movement(decision).progress)
 
-    def _world(self, free=None):
+    def _world(self, free=None) -> arrdict:
         """Respawns agents whose episode has ended, renders, and computes rewards and flags."""
         self.spawner(self.ended)
         obs = self._view()
@@ -181,7 +183,7 @@ class PointGoal(SceneryEnv):
             world["privileged"] = arrdict(way=step.privileged)
         return world
 
-    def _view(self):
+    def _view(self) -> arrdict:
         """Returns the observation without the goal."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
         return arrdict(images(view), imu=view.imu)

@@ -99,7 +99,7 @@ def n_cells(g: Any) -> int:
     return n
 
 
-def _chunks(geometries, most):
+def _chunks(geometries, most) -> Iterator[slice]:
     """Yields slices of geometries whose grids have about `most` cells in all, at least one each."""
     first = total = 0
     for d, g in enumerate(geometries):

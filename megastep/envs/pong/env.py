@@ -93,7 +93,7 @@ class Pong(DisplayedEnv):
         self.obs_space = spaces.MultiVector(1, FEATURES)
         n_lanes = n_envs * self.n_agents
         engine.fit(n_envs, 64 + self.n_agents * (64 + pixels * ROWS * COLUMNS), self.device)
-        on = dict(device=self.device)
+        on: dict = dict(device=self.device)
         self.games = torch.zeros((GAME_FIELDS, n_envs), dtype=torch.int32, **on)
         self.error_flag = torch.zeros(1, dtype=torch.int32, **on)
         self.no_actions = torch.zeros((n_lanes, 1), dtype=torch.int64, **on)
@@ -111,7 +111,7 @@ class Pong(DisplayedEnv):
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         return self._world(checks.alike("actions", decision["actions"], self.no_actions))
 
-    def _world(self, actions, restart=False):
+    def _world(self, actions, restart=False) -> arrdict:
         step = pong_step(
             self.games,
             actions,

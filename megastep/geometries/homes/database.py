@@ -30,7 +30,7 @@ REMEDY = "install megastep again, or run scripts/make_homes.py"
 
 
 @functools.lru_cache(maxsize=1)
-def _arrays(path):
+def _arrays(path) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Returns the arrays of a database and the index at which each home's begin.
 
     Raises ValueError unless the file's sha256 is the one in the file beside it.
@@ -67,7 +67,7 @@ def pack(plans: Sequence[dotdict]) -> bytes:
     return buffer.getvalue()
 
 
-def _unpack(content):
+def _unpack(content) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Returns the arrays of a database and the index at which each home's begin."""
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -82,7 +82,7 @@ def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
     return _home(*_arrays(path), index, index, outer)
 
 
-def _home(arrays, starts, index, seed, outer):
+def _home(arrays, starts, index, seed, outer) -> dotdict:
     _, n_outer, _, height, width = arrays["widths"][index]
     walls, lights, cells = (
         arrays[key][a:b]
@@ -113,7 +113,7 @@ def generated(
     return {seed: _home(*database, index, seed, outer) for index, seed in enumerate(seeds)}
 
 
-def _generate(seeds, density, clutter):
+def _generate(seeds, density, clutter) -> bytes:
     """Returns the bytes of a database of generated homes."""
     import loky
 

@@ -112,7 +112,7 @@ def clear(contact: Contact, others: Iterable[Contact], depth: Callable) -> tuple
     return low, high
 
 
-def _cost(a, b):
+def _cost(a, b) -> float:
     """Returns the cost of a connection between rooms of kinds a and b."""
     pair = frozenset((a, b))
     return COSTS.get(

@@ -17,13 +17,16 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from megastep import cache
 from megastep.kernels.build.forks import end_threads_at_forks
 from megastep.kernels.build.program import KERNELS, Program
+
+if TYPE_CHECKING:
+    from ctypes import CDLL
 
 __all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
 
@@ -34,7 +37,7 @@ class EngineError(RuntimeError):
     """
 
 
-def _key(*parts):
+def _key(*parts) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
 
@@ -72,7 +75,7 @@ def compiler() -> tuple[str, str]:
     )
 
 
-def _run(command, **env):
+def _run(command, **env) -> subprocess.CompletedProcess[str]:
     """Runs a compiler in a new session, so that Ctrl-C reaches Python's handlers only.
 
     Raises:
@@ -91,7 +94,7 @@ def _run(command, **env):
     return process
 
 
-def _processor():
+def _processor() -> str:
     """Returns the CPU's features, which -march=native depends on."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -102,7 +105,7 @@ def _processor():
         return platform.machine() + platform.processor()
 
 
-def _build_cpu(program, command):
+def _build_cpu(program, command) -> bytes:
     """Returns a library of all ``.cpp`` files."""
     files = [str(program.folder / name) for name in program.sources(".cpp")]
     try:
@@ -125,7 +128,7 @@ def _build_cpu(program, command):
     )
 
 
-def _load(name, body, path):
+def _load(name, body, path) -> "CDLL":
     """Loads a library from its cached file or, without a cache, from a temporary copy."""
     if path is not None:
         try:
@@ -191,7 +194,7 @@ def build_cuda(program: Program, architecture: str) -> bytes:
 def bindings() -> tuple[Any, Any]:
     """Returns the modules ``driver`` and ``nvrtc`` of cuda.bindings."""
     try:
-        from cuda.bindings import driver, nvrtc
+        from cuda.bindings import driver, nvrtc  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise EngineError(
             "Kernels on a GPU need the package cuda-bindings, which comes with PyTorch for CUDA "
@@ -215,7 +218,7 @@ def check_status(result: tuple, action: str) -> Any:
     return values[0] if len(values) == 1 else values
 
 
-def _build_cuda(files, flags):
+def _build_cuda(files, flags) -> bytes:
     """Returns a cubin of all ``.cu`` files.
 
     NVRTC gets every file under its own name, so its errors, ncu and compute-sanitizer name file and

@@ -90,7 +90,7 @@ def launch(
     check_status(status, f"Launching {operation}")
 
 
-def _missing(program, operation, suffix, other):
+def _missing(program, operation, suffix, other) -> EngineError:
     return EngineError(
         f"No {suffix} file in {program.folder} defines the operation {operation}: add one, or run "
         f"on {other}."

@@ -73,11 +73,11 @@ class Program:
     ):
         self.folder, self.cuda_flags, self.cpu_flags = Path(folder), cuda_flags, cpu_flags
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"Program({str(self.folder)!r})"
 
     @cached_property
-    def constants(self) -> dict[str, int | float]:
+    def constants(self) -> dict[str, Any]:
         return headers.constants(self.sources(".h"))
 
     @cached_property
@@ -113,5 +113,5 @@ class Program:
         return {name: path.read_text() for name, path in files.items() if path.suffix in suffixes}
 
 
-def _pack(packer, /, **fields):
+def _pack(packer, /, **fields) -> bytes:
     return packer(fields)
