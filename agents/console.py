@@ -38,7 +38,7 @@ class TolerantStream:
     def flush(self) -> None:
         self._attempt(self._stream.flush)
 
-    def _attempt(self, method, *arguments):
+    def _attempt(self, method, *arguments) -> None:
         try:
             method(*arguments)
         except (OSError, ValueError):
@@ -66,7 +66,7 @@ def say(text: str, file: TextIO | None = None) -> None:
     print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
 
 
-def warn(sentence: object, *_: Any, **__: Any) -> None:
+def warn(sentence: object, *_: object, **__: object) -> None:
     """One line on stderr; can stand in for `warnings.showwarning`."""
     say(f"warning: {sentence}", sys.stderr)
 
@@ -83,7 +83,8 @@ def warned(prefix: str = "") -> Iterator[None]:
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
     """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
     if isinstance(failure.exc_value, OSError):
-        warn(f"{failure.thread.name} stopped: {failure.exc_value}")
+        name = failure.thread.name if failure.thread else "a thread"
+        warn(f"{name} stopped: {failure.exc_value}")
     else:
         threading.__excepthook__(failure)
 
@@ -102,7 +103,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool 
     grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
     for row in rows:
         grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
-    plain = dict(markup=False, emoji=False, color_system=None)
+    plain: dict = dict(markup=False, emoji=False, color_system=None)
     Console(file=text, width=10_000, force_terminal=False, **plain).print(grid)
     return text.getvalue().strip()
 
@@ -117,7 +118,7 @@ def restore() -> None:
 class Progress:
     """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         from rich import progress  # only for those who wait
 
         is_dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")

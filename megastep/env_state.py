@@ -17,9 +17,12 @@ import torch
 
 from megastep.engine.state_tree import OPAQUE, children, is_expanded, node_at, rebind, walk
 from megastep.read_only import ReadOnlyTensor
+from megastep.types import Env
 
 __all__ = ["EnvState"]
 
+#: A part of the state by name, such as the arrays, by path.
+State = dict[str, dict[str, Any]]
 _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
 _NUMBERS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
@@ -53,7 +56,7 @@ class EnvState:
         host_only: it is used for `host_state` only, so no large tensor is read.
     """
 
-    def __init__(self, env: Any, bot: Any = None, host_only: bool = False):
+    def __init__(self, env: Env, bot: object = None, host_only: bool = False):
         self.env, device = env, torch.device(env.device)
         generators = dict(torch=torch.default_generator)
         if device.type == "cuda":
@@ -74,7 +77,7 @@ class EnvState:
 
     # ---- Saving ----
 
-    def state_dict(self) -> dict[str, dict[str, Any]]:
+    def state_dict(self) -> State:
         """Returns the state by path. Tensors share their memory with the environment; all else is
         a copy, in types that `torch.load(weights_only=True)` reads.
         """
@@ -101,7 +104,7 @@ class EnvState:
         arrays = {path: leaf for path, leaf in arrays.items() if path not in unchanged}
         return state | dict(arrays=arrays, aliases=aliases, unchanged=unchanged)
 
-    def host_state(self) -> dict[str, dict[str, Any]]:
+    def host_state(self) -> State:
         """Returns the part of the state that is not in tensors, for `restore_host`."""
         arrays, generators, frozen = {}, {}, {}
         is_on_gpu = torch.device(self.env.device).type == "cuda"
@@ -122,13 +125,13 @@ class EnvState:
         none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
         return state | none
 
-    def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
+    def restore_host(self, state: State) -> None:
         """Restores a `host_state` in the same process: of plain values, those that have changed."""
         now = {path: repr(_encoded(node)) for path, node in self._plain_values()}
         values = {k: value for k, value in state["values"].items() if now.get(k) != repr(value)}
         self._load(state | {"values": values})
 
-    def changed_on_host(self, before: dict[str, dict[str, Any]]) -> str | None:
+    def changed_on_host(self, before: State) -> str | None:
         """Returns the name of something that has changed since an earlier `host_state` and that no
         CUDA graph repeats: a plain value, an array, the length of a list, a generator of NumPy or
         Python, and a tensor or a generator on the CPU where the environment is on a GPU. None if
@@ -143,7 +146,7 @@ class EnvState:
         is_global = re.match(r"\.generators\['(\w+)'\]", changed[0])
         return f"the global generator of {is_global[1]}" if is_global else _name(changed[0])
 
-    def _members(self) -> dict[str, dict[str, Any]]:
+    def _members(self) -> State:
         """Returns the classes of objects, the lengths of lists and the keys of dicts that hold
         tensors or objects.
         """
@@ -166,7 +169,7 @@ class EnvState:
 
     # ---- Restoring ----
 
-    def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores a `state_dict`, whose tensors may be on any device. Tensors change in place, so
         that whatever refers to them sees it.
 

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
     from typing_extensions import Self
 
+    from megastep.types import Env, PolicyLike
+
 __all__ = ["ParallelEncoder", "draw"]
 
 MAX_WORKERS = 8  # about 80 figures per second; each imports torch, about half a gigabyte of memory
@@ -298,7 +300,12 @@ def draw(plot_state: Callable, state: Tree) -> np.ndarray:
 
 @torch.no_grad()
 def film(
-    env: Any, policy: Any, path: str | pathlib.Path, steps: int, greedy: bool = False, seed: int = 1
+    env: Env,
+    policy: PolicyLike,
+    path: str | pathlib.Path,
+    steps: int,
+    greedy: bool = False,
+    seed: int = 1,
 ) -> pathlib.Path:
     """Films environment 0 of `env` for some steps from its reset, each a frame, at the
     environment's own frames per second. Returns the path.
@@ -310,7 +317,8 @@ def film(
         ValueError: for another kind of file, or an environment that cannot be drawn.
         RuntimeError: naming the first frame that failed.
     """
-    if not (hasattr(env, "state") and hasattr(env, "plot_state")):
+    plot_state = getattr(env, "plot_state", None)
+    if plot_state is None or not hasattr(env, "state"):
         raise ValueError(
             f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
             "plot_state(state), which docs/new-environment.md shows"
@@ -321,9 +329,9 @@ def film(
 
         (last,) = collections.deque(states, maxlen=1)
         path.parent.mkdir(parents=True, exist_ok=True)
-        imsave(path, draw(env.plot_state, numpyify(last)))
+        imsave(path, draw(plot_state, numpyify(last)))
         return path
-    with ParallelEncoder(env.plot_state, fps=optional(env, "fps")) as encoder:
+    with ParallelEncoder(plot_state, fps=optional(env, "fps")) as encoder:
         for state in states:
             encoder(state)
     return encoder.save(path)

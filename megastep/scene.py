@@ -1,7 +1,7 @@
 """Scenery from geometries: textures, lights, the agents' model, baked light."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +11,9 @@ from megastep.colour import gamma_decode
 from megastep.engine import checks
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["TEXEL", "agent_model", "display", "scenery", "spread", "texel_widths", "wall_textures"]
 
@@ -165,7 +168,7 @@ def scenery(
     n_agents: int = 1,
     n_envs: int | None = None,
     seed: int = 1,
-    device: Any = None,
+    device: torch.device | str | None = None,
 ) -> Scenery:
     """Returns the baked :class:`~megastep.engine.Scenery` of ``n_envs`` environments.
 
@@ -217,7 +220,7 @@ def scenery(
     return result
 
 
-def display(scenery: Scenery, e: int = 0, ax: Any = None) -> Any:
+def display(scenery: Scenery, e: int = 0, ax: "Axes | None" = None) -> "Axes":
     """Draws environment ``e`` in its lit colours, with its lights and agents.
 
     Returns the matplotlib axes.

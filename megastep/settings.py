@@ -17,12 +17,15 @@ import math
 import numbers
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import annotated_types
 import pydantic.dataclasses
 from pydantic.fields import FieldInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
+
+if TYPE_CHECKING:
+    from typing_extensions import dataclass_transform
 
 __all__ = [
     "MAX_ENVS",
@@ -55,8 +58,15 @@ class AtMost:
     key: str
 
 
-#: Class decorator: a frozen dataclass whose fields are checked against their annotations.
-frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
+if TYPE_CHECKING:
+
+    @dataclass_transform(kw_only_default=True, frozen_default=True)
+    def frozen(kind: type[T]) -> type[T]: ...
+
+else:
+    #: Class decorator: a frozen dataclass whose fields are checked against their annotations.
+    frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
+
 
 # the expected type, by the first part of pydantic's name of the error
 WANTED = {

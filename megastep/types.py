@@ -22,23 +22,26 @@ class World(Protocol):
     """The dict of tensors that ``reset`` and ``step`` return: an
     :class:`~megastep.arrdict.arrdict` with a leading axis B, whose keys are also attributes.
 
+    Keys:
+        obs: per ``env.obs_space``.
+        reward: (B,) float32, of the transition that led here.
+        reset: (B,) bool: the first observation of an episode.
+        terminal: (B,) bool: the episode ended here by its own rule.
+        truncated: (B,) bool: a time limit ended the episode here.
+
     Optional keys:
         metrics: dict of (B,) float32, statistics of an episode, read on its last step only.
         learns: (B,) bool, lanes whose transitions are used for learning. Default: all.
         privileged: per ``env.privileged_space``, inputs of the critic that no agent observes.
     """
 
-    obs: Tree  # per env.obs_space
-    reward: torch.Tensor  # (B,) float32, of the transition that led here
-    reset: torch.Tensor  # (B,) bool: the first observation of an episode
-    terminal: torch.Tensor  # (B,) bool: the episode ended here by its own rule
-    truncated: torch.Tensor  # (B,) bool: a time limit ended the episode here
+    def __getattr__(self, name: str) -> Tree: ...
 
-    def __getitem__(self, key: str) -> Tree: ...
+    def __getitem__(self, key: str, /) -> Tree: ...
 
     def __iter__(self) -> Iterator[str]: ...
 
-    def get(self, key: str, default: Tree = None) -> Tree: ...
+    def get(self, key: str, default: Tree = None, /) -> Tree: ...
 
 
 @runtime_checkable

@@ -53,7 +53,9 @@ HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, Assertio
 STORE = config_store.ConfigStore.instance()
 # Hydra copies its sources of files time and again, and in them this one, which took a third of a
 # second: there is only one
-config_store.ConfigStore.__deepcopy__ = lambda store, memo: store
+config_store.ConfigStore.__deepcopy__ = (  # pyright: ignore[reportAttributeAccessIssue]
+    lambda store, memo: store
+)
 STORE.store(name="open", node=OmegaConf.create(OPEN))
 STORE.store(group="logger", name="none", node={})
 for label, path in settings.loggers().items():
@@ -65,7 +67,7 @@ class FolderOfUser(SearchPathPlugin):
 
     path: str | None = None
 
-    def manipulate_search_path(self, search_path):
+    def manipulate_search_path(self, search_path) -> None:
         if self.path:
             search_path.append("command-line", f"file://{self.path}")
 
@@ -84,7 +86,11 @@ class Composer:
     """
 
     def __init__(
-        self, script: Script, name: str | None = None, folder: str | None = None, main: Any = None
+        self,
+        script: Script,
+        name: str | None = None,
+        folder: str | None = None,
+        main: str | None = None,
     ):
         self.script, self.name, self.folder = script, name or script.name, folder
         self.main = os.path.abspath(main or package.CONFIGS)
@@ -100,9 +106,8 @@ class Composer:
         global_hydra.GlobalHydra.instance().clear()
         hydra.initialize_config_dir(self.main, job_name=script.name, version_base="1.3")
         self.loader = global_hydra.GlobalHydra.instance().config_loader()
-        self.members, self.composed = map(
-            functools.cache, (self.loader.get_group_options, self._composed)
-        )
+        self.members = functools.cache(self.loader.get_group_options)
+        self.composed = functools.cache(self._composed)
 
     def groups(self) -> dict[str, list[str]]:
         """Returns {group: members} of the groups to choose from."""
@@ -209,8 +214,8 @@ class Composer:
             elif not options or isinstance(value, dict):
                 keys[key] = override
             elif group in settings.IMPORTED and all(map(is_import_path, others)):
-                for name in others:
-                    node = {"name": name}
+                for name in map(str, others):
+                    node: dict = {"name": name}
                     if group == "logger":
                         node = {settings.label(name): node}
                     elif group == "learner":  # it has the file of the one that it derives from
@@ -244,7 +249,9 @@ class Composer:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
             except (ConfigKeyError, ConfigAttributeError, TypeError):  # TypeError: below a value
-                hint = check.closest_key(key, dict(check.leaves({"hydra": plain(config.hydra)})))
+                hint = check.closest_key(
+                    key, dict(check.leaves({"hydra": blocks.plain(config.hydra)}))
+                )
                 errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:
                 errors.append((key, str(error).partition("\n")[0]))
@@ -279,16 +286,13 @@ def key_of(override: types.Override) -> str:
     return override.get_key_element().lstrip("+~")
 
 
-def is_import_path(value: Any) -> bool:
+def is_import_path(value: object) -> bool:
     # Hydra would interpolate a $
     return isinstance(value, str) and ":" in value and "$" not in value and len(value) <= LONGEST
 
 
 def own(config: DictConfig, resolve: bool = False) -> check.Tree:
     """Nested dicts of all but Hydra's part, without groups that nothing is in."""
-    tree = plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]), resolve)
+    keys = [str(key) for key in config if key != "hydra"]
+    tree = blocks.plain(OmegaConf.masked_copy(config, keys), resolve)
     return {key: value for key, value in tree.items() if value != {}}
-
-
-def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
-    return OmegaConf.to_container(config, resolve=resolve)

@@ -3,6 +3,7 @@ before PyTorch is imported.
 """
 
 import contextlib
+import dataclasses
 import importlib
 import re
 from collections.abc import Callable, Iterator
@@ -248,7 +249,8 @@ def check_run(cfg: settings.Evaluate | settings.Record) -> None:
 
 def without_training(tree: Tree, typed: list[str]) -> Tree:
     """Returns the tree without what files, such as environments', set for training alone."""
-    train, played = ({*kind.__pydantic_fields__} for kind in (settings.Train, settings.Played))
+    kinds = settings.Train, settings.Played
+    train, played = ({field.name for field in dataclasses.fields(kind)} for kind in kinds)
     absent = train - played - {key.split(".")[0] for key in typed}
     return {key: value for key, value in tree.items() if key not in absent}
 

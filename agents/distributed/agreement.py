@@ -5,7 +5,7 @@ Each function waits for the other ranks. In a process of its own it only calls w
 
 import pickle
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from megastep.agents.distributed.process_group import (
     exchange,
@@ -43,7 +43,7 @@ def together(function: Callable[[], T]) -> T:
     for number, first in enumerate(failures):
         if first is not None:
             raise first if failure is None or number != rank() else failure
-    return value
+    return cast(T, value)
 
 
 def from_rank_0(function: Callable[[], T]) -> T:
@@ -52,10 +52,11 @@ def from_rank_0(function: Callable[[], T]) -> T:
     Args:
         function: returns a small value that can be pickled.
     """
-    return gather_objects(together(lambda: function() if rank() == 0 else None))[0]
+    values = gather_objects(together(lambda: function() if rank() == 0 else None))
+    return cast(T, values[0])
 
 
-def _portable(error):
+def _portable(error) -> Exception | None:
     """Returns an error that can be pickled, None for None; that of another rank than 0 begins with
     the rank's place.
     """

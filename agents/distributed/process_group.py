@@ -14,12 +14,17 @@ import functools
 import itertools
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import distributed
 
 from megastep.agents.distributed.environment import hostname, launched
+
+if TYPE_CHECKING:
+    from torch.distributed import Store, TCPStore  # pyright: ignore[reportPrivateImportUsage]
+
+T = TypeVar("T")
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
@@ -68,7 +73,7 @@ def start(seconds: float = START_SECONDS) -> None:
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # torchrun may keep the store when it starts the ranks again, with addresses of the dead in it
-    keys = distributed.PrefixStore(f"ranks {place.attempt} {next(_STARTS)}", _store())
+    keys = _prefixed(f"ranks {place.attempt} {next(_STARTS)}", _store())
     distributed.init_process_group(
         backend, store=keys, rank=place.rank, world_size=place.n_ranks, timeout=wait
     )
@@ -79,14 +84,15 @@ _STARTS = itertools.count()
 
 
 @functools.cache
-def _store() -> distributed.Store:
+def _store() -> Store:
     """Returns the key-value store of the ranks, which torchrun's agent has, or else rank 0."""
     place, has_agent = launched(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    return _connection(is_master=place.rank == 0 and not has_agent)
+    is_master = place is not None and place.rank == 0 and not has_agent
+    return _connection(is_master)
 
 
-def _connection(is_master=False):
-    return distributed.TCPStore(
+def _connection(is_master=False) -> TCPStore:
+    return distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
         os.environ["MASTER_ADDR"],
         int(os.environ["MASTER_PORT"]),
         is_master=is_master,
@@ -95,13 +101,17 @@ def _connection(is_master=False):
     )
 
 
-def store(name: str) -> distributed.Store:
+def store(name: str) -> Store:
     """Returns a connection of its own to the ranks' key-value store: no other thread waits on it.
 
     Args:
         name: of a set of keys.
     """
-    return distributed.PrefixStore(f"megastep {name}", _connection())
+    return _prefixed(f"megastep {name}", _connection())
+
+
+def _prefixed(name: str, keys: Store) -> Store:
+    return distributed.PrefixStore(name, keys)  # pyright: ignore[reportPrivateImportUsage]
 
 
 def stop() -> None:
@@ -157,11 +167,11 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     return [other.tolist() for other in rows]
 
 
-def gather_objects(value: Any) -> list[Any]:
+def gather_objects(value: T) -> list[T]:
     """Returns a small value of every rank, in the order of ranks. Waits for the others."""
     if n_ranks() == 1:
         return [value]
-    values = [None] * n_ranks()
+    values: list = [None] * n_ranks()
     with communicating():
         distributed.all_gather_object(values, value)
     return values

@@ -2,7 +2,7 @@
 
 import itertools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
@@ -14,12 +14,17 @@ from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.slots import rotating_slots
-from megastep.types import optional
+from megastep.types import Env, PolicyLike, optional
+
+if TYPE_CHECKING:
+    import torch
+
+    from megastep.arrdict import arrdict
 
 
 class Player(NamedTuple):
     name: str
-    policy: Any
+    policy: PolicyLike
     step: int | None = None  # the number of samples it has learnt from
 
 
@@ -28,7 +33,7 @@ class Player(NamedTuple):
 FOR_TWO = {"n_agents": 2, "self_play": True, "resample": False}
 
 
-def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpoint) -> Player:
+def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpoint) -> Player:
     """Returns the player of a checkpoint, to meet the agent of `run` in `env`.
 
     Raises:
@@ -45,7 +50,7 @@ def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpo
 
 
 def find_player(
-    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Any, trust: bool
+    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env | None, env: Env, trust: bool
 ) -> Player:
     """Returns who is to meet the agent of `run` in `env`.
 
@@ -66,6 +71,7 @@ def find_player(
     if name == "bot":
         name = factory.config_of(run).opponents.bot_class or name
     if name in ("bot", *BOTS) or (":" in name and not Path(name).exists()):
+        assert env_settings is not None
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
 
@@ -82,9 +88,9 @@ class Arena:
         cfg,
         run: checkpoint.Checkpoint,
         env: settings.Env,
-        geometry: Any,
+        geometry: settings.Geometry,
         homes: list,
-        device: Any,
+        device: "torch.device",
     ):
         self.cfg, self.run, env = cfg, run, settings.changed(env, **FOR_TWO)
         where = dict(seed=cfg.seed, device=device)
@@ -110,7 +116,7 @@ class Arena:
         self.sources = factory.sources_of(homes)
         warn_without_layout(self.env, homes)
 
-    def play(self, player: Player, opponent: Player) -> Any:
+    def play(self, player: Player, opponent: Player) -> "arrdict":
         policies = player.policy, opponent.policy
         with factory.errors():
             played = duels.play(self.env, *policies, self.seed, self.cfg.greedy, slots=self.slots)
@@ -171,7 +177,7 @@ class Arena:
         return folder / "ratings.csv"
 
 
-def warn_without_layout(env: Any, homes: list) -> None:
+def warn_without_layout(env: Env, homes: list) -> None:
     """Warns if environments share homes and it is unknown which."""
     if optional(env, "layout") is None and 1 < len(homes) < env.n_envs:
         console.warn(

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
@@ -13,6 +13,9 @@ from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import optional
+
+if TYPE_CHECKING:
+    import torch
 
 
 def run(cfg: settings.Evaluate) -> Path:
@@ -63,7 +66,7 @@ def play(
     loaded: checkpoint.Checkpoint,
     env_settings: settings.Env,
     homes: list,
-    device: Any,
+    device: "torch.device",
     source: str | None = None,
 ) -> list[dict]:
     """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the table rows."""
@@ -94,7 +97,7 @@ def duel(
     env: settings.Env,
     geometry: settings.Geometry,
     homes: list,
-    device: Any,
+    device: "torch.device",
 ) -> Path:
     """Plays the run's agent against each of `cfg.against`, of a suite in each source. Prints and
     writes a table, and returns the path of its .json.
@@ -112,7 +115,7 @@ def duel(
     return tables.write_table(
         cfg,
         run,
-        ["duels", place.source, cfg.split, str(run.step), "against", *cfg.against],
+        ["duels", place.source, cfg.split, str(run.step), "against", *(cfg.against or ())],
         f"{meeting.agent.name}, in {title}, seed {cfg.seed}",
         rows,
         [*map(tables.duel_cells, rows)],

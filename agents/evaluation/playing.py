@@ -44,7 +44,7 @@ def step_until(
         max_steps: maximum number of steps.
     """
 
-    def several(world, state, n_steps=STEPS_PER_GRAPH):
+    def several(world, state, n_steps=STEPS_PER_GRAPH) -> tuple[World, Tree]:
         for _ in range(n_steps):
             world, state = step(world, state)
         return world, state
@@ -76,7 +76,7 @@ def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
     )
 
 
-def _has_fixed_form(before, after):
+def _has_fixed_form(before, after) -> bool:
     """Returns whether both trees have tensors only, under the same names."""
     (_, spec), (leaves, other) = map(_pytree.tree_flatten, (before, after))
     return spec == other and all(isinstance(leaf, torch.Tensor) for leaf in leaves)
@@ -117,7 +117,7 @@ def first_episodes(
         {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}
     )
 
-    def step(world, state):
+    def step(world, state) -> tuple[World, Tree]:
         decision, state = policy(world, state, sample=not greedy, generator=draws.on(done.device))
         world = env.step(decision)
         returns.add_(torch.where(done, 0.0, world.reward))

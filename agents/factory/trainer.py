@@ -8,7 +8,7 @@ import random
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -32,6 +32,9 @@ from megastep.agents.training import budget, loggers
 from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row, RunLogger
 
 
 def make_trainer(
@@ -66,8 +69,8 @@ def make_trainer(
     cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)
     factory.check_memory(cfg.env, sample, learner, **where)
     env = factory.construct(cfg.env, **where)
-    if cfg.resume or cfg.init:
-        path = folders.find(cfg.resume or cfg.init)
+    if start := cfg.resume or cfg.init:
+        path = folders.find(start)
         loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
@@ -77,10 +80,12 @@ def make_trainer(
         checkpoint.set_aside_after(folder / name, loaded.step)
     config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
     made_with = provenance.made_with(device, package.version(), n_ranks)
-    checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
+    checkpoints = folder / "checkpoints"
+    had: dict = (loaded.state or {}) if cfg.resume else Counter()
     with factory.errors():
         limits = budget_of(cfg, folder, loaded if cfg.resume else None)
-        logger, writers = loggers.NoLogger(), {}
+        logger: RunLogger = loggers.NoLogger()
+        writers: dict = {}
         rank_files = RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
             step = had["samples_at_report"]
@@ -115,12 +120,12 @@ def make_trainer(
             **writers,
         )
         if cfg.resume:
-            improves.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
+            improves.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
             improves.lost += differing(loaded.made_with, made_with)
     return improves
 
 
-def differing(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+def differing(before: "Row", now: "Row") -> list[str]:
     """Returns a clause for each of the things that a run's bits depend on that has changed."""
     before, now = {"ranks": 1, **before}, {"ranks": 1, **now}
     return [
@@ -162,6 +167,7 @@ def budget_of(
         recorded = annealing.read(folder)
         # a clock of another budget would have chosen others
         if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
+            assert loaded.state is not None
             recorded = recorded[: loaded.state["updates"]]
     return budget.Budget(*limits, recorded, is_rerun=cfg.rerun is not None)
 

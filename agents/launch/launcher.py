@@ -58,11 +58,12 @@ def n_ranks(cfg: settings.Train) -> int:
             text = f"'all' is every GPU, and {where}; give a number, such as ranks=2"
             raise ConfigErrors([("ranks", text)])
         return n_gpus
-    if n_gpus and cfg.ranks > n_gpus and place is None:
+    wanted = int(cfg.ranks)
+    if n_gpus and wanted > n_gpus and place is None:
         n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
-        text = f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all is one for each"
+        text = f"{wanted} is more than the {n_here} of this machine; ranks=all is one for each"
         raise ConfigErrors([("ranks", text)])
-    return cfg.ranks
+    return wanted
 
 
 def is_needed(cfg: settings.Train) -> bool:
@@ -79,7 +80,7 @@ def run(cfg: settings.Train) -> Path:
     cfg = settings.changed(cfg, ranks=n_ranks(cfg))
     with contextlib.ExitStack() as stack:
         job = Job(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="megastep-"))), cfg)
-        stack.enter_context(environment.variables(variables(job.folder, cfg.ranks)))
+        stack.enter_context(environment.variables(variables(job.folder, int(cfg.ranks))))
         agent = threading.Thread(target=job.run_agent, daemon=True)
         with signals.handled(job.stop, job.quit) as numbers:
             agent.start()
@@ -92,6 +93,7 @@ def run(cfg: settings.Train) -> Path:
         name = signal.Signals(numbers[0]).name
         raise signals.Interrupted(numbers[0], ending.text if by_signal else f"stopped by {name}")
     ending.raise_error()
+    assert ending.folder is not None
     return Path(ending.folder)
 
 
@@ -119,7 +121,7 @@ class Job:
     def run_agent(self) -> None:
         """Runs torchrun's agent until all ranks have ended."""
         try:
-            launch_ranks(self.cfg.ranks, self.cfg.restarts)
+            launch_ranks(int(self.cfg.ranks), self.cfg.restarts)
         except BaseException as error:
             self.error = error
 

@@ -11,12 +11,15 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu, launcher
+
+if TYPE_CHECKING:
+    from contextlib import ExitStack
 
 #: The environment variable with the GPUs that a process sees.
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -52,7 +55,7 @@ def check(jobs: Sequence[Any], hydra: Any) -> str | None:
     return next(filter(None, hints), None)
 
 
-def _check_on_node(cfg, n_gpus):
+def _check_on_node(cfg, n_gpus) -> str | None:
     # a job of Slurm's is given so many GPUs; those of this machine do not matter
     if not n_gpus or cfg.ranks == "all" or cfg.device == "cpu":
         return None
@@ -110,11 +113,11 @@ def taken(cfg: Any) -> Iterator[Any]:
         yield cfg
 
 
-def _has_ranks(cfg):
+def _has_ranks(cfg) -> bool:
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
 
 
-def _names(n_gpus):
+def _names(n_gpus) -> list[str]:
     # of this process's GPUs, as the variable has them
     if visible := os.environ.get(VISIBLE):
         return [name.strip() for name in visible.split(",")][:n_gpus]
@@ -138,7 +141,7 @@ def _locked(names: list[str], size: int) -> Iterator[range]:
             return
 
 
-def _lock(names):
+def _lock(names) -> "ExitStack | None":
     # all or none, which is None
     import filelock  # which takes a while
 

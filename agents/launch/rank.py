@@ -40,6 +40,7 @@ def tell(ending: endings.Ending) -> None:
     """Says how the ranks end: on stderr, or to the process that launched them, which says it."""
     place = environment.launched()
     if launcher.JOB in os.environ:
+        assert place is not None
         if place.rank > 0 and ending.code != launcher.LOST:
             name = f"rank {place.rank} on {environment.hostname()}: "
             ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
@@ -57,7 +58,7 @@ class Team:
         folder: the run's folder, once it is known.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         from megastep.agents.distributed import process_group
         from megastep.agents.launch import watch
 
@@ -76,7 +77,9 @@ class Team:
 
     def earlier_folder(self) -> Path | None:
         """Returns the run that was trained before torchrun started the ranks again."""
-        is_again = environment.launched().attempt > 0 and self.store.check(["run"])
+        place = environment.launched()
+        assert place is not None
+        is_again = place.attempt > 0 and self.store.check(["run"])
         return Path(self.store.get("run").decode()) if is_again else None
 
     def end(self, problem: str | None) -> NoReturn:
@@ -148,7 +151,7 @@ def joined() -> Iterator[Team | None]:
         process_group.stop()
 
 
-def _cause(error, kind):
+def _cause(error, kind) -> BaseException | None:
     """Returns the error of a kind that another was raised from or after, None if there is none."""
     while error is not None and not isinstance(error, kind):
         error = error.__context__

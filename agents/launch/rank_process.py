@@ -21,6 +21,7 @@ def main() -> int:
     torchrun is to start the ranks again.
     """
     place, job = environment.launched(), Path(os.environ[launcher.JOB])
+    assert place is not None
     for number in signals.SIGNALS:  # while there is nothing to save
         signal.signal(number, lambda number, frame: os._exit(128 + number))
     (job / f"pid-{place.attempt}-{place.rank}").write_text(str(os.getpid()))
@@ -38,7 +39,7 @@ def main() -> int:
 
     folder = None
 
-    def work():
+    def work() -> None:
         nonlocal folder
         folder = train.run(check.check(settings.Train, facts["settings"]))
 

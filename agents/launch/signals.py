@@ -41,7 +41,7 @@ def exit_on_signals(script: str) -> None:
     interpreter's end, which have nothing to save.
     """
 
-    def exit_at_once(number, frame):
+    def exit_at_once(number, frame) -> NoReturn:
         if environment.rank() == 0:
             name = signal.Signals(number).name
             _write(sys.__stderr__, f"{package.command(script)}: stopped by {name}")
@@ -63,7 +63,7 @@ def handled(
     """
     numbers, ends_after = [], time.monotonic()
 
-    def handle(number, frame):
+    def handle(number, frame) -> None:
         nonlocal ends_after
         if not numbers:
             numbers.append(number)
@@ -121,7 +121,7 @@ def stop(process: int) -> None:
         os.kill(process, signal.SIGTERM if is_ignored else signal.SIGHUP)
 
 
-def _install(handler: Callable) -> dict[int, object]:
+def _install(handler: Callable) -> dict[int, Callable | int | None]:
     # in the main thread; nohup has SIGHUP ignored, which stays so; returns the handlers there were
     if threading.current_thread() is not threading.main_thread():
         return {}
@@ -132,4 +132,5 @@ def _install(handler: Callable) -> dict[int, object]:
 def _write(stream: TextIO | None, line: str) -> None:
     # from a signal handler: past the stream's buffer, which may be in use
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        os.write(stream.fileno(), f"{line}\n".encode())
+        if stream is not None:
+            os.write(stream.fileno(), f"{line}\n".encode())

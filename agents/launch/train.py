@@ -5,7 +5,7 @@ import functools
 import itertools
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import yaml
 
@@ -25,12 +25,15 @@ from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
 
+if TYPE_CHECKING:
+    from megastep.agents.types import Config
+
 
 def with_more(cfg: settings.Train) -> settings.Train:
     """Returns `cfg` with more_samples and more_seconds added to what the resumed run has had."""
     totals = {}
     for name in ("samples", "seconds"):
-        if (more := getattr(cfg, f"more_{name}")) is not None:
+        if (more := getattr(cfg, f"more_{name}")) is not None and cfg.resume:
             had = folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).numbers[name]
             totals |= {name: had + more, f"more_{name}": None}
     return settings.changed(cfg, **totals)
@@ -70,7 +73,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
     progress = console.Progress()
 
-    def show(running):
+    def show(running) -> None:
         progress.show(*progress_of(running))
 
     rank_checks.check_start(cfg)
@@ -137,7 +140,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             raise UserError(unsaved)
         nonfinite, hint = running.nonfinite_guard.value, running.nonfinite_guard.hint
         del running  # its memory is the evaluation's now
-        common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
+        common: dict = dict(
+            run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device
+        )
         common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:
             with process_group.unhurried():
@@ -154,7 +159,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     return folder
 
 
-def write_config(folder: Path, config: dict[str, Any]) -> None:
+def write_config(folder: Path, config: "Config") -> None:
     """Writes a run's configuration into its folder."""
     with user_errors(folders.CANNOT.format(folder)):
         text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")

@@ -63,7 +63,7 @@ class Patience:
     Time is counted in looks, not by a clock: a machine that sleeps for an hour loses no rank.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.last = None
         self.n_silent = self.n_ahead = self.longest = 0
 
@@ -112,8 +112,9 @@ class Watch:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        attempt = environment.launched().attempt
-        self.store = process_group.store(f"watch {attempt} {next(NUMBERS)}")
+        place = environment.launched()
+        assert place is not None
+        self.store = process_group.store(f"watch {place.attempt} {next(NUMBERS)}")
         self._beat()
         self._thread.start()
 
@@ -148,7 +149,7 @@ class Watch:
                     break
                 time.sleep(0.1)
 
-    def _run(self):
+    def _run(self) -> None:
         patience, other = Patience(), (self.rank + 1) % self.n_ranks
         while not self.has_left:
             self._wakes.wait(PERIOD)
@@ -160,8 +161,8 @@ class Watch:
                     return self.on_lost(None)
                 self.is_broken |= self.store.check(["broken"])
                 theirs = self._heartbeat_of(other)
-                problem = theirs and patience.look(ours, theirs, self.is_broken)
-                if problem and not self.has_left:
+                problem = patience.look(ours, theirs, self.is_broken) if theirs else None
+                if theirs and problem and not self.has_left:
                     place = f"rank {other} on {theirs.host}"
                     return self.on_lost(f"{place} {problem}" if self.claim() else None)
             except RuntimeError:  # the store has ended, with torchrun or the machine of rank 0

@@ -18,7 +18,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import safetensors
 
@@ -29,6 +29,8 @@ from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, 
 
 if TYPE_CHECKING:
     import torch
+
+    from megastep.agents.types import Config, Row
 
 SUFFIX = ".safetensors"
 FORMAT = "1"
@@ -45,9 +47,9 @@ def is_agent_file(path: Path) -> bool:
 def write(
     path: Path,
     tensors: Mapping[str, torch.Tensor],
-    config: dict[str, Any],
-    facts: Mapping[str, Any],
-    tables: Sequence[dict[str, Any]] = (),
+    config: Config,
+    facts: Mapping[str, object],
+    tables: Sequence[Row] = (),
 ) -> None:
     """Writes the file of an agent, whole or not at all.
 
@@ -75,7 +77,7 @@ def write(
     write_atomically(path, save(arrays, metadata))
 
 
-def _split(content):
+def _split(content) -> tuple[bytes, bytes]:
     """Returns the header of a file, and the bytes of its tensors."""
     end = 8 + int.from_bytes(content[:8], "little")
     return content[8:end], content[end:]
@@ -103,7 +105,7 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
     )
 
 
-def read_metadata(path: Path) -> dict[str, Any]:
+def read_metadata(path: Path) -> Row:
     """Returns `config`, `facts` and `tables` of the file of an agent, and `untrusted`, the import
     paths outside megastep in its configuration.
 
@@ -112,7 +114,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
     return _read(path)[0]
 
 
-def _read(path):
+def _read(path) -> tuple[Row, Row]:
     """Returns what `read_metadata` does, and dtype, shape and bytes of each tensor by name."""
     try:
         content = path.read_bytes()
@@ -149,7 +151,7 @@ def _read(path):
     raise DamagedCheckpoint(f"{path} is damaged, or no agent of megastep: {problem}")
 
 
-def _tensors(entries, device):
+def _tensors(entries, device) -> dict:
     import numpy as np
     import torch
 

@@ -67,13 +67,13 @@ def delete_leftovers(folder: Path | str) -> None:
                 path.unlink()
 
 
-def _is_in_use(path, machine, pid, token):
+def _is_in_use(path, machine, pid, token) -> bool:
     if machine != _machine():
         return time.time() - path.stat().st_mtime < ABANDONED
     return token == _TOKEN if pid == os.getpid() else _is_alive(pid)
 
 
-def _is_alive(pid):
+def _is_alive(pid) -> bool:
     try:
         os.kill(pid, 0)  # sends nothing; not all systems have /proc
     except PermissionError:  # it is another user's
@@ -83,7 +83,7 @@ def _is_alive(pid):
     return True
 
 
-def _machine():
+def _machine() -> str:
     """The name of what process numbers belong to: a host, or a container on it."""
     name = re.sub(r"[^\w.]", "_", socket.gethostname())[:32]
     with contextlib.suppress(OSError):  # not all systems have namespaces

@@ -34,6 +34,8 @@ from megastep.agents.runs.atomic_files import sync_folder
 if TYPE_CHECKING:
     import torch
 
+    from megastep.agents.types import Config, Row, StateDict
+
 #: The format number. Increase it whenever older readers would misread a new checkpoint, or newer
 #: readers an old one, and add the last commit of the old format to `READERS`.
 FORMAT = 7
@@ -73,9 +75,9 @@ class Checkpoint:
     path: Path
     step: int
     numbers: dict[str, float]
-    config: dict[str, Any]
-    made_with: dict[str, Any]
-    state: dict[str, Any] | None = None
+    config: Config
+    made_with: Row
+    state: StateDict | None = None
     untrusted: tuple[str, ...] = ()
     n_ranks: int = 1
 
@@ -91,12 +93,12 @@ def rank_file(rank: int) -> str:
 def write(
     path: Path,
     step: int,
-    state: dict[str, Any],
-    config: dict[str, Any],
+    state: StateDict,
+    config: Config,
     score: float | None,
-    made_with: dict[str, Any] | None = None,
+    made_with: Row | None = None,
     replay_seconds: float | None = None,
-    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
+    add_files: Callable[[Path], Row] = lambda path: {},
 ) -> None:
     """Writes a checkpoint into a new folder and flushes it to disk.
 
@@ -126,7 +128,7 @@ def write(
     files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
     files |= add_files(path)
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
-    manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
+    manifest: dict = dict(format=FORMAT, step=step, score=score, numbers=numbers)
     manifest |= dict(torch=torch.__version__, made_with=made_with or {}, files=files)
     manifest["signature"] = trust.sign(text)
     text = sealed(manifest)
@@ -134,9 +136,7 @@ def write(
     sync_folder(path)
 
 
-def write_state(
-    path: Path, state: dict[str, Any], replay_seconds: float | None = None
-) -> dict[str, Any]:
+def write_state(path: Path, state: StateDict, replay_seconds: float | None = None) -> Row:
     """Writes a rank's whole state into one file and flushes it to disk. Returns its entry in the
     manifest.
 
@@ -155,7 +155,7 @@ def write_state(
         return _write_file(path, functools.partial(torch.save, state))
 
 
-def check_plain(tree: Any, name: str) -> None:
+def check_plain(tree: object, name: str) -> None:
     """Raises TypeError for what loading without code refuses. It allows tensors, numbers, strings
     and None, and lists, tuples and dicts of these.
 
@@ -210,9 +210,7 @@ class _HashedFile:
         pass
 
 
-def _write_file(
-    path: Path, write: Callable[[Any], Any], deadline: float | None = None
-) -> dict[str, Any]:
+def _write_file(path: Path, write: Callable[[Any], object], deadline: float | None = None) -> Row:
     """Writes a file and flushes it to disk. Returns its entry in the manifest."""
     with open(path, "wb") as file:
         hashed = _HashedFile(file, deadline)
@@ -224,7 +222,7 @@ def _write_file(
     return {"sha256": hashed.sha256.hexdigest(), "bytes": hashed.n_bytes}
 
 
-def sealed(manifest: dict[str, Any]) -> bytes:
+def sealed(manifest: Row) -> bytes:
     """Returns the text of a manifest, with its own SHA-256 added."""
     digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
     return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
@@ -279,7 +277,7 @@ def read(
     return dataclasses.replace(checkpoint, state=_migrated(state, manifest))
 
 
-def _load(path, device):
+def _load(path, device) -> Any:
     """Returns the state in a file."""
     import torch
 
@@ -297,7 +295,7 @@ def _load(path, device):
         ) from None
 
 
-def _migrated(state, manifest):
+def _migrated(state, manifest) -> dict:
     """Returns a state of the last format as one of this format."""
     import torch
     from torch.nn.functional import pad
@@ -315,7 +313,7 @@ def _migrated(state, manifest):
     return state | {"samples_at_report": state.get("samples", 0)}
 
 
-def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
+def with_loggers(config: Config) -> Config:
     """Returns a configuration with loggers by label. Before there were several, `train.logger` had
     the keys of W&B, or of none, and TensorBoard was always written.
     """
@@ -328,7 +326,7 @@ def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
     return config
 
 
-def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = None) -> None:
+def verify(path: Path, manifest: Row, names: Iterable[str] | None = None) -> None:
     """Compares files of a checkpoint, by default all, with the SHA-256 in its manifest.
 
     Raises: as `read`.
@@ -346,7 +344,7 @@ def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = N
             )
 
 
-def _digest(path):
+def _digest(path) -> str:
     digest = hashlib.sha256()
     with open(path, "rb") as file:
         while chunk := file.read(_CHUNK):
@@ -354,7 +352,7 @@ def _digest(path):
     return digest.hexdigest()
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path) -> Row:
     """Returns a checkpoint's manifest, which must equal what `sealed` writes to the last byte.
 
     Raises: as `read`.

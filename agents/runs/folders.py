@@ -11,11 +11,14 @@ import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
+
+if TYPE_CHECKING:
+    import torch
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
@@ -43,6 +46,7 @@ def make(path: Path) -> Path:
             with contextlib.suppress(FileExistsError):  # another program may have just taken it
                 folder.mkdir()
                 return folder
+    raise AssertionError("counting never ends")
 
 
 def new(name: str, folder: str | None = None) -> Path:
@@ -169,7 +173,11 @@ def find(name: str) -> Path:
 
 
 def load_checkpoint(
-    path: Path, trust: bool, device: Any = None, is_whole: bool = False, rank: int = 0
+    path: Path,
+    trust: bool,
+    device: "torch.device | str | None" = None,
+    is_whole: bool = False,
+    rank: int = 0,
 ) -> checkpoint.Checkpoint:
     """Returns the checkpoint of a run or an agent found with `find`, on a device; without one, all
     but its state, and PyTorch is not imported. Warns of damaged ones it skips.

@@ -7,9 +7,12 @@ import json
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs.atomic_files import AppendedFile, write_atomically
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
 
 class JsonLines:
@@ -33,7 +36,7 @@ class JsonLines:
         self.file.close()
 
 
-def read(path: Path | str) -> list[dict[str, Any]]:
+def read(path: Path | str) -> "list[Row]":
     """Returns the objects of a file.
 
     Skips damaged lines with a warning. Skips a last line that a crash cut short silently.
@@ -58,7 +61,7 @@ def truncate_after(path: Path | str, step: int) -> None:
         write_atomically(path, data)
 
 
-def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
+def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
     """Returns the intact lines, each as an object and as its bytes."""
     *lines, last = path.read_bytes().split(b"\n")
     rows = [(_parsed(line), line) for line in [*lines, last]]
@@ -69,7 +72,7 @@ def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
     return [(row, line) for row, line in rows if row is not None]
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
+def _parsed(line: bytes) -> "Row | None":
     """Returns a line's object, or None if it is damaged."""
     try:
         row = json.loads(line)

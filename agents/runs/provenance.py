@@ -75,13 +75,14 @@ def commit(folder: Path) -> str | None:
     version control have changed; None if there is no checkout or no git.
     """
 
-    def git(*words):
+    def git(*words) -> str:
         command = ["git", "-C", str(folder), *words]
         # not the repository of a git hook that starts this; no lock, as somebody may work there
         env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
         env["GIT_OPTIONAL_LOCKS"] = "0"
-        options = dict(capture_output=True, check=True, timeout=GIT_TIMEOUT, env=env, text=True)
-        return subprocess.run(command, stdin=subprocess.DEVNULL, **options).stdout.strip()
+        options: dict = dict(stdin=subprocess.DEVNULL, timeout=GIT_TIMEOUT, env=env)
+        result = subprocess.run(command, capture_output=True, check=True, text=True, **options)
+        return result.stdout.strip()
 
     try:
         # installed into an environment inside another project, megastep has not its commit

@@ -68,16 +68,16 @@ def foreign_names(config: bytes) -> list[str]:
     return sorted({*names})
 
 
-def _digest(key, config):
+def _digest(key, config) -> str:
     return hmac.new(key, config, "sha256").hexdigest()
 
 
-def _path():
+def _path() -> Path:
     base = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(base) / "megastep" / "key"
 
 
-def _read_key():
+def _read_key() -> bytes:
     """Returns the key. Raises OSError if there is none, or others could have read or written it."""
     with open(_path(), "rb") as file:
         status, key = os.fstat(file.fileno()), file.read()
@@ -87,7 +87,7 @@ def _read_key():
     return key
 
 
-def _make_key():
+def _make_key() -> bytes:
     """Returns the key, which is made if there is none. The first of several processes makes it."""
     with contextlib.suppress(FileNotFoundError):
         return _read_key()

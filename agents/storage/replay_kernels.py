@@ -203,6 +203,6 @@ def read_sequences(
     return results, bools, weight, age
 
 
-def _packed(levels):
+def _packed(levels) -> bytes:
     rows = [PROGRAM.params.TreeLevelParams(sums=level) for level in levels]
     return PROGRAM.params.SumTreeParams(levels=b"".join(rows), n_levels=len(levels))

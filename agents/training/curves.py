@@ -3,9 +3,12 @@
 import warnings
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs import json_lines
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
 MAX_COLUMNS = 4
 #: Statistics of episodes that are no curves of their own: how many they are of, and their spread.
@@ -60,7 +63,7 @@ def plot_curves(folder: Path | str) -> None:
         warnings.warn(f"curves.png cannot be drawn ({error.strerror})", stacklevel=2)
 
 
-def panels_of(metrics: list[dict[str, Any]], perf: list[dict[str, Any]]) -> dict[str, Lines]:
+def panels_of(metrics: "list[Row]", perf: "list[Row]") -> dict[str, Lines]:
     """Returns the lines of each panel by its title, from the rows of a run's two files.
 
     Panels are in the order return, length, other episode statistics, losses, speed.

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 
@@ -55,7 +54,7 @@ class Agents(SetOnce):
         fps: float = 10.0,
         cameras: Sequence[float] | None = None,
         radius: float = AGENT_RADIUS,
-        device: Any = "cpu",
+        device: torch.device | str = "cpu",
     ):
         device = checks.device("device", device)
         n_envs = checks.integer("n_envs", n_envs, 1)

@@ -9,7 +9,7 @@ environment's agents, W walls and T texels of all layouts.
 """
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -20,6 +20,7 @@ from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor, SetOnce
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
     from typing_extensions import Self
 
 __all__ = ["Layouts", "Scenery"]
@@ -49,7 +50,12 @@ class Layouts(SetOnce):
     """
 
     def __init__(
-        self, lines: Ragged, textures: Ragged, lights: Ragged, agent_textures: Any, device: Any
+        self,
+        lines: Ragged,
+        textures: Ragged,
+        lights: Ragged,
+        agent_textures: "ArrayLike",
+        device: torch.device,
     ):
         device = checks.device("device", device)
         lines = checks.ragged("lines", lines, ("W", 2, 2), device)
@@ -140,8 +146,8 @@ class Scenery(SetOnce):
         lights: Ragged,
         lines: Ragged,
         textures: Ragged,
-        model: Any,
-        device: Any = None,
+        model: "ArrayLike",
+        device: torch.device | str | None = None,
     ):
         n_agents = checks.integer("n_agents", n_agents, 0)
         device = None if device is None else checks.device("device", device)
@@ -177,7 +183,12 @@ class Scenery(SetOnce):
 
     @classmethod
     def of_layouts(
-        cls, n_agents: int, layouts: Layouts, model: Any, model_widths: Any, layout: Any
+        cls,
+        n_agents: int,
+        layouts: Layouts,
+        model: "ArrayLike",
+        model_widths: "ArrayLike",
+        layout: "ArrayLike",
     ) -> "Scenery":
         """Returns scenery whose environments share layouts.
 

@@ -1,7 +1,7 @@
 """Minimal: an agent that moves and sees. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -12,6 +12,9 @@ from megastep.core import Core
 from megastep.envs.common import SceneryEnv
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Minimal"]
 
@@ -105,7 +108,7 @@ class Minimal(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state`: the floor plan above the agent's image. Returns a
         matplotlib figure.
         """

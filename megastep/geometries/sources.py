@@ -143,7 +143,7 @@ class _Part(NamedTuple):
     mirror: bool
 
 
-def _part(name: str, part: Any) -> _Part:
+def _part(name: str, part: object) -> _Part:
     """Returns a part of `mixed`.
 
     Raises:

@@ -4,7 +4,7 @@ N environments of A agents. Each agent is a lane: B = N A.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -20,6 +20,9 @@ from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import MAX_AGENTS, TALLY_ROWS, deathmatch_step, privileged_size
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Deathmatch"]
 
@@ -307,7 +310,7 @@ class Deathmatch(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
         each agent to its target, and each agent's health, RGB and depth.
         """

@@ -1,7 +1,7 @@
 """Explorer: see as much of a home as possible. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -16,6 +16,9 @@ from megastep.envs.explorer.step import N_BINS, N_EPISODE, explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Explorer"]
 
@@ -201,7 +204,7 @@ class Explorer(SceneryEnv):
         return bits.flatten()[: last - first].bool()
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state`: the floor plan, bright where it was seen, above the
         agent's images. Returns a matplotlib figure.
         """

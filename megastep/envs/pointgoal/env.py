@@ -4,7 +4,7 @@ N environments of one agent, so B = N lanes.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -19,6 +19,9 @@ from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["PointGoal"]
 
@@ -203,7 +206,7 @@ class PointGoal(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan with the goal,
         and the agent's RGB and depth.
         """

@@ -6,13 +6,14 @@ D layouts, S spawn points and G goals per layout.
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from megastep import cache, engine
 from megastep.core import Core
+from megastep.dotdict import dotdict
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics, n_cells
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.geometry import content_hash
@@ -45,7 +46,7 @@ REST = {
 
 
 def goal_fields(
-    geometries: Sequence[Any],
+    geometries: Sequence[dotdict],
     core: Core,
     nearest: float = 1.0,
     furthest: float = 15.0,
@@ -104,7 +105,7 @@ def _in_range(layout, g, nearest, furthest) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def all_geodesics(
-    geometries: Sequence[Any], radius: float, seed: int, device: torch.device | str = "cpu"
+    geometries: Sequence[dotdict], radius: float, seed: int, device: torch.device | str = "cpu"
 ) -> list[Geodesics]:
     """Returns the geodesics of each geometry.
 

@@ -4,11 +4,11 @@ D homes, W walls of all homes, V corners of all homes, G goals per home, P point
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 
+from megastep.dotdict import dotdict
 from megastep.engine.devices import threads
 from megastep.envs.pointgoal.program import PROGRAM
 from megastep.kernels.build.launch import BLOCK, launch
@@ -39,7 +39,7 @@ class PathGraph:
         origins: (D, 2) float32. All points are relative to these.
     """
 
-    def __init__(self, geometries: Sequence[Any], radius: float, device: torch.device):
+    def __init__(self, geometries: Sequence[dotdict], radius: float, device: torch.device):
         self.geometries, self.device, self.radius = geometries, device, radius
         n_walls = np.array([len(g.walls) for g in geometries])
         firsts, home = self._starts(n_walls)[:-1], np.repeat(np.arange(len(n_walls)), n_walls)

@@ -5,7 +5,7 @@ one operation, :func:`~megastep.envs.pong.step.pong_step`.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from megastep.envs.common import DisplayedEnv
 from megastep.envs.pong.bot import Tracker
 from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, PROGRAM, pong_step
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Pong"]
 
@@ -174,7 +177,7 @@ class Pong(DisplayedEnv):
         return "\n".join([score, edge, *(line.rstrip() for line in lines), edge])
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws the court and the score of a numpyified :meth:`state` as a matplotlib figure."""
         from matplotlib.figure import Figure
 

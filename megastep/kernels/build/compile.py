@@ -152,7 +152,7 @@ def _load(name, body, path) -> "CDLL":
 
 
 @functools.cache
-def cuda(program: Program, index: int) -> dict[str, Any]:
+def cuda(program: Program, index: int) -> dict[str, object]:
     """Returns a program's operations on GPU ``index``: {name: CUfunction}."""
     if not program.cuda_operations:
         return {}

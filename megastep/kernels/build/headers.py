@@ -85,7 +85,7 @@ def _holds_pointer(fields) -> bool:
     return any("P" in kind for _, kind in fields)
 
 
-def builder(name: str, fields: Fields) -> Callable[[Mapping[str, Any]], bytes]:
+def builder(name: str, fields: Fields) -> Callable[[Mapping[str, object]], bytes]:
     """Returns a function of {field: value} that packs the struct ``name``.
 
     A pointer is a tensor, an address, or None for null. An array is the joined bytes of its

@@ -81,7 +81,7 @@ class Program:
         return headers.constants(self.sources(".h"))
 
     @cached_property
-    def packers(self) -> dict[str, Callable[[Mapping[str, Any]], bytes]]:
+    def packers(self) -> dict[str, Callable[[Mapping[str, object]], bytes]]:
         structs = headers.struct_fields(self.sources(".h"))
         return {name: headers.builder(name, fields) for name, fields in structs.items()}
 
