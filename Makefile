@@ -31,9 +31,10 @@ test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour
 	EXAMPLES=2000 $(PYTEST) tests/test_laws.py
 	$(PYTHON) scripts/mutate.py --n 30 --seed $(SEED) --jobs $(CORES)
 
-lint: $(SETUP)             ## check style and formatting of Python and kernels
+lint: $(SETUP)             ## check style, formatting and types of Python, and the format of kernels
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(PYTHON) -m pyright --pythonpath $(PYTHON)
 	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
 
 setup: $(SETUP)            ## create .venv
