@@ -19,7 +19,7 @@ def root(tmp_path):
     (tmp_path / "pyproject.toml").write_text('[project]\nversion = "1.2.0"\n')
     (tmp_path / "CITATION.cff").write_text("cff-version: 1.1.0\nversion: 1.2.0\n")
     (tmp_path / "CHANGELOG.md").write_text(
-        "# Changelog\n\n## Unreleased\n\n## 1.2.0 (2030-01-02)\n\n### Fixed\n\n- A.\n\n## 1.1.0\n\n- B.\n"
+        "# Changelog\n\n## Unreleased\n\n## 1.2.0 (2030)\n\n### Fixed\n\n- A.\n\n## 1.1.0\n\n- B.\n"
     )
     return tmp_path
 
