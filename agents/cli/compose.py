@@ -1,8 +1,9 @@
 """The words of a command line -> Hydra -> checked settings, before anything is written.
 
-Only Hydra's public API is used: its grammar reads the words, `hydra.compose` composes the groups
-from files with their `blocks`, and keys are set in what comes out, so that every error has its own
-word. Jobs of sweeps compose in the same way, in whichever process they run.
+Hydra's grammar reads the words, `hydra.compose` composes the groups from files with their `blocks`,
+and keys are set in what comes out, so that every error has its own word. Two methods of Hydra are
+replaced: `ConfigStore.__deepcopy__` here, and `load_config` of its sources of files in `blocks`.
+Jobs of sweeps compose in the same way, in whichever process they run.
 """
 
 import copy
