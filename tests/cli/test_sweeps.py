@@ -32,6 +32,7 @@ from tests.helpers.processes import HUNG, ROOT, finished, is_running, start, wai
 
 PAYER = '''
 import os
+import time
 
 import torch
 
@@ -39,7 +40,9 @@ from megastep.envs import Minimal
 
 
 class Payer(Minimal):
-    """Episodes of four steps with reward `pay` each; the constructor fails for some moods."""
+    """Episodes of four steps with reward `pay` each. Fails in some moods, and takes its time in
+    another, so that jobs that last for seconds leave the processor to others.
+    """
 
     def __init__(self, *args, pay: float = 1.0, mood: str = "fine", **settings):
         if mood == "cross":
@@ -49,9 +52,10 @@ class Payer(Minimal):
         if mood == "lost" and os.environ.get("RANK") == "1":
             os.kill(os.getpid(), 9)
         super().__init__(*args, shortest=4, longest=4, **settings)
-        self.pay = pay
+        self.pay, self.pause = pay, 0.05 if mood == "slow" else 0.0  # seconds
 
     def step(self, decision):
+        time.sleep(self.pause)
         world = super().step(decision)
         world["reward"] = torch.full_like(world.reward, self.pay).masked_fill(world.reset, 0.0)
         return world
@@ -236,7 +240,8 @@ def test_joblib(here):
 @pytest.mark.slow
 def test_signal_saves_jobs_in_other_processes(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    process = start("train", *SMALL, "samples=1e12", "-m", "seed=1,2,3", *JOBLIB)
+    words = "samples=1e12", "env.mood=slow", "-m", "seed=1,2,3"
+    process = start("train", *SMALL, *words, *JOBLIB)
 
     wait_until(lambda: n_learning(here) == 2, process)
     process.send_signal(signal.SIGTERM)
@@ -297,9 +302,8 @@ def children(process):
 @pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
 def test_kill_9(here, victim):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    process = start(
-        "train", *SMALL, "seconds=8", "checkpoint_seconds=1", "-m", "seed=1,2,3", *JOBLIB
-    )
+    words = "seconds=8", "checkpoint_seconds=1", "env.mood=slow", "-m", "seed=1,2,3"
+    process = start("train", *SMALL, *words, *JOBLIB)
 
     def jobs():
         return [json.loads(path.read_text()) for path in here.glob("mine/.jobs/*/*.json")]

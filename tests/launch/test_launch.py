@@ -17,7 +17,7 @@ from megastep.agents.launch.endings import Ending
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from tests.helpers import tiny
-from tests.helpers.processes import is_running, start, wait_until
+from tests.helpers.processes import forked, is_running, wait_until
 from tests.helpers.ranks import HUNG, ROOT
 
 pytestmark = pytest.mark.usefixtures("here")
@@ -188,7 +188,7 @@ def started(here, *words, base=TINY, **env):
     """
     (here / "tmp").mkdir(exist_ok=True)
     env = dict(TMPDIR=str(here / "tmp")) | env
-    process = start("train", *base, "ranks=2", *words, **env)
+    process = forked("train", *base, "ranks=2", *words, **env)
     try:
         yield process
     finally:
