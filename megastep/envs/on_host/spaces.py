@@ -5,7 +5,7 @@ N environments, one agent each; `...` the shape of a Gymnasium space.
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
 from megastep.types import Space
 
-__all__ = ["actions", "observation"]
+__all__ = ["actions", "identifiers", "observation"]
 
 #: The fewest rows and columns, and the most channels, of an image.
 MIN_SIDE, MAX_CHANNELS = 8, 4
@@ -54,7 +54,7 @@ def observation(space: Any, path: str = "observation") -> Conversion:
         if len({*sizes}) == 1:
             whole = spaces.MultiDiscrete(len(sizes), sizes[0])
             return whole, lambda x: (x - space.start).reshape(columns)
-        names = _identifiers(range(len(sizes)))
+        names = identifiers(range(len(sizes)))
         return _choices(names, sizes), lambda x: arrdict(
             zip(names, np.split((x - space.start).reshape(columns), len(names), 1))
         )
@@ -101,7 +101,7 @@ def actions(space: Any, path: str = "action") -> Conversion:
         if len({*sizes}) == 1:
             whole = spaces.MultiDiscrete(len(sizes), sizes[0])
             return whole, lambda x: (x.reshape(shape) + space.start).astype(dtype)
-        names = _identifiers(range(len(sizes)))
+        names = identifiers(range(len(sizes)))
         return _choices(names, sizes), lambda tree: (
             np.concatenate([tree[name] for name in names], 1).reshape(shape) + space.start
         ).astype(dtype)
@@ -154,7 +154,7 @@ def _parts(space, conversion, path):
     children = space.spaces if isinstance(space.spaces, Mapping) else dict(enumerate(space.spaces))
     return [
         (name, key, *conversion(child, f"{path}[{key!r}]"))
-        for name, (key, child) in zip(_identifiers(children), children.items())
+        for name, (key, child) in zip(identifiers(children), children.items())
     ]
 
 
@@ -166,13 +166,13 @@ def _choices(names, sizes):
     return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)})
 
 
-def _identifiers(keys):
+def identifiers(keys: Iterable[Any], reserved: Collection[str] = RESERVED) -> list[str]:
     """Returns a name for each key: `a-b` becomes a_b, 0 becomes part_0, `type` becomes type_."""
     names = []
     for key in keys:
         name = re.sub(r"\W", "_", str(key))
         name = name if name.isidentifier() else f"part_{name}"
-        while name in names or name in RESERVED:
+        while name in names or name in reserved:
             name += "_"
         names.append(name)
     return names
