@@ -12,14 +12,12 @@ import random
 import sys
 import time
 import traceback
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 __all__ = [
-    "MAX_NUMBERS",
     "EnvError",
     "SyncEnvs",
     "close_all",
@@ -28,9 +26,7 @@ __all__ = [
     "one_line",
 ]
 
-#: The most numbers of an ``info`` that become metrics.
-MAX_NUMBERS = 16
-#: Steps and seconds of the episode that tells the names of these numbers.
+#: Steps and seconds of the episode that tells which numbers the last ``info`` has.
 PROBE_STEPS, PROBE_SECONDS = 1000, 5.0
 
 
@@ -250,7 +246,7 @@ def numbers_of(info: Any) -> dict[str, float]:
 
 def names_of_numbers(env: Any, seed: int = 0) -> list[str]:
     """Plays an episode with random actions, of at most `PROBE_STEPS` and `PROBE_SECONDS`. Returns
-    the keys of the numbers in its last `info`, `is_success` first and at most `MAX_NUMBERS`.
+    the keys of the numbers in its last `info`, `is_success` first. Closes the environment.
 
     An error ends it: the same one comes in training, which tells of it.
     """
@@ -264,13 +260,9 @@ def names_of_numbers(env: Any, seed: int = 0) -> list[str]:
             names = sorted(numbers_of(info), key=lambda name: name != "is_success")
             if terminated or truncated or time.monotonic() > end:
                 break
-    if left_out := names[MAX_NUMBERS:]:
-        warnings.warn(
-            f"the last info of an episode has {len(names)} numbers; {MAX_NUMBERS} become metrics, "
-            f"and {', '.join(left_out)} do not",
-            stacklevel=2,
-        )
-    return names[:MAX_NUMBERS]
+    with contextlib.suppress(Exception):
+        env.close()
+    return names
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from megastep import workers
-from megastep.sync_envs import EnvError, SyncEnvs
+from megastep.sync_envs import EnvError, SyncEnvs, names_of_numbers
 
 __all__ = ["VectorProcesses", "start_rendering"]
 
@@ -49,7 +49,7 @@ class VectorProcesses:
         self.metadata, self.render_mode = example.metadata, example.render_mode
         self.single_observation_space = example.single_observation_space
         self.single_action_space = example.single_action_space
-        self.names, self.restart_failed = example.names, example.restart_failed
+        self.restart_failed = example.restart_failed
         with contextlib.suppress(Exception):
             example.close()
         edges = np.linspace(0, n_envs, min(max(n_processes, 1), n_envs) + 1).astype(int).tolist()
@@ -72,6 +72,10 @@ class VectorProcesses:
                 far_end.close()
                 self.pipes.append(pipe)
                 self.processes.append(process)
+        self.pipes[0].send(("try", None))
+        names = self._receive(0)
+        self.names = () if isinstance(names, Exception) else names
+        self._ask("name", [self.names for _ in self.pipes])
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Any, dict]:
         """Resets every environment. Returns (observations, news), see `step`."""
@@ -128,7 +132,7 @@ class VectorProcesses:
         return answers
 
     def _receive(self, number):
-        """Returns the answer of a process.
+        """Returns the answer of a process, which may be an error of an environment.
 
         Raises:
             MemoryError: it was killed.
@@ -196,6 +200,11 @@ def _answer(envs, command, argument):
         return envs.reset(seed=argument)
     if command == "step":
         return envs.step(argument)
+    if command == "try":
+        return names_of_numbers(envs.make())
+    if command == "name":
+        envs.names = argument
+        return None
     if command == "close":
         return envs.close()
     start_rendering(envs)

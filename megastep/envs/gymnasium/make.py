@@ -52,12 +52,18 @@ def vector_env(
             return _checked(id, _own(make_vec, spec, wrappers, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
         settings = {"disable_env_checker": True, **kwargs}
-        names, can_film, max_steps = _tried(make_env(spec, wrappers, settings))
-        if films and can_film:
+        example = make_env(spec, wrappers, settings)
+        max_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
+        if films and "rgb_array" in (example.metadata.get("render_modes") or ()):
             settings = {"render_mode": "rgb_array", **settings}
         make_one = functools.partial(make_env, spec, wrappers, settings)
-        make = functools.partial(SyncEnvs, make_one, restart_failed=restart_failed, names=names)
-        vector = make(n_envs=n_envs) if vectorization == "sync" else VectorProcesses(make, n_envs)
+        make = functools.partial(SyncEnvs, make_one, restart_failed=restart_failed)
+        if vectorization == "sync":
+            vector = make(n_envs=n_envs, names=names_of_numbers(example))
+        else:  # a fault may end the process that it happens in
+            vector = VectorProcesses(make, n_envs)
+            with contextlib.suppress(Exception):
+                example.close()
         vector.max_episode_steps = max_steps
         return vector
     except gymnasium.error.DependencyNotInstalled as error:
@@ -95,21 +101,6 @@ def _spec(id):
             + "Those of other packages are package:id, such as minigrid:MiniGrid-MemoryS7-v0"
         )
     return gymnasium.registry[name]
-
-
-def _tried(env):
-    """Returns what one environment tells, before it is closed: the names of the numbers in the last
-    `info`, whether it renders images, and the steps of an episode, None if they have no limit.
-    """
-    names = names_of_numbers(env)
-    with contextlib.suppress(Exception):
-        env.close()
-    spec = env.unwrapped.spec
-    return (
-        names,
-        "rgb_array" in (env.metadata.get("render_modes") or ()),
-        spec and spec.max_episode_steps,
-    )
 
 
 def _own(make, spec, wrappers, n_envs, kwargs):

@@ -25,6 +25,8 @@ from megastep.vector_processes import VectorProcesses, start_rendering
 
 __all__ = ["VectorizedEnv"]
 
+#: The most numbers of an ``info`` that become metrics.
+MAX_NUMBERS = 16
 #: Steps of an episode in an evaluation, of environments whose specification names no limit.
 MAX_EPISODE_STEPS = 10_000
 
@@ -72,6 +74,13 @@ class VectorizedEnv:
             raise ValueError(f"{id}: {error}") from None
         n_lanes = n_envs * n_agents
         names = getattr(vector, "names", ())
+        if left_out := names[MAX_NUMBERS:]:
+            warnings.warn(
+                f"{id}: the last info of an episode has {len(names)} numbers; {MAX_NUMBERS} become "
+                f"metrics, and {', '.join(left_out)} do not",
+                stacklevel=3,
+            )
+        names = names[:MAX_NUMBERS]
         reserved = {*RESERVED_KEYS, *RESERVED, "restarts"}
         self._metrics = {
             name: (key, np.full(n_lanes, np.nan, np.float32))
