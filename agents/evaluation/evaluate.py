@@ -31,7 +31,8 @@ def run(cfg: settings.Evaluate) -> Path:
     env_settings = cfg.env or trained.env
     geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
     homes = factory.homes(env_settings, geometry, cfg.split)
-    with env_failures.told(env_settings, folders.folder_of(loaded.path)):
+    folder, rank = folders.folder_of(loaded.path), process_group.rank()
+    with env_failures.told(env_settings, folder, rank=rank):
         path = measure(cfg, loaded, env_settings, geometry, homes, device)
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from megastep import engine
-from megastep.agents.distributed.process_group import rank
 from megastep.agents.errors import EnvFailed, UserError, memory_problem
 from megastep.agents.factory.settings import Env
 from megastep.imports import import_object
@@ -20,13 +19,16 @@ METHODS = "__init__", "reset", "step", "check", "desync"
 
 
 @contextlib.contextmanager
-def told(env: Env, folder: Path, saved: Callable[[], str] = lambda: "") -> Iterator[None]:
+def told(
+    env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
+) -> Iterator[None]:
     """Turns an error of an environment into one sentence, and writes its traceback into a file.
 
     Args:
         env: settings of the environment.
         folder: where the file goes.
         saved: returns what else to say, such as the command that resumes.
+        rank: number of this process, which another's file than rank 0's has in its name.
 
     Raises:
         EnvFailed: in place of the error. Errors of megastep's own code are raised as they are.
@@ -38,7 +40,9 @@ def told(env: Env, folder: Path, saved: Callable[[], str] = lambda: "") -> Itera
             raise
         is_told = isinstance(error, UserError)  # that a video could not be made because of it
         text = [str(error if is_told else failure).rstrip(".")]
-        text.append(f"Its traceback is in {_write(folder, failure.trace)}" * bool(failure.trace))
+        if failure.trace:
+            name = f"rank_{rank}_{FILE}" if rank else FILE
+            text.append(f"Its traceback is in {_write(folder, name, failure.trace)}")
         if getattr(env, "restart_failed", None) == 0 and not is_told:
             text.append("env.restart_failed=3 would make it anew up to 3 times")
         raise EnvFailed(". ".join(filter(None, [*text, saved()]))) from error
@@ -74,9 +78,8 @@ def _code(kind, name):
     return getattr(inspect.unwrap(getattr(kind, name, None) or kind), "__code__", None)
 
 
-def _write(folder, trace):
+def _write(folder, name, trace):
     """Writes a traceback into a folder, or a temporary one. Returns the path."""
-    name = f"{rank()}-{FILE}" if rank() else FILE
     for place in (folder, Path(tempfile.gettempdir())):
         with contextlib.suppress(OSError):
             path = place / name

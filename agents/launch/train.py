@@ -95,7 +95,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
             try:
                 running = together(
-                    env_failures.told(cfg.env, folder)(
+                    env_failures.told(cfg.env, folder, rank=process_group.rank())(
                         lambda: make_trainer(cfg, folder, device, token, show)
                     )
                 )
@@ -120,7 +120,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         saved = functools.partial(saved_by, running, resume)
         try:
             with (
-                env_failures.told(cfg.env, folder, saved),
+                env_failures.told(cfg.env, folder, saved, process_group.rank()),
                 signals.handled(rank.announce) as numbers,
                 progress if is_first else contextlib.nullcontext(),
                 contextlib.closing(running),

@@ -1,6 +1,6 @@
-"""Environments of Gymnasium with odd lives, and one of our own interface that fails.
+"""Environments of Gymnasium with odd lives: `env.id=tests.helpers.odd_envs:OddCrash-v0`.
 
-In workers, too, which import this module: `env.id=tests.helpers.odd_envs:OddCrash-v0`.
+Workers import this module, so without PyTorch.
 """
 
 import os
@@ -9,8 +9,6 @@ import time
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-
-from megastep.envs.minimal import Minimal
 
 
 class Odd(gymnasium.Env):
@@ -38,10 +36,10 @@ class Odd(gymnasium.Env):
 
 
 class Crash(Odd):
-    """Fails in one of 50 steps."""
+    """Fails in one of 100 steps."""
 
     def step(self, action):
-        if self.np_random.random() < 1 / 50:
+        if self.np_random.random() < 1 / 100:
             raise OSError("simulator does not answer")
         return super().step(action)
 
@@ -112,15 +110,3 @@ class ManyActions(Odd):
 
 for _kind in [kind for kind in vars().values() if isinstance(kind, type) and issubclass(kind, Odd)]:
     gymnasium.register(f"Odd{_kind.__name__}-v0", _kind)
-
-
-class Own(Minimal):
-    """Fails in its 20th step, with an error that no user of megastep has to know."""
-
-    count = 0
-
-    def step(self, decision):
-        self.count += 1
-        if self.count == 20:
-            raise KeyError("door")
-        return super().step(decision)

@@ -83,7 +83,7 @@ class VectorizedEnv:
         names = names[:MAX_NUMBERS]
         reserved = {*RESERVED_KEYS, *RESERVED, "restarts"}
         self._metrics = {
-            name: (key, np.full(n_lanes, np.nan, np.float32))
+            name: (key, np.zeros(n_lanes, np.float32))
             for name, key in zip(identifiers(names, reserved), names)
         }
         self._buffers = HostBuffers(
@@ -99,7 +99,7 @@ class VectorizedEnv:
             EnvError: an environment failed.
         """
         obs, news = self._call(self.vector.reset, seed=self._seeds)
-        self._read_news(news)
+        self._read_news(news, self._ended)
         self._seeds = None
         self._ended[:] = True
         return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended)
@@ -112,7 +112,7 @@ class VectorizedEnv:
         """
         actions = self._write(self._buffers.receive(decision["actions"]))
         obs, reward, terminated, truncated, news = self._call(self.vector.step, actions)
-        self._read_news(news)
+        self._read_news(news, terminated | truncated)
         return self._world(obs, reward, terminated, truncated)
 
     def pop_restarts(self) -> int | None:
@@ -136,13 +136,13 @@ class VectorizedEnv:
         except Exception as error:
             raise EnvError.of(error, f"{self.id}: an environment") from error
 
-    def _read_news(self, news):
+    def _read_news(self, news, ended):
         """Keeps the numbers of episodes that ended, and counts environments that were made anew."""
         if not news or not hasattr(self.vector, "names"):
             return
         for key, values in self._metrics.values():
             if "numbers" in news:
-                values[:] = news["numbers"][key]
+                np.copyto(values, news["numbers"][key], "unsafe", where=ended)
         for failure in news.get("failures", ()):
             if not self._has_warned:
                 self._has_warned = True
