@@ -89,6 +89,7 @@ RESUMABLE = (
     "dry_run",
     "logger",
     "finish",
+    "env.restart_failed",
 )
 
 

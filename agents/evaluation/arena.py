@@ -1,5 +1,6 @@
 """An environment in unseen homes, where the agent of a run meets others."""
 
+import functools
 import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,7 +114,9 @@ class Arena:
     def play(self, player: Player, opponent: Player) -> Any:
         policies = player.policy, opponent.policy
         with factory.errors():
-            played = duels.play(self.env, *policies, self.seed, self.cfg.greedy, slots=self.slots)
+            limit = self.cfg.max_steps or duels.MAX_STEPS
+            play = functools.partial(duels.play, max_steps=limit, slots=self.slots)
+            played = play(self.env, *policies, self.seed, self.cfg.greedy)
         return self.share.with_others(played)
 
     def duel(self, source: str | None = None) -> list[dict]:

@@ -8,7 +8,7 @@ from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.share import Share
 from megastep.agents.evaluation import arena, playing, statistics, suite, tables
-from megastep.agents.factory import settings
+from megastep.agents.factory import env_failures, settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
 from megastep.agents.selfplay.bots.random import RandomActions
@@ -31,6 +31,22 @@ def run(cfg: settings.Evaluate) -> Path:
     env_settings = cfg.env or trained.env
     geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
     homes = factory.homes(env_settings, geometry, cfg.split)
+    folder, rank = folders.folder_of(loaded.path), process_group.rank()
+    with env_failures.told(env_settings, folder, rank=rank):
+        path = measure(cfg, loaded, env_settings, geometry, homes, device)
+    console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
+    return path
+
+
+def measure(
+    cfg: settings.Evaluate,
+    loaded: checkpoint.Checkpoint,
+    env_settings: settings.Env,
+    geometry: settings.Geometry,
+    homes: list,
+    device: Any,
+) -> Path:
+    """Does what `run` does, with what its settings name."""
     if cfg.ratings:
         path = arena.Arena(cfg, loaded, env_settings, geometry, homes, device).rate()
     elif cfg.against is not None:
@@ -54,7 +70,6 @@ def run(cfg: settings.Evaluate) -> Path:
             rows,
             [*map(tables.cells, rows)],
         )
-    console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
 
 
@@ -78,7 +93,15 @@ def play(
     players += [("random", RandomActions(env.action_space), False)] * cfg.baseline
     sources = None if source else factory.sources_of(homes)
     for name, player, greedy in players:
-        episodes = share.with_others(playing.first_episodes(env, player, seed, greedy))
+        played = playing.first_episodes(env, player, seed, greedy, cfg.max_steps)
+        episodes = share.with_others(played)
+        n_cut = int((~episodes["done"]).sum())
+        if n_cut and process_group.rank() == 0:
+            limit = cfg.max_steps or optional(env, "max_episode_steps")
+            console.warn(
+                f"{name}: {n_cut:,} of {len(episodes['done']):,} episodes had not ended after "
+                f"{limit:,} steps and are counted as truncated there; max_steps= sets the limit"
+            )
         summaries = statistics.summaries(episodes, optional(env, "roles"), sources)
         if source == suite.DENSE and "homes" in episodes:
             summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(episodes)})

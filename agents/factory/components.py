@@ -38,7 +38,9 @@ LEARNERS, LOGGERS = "megastep.agents.algorithms", "megastep.agents.training.logg
 #: are passed by the program, `missing` are defaults, and the others are settings beside them.
 ARGUMENTS = {
     "env": dict(
-        reserved=("geometries", "seed", "device", "privileged"), missing={"n_envs": 128}, name=str
+        reserved=("geometries", "seed", "device", "privileged", "films"),
+        missing={"n_envs": 128},
+        name=str,
     ),
     "geometry": dict(reserved=("split",), missing={"n": 512, "seed": 1}, name=str),
     "learner": dict(

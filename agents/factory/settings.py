@@ -327,6 +327,7 @@ def _given(run):
 class Evaluate(Played):
     run: Annotated[str, BeforeValidator(_given)]
     episodes: Count
+    max_steps: Count | None = None  # None: the environment's own limit
     baseline: bool
     against: tuple[str, ...] | None = None
     ratings: bool = False

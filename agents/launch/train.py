@@ -15,15 +15,23 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
 from megastep.agents.distributed.drift import DriftError
-from megastep.agents.errors import Differs, NonFinite, UserError, memory_problem, user_errors
+from megastep.agents.errors import (
+    Differs,
+    EnvFailed,
+    NonFinite,
+    UserError,
+    memory_problem,
+    user_errors,
+)
 from megastep.agents.evaluation import evaluate, record
-from megastep.agents.factory import settings
+from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import dry_run, launcher, rank, rank_checks, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
+from megastep.agents.training.trainer import Trainer
 
 
 def with_more(cfg: settings.Train) -> settings.Train:
@@ -85,7 +93,15 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             if team:
                 team.set_folder(folder)
             cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
-            running = together(lambda: make_trainer(cfg, folder, device, token, show))
+            try:
+                running = together(
+                    env_failures.told(cfg.env, folder, rank=process_group.rank())(
+                        lambda: make_trainer(cfg, folder, device, token, show)
+                    )
+                )
+            except EnvFailed:
+                undo.pop_all()  # the folder has the traceback
+                raise
             rank_checks.check_world(cfg, running)
             from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
             hosts = process_group.gather_objects(process_group.hostname())
@@ -101,8 +117,10 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 console.say(f"Training on {ranks} in {folder}")
             undo.pop_all()
         resume = f"To continue: {folders.resume_command(folder)}"
+        saved = functools.partial(saved_by, running, resume)
         try:
             with (
+                env_failures.told(cfg.env, folder, saved, process_group.rank()),
                 signals.handled(rank.announce) as numbers,
                 progress if is_first else contextlib.nullcontext(),
                 contextlib.closing(running),
@@ -117,10 +135,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             problem = memory_problem(error)
             if not (problem or isinstance(error, engine.EngineError)):
                 raise
-            saved = running.saver.error or "What was learnt last could not be saved"
-            saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
             reason = problem or str(error).partition("\n")[0].rstrip(".")
-            raise UserError(f"{reason}. {saved}. {resume}") from error
+            raise UserError(f"{reason}. {saved()}") from error
         finally:
             if is_first:
                 with process_group.unhurried():
@@ -136,7 +152,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
         nonfinite, hint = running.nonfinite_guard.value, running.nonfinite_guard.hint
-        del running  # its memory is the evaluation's now
+        del running, saved  # its memory is the evaluation's now
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
         common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:
@@ -152,6 +168,13 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if cfg.rerun and is_first:
             compare(folder, folders.folder_of(folders.find(cfg.rerun)))
     return folder
+
+
+def saved_by(running: Trainer, resume: str) -> str:
+    """Returns what is saved of a training run that an error ended, and how to resume it."""
+    text = running.saver.error or "What was learnt last could not be saved"
+    text = f"All {running.samples:,} samples are saved" if running.is_saved else text
+    return f"{text}. {resume}"
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
