@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch.utils._pytree import tree_leaves_with_path
 
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.kernels.build.launch import Blocks, launch
 
 #: The largest magnitude allowed in a rollout. Squares of returns made of such rewards, summed over
@@ -147,14 +147,14 @@ class NonFiniteCheck:
         """Does the same as `__call__` in two kernels."""
         tensors = list(floats.values())
         n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
-        device, constants = tensors[0].device, PROGRAM.constants
+        device, constants = tensors[0].device, LIBRARY.constants
         first_rows = torch.full((n_lanes,), 2**31 - 1, dtype=torch.int32, device=device)
         is_finite = torch.empty((), dtype=torch.bool, device=device)
         block_bytes = 16 * constants["CHECKED_THREADS"] * constants["CHECKED_WORDS"]
         packed, n_blocks = [], 0
         for tensor in tensors:
             packed.append(
-                PROGRAM.params.CheckedTensorParams(
+                LIBRARY.params.CheckedTensorParams(
                     values=tensor,
                     first_block=n_blocks,
                     n_steps=len(tensor),
@@ -172,9 +172,9 @@ class NonFiniteCheck:
             n_lanes=n_lanes,
         )
         blocks = Blocks(n_blocks, threads=constants["CHECKED_THREADS"])
-        launch(PROGRAM, "find_bad", device, blocks, **shared, limit=LIMIT)
+        launch(LIBRARY, "find_bad", device, blocks, **shared, limit=LIMIT)
         launch(
-            *(PROGRAM, "record", device, Blocks(1, threads=constants["RECORD_THREADS"])),
+            *(LIBRARY, "record", device, Blocks(1, threads=constants["RECORD_THREADS"])),
             **shared,
             record=self.record,
             is_finite=is_finite,
@@ -220,7 +220,7 @@ class NonFiniteCheck:
 def _is_fused(floats):
     """Returns whether kernels can check these tensors."""
     tensors = list(floats.values())
-    return len(tensors) <= PROGRAM.constants["CHECKED_TENSORS"] and all(
+    return len(tensors) <= LIBRARY.constants["CHECKED_TENSORS"] and all(
         tensor.is_cuda
         and tensor.dtype in (torch.float16, torch.float32)
         and tensor.is_contiguous()

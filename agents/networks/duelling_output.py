@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.kernels import duelling as kernels
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.outputs import Output, gather
 from megastep.agents.networks.precision import cast, compute_dtype, product
