@@ -165,7 +165,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     if how == "resume" and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
         raise ConfigErrors(errors)
     saved |= {"trust": tree.get("trust", False)}
-    if environment.launched() is not None:
+    if environment.rank_info() is not None:
         saved["ranks"] = tree["ranks"]
     return saved
 
@@ -188,14 +188,14 @@ def set_ranks(tree: Tree, typed: list[str]) -> None:
         ConfigErrors: another number was typed.
     """
     with user_errors():
-        place = environment.launched()
-    if place is None:
+        info = environment.rank_info()
+    if info is None:
         return
-    if "ranks" in typed and tree["ranks"] != place.n_ranks:
+    if "ranks" in typed and tree["ranks"] != info.n_ranks:
         text = f"{tree['ranks']!r} is not the number of ranks that torchrun has started, "
-        cure = f"{place.n_ranks}; leave it out, or start train.py without torchrun"
+        cure = f"{info.n_ranks}; leave it out, or start train.py without torchrun"
         raise ConfigErrors([("ranks", text + cure)])
-    tree["ranks"] = place.n_ranks
+    tree["ranks"] = info.n_ranks
 
 
 def check_training(cfg: settings.Train) -> None:

@@ -11,8 +11,8 @@ from megastep.agents.distributed.process_group import (
     exchange,
     gather_objects,
     n_ranks,
-    place,
     rank,
+    rank_label,
 )
 
 T = TypeVar("T")
@@ -62,9 +62,9 @@ def _portable(error):
     if error is None:
         return None
     if rank() > 0 and len(error.args) == 1 and isinstance(error.args[0], str):
-        error.args = (f"{place()}: {error.args[0]}",)
+        error.args = (f"{rank_label()}: {error.args[0]}",)
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
-        return RuntimeError(f"{place()}: {type(error).__name__}: {error}")
+        return RuntimeError(f"{rank_label()}: {type(error).__name__}: {error}")
     return error

@@ -11,7 +11,7 @@ from typing import NamedTuple
 NAMES = "RANK", "WORLD_SIZE", "LOCAL_RANK"
 
 
-class Launched(NamedTuple):
+class RankInfo(NamedTuple):
     """This process's place among the ranks, as torchrun says."""
 
     rank: int
@@ -20,7 +20,7 @@ class Launched(NamedTuple):
     attempt: int = 0  # how often torchrun has started the ranks again
 
 
-def launched() -> Launched | None:
+def rank_info() -> RankInfo | None:
     """Returns this process's place if torchrun started it, None for a process of its own.
 
     Raises:
@@ -36,13 +36,13 @@ def launched() -> Launched | None:
             f"{variables} is no rank of torchrun; to train in one process, unset these "
             "environment variables"
         )
-    return Launched(*map(int, texts))
+    return RankInfo(*map(int, texts))
 
 
 def rank() -> int:
     """Returns the number of the rank that this process is, 0 for a process of its own."""
-    place = launched()
-    return place.rank if place else 0
+    info = rank_info()
+    return info.rank if info else 0
 
 
 def hostname() -> str:

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.environment import hostname, launched
+from megastep.agents.distributed.environment import hostname, rank_info
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
@@ -62,15 +62,15 @@ def start(seconds: float = START_SECONDS) -> None:
     """Joins the ranks that torchrun started. Returns when all have. Does nothing in a process of
     its own.
     """
-    place = launched()
-    if place is None or distributed.is_initialized():
+    info = rank_info()
+    if info is None or distributed.is_initialized():
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # torchrun may keep the store when it starts the ranks again, with addresses of the dead in it
-    keys = distributed.PrefixStore(f"ranks {place.attempt} {next(_STARTS)}", _store())
+    keys = distributed.PrefixStore(f"ranks {info.attempt} {next(_STARTS)}", _store())
     distributed.init_process_group(
-        backend, store=keys, rank=place.rank, world_size=place.n_ranks, timeout=wait
+        backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
     )
     atexit.register(stop)  # threads of gloo that still run would abort the interpreter's end
 
@@ -81,8 +81,8 @@ _STARTS = itertools.count()
 @functools.cache
 def _store() -> distributed.Store:
     """Returns the key-value store of the ranks, which torchrun's agent has, or else rank 0."""
-    place, has_agent = launched(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    return _connection(is_master=place.rank == 0 and not has_agent)
+    info, has_agent = rank_info(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    return _connection(is_master=info.rank == 0 and not has_agent)
 
 
 def _connection(is_master=False):
@@ -122,11 +122,11 @@ def n_ranks() -> int:
 
 def local_rank() -> int | None:
     """Returns this rank's number on its machine, which is that of its GPU; None without ranks."""
-    place = launched()
-    return place and place.local_rank
+    info = rank_info()
+    return info and info.local_rank
 
 
-def place() -> str:
+def rank_label() -> str:
     """Returns this rank's place for messages, such as `rank 1 on node-7`."""
     return f"rank {rank()} on {hostname()}"
 

@@ -234,7 +234,7 @@ def make_opponents(
     Raises:
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
     """
-    shares = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
+    options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot):
         return None
     bot = None
@@ -245,7 +245,7 @@ def make_opponents(
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
             engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")
-        return Opponents(env, policy, bot, seed=seed, **shares)
+        return Opponents(env, policy, bot, seed=seed, **options)
 
 
 def make_bot(name: str | None, settings: Env, env: Any) -> Any:

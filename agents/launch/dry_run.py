@@ -45,8 +45,9 @@ def count_opponents(cfg: settings.Train, sample) -> int:
     opponents = cfg.opponents
     if not (opponents.past or opponents.bot):
         return 0
-    shares = opponents.past, opponents.bot, opponents.snapshots
     with factory.errors():
-        n_per_snapshot, n_bot = count_environments(sample, cfg.env.n_envs, *shares)
+        n_per_snapshot, n_bot = count_environments(
+            sample, cfg.env.n_envs, opponents.past, opponents.bot, opponents.snapshots
+        )
     n_past = n_per_snapshot * opponents.snapshots if opponents.past else 0
     return (n_past + n_bot) * (optional(sample, "n_agents") - 1)

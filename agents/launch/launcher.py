@@ -48,7 +48,7 @@ def n_ranks(cfg: settings.Train) -> int:
     """
     if cfg.ranks == 1:
         return 1
-    place, n_gpus = environment.launched(), gpu.count() if cfg.device != "cpu" else 0
+    info, n_gpus = environment.rank_info(), gpu.count() if cfg.device != "cpu" else 0
     if ":" in cfg.device:
         text = f"{cfg.device!r} is one GPU, and ranks have one each; use device=cuda"
         raise ConfigErrors([("device", text)])
@@ -58,7 +58,7 @@ def n_ranks(cfg: settings.Train) -> int:
             text = f"'all' is every GPU, and {where}; give a number, such as ranks=2"
             raise ConfigErrors([("ranks", text)])
         return n_gpus
-    if n_gpus and cfg.ranks > n_gpus and place is None:
+    if n_gpus and cfg.ranks > n_gpus and info is None:
         n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
         text = f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all is one for each"
         raise ConfigErrors([("ranks", text)])
@@ -67,7 +67,7 @@ def n_ranks(cfg: settings.Train) -> int:
 
 def is_needed(cfg: settings.Train) -> bool:
     """Returns whether training is done by other processes, which this one starts."""
-    return environment.launched() is None and (cfg.ranks != 1 or cfg.restarts > 0)
+    return environment.rank_info() is None and (cfg.ranks != 1 or cfg.restarts > 0)
 
 
 def run(cfg: settings.Train) -> Path:
@@ -85,7 +85,7 @@ def run(cfg: settings.Train) -> Path:
             agent.start()
             while agent.is_alive():
                 agent.join(0.2)
-                job.look()
+                job.poll()
         ending = job.ending()
     if numbers:
         by_signal = ending.code == 128 + numbers[0]
@@ -126,7 +126,7 @@ class Job:
     def stop(self, number: int) -> None:
         """Passes a signal on to the ranks; those that begin later end at once."""
         (self.folder / STOPPED).touch()
-        self.look()
+        self.poll()
         self.send(number)
 
     def quit(self, number: int) -> None:
@@ -139,7 +139,7 @@ class Job:
             with contextlib.suppress(OSError, ValueError):  # it has ended, or just begins to write
                 os.kill(int(path.read_text()), number)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Ends what is left of ranks that lost one; torchrun gives them 30 s. Says so if the ranks
         start again.
         """
@@ -175,8 +175,8 @@ class Job:
                 text = f"was ended by {name}" + ", or too little memory" * (name == "SIGKILL")
             else:
                 text = f"ended with exit code {failure.exitcode}"
-            place = f"rank {rank} on {environment.hostname()}"
-            return Ending(LOST, f"{place} {text}. {hint(self.run_folder())}")
+            label = f"rank {rank} on {environment.hostname()}"
+            return Ending(LOST, f"{label} {text}. {hint(self.run_folder())}")
         reason = shortened(self.error or "they ended without a message", 400)
         return Ending(2, f"The ranks cannot be started: {reason}")
 

@@ -32,18 +32,18 @@ def announce(number: int) -> None:
 
 def refuse(problem: str) -> None:
     """Raises UserError if torchrun started this process. Rank 0 says it for all."""
-    if environment.launched():
+    if environment.rank_info():
         raise UserError(problem) if environment.rank() == 0 else SystemExit(UserError.code)
 
 
 def tell(ending: endings.Ending) -> None:
     """Says how the ranks end: on stderr, or to the process that launched them, which says it."""
-    place = environment.launched()
+    info = environment.rank_info()
     if launcher.JOB in os.environ:
-        if place.rank > 0 and ending.code != launcher.LOST:
-            name = f"rank {place.rank} on {environment.hostname()}: "
+        if info.rank > 0 and ending.code != launcher.LOST:
+            name = f"rank {info.rank} on {environment.hostname()}: "
             ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
-        path = Path(os.environ[launcher.JOB], f"ending-{place.attempt}")
+        path = Path(os.environ[launcher.JOB], f"ending-{info.attempt}")
         if not path.exists():
             ending.write(path)
     elif ending.text:
@@ -76,7 +76,7 @@ class Team:
 
     def earlier_folder(self) -> Path | None:
         """Returns the run that was trained before torchrun started the ranks again."""
-        is_again = environment.launched().attempt > 0 and self.store.check(["run"])
+        is_again = environment.rank_info().attempt > 0 and self.store.check(["run"])
         return Path(self.store.get("run").decode()) if is_again else None
 
     def end(self, problem: str | None) -> NoReturn:
@@ -112,15 +112,15 @@ def joined() -> Iterator[Team | None]:
     """
     global _team
     with user_errors():
-        place = environment.launched()
-    if place is None or place.n_ranks == 1 or _team is not None:
+        info = environment.rank_info()
+    if info is None or info.n_ranks == 1 or _team is not None:
         yield _team
         return
     from megastep.agents.distributed import process_group
 
-    if place.rank > 0:
+    if info.rank > 0:
         console.is_silent = True
-        console.prefix = f"{console.prefix}rank {place.rank} on {environment.hostname()}: "
+        console.prefix = f"{console.prefix}rank {info.rank} on {environment.hostname()}: "
     address = f"{os.environ.get('MASTER_ADDR')}:{os.environ.get('MASTER_PORT')}"
     problem = f"The ranks cannot meet at {address}; is the port in use, or closed? "
     with user_errors(problem, (RuntimeError, ValueError)):
@@ -135,7 +135,7 @@ def joined() -> Iterator[Team | None]:
                 team.watch.await_verdict()  # which ends this process
             team.end(f"A rank is lost: {loss}" if team.watch.claim() else None)
         is_signal = isinstance(error, signals.Interrupted)
-        tells = place.rank == 0 and team.watch.claim()
+        tells = info.rank == 0 and team.watch.claim()
         team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
         if tells or team.watch.claim():
             raise

@@ -45,14 +45,14 @@ def check_start(cfg: settings.Train) -> None:
         _check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
 
 
-def check_world(cfg: settings.Train, running: Trainer) -> None:
+def check_world(cfg: settings.Train, trainer: Trainer) -> None:
     """Raises UserError if the ranks differ in homes, spaces or initial weights."""
     if process_group.n_ranks() > 1:
         homes = factory.homes(cfg.env, cfg.geometry, "training")
         _check_equal(
-            {"the digest of the training homes": digest(homes), **running.saver.config["spaces"]}
+            {"the digest of the training homes": digest(homes), **trainer.saver.config["spaces"]}
         )
-        if difference := first_difference(running.policy):
+        if difference := first_difference(trainer.policy):
             raise UserError(f"The ranks begin with different weights: {difference}")
 
 
@@ -88,7 +88,7 @@ def check_shared(folder: Path) -> str:
         return name
     token = f".ranks-{name}"
 
-    def look():
+    def wait_for_token():
         deadline = time.monotonic() + SHARED_SECONDS
         while not (folder.is_dir() and token in os.listdir(folder)):
             if time.monotonic() > deadline:
@@ -101,7 +101,7 @@ def check_shared(folder: Path) -> str:
     with user_errors(folders.CANNOT.format(folder)):
         from_rank_0((folder / token).touch)
     try:
-        together(look)
+        together(wait_for_token)
     finally:
         if process_group.rank() == 0:
             with contextlib.suppress(OSError):

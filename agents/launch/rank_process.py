@@ -20,10 +20,10 @@ def main() -> int:
     """Trains as one of the ranks that `launch` has started. Returns the exit code: 0, or another if
     torchrun is to start the ranks again.
     """
-    place, job = environment.launched(), Path(os.environ[launcher.JOB])
+    info, job = environment.rank_info(), Path(os.environ[launcher.JOB])
     for number in signals.SIGNALS:  # while there is nothing to save
         signal.signal(number, lambda number, frame: os._exit(128 + number))
-    (job / f"pid-{place.attempt}-{place.rank}").write_text(str(os.getpid()))
+    (job / f"pid-{info.attempt}-{info.rank}").write_text(str(os.getpid()))
     if (job / launcher.STOPPED).exists():
         return 0
     facts = json.loads((job / launcher.SETTINGS).read_text())

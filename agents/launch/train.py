@@ -70,8 +70,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
     progress = console.Progress()
 
-    def show(running):
-        progress.show(*progress_of(running))
+    def show(trainer):
+        progress.show(*progress_of(trainer))
 
     rank_checks.check_start(cfg)
     cfg = rank_checks.started_again(cfg, team)
@@ -85,17 +85,17 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             if team:
                 team.set_folder(folder)
             cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
-            running = together(lambda: make_trainer(cfg, folder, device, token, show))
-            rank_checks.check_world(cfg, running)
-            from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
+            trainer = together(lambda: make_trainer(cfg, folder, device, token, show))
+            rank_checks.check_world(cfg, trainer)
+            from_rank_0(functools.partial(write_config, folder, trainer.saver.config["train"]))
             hosts = process_group.gather_objects(process_group.hostname())
-            clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
+            clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(trainer.lost)))
             if is_first:
                 if clauses:
                     console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
                 folders.record_start(folder)
                 provenance.record(
-                    folder, running.samples, device, package.version(), package.ROOT, hosts
+                    folder, trainer.samples, device, package.version(), package.ROOT, hosts
                 )
                 ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
                 console.say(f"Training on {ranks} in {folder}")
@@ -105,11 +105,11 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             with (
                 signals.handled(rank.announce) as numbers,
                 progress if is_first else contextlib.nullcontext(),
-                contextlib.closing(running),
+                contextlib.closing(trainer),
             ):
-                running.train(lambda: bool(numbers))
+                trainer.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            saved = f"What was saved before is in {folder}{running.nonfinite_guard.hint}"
+            saved = f"What was saved before is in {folder}{trainer.nonfinite_guard.hint}"
             raise NonFinite(f"{error}. {saved}") from error
         except DriftError as error:
             raise UserError(f"{error}. What was saved before is in {folder}") from error
@@ -117,26 +117,26 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             problem = memory_problem(error)
             if not (problem or isinstance(error, engine.EngineError)):
                 raise
-            saved = running.saver.error or "What was learnt last could not be saved"
-            saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
+            saved = trainer.saver.error or "What was learnt last could not be saved"
+            saved = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else saved
             reason = problem or str(error).partition("\n")[0].rstrip(".")
             raise UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             if is_first:
                 with process_group.unhurried():
                     curves.plot_curves(folder)
-        if running.profiler and running.profiler.path:
-            console.say(f"Profile: {running.profiler.path}, and a trace beside it")
+        if trainer.profiler and trainer.profiler.path:
+            console.say(f"Profile: {trainer.profiler.path}, and a trace beside it")
         # a signal that one rank got stops all, and so does a checkpoint that one could not save
-        ends = process_group.gather_objects((numbers[:1], running.saver.error))
+        ends = process_group.gather_objects((numbers[:1], trainer.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
-                signal, f"Stopped after {running.samples:,} samples. {resume}"
+                signal, f"Stopped after {trainer.samples:,} samples. {resume}"
             )
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
-        nonfinite, hint = running.nonfinite_guard.value, running.nonfinite_guard.hint
-        del running  # its memory is the evaluation's now
+        nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
+        del trainer  # its memory is the evaluation's now
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
         common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:

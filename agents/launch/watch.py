@@ -60,14 +60,14 @@ class Heartbeat(NamedTuple):
 class Patience:
     """Tells when another rank is lost, from its heartbeats and our own.
 
-    Time is counted in looks, not by a clock: a machine that sleeps for an hour loses no rank.
+    Time is counted in polls, not by a clock: a machine that sleeps for an hour loses no rank.
     """
 
     def __init__(self):
         self.last = None
         self.n_silent = self.n_ahead = self.longest = 0
 
-    def look(self, ours: Heartbeat, theirs: Heartbeat, is_broken: bool) -> str | None:
+    def poll(self, ours: Heartbeat, theirs: Heartbeat, is_broken: bool) -> str | None:
         """Returns what has become of the other rank, None if nothing is wrong.
 
         Args:
@@ -112,7 +112,7 @@ class Watch:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        attempt = environment.launched().attempt
+        attempt = environment.rank_info().attempt
         self.store = process_group.store(f"watch {attempt} {next(NUMBERS)}")
         self._beat()
         self._thread.start()
@@ -160,10 +160,10 @@ class Watch:
                     return self.on_lost(None)
                 self.is_broken |= self.store.check(["broken"])
                 theirs = self._heartbeat_of(other)
-                problem = theirs and patience.look(ours, theirs, self.is_broken)
+                problem = theirs and patience.poll(ours, theirs, self.is_broken)
                 if problem and not self.has_left:
-                    place = f"rank {other} on {theirs.host}"
-                    return self.on_lost(f"{place} {problem}" if self.claim() else None)
+                    label = f"rank {other} on {theirs.host}"
+                    return self.on_lost(f"{label} {problem}" if self.claim() else None)
             except RuntimeError:  # the store has ended, with torchrun or the machine of rank 0
                 os.kill(os.getpid(), signal.SIGTERM)
                 self._wakes.wait(LAST_SECONDS)

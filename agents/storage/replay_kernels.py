@@ -30,25 +30,27 @@ _CONVERSIONS = {
 }
 
 
-def draw(levels: Sequence[torch.Tensor], shares: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def draw(
+    levels: Sequence[torch.Tensor], fractions: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Draws an index from each of M equal parts of a sum tree's total.
 
     Args:
         levels: of the tree, (blocks, FAN_OUT) float64 each.
-        shares: (M,) float64 from 0 to 1, where in its part.
+        fractions: (M,) float64 from 0 to 1, where in its part.
 
     Returns:
         indices (M,) int64 and their probabilities (M,) float64.
     """
-    index = torch.empty_like(shares, dtype=torch.int64)
-    probability = torch.empty_like(shares)
+    index = torch.empty_like(fractions, dtype=torch.int64)
+    probability = torch.empty_like(fractions)
     launch(
-        *(LIBRARY, "sample_tree", shares.device, WARP * len(shares)),
+        *(LIBRARY, "sample_tree", fractions.device, WARP * len(fractions)),
         tree=_packed(levels),
-        shares=shares,
+        fractions=fractions,
         index=index,
         probability=probability,
-        n_samples=len(shares),
+        n_samples=len(fractions),
     )
     return index, probability
 

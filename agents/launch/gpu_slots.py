@@ -1,4 +1,4 @@
-"""The GPUs of a sweep's jobs. A *place* is as many of this machine's GPUs as a job has ranks.
+"""The GPUs of a sweep's jobs. A *slot* is as many of this machine's GPUs as a job has ranks.
 
 Jobs know of each other by locks on temporary files, one for each GPU and each job on it; the system
 drops them when a process ends.
@@ -71,24 +71,24 @@ def idle(n_ranks: int, n_gpus: int, is_parallel: bool) -> str | None:
         n_ranks: of a job, at most `n_gpus`.
         is_parallel: jobs run side by side.
     """
-    n_places = n_gpus // n_ranks
-    n_idle = n_gpus - n_ranks * (n_places if is_parallel else 1)
+    n_slots = n_gpus // n_ranks
+    n_idle = n_gpus - n_ranks * (n_slots if is_parallel else 1)
     if not n_idle:
         return None
-    if is_parallel or n_places == 1:
+    if is_parallel or n_slots == 1:
         return f"Jobs with ranks={n_ranks} leave {n_idle} of {n_gpus} GPUs idle."
     which = f"Jobs with ranks={n_ranks} that run one after another"
-    cure = f"hydra/launcher=joblib hydra.launcher.n_jobs={n_places} runs {n_places} at a time"
+    cure = f"hydra/launcher=joblib hydra.launcher.n_jobs={n_slots} runs {n_slots} at a time"
     return f"{which} leave {n_idle} of {n_gpus} GPUs idle; {cure}."
 
 
 @contextlib.contextmanager
 def taken(cfg: Any) -> Iterator[Any]:
-    """Takes a place for a job, one with the fewest jobs on it, as long as this context lasts.
+    """Takes a slot for a job, one with the fewest jobs on it, as long as this context lasts.
 
-    Ranks are other processes, and see the GPUs of their place only. A job of this process gets its
+    Ranks are other processes, and see the GPUs of their slot only. A job of this process gets its
     GPU as PyTorch's current one, which device=auto means. A job with a device of its own takes no
-    place.
+    slot.
 
     Args:
         cfg: the job's settings.
@@ -101,8 +101,8 @@ def taken(cfg: Any) -> Iterator[Any]:
         if n_gpus > 1:
             names = _names(n_gpus)
             if _has_ranks(cfg):
-                place = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
-                visible = {VISIBLE: ",".join(names[i] for i in place)}
+                slot = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
+                visible = {VISIBLE: ",".join(names[i] for i in slot)}
                 stack.enter_context(environment.variables(visible))
             else:
                 (number,) = stack.enter_context(_locked(names, 1))
@@ -123,18 +123,18 @@ def _names(n_gpus):
 
 @contextlib.contextmanager
 def _locked(names: list[str], size: int) -> Iterator[range]:
-    """Locks the first place that has the fewest jobs on it. Yields the numbers of its GPUs.
+    """Locks the first slot that has the fewest jobs on it. Yields the numbers of its GPUs.
 
     Args:
         names: of this process's GPUs.
-        size: number of GPUs of a place; the first place begins with the first GPU.
+        size: number of GPUs of a slot; the first slot begins with the first GPU.
     """
     starts = range(0, len(names) - size + 1, size)
     for n_jobs, start in ((n, start) for n in itertools.count() for start in starts):
-        place = range(start, start + size)
-        if locks := _lock([f"{names[i]}-{n_jobs}" for i in place]):
+        slot = range(start, start + size)
+        if locks := _lock([f"{names[i]}-{n_jobs}" for i in slot]):
             with locks:
-                yield place
+                yield slot
             return
 
 

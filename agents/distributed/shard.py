@@ -15,7 +15,7 @@ from megastep.arrdict import arrdict
 Values = TypeVar("Values", torch.Tensor, arrdict)
 
 
-class Share:
+class Shard:
     """One rank's share.
 
     Args:
@@ -35,7 +35,7 @@ class Share:
         self.homes = [*dict.fromkeys(env % n_homes for env in self.envs)] if n_homes else []
 
     @classmethod
-    def of_this_rank(cls, n_envs: int, n_homes: int) -> "Share":
+    def of_this_rank(cls, n_envs: int, n_homes: int) -> "Shard":
         """Returns this rank's share: all of them, if there are fewer environments than ranks."""
         is_shared = n_ranks() <= n_envs
         return cls(n_envs, n_homes, rank(), n_ranks()) if is_shared else cls(n_envs, n_homes)
