@@ -1,4 +1,4 @@
-"""Trains in this process, or has ranks train in processes of their own."""
+"""Training, in this process or with several ranks in processes of their own."""
 
 import contextlib
 import functools
@@ -27,7 +27,7 @@ from megastep.agents.training.progress import progress_of
 
 
 def with_more(cfg: settings.Train) -> settings.Train:
-    """Returns `cfg` with more_samples and more_seconds added to what the resumed run has had."""
+    """Returns `cfg` with more_samples and more_seconds turned into totals of the resumed run."""
     totals = {}
     for name in ("samples", "seconds"):
         if (more := getattr(cfg, f"more_{name}")) is not None:
@@ -37,24 +37,27 @@ def with_more(cfg: settings.Train) -> settings.Train:
 
 
 def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
-    """Returns the run folder, locked, and what to resume."""
+    """Returns the run folder, locked, and the path to resume from (None for a new run)."""
     folder = (
         folders.folder_of(folders.find(cfg.resume))
         if cfg.resume
         else folders.new(settings.run_name(cfg), cfg.folder)
     )
     locks.enter_context(folders.locked(folder))
-    if cfg.resume and process_group.n_ranks() > 1:  # all from the newest one that is intact
+    if cfg.resume and process_group.n_ranks() > 1:  # all ranks from the same intact checkpoint
         return folder, str(folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).path)
     return folder, cfg.resume
 
 
 def run(cfg: settings.Train) -> Path | None:
-    """Trains as `cfg` says, and returns the run folder, None for a dry run. A signal saves and
-    raises Interrupted.
+    """Trains. Returns the run folder, None for a dry run.
 
-    Where torchrun started this process as a rank, all ranks train together. Rank 0 writes. With
-    `cfg.ranks`, other processes are started that do so.
+    If torchrun started this process, it trains as one of the ranks, of which rank 0 writes the run
+    folder. With `cfg.ranks` or `cfg.restarts`, this process starts the ranks.
+
+    Raises:
+        Interrupted: a signal came; the run was saved.
+        UserError: training cannot start or continue.
     """
     if cfg.dry_run:
         return dry_run.show(cfg)
@@ -65,7 +68,7 @@ def run(cfg: settings.Train) -> Path | None:
 
 
 def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
-    """Trains in this process, as one of a team of ranks if it is one. Returns the run folder."""
+    """Trains in this process, alone or as one rank of a team. Returns the run folder."""
     is_first = process_group.rank() == 0
     device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
     progress = console.Progress()
@@ -127,7 +130,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                     curves.plot_curves(folder)
         if trainer.profiler and trainer.profiler.path:
             console.say(f"Profile: {trainer.profiler.path}, and a trace beside it")
-        # a signal that one rank got stops all, and so does a checkpoint that one could not save
+        # a signal on one rank stops all, and so does a checkpoint that one cannot save
         ends = process_group.gather_objects((numbers[:1], trainer.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
@@ -136,9 +139,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
         nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
-        del trainer  # its memory is the evaluation's now
+        del trainer  # frees GPU memory for the evaluation
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
-        common["trust"] = True  # what it names has just run
+        common["trust"] = True  # its modules have just been imported
         if cfg.finish.evaluate:
             with process_group.unhurried():
                 episodes = cfg.finish.episodes
@@ -162,7 +165,7 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
 
 
 def compare(folder: Path, original: Path) -> None:
-    """Says whether two runs have the same metrics, byte for byte. Raises Differs if not."""
+    """Checks that two runs have the same metrics, byte for byte. Raises Differs if not."""
     ours, theirs = ((run / "metrics.jsonl").read_bytes() for run in (folder, original))
     if ours == theirs:
         console.say(f"metrics.jsonl equals that of {original}, byte for byte.")

@@ -3,7 +3,7 @@
 import pytest
 
 from megastep.agents.launch import watch
-from megastep.agents.launch.watch import Heartbeat, Patience
+from megastep.agents.launch.watch import Heartbeat, LossDetector
 
 
 def heartbeat(number, n_operations=100, n_updates=9, is_exempt=False, has_left=False):
@@ -12,9 +12,9 @@ def heartbeat(number, n_operations=100, n_updates=9, is_exempt=False, has_left=F
 
 def polled(ours, theirs, is_broken=False):
     """Returns the number of the poll, from 0, that finds the other rank lost, and what is said."""
-    patience = Patience()
+    detector = LossDetector()
     for number, pair in enumerate(zip(ours, theirs, strict=True)):
-        if problem := patience.poll(*pair, is_broken):
+        if problem := detector.poll(*pair, is_broken):
             return number * watch.PERIOD, problem
     return None, None
 
