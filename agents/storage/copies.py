@@ -1,4 +1,4 @@
-"""Copies and selections of many tensors at once."""
+"""Copies and index selections of many tensors in one kernel."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -24,15 +24,15 @@ def copy_all(
 ) -> None:
     """Copies the second tensor of each pair into the first, as `Tensor.copy_` does.
 
-    On a GPU contiguous tensors of equal dtype and shape are copied by one kernel: a copy of a few
-    kilobytes takes no time, but its launch takes a microsecond. They are copied in no order, so no
-    target may share memory with another tensor of the pairs.
+    On a GPU, contiguous tensors of equal dtype and shape are copied by one kernel, since launches
+    take longer than copies of a few kilobytes. Copies run in any order, so a target must not share
+    memory with another tensor of the pairs.
 
     Args:
-        pairs: targets and sources, all on one device but for sources on the host.
-        condition: () bool on the device. If false, no bit changes. None: copies always.
+        pairs: targets and sources, all on one device; sources may also be on the host.
+        condition: () bool on the device; if false, nothing is copied. None copies always.
     """
-    pairs = list(pairs)  # a source that nobody else holds lives until the launch
+    pairs = list(pairs)  # keeps sources alive until the launch
     fused = []
     for target, source in pairs:
         if target.is_cuda and _is_plain_copy(target, source):

@@ -1,6 +1,6 @@
-"""What a run does about NaN and infinity: it names the first, and ends if they persist.
+"""Warns of the first NaN or infinity of a run, and ends the run if they persist.
 
-The learner skips the updates, see `nonfinite.NonFiniteCheck`.
+The learner skips such updates, see `nonfinite.NonFiniteCheck`.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ MAX_SKIPPED = 20
 
 
 class NonFiniteGuard:
-    """Warns of the first NaN or infinity of a run, says how to meet it again, and ends a run whose
+    """Warns of the first NaN or infinity of a run, says how to reproduce it, and ends a run whose
     updates are all skipped.
 
-    With several ranks, all call it at the same updates, and know the same of each other's numbers.
+    All ranks must call it at the same updates; they exchange their detections.
 
     Args:
         env: the environment.
-        learner: its `check` is read. Without one, only metrics are guarded.
-        make_hint: returns how to meet the first NaN or infinity again, as the rest of a sentence,
+        learner: its `check` is read. Without one, only metrics are checked.
+        make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,
             such as `repeat.hint`. Called on rank 0.
 
     Attributes:
         value: the first NaN or infinity of the run, or None.
-        hint: how to meet it again, or "".
+        hint: how to reproduce it, or "".
     """
 
     def __init__(self, env: Env, learner: Learner, make_hint: Callable[[NonFiniteValue], str]):
@@ -50,11 +50,11 @@ class NonFiniteGuard:
     def check(self, rollout: RolloutLike) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.
 
-        Warns about the first NaN or infinity of the run. Call it before a checkpoint is saved: the
-        last one is then from before the number.
+        Warns of the first NaN or infinity of the run. Call it before a checkpoint is saved, so that
+        the last checkpoint precedes the NaN.
 
         Args:
-            rollout: the latest one.
+            rollout: the latest rollout.
 
         Raises:
             NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
