@@ -51,17 +51,19 @@ def n_ranks(cfg: settings.Train) -> int:
         return 1
     info, n_gpus = environment.rank_info(), gpu.count() if cfg.device != "cpu" else 0
     if ":" in cfg.device:
-        text = f"{cfg.device!r} is one GPU, and ranks have one each; use device=cuda"
+        text = f"{cfg.device!r} names one GPU, but every rank needs its own; use device=cuda"
         raise ConfigErrors([("device", text)])
     if cfg.ranks == "all":
         if not n_gpus:
             where = "device=cpu" if cfg.device == "cpu" else "this machine has none"
-            text = f"'all' is every GPU, and {where}; give a number, such as ranks=2"
+            text = f"'all' uses every GPU, but {where}; give a number, such as ranks=2"
             raise ConfigErrors([("ranks", text)])
         return n_gpus
     if n_gpus and cfg.ranks > n_gpus and info is None:
         n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
-        text = f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all is one for each"
+        text = (
+            f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all uses each GPU once"
+        )
         raise ConfigErrors([("ranks", text)])
     return cfg.ranks
 
@@ -156,7 +158,7 @@ class Job:
         if [*self.folder.glob(f"pid-{self.attempt + 1}-*")]:
             ending = self.ending_of(self.attempt) or self.unknown_ending()
             self.attempt += 1
-            again = f"Starting again, {self.attempt} of restarts={self.cfg.restarts}"
+            again = f"Restarting, {self.attempt} of restarts={self.cfg.restarts}"
             problem = ending.text.partition(" To continue: ")[0]
             console.warn(" ".join(filter(None, [problem, f"{again}."])))
 
@@ -178,7 +180,7 @@ class Job:
         for rank, failure in failures.items():
             if failure.exitcode < 0:
                 name = signal.Signals(-failure.exitcode).name
-                text = f"was ended by {name}" + ", or too little memory" * (name == "SIGKILL")
+                text = f"was killed by {name}" + ", perhaps out of memory" * (name == "SIGKILL")
             else:
                 text = f"ended with exit code {failure.exitcode}"
             label = f"rank {rank} on {environment.hostname()}"
@@ -195,7 +197,7 @@ def hint(folder: Path | None) -> str:
     """Returns how to continue a run whose ranks were lost in the middle of an update."""
     if folder is None or not any((folder / "checkpoints").glob("*")):
         return "Nothing was saved yet"
-    return f"Its last checkpoint is whole. To continue: {folders.resume_command(folder)}"
+    return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
 
 
 def launch_ranks(n_ranks: int, n_restarts: int) -> None:

@@ -124,7 +124,7 @@ def joined() -> Iterator[Team | None]:
         console.is_silent = True
         console.prefix = f"{console.prefix}rank {info.rank} on {environment.hostname()}: "
     address = f"{os.environ.get('MASTER_ADDR')}:{os.environ.get('MASTER_PORT')}"
-    problem = f"The ranks cannot meet at {address}; is the port in use, or closed? "
+    problem = f"The ranks cannot connect to {address}; is the port in use, or closed? "
     with user_errors(problem, (RuntimeError, ValueError)):
         has_joined = process_group.n_ranks() == 1
         process_group.start()

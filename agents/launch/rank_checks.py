@@ -53,13 +53,13 @@ def check_world(cfg: settings.Train, trainer: Trainer) -> None:
             {"the digest of the training homes": digest(homes), **trainer.saver.config["spaces"]}
         )
         if difference := first_difference(trainer.policy):
-            raise UserError(f"The ranks begin with different weights: {difference}")
+            raise UserError(f"The ranks start with different weights: {difference}")
 
 
 def _check_equal(facts):
     if difference := first_differing_fact(facts):
         raise UserError(
-            f"The ranks differ: {difference}; start all with the same code, packages and words"
+            f"The ranks differ: {difference}; start all with the same code, packages and options"
         )
 
 

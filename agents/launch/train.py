@@ -95,7 +95,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(trainer.lost)))
             if is_first:
                 if clauses:
-                    console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
+                    console.say(f"Resuming, but not bit for bit: {'; '.join(clauses)}.")
                 folders.record_start(folder)
                 provenance.record(
                     folder, trainer.samples, device, package.version(), package.ROOT, hosts
@@ -112,15 +112,15 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             ):
                 trainer.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            saved = f"What was saved before is in {folder}{trainer.nonfinite_guard.hint}"
+            saved = f"Earlier checkpoints are in {folder}{trainer.nonfinite_guard.hint}"
             raise NonFinite(f"{error}. {saved}") from error
         except DriftError as error:
-            raise UserError(f"{error}. What was saved before is in {folder}") from error
+            raise UserError(f"{error}. Earlier checkpoints are in {folder}") from error
         except (MemoryError, RuntimeError) as error:
             problem = memory_problem(error)
             if not (problem or isinstance(error, engine.EngineError)):
                 raise
-            saved = trainer.saver.error or "What was learnt last could not be saved"
+            saved = trainer.saver.error or "The latest updates could not be saved"
             saved = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else saved
             reason = problem or str(error).partition("\n")[0].rstrip(".")
             raise UserError(f"{reason}. {saved}. {resume}") from error
@@ -150,7 +150,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         if nonfinite and nonfinite.is_from_env:
-            learnt = f"All else was learnt from, and is in {folder}"
+            learnt = f"All other rollouts were used; the run is in {folder}"
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
         if cfg.rerun and is_first:
             compare(folder, folders.folder_of(folders.find(cfg.rerun)))

@@ -83,7 +83,7 @@ class LossDetector:
             return None
         self.n_silent = self.n_silent + 1 if theirs == before else 0
         if self.n_silent * PERIOD > (BROKEN_SECONDS if is_broken else LOST_SECONDS):
-            return "does not answer: it was killed, or stopped, or the system ran out of memory"
+            return "does not answer: it was killed or suspended, or the system ran out of memory"
         is_ahead = ours.n_operations > theirs.n_operations and not theirs.is_exempt
         if is_ahead and theirs.n_operations == before.n_operations:
             self.n_ahead += 1

@@ -127,7 +127,7 @@ class Rollout:
         copy_all(pairs)
 
     def store_outcome(self, t: int, world: arrdict, layout: torch.Tensor | None = None) -> arrdict:
-        """Stores the world after the action of time t: reward, episode end and metrics in row t, the
+        """Stores the world after the action of time t: reward, episode end, metrics in row t, the
         observation in row t + 1. Returns `world(t + 1)`, the stored observation.
 
         Args:

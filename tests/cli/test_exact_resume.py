@@ -288,7 +288,7 @@ def test_resume_with_another_number_of_threads(here, capsys):
         torch.set_num_threads(1)
         engine.set_threads(None)
     lines = [line for line in capsys.readouterr().out.splitlines() if "bit for bit" in line]
-    assert lines == ["This run goes on, but not bit for bit: threads was 1 and is 2."]
+    assert lines == ["Resuming, but not bit for bit: threads was 1 and is 2."]
     for row, expected in zip(json_lines.read("run/metrics.jsonl"), alone, strict=True):
         assert row.pop("anneal") == expected.pop("anneal")
         assert row == pytest.approx(expected, rel=0.01, abs=0.01)

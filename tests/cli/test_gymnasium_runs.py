@@ -44,7 +44,7 @@ def test_train_evaluate_and_begin_new_episodes(here, capsys):
     assert [row["lanes"] for row in json.loads(table.read_text())["rows"]] == [8, 8]
     assert "Checkpoints cannot hold" not in capsys.readouterr().err
     assert train.main([f"resume={run}", "more_samples=32"]) == 0
-    assert "its environments were not saved, so new episodes begin" in capsys.readouterr().out
+    assert "environments were not saved, so new episodes start" in capsys.readouterr().out
     assert [row["samples"] for row in json_lines.read(run / "metrics.jsonl")] == [32, 64, 96]
 
 

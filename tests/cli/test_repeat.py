@@ -133,7 +133,7 @@ def test_the_learning_rate_of_another_clock_cannot_be_repeated(capsys):
     words = ["learner.anneal=seconds", "seconds=60"]
     assert train.main([*TINY, *PPO, f"samples={2 * UPDATE}", *words]) == 0
     _, hint = met(capsys, "resume=run", f"samples={12 * UPDATE}", "seconds=70")
-    clause = "the learning rate has followed another clock since the last one"
+    clause = "seconds= has changed since the last one, and with it the learning rate"
     assert hint == f". Checkpoints cannot repeat it, as {clause}"
 
 

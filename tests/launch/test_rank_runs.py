@@ -155,7 +155,7 @@ def test_another_number_of_ranks_goes_on(alone, here, capsys):
     assert line in capsys.readouterr().out
     assert not (here / "alone/checkpoints/step_1408/rank1.pt").exists()
     first, _ = ranks.train("resume=alone", "samples=1536", *NO_FINISH)
-    assert "ranks was 1 and is 2; ranks that it did not have begin new episodes." in first.stdout
+    assert "ranks was 1 and is 2; added ranks start new episodes." in first.stdout
     assert checkpoint.load_latest("alone/checkpoints/step_1536").n_ranks == 2
     states = whole(checkpoint.list_checkpoints("alone/checkpoints")[-1])
     generators = [state["learner"]["policy_generator"] for state in states.values()]
