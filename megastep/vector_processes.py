@@ -102,7 +102,7 @@ class VectorProcesses:
             answers = [pipe.recv() for pipe in self.pipes]
         except (EOFError, OSError):
             raise MemoryError(
-                "a process that steps environments was killed, perhaps for want of memory"
+                "a process that steps environments was killed, perhaps because memory ran out"
             ) from None
         for error in answers:
             if isinstance(error, str):

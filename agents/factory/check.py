@@ -92,7 +92,7 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
 #: Keys of earlier versions, with what took their place.
 GONE = {
     "preset": "values follow device=cpu or device=cuda, and what you type wins",
-    "nonfinite_replay": "a NaN is met again by resuming, with the command that is printed",
+    "nonfinite_replay": "resuming reproduces a NaN; the warning has the command",
 }
 
 

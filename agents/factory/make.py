@@ -181,7 +181,7 @@ def share_threads(width: int) -> None:
 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
     learner = construct(settings, policy=policy, seed=seed, graph=True)
-    with errors(f"{settings.name} is no learner: "):
+    with errors(f"{settings.name} is not a learner: "):
         check_learner(learner)
         try:
             checkpoint_format.check_plain(learner.state_dict(), "state_dict")

@@ -143,7 +143,7 @@ def _read(path):
     except safetensors.SafetensorError as error:
         problem = shortened(error)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        problem = str(error) if type(error) is ValueError else "not the header of an agent file"
+        problem = str(error) if type(error) is ValueError else "unexpected header"
     else:
         raise CheckpointError(
             f"{path} has format {version!r}, and this version of megastep reads {FORMAT}. Update "

@@ -48,7 +48,7 @@ def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
             if "seconds" not in changed or trainer.budget.anneal != "seconds":
                 path = _keep(whole[-1], run, trainer)
                 words = [f"{key}={'null' if now is None else now}" for key, now in changed.items()]
-                return f". To see it again: {' '.join([folders.resume_command(path), *words])}"
+                return f". To reproduce it: {' '.join([folders.resume_command(path), *words])}"
             reason = "seconds= has changed since the last one, and with it the learning rate"
     except (OSError, UserError) as error:
         return f". The checkpoint before it could not be kept ({error})"
@@ -56,7 +56,7 @@ def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
     # rerun needs a checkpoint at the end, and a policy that diverged is not saved
     if is_resumed or not value.is_from_env:
         return why
-    how = "To try from the start" if reason else "To see it again"
+    how = "To try from the start" if reason else "To reproduce it"
     return f"{why}. {how}, once this run has ended: {folders.resume_command(run, 'rerun')}"
 
 

@@ -143,7 +143,7 @@ def test_folder_that_is_no_text(here, monkeypatch, capsys):
     monkeypatch.chdir(here / "r\udcff")
     assert train.main([*SHORT, "-m", "seed=1,2"]) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
-    assert "is no text in this locale" in sentence and not any((here / "r\udcff").iterdir())
+    assert "is not valid text in this locale" in sentence and not any((here / "r\udcff").iterdir())
 
 
 def test_table_stands_while_jobs_run(here, monkeypatch):
