@@ -41,7 +41,7 @@ TWO_GPUS = [
         (["ranks=3", "device=auto"], 1, "ranks: 3 is more than the 1 GPU "),
         (["ranks=all", "device=auto"], 0, "ranks: 'all' uses every GPU, but this machine has none"),
         (["ranks=all", "device=cpu"], 2, "device=cpu; give a number"),
-        (["ranks=2", "device=cuda:1"], 2, "device: 'cuda:1' is one GPU"),
+        (["ranks=2", "device=cuda:1"], 2, "device: 'cuda:1' names one GPU"),
         (["ranks=0"], 2, "ranks: 0 is not a number of ranks"),
         (["ranks=many"], 2, "ranks: 'many' is not a number of ranks"),
     ],
