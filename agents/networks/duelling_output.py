@@ -22,7 +22,7 @@ class DuellingOutput(Output):
     """Action values (..., A, n) of a duelling network (Wang et al. 2016): the lane's value plus
     advantages minus their mean, each behind a hidden layer, in whatever scale a learner fits.
 
-    The action values take the place of `logits`. `sample` is epsilon-greedy: a policy that is
+    Action values replace `logits`. `sample` is epsilon-greedy: a policy that is
     always greedy can stand before a wall forever. `action_value` (...,) belongs to the lane's joint
     action, the sum over its agents (VDN, Sunehag et al. 2018).
 
