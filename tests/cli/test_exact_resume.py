@@ -300,7 +300,7 @@ def test_format_6_is_migrated(here, capsys):
     assert entry.run_command("inspect", ["run"]) == 0 and "format 6" in capsys.readouterr().out
     saved = checkpoint.load_latest("run/checkpoints").state
     run("resume=run", "more_samples=96")
-    assert "not bit for bit: its environments were not saved" in capsys.readouterr().out
+    assert "not bit for bit: environments were not saved" in capsys.readouterr().out
     state = checkpoint.load_latest("run/checkpoints").state
     assert state["updates"] == saved["updates"] + 2
     assert state["learner"]["optimizer"]["n_steps"] > saved["learner"]["optimizer"]["n_steps"]

@@ -1,4 +1,4 @@
-"""A run's NaN or infinity, met again by the command that its warning names."""
+"""A run's NaN or infinity is reproduced by the command that its warning names."""
 
 import os
 import shlex
