@@ -37,7 +37,7 @@ from megastep.settings import closest
 LONGEST, MOST_BRACKETS = 200, 40
 #: Bytes that the locale's encoding does not have.
 UNDECODED = re.compile(r"[\ud800-\udfff]")
-NO_TEXT = "is no text in this locale; PYTHONUTF8=1 reads UTF-8"
+NO_TEXT = "is not valid text in this locale; PYTHONUTF8=1 reads UTF-8"
 #: An element of a value with = in it, as folders of sweeps have, and what quotes it.
 WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
 #: Members of Hydra's own groups that come with the optional dependencies.
@@ -189,8 +189,8 @@ class Composer:
         keys += ["resume"] * (word == "latest" or "/" in word)
         keys = groups + [key for key in keys if key in names]
         if not word or not keys:
-            return "is no key=value; --cfg job prints all keys"
-        return f"is no key=value; did you mean {keys[0]}={word}?"
+            return "is not key=value; --cfg job prints all keys"
+        return f"is not key=value; did you mean {keys[0]}={word}?"
 
     def config(self, overrides: list[types.Override]) -> tuple[DictConfig, list[tuple[str, str]]]:
         """Returns (the configuration, the errors of words that are not in it)."""

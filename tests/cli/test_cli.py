@@ -136,4 +136,4 @@ def test_folder_that_the_locale_cannot_spell(tmp_path, monkeypatch):
     assert [checkpoint.load_latest(path).step for path in (first, latest)] == [64, 32]
     assert (latest.parent / "video.mp4").exists() and any(latest.parent.glob("evaluations/*.json"))
     code, _, err = finished("train", *TINY, "folder='ü'", cwd=folder, **ascii_only)
-    assert code == 2 and "is no text in this locale" in err and "Traceback" not in err
+    assert code == 2 and "is not valid text in this locale" in err and "Traceback" not in err

@@ -289,7 +289,7 @@ def test_resume_with_another_number_of_threads(here, capsys):
         torch.set_num_threads(1)
         engine.set_threads(None)
     lines = [line for line in capsys.readouterr().out.splitlines() if "bit for bit" in line]
-    assert lines == ["This run goes on, but not bit for bit: threads was 1 and is 2."]
+    assert lines == ["Resuming, but not bit for bit: threads was 1 and is 2."]
     for row, expected in zip(json_lines.read("run/metrics.jsonl"), alone, strict=True):
         assert row.pop("anneal") == expected.pop("anneal")
         assert row == pytest.approx(expected, rel=0.01, abs=0.01)
@@ -301,7 +301,7 @@ def test_format_6_is_migrated(here, capsys):
     assert entry.run_command("inspect", ["run"]) == 0 and "format 6" in capsys.readouterr().out
     saved = checkpoint.load_latest("run/checkpoints").state
     run("resume=run", "more_samples=96")
-    assert "not bit for bit: its environments were not saved" in capsys.readouterr().out
+    assert "not bit for bit: environments were not saved" in capsys.readouterr().out
     state = checkpoint.load_latest("run/checkpoints").state
     assert state["updates"] == saved["updates"] + 2
     assert state["learner"]["optimizer"]["n_steps"] > saved["learner"]["optimizer"]["n_steps"]

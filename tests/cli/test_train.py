@@ -286,7 +286,7 @@ def test_error_on_the_device_names_the_environment_and_keeps_what_was_learnt(
     assert f"All {UPDATE} samples are saved" in text
     # the damaged environments are not saved: a resumed run begins new episodes
     assert train.main(["resume=run", f"samples={2 * UPDATE}"]) == 0
-    assert "new episodes begin" in capsys.readouterr().out
+    assert "new episodes start" in capsys.readouterr().out
 
 
 def inject(monkeypatch, name, step, value, lane=2):
