@@ -18,6 +18,8 @@ from megastep.engine.launch_params import (
     state_params,
     texel_bits,
 )
+from megastep.engine.object_updates import update_objects
+from megastep.engine.objects import object_params
 from megastep.engine.outputs import Observation, Render
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
@@ -60,6 +62,7 @@ def render(scenery: Scenery, agents: Agents) -> Render:
     Also updates the agents' lines in ``scenery``. Training uses :func:`observe`, which is faster.
     """
     update_agent_geometry(scenery, agents)
+    update_objects(scenery, agents)
     device, shape = scenery.device, (*_per_camera(lanes_of(scenery, agents), agents), agents.res)
     out = Render(
         indices=torch.empty(shape, dtype=torch.int32, device=device),
@@ -116,6 +119,7 @@ def observe(
         seen_fields = _seen_fields(scenery, seen, clear_mask)
     if a > 1:
         update_agent_geometry(scenery, agents, lit=rgb)
+    update_objects(scenery, agents)
     shape, pixels = _per_camera(lanes, agents), agents.res // subsample
     half, int32 = torch.float16, torch.int32
     out = Observation(
@@ -153,6 +157,8 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     n = scenery.n_envs * scenery.n_agents
     kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
     n_per_block = 1 if kernel == "render_split" else BLOCK // WARP
+    if scenery.objects is not None and device.type != "cpu":  # where one kernel does both
+        kernel = kernel.replace("render", "render_objects")
     launch(
         *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared * n_per_block)),
         scenery=scenery_params(scenery, agents.radius),
@@ -174,6 +180,7 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
         n_pixels=res // subsample,
         inv_subsample=1 / subsample,
         inv_max_depth=1 / max_depth,
+        objects=object_params(scenery),
         **{**_OPTIONAL, **outputs},
     )
     check_on_cpu(agents)

@@ -17,6 +17,24 @@ HD float sweep_agent(const PhysicsParams& p, int k, float px, float py, float dx
     return sweep_point(px - kx, py - ky, dx - other_dx, dy - other_dy, 2.f * rho);
 }
 
+// The fraction of the step d after which an agent at p touches object i, if that is an obstacle.
+HD float sweep_object(const ObjectsParams& o, int i, float px, float py, float dx, float dy,
+                      float rho) {
+    if (!is_obstacle(o, i))
+        return NO_CONTACT;
+    int shape = o.shapes[i % o.n_objects];
+    float size = o.sizes[i], contact = NO_CONTACT;
+    if (shape == DISC)
+        return sweep_point(px - o.positions[2 * i], py - o.positions[2 * i + 1], dx, dy,
+                           rho + size);
+    Pose pose = pose_of(o, i);
+    for (int k = 0; k < n_lines_of(shape); k++) {
+        Float4 line = line_of(shape, k, size, pose);
+        contact = minf(contact, sweep_segment(px, py, dx, dy, line.x, line.y, line.z, line.w, rho));
+    }
+    return contact;
+}
+
 HD float progress_of(float contact) {
     return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
 }

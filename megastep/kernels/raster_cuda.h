@@ -135,7 +135,7 @@ DEVICE void raster_group(View<is_split>& v, const Float4* ends, int line, int ac
 // Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
 // skipped. The others come nearest first, so that groups entirely behind earlier ones can be
 // skipped too.
-template <int is_split>
+template <int drawn, int is_split>
 DEVICE void raster_walls(View<is_split>& v, const SceneryParams& s, const EnvScenery& scenery,
                          float half_width) {
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
@@ -163,7 +163,7 @@ DEVICE void raster_walls(View<is_split>& v, const SceneryParams& s, const EnvSce
                 continue;  // the box is entirely behind earlier ones
             int l = BOX_WALLS * (start + k);
             raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
-                         scenery.n_agent_lines + l, l + v.warp_lane < scenery.n_walls);
+                         first_static_line<drawn>(scenery) + l, l + v.warp_lane < scenery.n_walls);
         }
     }
 }
@@ -176,5 +176,16 @@ DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvSc
         int l = first + v.warp_lane;
         int active = l < scenery.n_agent_lines && l / s.n_model != a;
         raster_group(v, (const Float4*)scenery.agent_lines + l, first, active);
+    }
+}
+
+// Rasterises the lines of all objects except those that agent a carries.
+template <int is_split>
+DEVICE void raster_objects(View<is_split>& v, const EnvScenery& scenery, int a) {
+    for (int first = 0; first < scenery.n_object_lines; first += WARP) {
+        int l = first + v.warp_lane;
+        int active = l < scenery.n_object_lines && scenery.carriers[scenery.line_object[l]] != a;
+        raster_group(v, (const Float4*)scenery.object_lines + l, scenery.n_agent_lines + first,
+                     active);
     }
 }

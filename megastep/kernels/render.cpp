@@ -87,10 +87,11 @@ static void raster_span(PixelSpan span, int index, float* inverse, int* indices)
     }
 }
 
-// Rasterises n lines except [skip_first, skip_end), the agent's own. `offset` is the index of the
-// first line in the environment.
+// Rasterises n lines except those for which `is_skipped(line)`. `offset` is the index of the first
+// line in the environment.
+template <class IsSkipped>
 static void raster_lines(const Pose& camera, const Screen& screen, const RenderParams& p,
-                         const float* lines, int n, int offset, int skip_first, int skip_end,
+                         const float* lines, int n, int offset, IsSkipped is_skipped,
                          Scratch& scratch) {
     Projections& spans = scratch.projections;
     if ((int)scratch.visible.size() < n) {
@@ -118,7 +119,7 @@ static void raster_lines(const Pose& camera, const Screen& screen, const RenderP
     }
     for (int i = 0; i < n_visible; i++) {
         int l = scratch.visible[i];
-        if (l >= skip_first && l < skip_end)
+        if (is_skipped(l))
             continue;
         PixelSpan span = {firsts[l], ends[l], bases[l], gains[l]};
         if (nears[l])
@@ -143,7 +144,7 @@ static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, cons
     for (auto [line, first, end] : rays.runs) {
         Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
         if (line >= 0)
-            surface = surface_of<1>(p.scenery, scenery, camera, line);
+            surface = surface_of<OBJECTS>(p.scenery, scenery, camera, line);
         int n = end - first;
         std::fill_n(&rays.ax[first], n, surface.ax);
         std::fill_n(&rays.ay[first], n, surface.ay);
@@ -207,12 +208,21 @@ static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int 
     }
 }
 
+static void object_samples(const EnvScenery& scenery, Rays& rays, int first, int end) {
+    for (int r = first; r < end; r++) {
+        Colour colour = object_colour(scenery, rays.first_texel[r], {0.f, rays.facing[r]});
+        rays.samples[r] = Four{colour.red, colour.green, colour.blue, rays.depth[r]};
+    }
+}
+
 static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays) {
     for (auto [line, first, end] : rays.runs) {
         if (line < 0)
             std::fill_n(&rays.samples[first], end - first, Four{});
         else if (line < scenery.n_agent_lines)
             agent_samples(scenery, rays, first, end);
+        else if (line < first_static_line<OBJECTS>(scenery))
+            object_samples(scenery, rays, first, end);
         else
             wall_samples(p.scenery, rays, first, end);
     }
@@ -221,18 +231,19 @@ static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays&
 // Returns the number of newly seen texels. Nearly all were seen before, so blocks of rays are
 // tested for others first.
 static int mark_all_seen(const EnvScenery& scenery, Rays& rays, unsigned int* seen) {
-    int newly_seen = 0, n_agent_lines = scenery.n_agent_lines, first_texel = scenery.first_texel;
+    int newly_seen = 0, first_line = first_static_line<OBJECTS>(scenery);
+    int first_texel = scenery.first_texel;
     const int *index = rays.index.data(), *texel = rays.texel.data();
     for (int block = 0; block < (int)rays.index.size(); block += BLOCK_RAYS) {
         unsigned int unseen = 0;
 #pragma omp simd reduction(| : unseen)
         for (int i = 0; i < BLOCK_RAYS; i++) {
             int r = block + i, at = texel[r] - first_texel;
-            if (index[r] >= n_agent_lines)
+            if (index[r] >= first_line)
                 unseen |= ~seen[at >> 5] & 1u << (at & 31);
         }
         for (int r = block; unseen && r < block + BLOCK_RAYS; r++)
-            if (index[r] >= n_agent_lines)
+            if (index[r] >= first_line)
                 newly_seen += mark_seen(seen, texel[r] - first_texel);
     }
     return newly_seen;
@@ -311,10 +322,16 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
     std::fill(rays.inverse.begin(), rays.inverse.end(), 0.f);
     std::fill(rays.index.begin(), rays.index.end(), -1);
     if (s.n_agents > 1)
-        raster_lines(camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
-                     a * s.n_model, (a + 1) * s.n_model, scratch);
-    raster_lines(camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
-                 scenery.n_agent_lines, 0, 0, scratch);
+        raster_lines(
+            camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
+            [&](int l) { return l / s.n_model == a; }, scratch);
+    if (scenery.n_object_lines)
+        raster_lines(
+            camera, screen, p, scenery.object_lines, scenery.n_object_lines, scenery.n_agent_lines,
+            [&](int l) { return scenery.carriers[scenery.line_object[l]] == a; }, scratch);
+    raster_lines(
+        camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
+        first_static_line<OBJECTS>(scenery), [](int) { return false; }, scratch);
     if (p.centre_line)
         p.centre_line[view] = rays.index[p.res / 2];
     if (p.agent_ray)
@@ -337,6 +354,8 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
+    if (p.objects.n_objects)
+        add_objects(scenery, p.objects, env);
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);
     if (p.imu)

@@ -57,7 +57,7 @@ HD void write_miss(const RenderParams& p, long long ray) {
 // Shades ray r of camera `view`, which hits a surface at this inverse depth. Writes the
 // full-resolution outputs if `full_res`, and adds to newly_seen a texel that is seen for the first
 // time.
-template <int full_res>
+template <int full_res, int drawn>
 HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvScenery& scenery,
                        const Surface& surface, int view, unsigned int* seen, int r,
                        float inverse_depth, int& newly_seen) {
@@ -67,13 +67,13 @@ HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvSce
     Hit hit = hit_of(surface, y, length);
     RaySample sample = {0.f, 0.f, 0.f, depth_reading(distance, screen.radius, p.inv_max_depth)};
     if (p.rgb || (full_res && p.screen)) {
-        Colour colour = surface.is_agent ? agent_colour(scenery, first, width, hit)
-                                         : wall_colour(p.scenery, first, width, hit);
+        Colour colour = surface.kind ? moving_colour<drawn>(scenery, surface, hit)
+                                     : wall_colour(p.scenery, first, width, hit);
         sample.red = colour.red;
         sample.green = colour.green;
         sample.blue = colour.blue;
     }
-    if (seen && !surface.is_agent)
+    if (seen && !surface.kind)
         newly_seen += mark_seen(seen, first - scenery.first_texel + texel_at(hit.location, width));
     if (!full_res)
         return sample;

@@ -10,6 +10,11 @@ struct EnvScenery {
     const float* agent_textures;
     const float* agent_light;
     int first_box, first_wall, n_walls, n_agent_lines, first_texel;
+    int n_object_lines;
+    const float* object_lines;
+    const float* object_texels;
+    const int* line_object;
+    const int* carriers;
 };
 
 HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
@@ -22,21 +27,55 @@ HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
             first,
             s.wall_starts[layout + 1] - first,
             n_agent_lines,
-            s.texel_starts[first]};
+            s.texel_starts[first],
+            0,
+            nullptr,
+            nullptr,
+            nullptr,
+            nullptr};
 }
 
-// A line hit by rays: its start and direction in the camera's frame, and its texels.
+// Adds an environment's objects to its scenery. Their lines come between the agents' and the walls.
+HD void add_objects(EnvScenery& scenery, const ObjectsParams& o, int env) {
+    scenery.n_object_lines = o.n_lines;
+    scenery.object_lines = o.lines + 4 * (env * (long long)o.n_lines);
+    scenery.object_texels = o.texels + 4 * (env * (long long)o.n_objects);
+    scenery.line_object = o.line_object;
+    scenery.carriers = o.carriers + env * (long long)o.n_objects;
+}
+
+// What is drawn beside walls, at most: nothing, agents, or agents and objects.
+constexpr int AGENTS = 1;
+constexpr int OBJECTS = 2;
+
+// The first wall's index among an environment's lines.
+template <int drawn>
+HD int first_static_line(const EnvScenery& scenery) {
+    return drawn == OBJECTS ? scenery.n_agent_lines + scenery.n_object_lines
+                            : scenery.n_agent_lines;
+}
+
+// A line hit by rays: its start and direction in the camera's frame, and its texels. `kind`: 0 of a
+// wall, AGENTS, OBJECTS.
 struct Surface {
     float ax, ay, vx, vy;
-    int first_texel, width, is_agent;
+    int first_texel, width, kind;
 };
 
-// Line l of an environment; agents' lines come first. If not `has_agents`, it is always a wall.
-template <int has_agents>
+// Line l of an environment: agents' come first, then objects', then walls.
+template <int drawn>
 HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const Pose& camera,
                       int l) {
-    int is_agent = has_agents && l < scenery.n_agent_lines;
-    int i = is_agent ? l : l + (scenery.first_wall - scenery.n_agent_lines);
+    if (drawn == OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(scenery)) {
+        int i = l - scenery.n_agent_lines;
+        Float4 line = LOAD((const Float4*)scenery.object_lines + i);
+        float ax, ay, bx, by;
+        to_camera(camera, line.x, line.y, ax, ay);
+        to_camera(camera, line.z, line.w, bx, by);
+        return {ax, ay, bx - ax, by - ay, scenery.line_object[i], 1, OBJECTS};
+    }
+    int is_agent = drawn && l < scenery.n_agent_lines;
+    int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(scenery));
     Float4 line = LOAD((const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i);
     const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;
     float ax, ay, bx, by;
@@ -111,4 +150,19 @@ HD Colour agent_colour(const EnvScenery& scenery, int first, int width, const Hi
     Filter f = filter_at(hit.location, width);
     return blend(agent_texel(scenery, first + f.left), agent_texel(scenery, first + f.right),
                  f.weight, hit.facing);
+}
+
+// An object has one texel, which all its lines show.
+HD Colour object_colour(const EnvScenery& scenery, int object, const Hit& hit) {
+    Float4 texel = LOAD((const Float4*)scenery.object_texels + object);
+    float light = texel.w * hit.facing;
+    return {texel.x * light, texel.y * light, texel.z * light};
+}
+
+// The colour where a ray hits an agent or an object.
+template <int drawn>
+HD Colour moving_colour(const EnvScenery& scenery, const Surface& surface, const Hit& hit) {
+    if (drawn == OBJECTS && surface.kind == OBJECTS)
+        return object_colour(scenery, surface.first_texel, hit);
+    return agent_colour(scenery, surface.first_texel, surface.width, hit);
 }

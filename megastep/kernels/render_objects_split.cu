@@ -1,0 +1,12 @@
+// Does what render_split.cu does, with objects.
+#include "render_cuda.h"
+
+KERNEL BOUNDS(18) render_objects_split(RenderParams p) {
+    wait_for_previous();
+    extern __shared__ NearestLine nearest[];
+    __shared__ PixelSpan spans[BLOCK];
+    __shared__ int newly_seen_by_warp[BLOCK / WARP];
+    int warp_lane = threadIdx.x % WARP;
+    PixelSpan* warp_spans = spans + (threadIdx.x - warp_lane);
+    render_agent<0, OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest, newly_seen_by_warp);
+}
