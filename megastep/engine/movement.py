@@ -62,7 +62,7 @@ def physics(
         actions_at, controls_at = _addresses(actions, lanes, n_moves, device)
     progress = torch.empty(lanes, device=device)
     kernel = _kernel(n, device)
-    if scenery.objects is not None and device.type != "cpu":  # where one kernel does both
+    if scenery.objects is not None:
         kernel = "physics_objects"
     threads_per_env = _threads_per_env(n, device)
     launch(

@@ -20,7 +20,7 @@ __all__ = ["SHAPES", "Objects", "check_objects", "object_params"]
 
 #: {shape: number of lines it is drawn with}.
 SHAPES = {"disc": 6, "crate": 4, "door": 1}
-_NUMBERS = {name: ENGINE.constants[name.upper()] for name in SHAPES}
+NUMBERS = {name: ENGINE.constants[name.upper()] for name in SHAPES}
 MAX_OBJECTS = 1024  # per environment
 _KINDS = ENGINE.constants["OBJECT_ERROR_KINDS"]
 _MESSAGES = dict(
@@ -100,7 +100,7 @@ class Objects(SetOnce):
         self.visible, self.solid, self.open = (full(dtype=torch.bool) for _ in range(3))
         self.carriers = full(value=-1, dtype=torch.int32)
         widths = torch.tensor([SHAPES[shape] for shape in shapes])
-        self.shapes = torch.tensor([_NUMBERS[s] for s in shapes], dtype=torch.int32, device=device)
+        self.shapes = torch.tensor([NUMBERS[s] for s in shapes], dtype=torch.int32, device=device)
         self.line_starts = torch.cat([widths[:1] * 0, widths.cumsum(0)]).int().to(device)
         objects = torch.arange(len(shapes), dtype=torch.int32)
         self.line_object = objects.repeat_interleave(widths).to(device)

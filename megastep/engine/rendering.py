@@ -157,7 +157,7 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     n = scenery.n_envs * scenery.n_agents
     kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
     n_per_block = 1 if kernel == "render_split" else BLOCK // WARP
-    if scenery.objects is not None and device.type != "cpu":  # where one kernel does both
+    if scenery.objects is not None:
         kernel = kernel.replace("render", "render_objects")
     launch(
         *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared * n_per_block)),

@@ -72,7 +72,7 @@ def spawn(
         cumulative_at = checks.address("cumulative", cumulative, (n_layouts,), torch.int32, device)
     is_hidden, n_envs = checks.flag("hidden", hidden), scenery.n_envs
     kernel, n_threads = ("spawn_hidden", WARP * n_envs) if is_hidden else ("spawn", n_envs)
-    if scenery.objects is not None and device.type != "cpu":  # where one kernel does both
+    if scenery.objects is not None:
         kernel += "_objects"
     launch(
         *(ENGINE, kernel, device, n_threads),

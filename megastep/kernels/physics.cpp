@@ -72,3 +72,5 @@ KERNEL physics(const PhysicsParams& p) {
             step(p, env, meets);
     }
 }
+
+KERNEL physics_objects(const PhysicsParams& p) { physics(p); }

@@ -381,3 +381,5 @@ KERNEL render(const RenderParams& p) {
             render_agent(p, agent, scratch);
     }
 }
+
+KERNEL render_objects(const RenderParams& p) { render(p); }

@@ -13,3 +13,5 @@ KERNEL spawn(const SpawnParams& p) {
         else
             spawn_env<0, 0>(p, SingleThread{0}, env);
 }
+
+KERNEL spawn_objects(const SpawnParams& p) { spawn(p); }

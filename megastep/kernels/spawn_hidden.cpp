@@ -9,3 +9,5 @@ KERNEL spawn_hidden(const SpawnParams& p) {
         else
             spawn_env<1, 0>(p, SingleThread{0}, env);
 }
+
+KERNEL spawn_hidden_objects(const SpawnParams& p) { spawn_hidden(p); }
