@@ -14,6 +14,7 @@ from megastep.capture import state_tree
 from megastep.geometries import toys
 from megastep.geometries.sources import homes
 from megastep.kernels.build import compile
+from megastep.modules.spawning import cached_points
 from tests.helpers import twin
 from tests.helpers.cuda_on_cpu import ORDERS
 
@@ -119,7 +120,7 @@ def test_cameras_see_objects_as_the_twin_does(lit):
             colours = PALETTE.double()[o.colours[e, k].long()] * light[k][:, None] * facing
             seen = view.screen[e, a][same].double()
             torch.testing.assert_close(seen[is_object], colours[is_object], rtol=0, atol=2e-3)
-    assert n_same > 0.99 * n_rays and n_of_objects > 0.05 * n_rays
+    assert n_same > 0.99 * n_rays and n_of_objects > 0.03 * n_rays
     lines = scenery.lines[0]
     assert torch.equal(lines, scenery.env(0)[0]) and len(lines) == len(scenery.env(0)[1])
     first = scenery.agent_lines.shape[1]
@@ -141,7 +142,7 @@ def test_observations_are_means_of_rays_with_objects():
 
 def test_agents_stop_at_solid_objects_as_in_the_twin():
     n_stopped = 0
-    for seed in range(8):
+    for seed in range(12):
         scenery, agents = world(seed=seed)
         o, before = scenery.objects, {k: getattr(agents, k).double() for k in MOVING}
         expected = []
@@ -213,7 +214,7 @@ def same_bits(ours, theirs):
 def test_cuda_kernels_on_a_cpu_agree_on_every_bit(case, amount, cuda_on_cpu, monkeypatch):
     expected = trajectory("cpu", **case)
     cuda_on_cpu.install(monkeypatch)
-    room = {"few": 10**6, "some": 100, "many": 1}[amount]
+    room = {"few": 10**6, "some": 200, "many": 1}[amount]
     monkeypatch.setattr(engine.rendering, "n_resident_threads", lambda device: room)
     for order in ORDERS:
         monkeypatch.setattr(cuda_on_cpu, "order", order)
@@ -236,8 +237,6 @@ def test_placed_objects_keep_clear_of_agents_and_of_each_other(device):
     o.carriers.fill_(-1)
     o.sizes.fill_(0.15)
     plans = homes(3, seed=1)
-    from megastep.modules.spawning import cached_points
-
     points = torch.as_tensor(cached_points(plans, 128, 1, 0.15, 3), device=device)
     counts = torch.zeros_like(o.carriers)
     mask = torch.zeros_like(o.visible)
@@ -249,8 +248,8 @@ def test_placed_objects_keep_clear_of_agents_and_of_each_other(device):
     apart = torch.cdist(o.positions[::2], o.positions[::2]) + 9 * torch.eye(6, device=device)
     assert apart.min() >= 0.35 - 1e-5
     assert torch.cdist(o.positions[::2], agents.positions[::2]).min() >= 0.2 + agents.radius - 1e-5
-    among = torch.cdist(o.positions[::2].flatten(0, 1), points.flatten(0, 1)).min(1).values
-    assert among.max() == 0, "at points of the layout"
+    among = o.positions[::2, :, None] == points[scenery.layout.long()[::2], None]
+    assert among.all(-1).any(-1).all(), "at points of the layout"
     moved = o.positions.clone()
     engine.place_objects(scenery, agents, mask, points, counts, 9)
     assert not torch.equal(moved[::2], o.positions[::2]), "another draw"
