@@ -27,6 +27,7 @@ from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
 __all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
+MAX_DRAWN_LINES = ENGINE.constants["MAX_DRAWN_LINES"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
 #: Agents are many if they need more threads than this many times those that a GPU runs at once, by
 #: what is faster on an H200.
@@ -91,7 +92,7 @@ def observe(
     """Renders what training needs, in one pass and without full-resolution tensors.
 
     Equals :func:`render` followed by the sensors of :mod:`~megastep.modules`. With one agent per
-    environment, ``scenery.lines`` is not updated.
+    environment, ``scenery.lines`` is not updated, nor are few unlit objects' lines.
 
     Args:
         subsample: rays per pixel, a divisor of ``agents.res``; at most 32.
@@ -119,7 +120,6 @@ def observe(
         seen_fields = _seen_fields(scenery, seen, clear_mask)
     if a > 1:
         update_agent_geometry(scenery, agents, lit=rgb)
-    update_objects(scenery, agents)
     shape, pixels = _per_camera(lanes, agents), agents.res // subsample
     half, int32 = torch.float16, torch.int32
     out = Observation(
@@ -130,9 +130,19 @@ def observe(
         imu=torch.empty((n, a, 3), dtype=half, device=device) if imu else None,
         newly_seen=torch.empty(lanes, dtype=int32, device=device) if seen_fields else None,
     )
+    draws_objects = _draws_objects(scenery)
+    if not draws_objects:
+        update_objects(scenery, agents)
     moving = state_params(scenery, agents, "velocity", "angvelocity") if imu else {}
-    _render(scenery, agents, subsample, max_depth, **moving, **seen_fields, **out._asdict())
+    optional = {**moving, **seen_fields, **out._asdict()}
+    _render(scenery, agents, subsample, max_depth, draws_objects, **optional)
     return out
+
+
+def _draws_objects(scenery):
+    """Returns True if the kernel that renders also draws the objects: few lines, unlit."""
+    objects = scenery.objects
+    return objects is not None and not objects.lit and len(objects.line_object) <= MAX_DRAWN_LINES
 
 
 def _per_camera(lanes, agents):
@@ -150,7 +160,7 @@ def _seen_fields(scenery, seen, clear_mask):
     return dict(seen=address, clear_mask=mask, n_words=n_words)
 
 
-def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
+def _render(scenery, agents, subsample=1, max_depth=10.0, draws_objects=False, **outputs):
     res, device = agents.res, scenery.device
     half_width = math.tan(math.radians(agents.fov / 2))
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
@@ -181,6 +191,7 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
         inv_subsample=1 / subsample,
         inv_max_depth=1 / max_depth,
         objects=object_params(scenery),
+        draws_objects=int(draws_objects),
         **{**_OPTIONAL, **outputs},
     )
     check_on_cpu(agents)

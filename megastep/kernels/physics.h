@@ -23,10 +23,12 @@ HD float sweep_object(const ObjectsParams& o, int i, float px, float py, float d
     if (!is_obstacle(o, i))
         return NO_CONTACT;
     int shape = o.shapes[i % o.n_objects];
-    float size = o.sizes[i], contact = NO_CONTACT;
+    float x = o.positions[2 * i], y = o.positions[2 * i + 1], size = o.sizes[i];
+    float contact = NO_CONTACT, reach = rho + 1.5f * size;  // beyond a crate's corners
+    if (!boxes_meet(px, py, dx, dy, x, y, x, y, reach))
+        return NO_CONTACT;
     if (shape == DISC)
-        return sweep_point(px - o.positions[2 * i], py - o.positions[2 * i + 1], dx, dy,
-                           rho + size);
+        return sweep_point(px - x, py - y, dx, dy, rho + size);
     Pose pose = pose_of(o, i);
     for (int k = 0; k < n_lines_of(shape); k++) {
         Float4 line = line_of(shape, k, size, pose);

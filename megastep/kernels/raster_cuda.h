@@ -181,11 +181,13 @@ DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvSc
 
 // Rasterises the lines of all objects except those that agent a carries.
 template <int is_split>
-DEVICE void raster_objects(View<is_split>& v, const EnvScenery& scenery, int a) {
+DEVICE void raster_objects(View<is_split>& v, const ObjectsParams& o, const EnvScenery& scenery,
+                           int a) {
     for (int first = 0; first < scenery.n_object_lines; first += WARP) {
         int l = first + v.warp_lane;
-        int active = l < scenery.n_object_lines && scenery.carriers[scenery.line_object[l]] != a;
-        raster_group(v, (const Float4*)scenery.object_lines + l, scenery.n_agent_lines + first,
-                     active);
+        int active = l < scenery.n_object_lines;
+        if (active && !scenery.is_drawn)
+            active = o.carriers[scenery.first_object + o.line_object[l]] != a;
+        raster_group(v, scenery.object_lines + l, scenery.n_agent_lines + first, active);
     }
 }

@@ -61,6 +61,7 @@ struct Scratch {
     std::vector<float> sums;
     std::vector<unsigned short> halves;
     Rays rays;
+    std::vector<Float4> object_lines;
 };
 
 // Rasterises a near-clipped line, which is invisible where it is within the radius.
@@ -208,9 +209,11 @@ static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int 
     }
 }
 
-static void object_samples(const EnvScenery& scenery, Rays& rays, int first, int end) {
+static void object_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays, int first,
+                           int end) {
     for (int r = first; r < end; r++) {
-        Colour colour = object_colour(scenery, rays.first_texel[r], {0.f, rays.facing[r]});
+        Surface surface = {0.f, 0.f, 0.f, 0.f, rays.first_texel[r], 1, OBJECTS};
+        Colour colour = moving_colour<OBJECTS>(p.objects, scenery, surface, {0.f, rays.facing[r]});
         rays.samples[r] = Four{colour.red, colour.green, colour.blue, rays.depth[r]};
     }
 }
@@ -222,7 +225,7 @@ static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays&
         else if (line < scenery.n_agent_lines)
             agent_samples(scenery, rays, first, end);
         else if (line < first_static_line<OBJECTS>(scenery))
-            object_samples(scenery, rays, first, end);
+            object_samples(p, scenery, rays, first, end);
         else
             wall_samples(p.scenery, rays, first, end);
     }
@@ -327,8 +330,13 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
             [&](int l) { return l / s.n_model == a; }, scratch);
     if (scenery.n_object_lines)
         raster_lines(
-            camera, screen, p, scenery.object_lines, scenery.n_object_lines, scenery.n_agent_lines,
-            [&](int l) { return scenery.carriers[scenery.line_object[l]] == a; }, scratch);
+            camera, screen, p, (const float*)scenery.object_lines, scenery.n_object_lines,
+            scenery.n_agent_lines,
+            [&](int l) {
+                int i = scenery.first_object + scenery.line_object[l];
+                return !scenery.is_drawn && p.objects.carriers[i] == a;
+            },
+            scratch);
     raster_lines(
         camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
         first_static_line<OBJECTS>(scenery), [](int) { return false; }, scratch);
@@ -354,8 +362,15 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
+    if (p.draws_objects) {
+        scratch.object_lines.resize(p.objects.n_lines);
+        for (int l = 0; l < p.objects.n_lines; l++)
+            scratch.object_lines[l] =
+                drawn_line(p.objects, s, p.positions, p.angles, env, a, l, a == 0);
+    }
     if (p.objects.n_objects)
-        add_objects(scenery, p.objects, env);
+        add_objects(scenery, p.objects, env,
+                    p.draws_objects ? scratch.object_lines.data() : nullptr);
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);
     if (p.imu)
@@ -375,7 +390,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
 KERNEL render(const RenderParams& p) {
 #pragma omp parallel num_threads(p.scenery.n_threads)
     {
-        Scratch scratch = {{}, {}, {}, {}, Rays(p.res)};
+        Scratch scratch = {{}, {}, {}, {}, Rays(p.res), {}};
 #pragma omp for schedule(static)
         for (int agent = 0; agent < p.scenery.n_envs * p.scenery.n_agents; agent++)
             render_agent(p, agent, scratch);

@@ -67,7 +67,7 @@ HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvSce
     Hit hit = hit_of(surface, y, length);
     RaySample sample = {0.f, 0.f, 0.f, depth_reading(distance, screen.radius, p.inv_max_depth)};
     if (p.rgb || (full_res && p.screen)) {
-        Colour colour = surface.kind ? moving_colour<drawn>(scenery, surface, hit)
+        Colour colour = surface.kind ? moving_colour<drawn>(p.objects, scenery, surface, hit)
                                      : wall_colour(p.scenery, first, width, hit);
         sample.red = colour.red;
         sample.green = colour.green;

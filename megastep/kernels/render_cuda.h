@@ -85,7 +85,8 @@ DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, 
 
 template <int full_res, int drawn, int is_split>
 DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelSpan* spans,
-                         NearestLine* nearest, int* newly_seen_by_warp) {
+                         NearestLine* nearest, int* newly_seen_by_warp,
+                         Float4* object_lines = nullptr) {
     const SceneryParams& s = p.scenery;
     int warp = threadIdx.x / WARP;
     int rank = is_split ? threadIdx.x : warp_lane, n_threads = is_split ? BLOCK : WARP;
@@ -94,8 +95,17 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     Screen screen = screen_of(p);
     EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
-    if (drawn == OBJECTS)
-        add_objects(scenery, p.objects, env);
+    if (drawn == OBJECTS) {
+        const Float4* lines = nullptr;
+        if (p.draws_objects) {
+            lines = object_lines;
+            for (int l = warp_lane; l < p.objects.n_lines; l += WARP)
+                object_lines[l] = drawn_line(p.objects, s, p.positions, p.angles, env, a, l,
+                                             a == 0 && rank < WARP);
+            __syncwarp();
+        }
+        add_objects(scenery, p.objects, env, lines);
+    }
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
     if (rank == 0)
         flag_nonfinite(p.error_flag, env, x, y, angle);
@@ -118,7 +128,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         if (drawn && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
         if (drawn == OBJECTS)
-            raster_objects(v, scenery, a);
+            raster_objects(v, p.objects, scenery, a);
         raster_walls<drawn>(v, s, scenery, p.half_width);
         __syncwarp();
         if (reads_both)
@@ -161,11 +171,14 @@ DEVICE void render_by_warps(const RenderParams& p) {
         return;
     PixelSpan* warp_spans = spans + WARP * warp;
     NearestLine* nearest = shared + whole_tiles(p.res) * warp;
-    if (with_objects && may_write_all && p.indices)
-        render_agent<1, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
-    else if (with_objects)
-        render_agent<0, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
-    else if (may_write_all && p.indices)
+    if (with_objects) {
+        __shared__ Float4 object_lines[with_objects ? BLOCK / WARP * MAX_DRAWN_LINES : 1];
+        Float4* lines = object_lines + MAX_DRAWN_LINES * warp;
+        if (may_write_all && p.indices)
+            render_agent<1, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0, lines);
+        else
+            render_agent<0, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0, lines);
+    } else if (may_write_all && p.indices)
         render_agent<1, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
     else if (p.scenery.n_agents > 1)
         render_agent<0, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);

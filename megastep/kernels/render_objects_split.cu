@@ -6,7 +6,9 @@ KERNEL BOUNDS(18) render_objects_split(RenderParams p) {
     extern __shared__ NearestLine nearest[];
     __shared__ PixelSpan spans[BLOCK];
     __shared__ int newly_seen_by_warp[BLOCK / WARP];
-    int warp_lane = threadIdx.x % WARP;
+    __shared__ Float4 object_lines[BLOCK / WARP * MAX_DRAWN_LINES];
+    int warp_lane = threadIdx.x % WARP, warp = threadIdx.x / WARP;
     PixelSpan* warp_spans = spans + (threadIdx.x - warp_lane);
-    render_agent<0, OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest, newly_seen_by_warp);
+    render_agent<0, OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest, newly_seen_by_warp,
+                                object_lines + MAX_DRAWN_LINES * warp);
 }

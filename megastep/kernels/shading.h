@@ -1,6 +1,7 @@
 // Shading: where a ray hits a line, at which angle, and the colour there.
 #pragma once
 #include "common/math.h"
+#include "draw_objects.h"
 #include "params.h"
 #include "raster.h"
 
@@ -10,11 +11,9 @@ struct EnvScenery {
     const float* agent_textures;
     const float* agent_light;
     int first_box, first_wall, n_walls, n_agent_lines, first_texel;
-    int n_object_lines;
-    const float* object_lines;
-    const float* object_texels;
+    int n_object_lines, is_drawn, first_object;
+    const Float4* object_lines;
     const int* line_object;
-    const int* carriers;
 };
 
 HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
@@ -29,19 +28,21 @@ HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
             n_agent_lines,
             s.texel_starts[first],
             0,
-            nullptr,
-            nullptr,
+            0,
+            0,
             nullptr,
             nullptr};
 }
 
 // Adds an environment's objects to its scenery. Their lines come between the agents' and the walls.
-HD void add_objects(EnvScenery& scenery, const ObjectsParams& o, int env) {
+// `drawn`: the lines, if they are drawn for the agent that sees them; else update_objects has drawn
+// them.
+HD void add_objects(EnvScenery& scenery, const ObjectsParams& o, int env, const Float4* drawn) {
     scenery.n_object_lines = o.n_lines;
-    scenery.object_lines = o.lines + 4 * (env * (long long)o.n_lines);
-    scenery.object_texels = o.texels + 4 * (env * (long long)o.n_objects);
+    scenery.object_lines = drawn ? drawn : (const Float4*)o.lines + env * (long long)o.n_lines;
+    scenery.is_drawn = drawn != nullptr;
+    scenery.first_object = env * o.n_objects;
     scenery.line_object = o.line_object;
-    scenery.carriers = o.carriers + env * (long long)o.n_objects;
 }
 
 // What is drawn beside walls, at most: nothing, agents, or agents and objects.
@@ -68,7 +69,7 @@ HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const P
                       int l) {
     if (drawn == OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(scenery)) {
         int i = l - scenery.n_agent_lines;
-        Float4 line = LOAD((const Float4*)scenery.object_lines + i);
+        Float4 line = scenery.object_lines[i];  // may be in shared memory
         float ax, ay, bx, by;
         to_camera(camera, line.x, line.y, ax, ay);
         to_camera(camera, line.z, line.w, bx, by);
@@ -152,17 +153,19 @@ HD Colour agent_colour(const EnvScenery& scenery, int first, int width, const Hi
                  f.weight, hit.facing);
 }
 
-// An object has one texel, which all its lines show.
-HD Colour object_colour(const EnvScenery& scenery, int object, const Hit& hit) {
-    Float4 texel = LOAD((const Float4*)scenery.object_texels + object);
+// The colour where a ray hits an agent or an object. An object has one texel, which all its lines
+// show.
+template <int drawn>
+HD Colour moving_colour(const ObjectsParams& o, const EnvScenery& scenery, const Surface& surface,
+                        const Hit& hit) {
+    if (drawn != OBJECTS || surface.kind != OBJECTS)
+        return agent_colour(scenery, surface.first_texel, surface.width, hit);
+    int i = scenery.first_object + surface.first_texel;
+    if (scenery.is_drawn) {
+        const float* rgb = colour_of(o, i);
+        return {rgb[0] * hit.facing, rgb[1] * hit.facing, rgb[2] * hit.facing};
+    }
+    Float4 texel = LOAD((const Float4*)o.texels + i);
     float light = texel.w * hit.facing;
     return {texel.x * light, texel.y * light, texel.z * light};
-}
-
-// The colour where a ray hits an agent or an object.
-template <int drawn>
-HD Colour moving_colour(const EnvScenery& scenery, const Surface& surface, const Hit& hit) {
-    if (drawn == OBJECTS && surface.kind == OBJECTS)
-        return object_colour(scenery, surface.first_texel, hit);
-    return agent_colour(scenery, surface.first_texel, surface.width, hit);
 }

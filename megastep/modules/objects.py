@@ -202,7 +202,7 @@ class Kind:
 
         Args:
             mask: (N,) or (N, K) bool.
-            colours: (N, K), (K,) or one integer, their new colours. Default: they keep theirs.
+            colours: (N, K) or (K,) integers, or one; their new colours. Default: they keep theirs.
         """
         mask, whole = self._broadcast(mask), self._objects._mask
         self._paint(mask, colours)
@@ -283,10 +283,10 @@ class Kind:
         return mask.view(n, -1).expand(n, k)
 
     def _paint(self, mask, colours):
-        if colours is None:
-            return
-        colours = torch.as_tensor(colours, dtype=torch.int32, device=self.colours.device)
-        self.colours.copy_(torch.where(mask, colours, self.colours))
+        if isinstance(colours, int):
+            self.colours.masked_fill_(mask, colours)
+        elif colours is not None:
+            self.colours.copy_(torch.where(mask, colours.to(self.colours), self.colours))
 
 
 class Doors(Kind):
@@ -314,7 +314,7 @@ class Doors(Kind):
 
         Args:
             mask: (N,) or (N, K) bool.
-            colours: (N, K), (K,) or one integer, their new colours. Default: they keep theirs.
+            colours: (N, K) or (K,) integers, or one; their new colours. Default: they keep theirs.
         """
         mask = self._broadcast(mask)
         self._paint(mask, colours)
