@@ -78,7 +78,6 @@ def place_objects(
         scenery=scenery_params(scenery, agents.radius),
         objects=object_params(scenery),
         agents=state_params(scenery, agents, "positions")["positions"],
-        visible=scenery.objects.visible,
         mask=checks.address("mask", mask, shape, torch.bool, device),
         points=checks.address("points", points, points_shape, torch.float32, device),
         counts=checks.address("counts", counts, shape, torch.int32, device),

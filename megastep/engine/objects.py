@@ -21,6 +21,7 @@ __all__ = ["SHAPES", "Objects", "check_objects", "object_params"]
 #: {shape: number of lines it is drawn with}.
 SHAPES = {"disc": 6, "crate": 4, "door": 1}
 NUMBERS = {name: ENGINE.constants[name.upper()] for name in SHAPES}
+_BYTES = ENGINE.constants["OBJECT_BYTES"]
 MAX_OBJECTS = 1024  # per environment
 _KINDS = ENGINE.constants["OBJECT_ERROR_KINDS"]
 _MESSAGES = dict(
@@ -53,6 +54,7 @@ class Objects(SetOnce):
         device: where to put them.
 
     Attributes:
+        records: (N, O, 8) float32, the memory that the tensors below, to ``carriers``, share.
         positions: (N, O, 2) metres. Of a carried object, its carrier's at each render.
         angles: (N, O) degrees.
         sizes: (N, O) metres: the radius of a disc, half the side of a crate, half a door's length.
@@ -92,21 +94,49 @@ class Objects(SetOnce):
         self.n_colours = checks.integer("len(palette)", len(self.palette), 1)
         self.device = device
 
-        def full(*shape, value=0, dtype=torch.float32):
-            return torch.full((n, len(shapes), *shape), value, dtype=dtype, device=device)
-
-        self.positions, self.angles, self.sizes = full(2), full(), full(value=0.1)
-        self.colours = full(dtype=torch.int32)
-        self.visible, self.solid, self.open = (full(dtype=torch.bool) for _ in range(3))
-        self.carriers = full(value=-1, dtype=torch.int32)
+        self.records = torch.zeros((n, len(shapes), _BYTES // 4), device=device)
+        self.sizes.fill_(0.1)
+        self.carriers.fill_(-1)
         widths = torch.tensor([SHAPES[shape] for shape in shapes])
         self.shapes = torch.tensor([NUMBERS[s] for s in shapes], dtype=torch.int32, device=device)
         self.line_starts = torch.cat([widths[:1] * 0, widths.cumsum(0)]).int().to(device)
         objects = torch.arange(len(shapes), dtype=torch.int32)
         self.line_object = objects.repeat_interleave(widths).to(device)
         self.lines = torch.zeros((n, int(widths.sum()), 2, 2), device=device)
-        self.texels = full(4)
+        self.texels = torch.zeros((n, len(shapes), 4), device=device)
         self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
+
+    @property
+    def positions(self) -> torch.Tensor:
+        return self.records[..., :2]
+
+    @property
+    def angles(self) -> torch.Tensor:
+        return self.records[..., 2]
+
+    @property
+    def sizes(self) -> torch.Tensor:
+        return self.records[..., 3]
+
+    @property
+    def carriers(self) -> torch.Tensor:
+        return self.records.view(torch.int32)[..., 4]
+
+    @property
+    def colours(self) -> torch.Tensor:
+        return self.records.view(torch.int32)[..., 5]
+
+    @property
+    def visible(self) -> torch.Tensor:
+        return self.records.view(torch.bool)[..., 24]
+
+    @property
+    def solid(self) -> torch.Tensor:
+        return self.records.view(torch.bool)[..., 25]
+
+    @property
+    def open(self) -> torch.Tensor:
+        return self.records.view(torch.bool)[..., 26]
 
     def at_lines(self, lines: torch.Tensor, n_agent_lines: int) -> torch.Tensor:
         """Returns the object of each line, int64 and -1 for others.
@@ -121,19 +151,8 @@ class Objects(SetOnce):
         return objects.masked_fill(~is_object, -1)
 
 
-_TENSORS = dict(
-    positions=((2,), torch.float32),
-    angles=((), torch.float32),
-    sizes=((), torch.float32),
-    colours=((), torch.int32),
-    visible=((), torch.bool),
-    solid=((), torch.bool),
-    open=((), torch.bool),
-    carriers=((), torch.int32),
-    texels=((4,), torch.float32),
-)
 _FIELDS = [
-    *("shapes", "line_starts", "line_object", "palette", "extents", *_TENSORS, "lines"),
+    *("shapes", "line_starts", "line_object", "palette", "extents", "objects", "lines", "texels"),
     *("error_flag", "n_objects", "n_lines", "n_colours", "lit"),
 ]
 _NONE = ENGINE.params.ObjectsParams(**dict.fromkeys(_FIELDS, 0))
@@ -159,10 +178,8 @@ def object_params(scenery: "Scenery") -> bytes:
     packed = vars(objects).get("_packed")
     if packed is None:
         packed = vars(objects)["_packed"] = _Packed()
-        packed.inputs, packed.tensors = (
-            None,
-            [getattr(objects, name) for name in (*_TENSORS, "lines", "palette")],
-        )
+        packed.inputs = None
+        packed.tensors = objects.records, objects.lines, objects.texels, objects.palette
     inputs = [(t.data_ptr(), t.nbytes, t.untyped_storage().nbytes()) for t in packed.tensors]
     if packed.inputs != inputs:
         packed.params, packed.inputs = _pack(scenery, objects), inputs
@@ -170,24 +187,20 @@ def object_params(scenery: "Scenery") -> bytes:
 
 
 def _pack(scenery, o):
-    shape, device = (o.n_envs, o.n_objects), scenery.device
-    addresses = {
-        name: checks.address(f"objects.{name}", getattr(o, name), (*shape, *axes), dtype, device)
-        for name, (axes, dtype) in _TENSORS.items()
-    }
-    n_lines = len(o.line_object)
+    shape, n_lines = (o.n_envs, o.n_objects), len(o.line_object)
+
+    def address(name, tensor, *shape):
+        return checks.address(f"objects.{name}", tensor, shape, torch.float32, scenery.device)
+
     return ENGINE.params.ObjectsParams(
-        **addresses,
         shapes=o.shapes,
         line_starts=o.line_starts,
         line_object=o.line_object,
-        palette=checks.address(
-            "objects.palette", o.palette, (o.n_colours, 3), torch.float32, device
-        ),
+        palette=address("palette", o.palette, o.n_colours, 3),
         extents=scenery.layouts.extents,
-        lines=checks.address(
-            "objects.lines", o.lines, (o.n_envs, n_lines, 2, 2), torch.float32, device
-        ),
+        objects=address("records", o.records, *shape, _BYTES // 4),
+        lines=address("lines", o.lines, o.n_envs, n_lines, 2, 2),
+        texels=address("texels", o.texels, *shape, 4),
         error_flag=o.error_flag,
         n_objects=o.n_objects,
         n_lines=n_lines,

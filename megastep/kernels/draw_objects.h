@@ -4,66 +4,68 @@
 
 HD int is_agent(int a, int n_agents) { return a >= 0 && a < n_agents; }
 
-// The pose of object i of environment `env`: its carrier's if it has one. `positions` and `angles`
-// are the agents'.
-HD Pose pose_of(const ObjectsParams& o, const SceneryParams& s, const float* positions,
-                const float* angles, int env, int i) {
-    int carrier = o.carriers[i];
-    if (!is_agent(carrier, s.n_agents))
-        return pose_of(o, i);
-    int agent = env * s.n_agents + carrier;
-    return pose_at(positions[2 * agent], positions[2 * agent + 1], angles[agent]);
+// An object of environment `env`, at its carrier if it has one. `positions` and `angles` are the
+// agents'.
+HD Object placed(const Object& object, const SceneryParams& s, const float* positions,
+                 const float* angles, int env) {
+    Object result = object;
+    if (is_agent(object.carrier, s.n_agents)) {
+        int agent = env * s.n_agents + object.carrier;
+        result.x = positions[2 * agent];
+        result.y = positions[2 * agent + 1];
+        result.angle = angles[agent];
+    }
+    return result;
 }
 
-// Returns 1 if object i is drawn. Its size must be a number above 0, and so must its pose be
-// finite, which `is_finite(sine)` tells of its angle.
-HD int is_drawn(const ObjectsParams& o, const Pose& pose, int i) {
-    float size = o.sizes[i];
-    return is_there(o, i) && is_finite(pose.x) && is_finite(pose.y) && is_finite(pose.sine) &&
-           size > 0.f && is_finite(size);
+HD int is_drawn(const Object& object) {
+    return is_there(object) && is_finite(object.x) && is_finite(object.y) &&
+           is_finite(object.angle) && object.size > 0.f && is_finite(object.size);
 }
 
-// Writes object i's pose, if it is carried, and flags what is wrong with it.
-HD void settle(const ObjectsParams& o, const SceneryParams& s, const Pose& pose,
-               const float* angles, int env, int i) {
-    int carrier = o.carriers[i], layout = s.layout[env];
-    if (is_agent(carrier, s.n_agents)) {
-        o.positions[2 * i] = pose.x;
-        o.positions[2 * i + 1] = pose.y;
-        o.angles[i] = angles[env * s.n_agents + carrier];
-    } else if (carrier != -1) {
+// Writes object i's pose, if it is carried, and flags what is wrong with it. `object` is as placed.
+HD void settle(const ObjectsParams& o, const SceneryParams& s, const Object& object, int layout,
+               int i) {
+    if (is_agent(object.carrier, s.n_agents)) {
+        objects_of(o)[i].x = object.x;
+        objects_of(o)[i].y = object.y;
+        objects_of(o)[i].angle = object.angle;
+    } else if (object.carrier != -1) {
         flag_object(o, i, BAD_CARRIER);
     }
-    if (!is_there(o, i))
+    if (!is_there(object))
         return;
-    if (!is_drawn(o, pose, i)) {
+    Float4 extent = LOAD((const Float4*)o.extents + layout);
+    if (!is_drawn(object))
         flag_object(o, i, BAD_POSE);
-        return;
-    }
-    // a layout that does not exist is flagged where it is rendered
-    const float* extent =
-        o.extents + 4 * ((unsigned int)layout < (unsigned int)s.n_layouts ? layout : 0);
-    if (pose.x < extent[0] || pose.y < extent[1] || pose.x > extent[2] || pose.y > extent[3])
+    else if (object.x < extent.x || object.y < extent.y || object.x > extent.z ||
+             object.y > extent.w)
         flag_object(o, i, OUTSIDE);
-    if ((unsigned int)o.colours[i] >= (unsigned int)o.n_colours)
+    else if ((unsigned int)object.colour >= (unsigned int)o.n_colours)
         flag_object(o, i, BAD_COLOUR);
 }
 
 // The colour of object i, in full light.
 HD const float* colour_of(const ObjectsParams& o, int i) {
-    int colour = o.colours[i];
+    int colour = objects_of(o)[i].colour;
     return o.palette + 3 * ((unsigned int)colour < (unsigned int)o.n_colours ? colour : 0);
 }
 
-// Line l of an environment's objects as agent a sees it, of 0 m if it does not. `settles`: the
-// object is settled with its first line.
-HD Float4 drawn_line(const ObjectsParams& o, const SceneryParams& s, const float* positions,
-                     const float* angles, int env, int a, int l, int settles) {
-    int k = o.line_object[l], i = env * o.n_objects + k, first = o.line_starts[k];
-    Pose pose = pose_of(o, s, positions, angles, env, i);
-    if (settles && l == first)
-        settle(o, s, pose, angles, env, i);
-    if (!is_drawn(o, pose, i) || o.carriers[i] == a)
+// Line k of a placed object, of 0 m if it is not drawn.
+HD Float4 drawn_line(const Object& object, int shape, int k) {
+    if (!is_drawn(object))
         return {0.f, 0.f, 0.f, 0.f};
-    return line_of(o.shapes[k], l - first, o.sizes[i], pose);
+    return line_of(shape, k, object.size, pose_at(object.x, object.y, object.angle));
+}
+
+// Draws line l of an environment's objects as agent a sees it, who does not see what it carries.
+// `settles`: the object is settled with its first line.
+HD Float4 seen_line(const ObjectsParams& o, const SceneryParams& s, const float* positions,
+                    const float* angles, int env, int layout, int a, int l, int settles) {
+    int k = o.line_object[l], i = env * o.n_objects + k, first = o.line_starts[k];
+    Object object = placed(objects_of(o)[i], s, positions, angles, env);
+    Float4 line = drawn_line(object, o.shapes[k], l - first);
+    if (settles && l == first)
+        settle(o, s, object, layout, i);
+    return object.carrier == a ? Float4{0.f, 0.f, 0.f, 0.f} : line;
 }

@@ -110,7 +110,6 @@ struct PlaceObjectsParams {
     SceneryParams scenery;
     ObjectsParams objects;
     const float* agents;        // (N, A, 2) metres
-    unsigned char* visible;     // (N, O) out: 1 where mask
     const unsigned char* mask;  // (N, O) objects to place
     const float* points;        // (D, n_points, 2) metres
     int* counts;                // (N, O) in and out: numbers drawn so far

@@ -20,18 +20,17 @@ HD float sweep_agent(const PhysicsParams& p, int k, float px, float py, float dx
 // The fraction of the step d after which an agent at p touches object i, if that is an obstacle.
 HD float sweep_object(const ObjectsParams& o, int i, float px, float py, float dx, float dy,
                       float rho) {
-    if (!is_obstacle(o, i))
+    Object object = objects_of(o)[i];
+    float x = object.x, y = object.y, reach = rho + 1.5f * object.size;  // beyond crates' corners
+    if (!is_obstacle(object) || !boxes_meet(px, py, dx, dy, x, y, x, y, reach))
         return NO_CONTACT;
     int shape = o.shapes[i % o.n_objects];
-    float x = o.positions[2 * i], y = o.positions[2 * i + 1], size = o.sizes[i];
-    float contact = NO_CONTACT, reach = rho + 1.5f * size;  // beyond a crate's corners
-    if (!boxes_meet(px, py, dx, dy, x, y, x, y, reach))
-        return NO_CONTACT;
     if (shape == DISC)
-        return sweep_point(px - x, py - y, dx, dy, rho + size);
-    Pose pose = pose_of(o, i);
+        return sweep_point(px - x, py - y, dx, dy, rho + object.size);
+    float contact = NO_CONTACT;
+    Pose pose = pose_at(x, y, object.angle);
     for (int k = 0; k < n_lines_of(shape); k++) {
-        Float4 line = line_of(shape, k, size, pose);
+        Float4 line = line_of(shape, k, object.size, pose);
         contact = minf(contact, sweep_segment(px, py, dx, dy, line.x, line.y, line.z, line.w, rho));
     }
     return contact;

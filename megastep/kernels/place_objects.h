@@ -7,17 +7,18 @@
 // that are there and are not to be placed after it.
 HD int fits(const PlaceObjectsParams& p, int env, int i, float x, float y) {
     const ObjectsParams& o = p.objects;
-    float size = o.sizes[i], apart = p.scenery.radius + size + p.apart;
+    float size = objects_of(o)[i].size, apart = p.scenery.radius + size + p.apart;
     for (int a = env * p.scenery.n_agents; a < (env + 1) * p.scenery.n_agents; a++) {
         float dx = x - p.agents[2 * a], dy = y - p.agents[2 * a + 1];
         if (dx * dx + dy * dy < apart * apart)
             return 0;
     }
     for (int k = env * o.n_objects; k < (env + 1) * o.n_objects; k++) {
-        if ((p.mask[k] && k >= i) || !p.visible[k] || (!p.mask[k] && o.carriers[k] >= 0))
+        Object other = objects_of(o)[k];
+        if ((p.mask[k] && k >= i) || !other.visible || (!p.mask[k] && other.carrier >= 0))
             continue;
-        float dx = x - o.positions[2 * k], dy = y - o.positions[2 * k + 1];
-        apart = o.sizes[k] + size + p.apart;
+        float dx = x - other.x, dy = y - other.y;
+        apart = other.size + size + p.apart;
         if (dx * dx + dy * dy < apart * apart)
             return 0;
     }
@@ -48,10 +49,11 @@ HD void place_objects_of(const PlaceObjectsParams& p, int env) {
         }
         if (n_tried == p.n_points)
             flag_object(o, i, NO_ROOM);
-        o.positions[2 * i] = points[2 * point];
-        o.positions[2 * i + 1] = points[2 * point + 1];
-        o.angles[i] = 360.f * unit_float(bits.b) - 180.f;
-        o.carriers[i] = -1;
-        p.visible[i] = 1;
+        Object& object = objects_of(o)[i];
+        object.x = points[2 * point];
+        object.y = points[2 * point + 1];
+        object.angle = 360.f * unit_float(bits.b) - 180.f;
+        object.carrier = -1;
+        object.visible = 1;
     }
 }

@@ -187,7 +187,7 @@ DEVICE void raster_objects(View<is_split>& v, const ObjectsParams& o, const EnvS
         int l = first + v.warp_lane;
         int active = l < scenery.n_object_lines;
         if (active && !scenery.is_drawn)
-            active = o.carriers[scenery.first_object + o.line_object[l]] != a;
+            active = objects_of(o)[scenery.first_object + o.line_object[l]].carrier != a;
         raster_group(v, scenery.object_lines + l, scenery.n_agent_lines + first, active);
     }
 }

@@ -145,7 +145,7 @@ static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, cons
     for (auto [line, first, end] : rays.runs) {
         Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
         if (line >= 0)
-            surface = surface_of<OBJECTS>(p.scenery, scenery, camera, line);
+            surface = surface_of<AGENTS | OBJECTS>(p.scenery, scenery, camera, line);
         int n = end - first;
         std::fill_n(&rays.ax[first], n, surface.ax);
         std::fill_n(&rays.ay[first], n, surface.ay);
@@ -334,7 +334,7 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
             scenery.n_agent_lines,
             [&](int l) {
                 int i = scenery.first_object + scenery.line_object[l];
-                return !scenery.is_drawn && p.objects.carriers[i] == a;
+                return !scenery.is_drawn && objects_of(p.objects)[i].carrier == a;
             },
             scratch);
     raster_lines(
@@ -361,12 +361,13 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     int env = agent / s.n_agents, a = agent % s.n_agents;
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
-    EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
+    int layout = layout_of(s, env, p.error_flag);
+    EnvScenery scenery = env_scenery(s, env, layout);
     if (p.draws_objects) {
         scratch.object_lines.resize(p.objects.n_lines);
         for (int l = 0; l < p.objects.n_lines; l++)
             scratch.object_lines[l] =
-                drawn_line(p.objects, s, p.positions, p.angles, env, a, l, a == 0);
+                seen_line(p.objects, s, p.positions, p.angles, env, layout, a, l, a == 0);
     }
     if (p.objects.n_objects)
         add_objects(scenery, p.objects, env,

@@ -90,18 +90,21 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     const SceneryParams& s = p.scenery;
     int warp = threadIdx.x / WARP;
     int rank = is_split ? threadIdx.x : warp_lane, n_threads = is_split ? BLOCK : WARP;
-    int env = drawn ? agent / s.n_agents : agent, a = drawn ? agent % s.n_agents : 0;
+    int env = drawn & AGENTS ? agent / s.n_agents : agent,
+        a = drawn & AGENTS ? agent % s.n_agents : 0;
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     Screen screen = screen_of(p);
-    EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
-    if (drawn == OBJECTS) {
+    int layout = layout_of(s, env, p.error_flag);
+    EnvScenery scenery = env_scenery(s, env, layout);
+    if (drawn & OBJECTS) {
         const Float4* lines = nullptr;
         if (p.draws_objects) {
             lines = object_lines;
+            int settles = a == 0 && rank < WARP;
             for (int l = warp_lane; l < p.objects.n_lines; l += WARP)
-                object_lines[l] = drawn_line(p.objects, s, p.positions, p.angles, env, a, l,
-                                             a == 0 && rank < WARP);
+                object_lines[l] =
+                    seen_line(p.objects, s, p.positions, p.angles, env, layout, a, l, settles);
             __syncwarp();
         }
         add_objects(scenery, p.objects, env, lines);
@@ -125,9 +128,9 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         Pose camera = pose_at(x, y, angle + p.yaws[c]);
         View<is_split> v = {camera, screen, p.ray_lengths, spans, nearest, warp_lane, tiles, 0.f};
         clear(v);
-        if (drawn && s.n_agents > 1)
+        if (drawn & AGENTS && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
-        if (drawn == OBJECTS)
+        if (drawn & OBJECTS)
             raster_objects(v, p.objects, scenery, a);
         raster_walls<drawn>(v, s, scenery, p.half_width);
         __syncwarp();
@@ -137,7 +140,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
             p.centre_line[view] = nearest[p.res / 2].line;
         if (p.agent_ray && rank == warp_lane) {
             int ray = -1;
-            if (drawn)
+            if (drawn & AGENTS)
                 ray = agent_ray_of(nearest, p.res, scenery.n_agent_lines, warp_lane);
             if (warp_lane == 0)
                 p.agent_ray[view] = ray;
@@ -160,7 +163,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
 }
 
 // One warp per agent. Three variants: all outputs, several agents, one agent. The last needs the
-// fewest registers. With objects there are two: all outputs, or observations.
+// fewest registers. With objects there are the same three.
 template <int may_write_all, int with_objects = 0>
 DEVICE void render_by_warps(const RenderParams& p) {
     extern __shared__ NearestLine shared[];
@@ -175,7 +178,11 @@ DEVICE void render_by_warps(const RenderParams& p) {
         __shared__ Float4 object_lines[with_objects ? BLOCK / WARP * MAX_DRAWN_LINES : 1];
         Float4* lines = object_lines + MAX_DRAWN_LINES * warp;
         if (may_write_all && p.indices)
-            render_agent<1, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0, lines);
+            render_agent<1, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0,
+                                                 lines);
+        else if (p.scenery.n_agents > 1)
+            render_agent<0, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0,
+                                                 lines);
         else
             render_agent<0, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0, lines);
     } else if (may_write_all && p.indices)

@@ -9,6 +9,11 @@ KERNEL BOUNDS(18) render_objects_split(RenderParams p) {
     __shared__ Float4 object_lines[BLOCK / WARP * MAX_DRAWN_LINES];
     int warp_lane = threadIdx.x % WARP, warp = threadIdx.x / WARP;
     PixelSpan* warp_spans = spans + (threadIdx.x - warp_lane);
-    render_agent<0, OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest, newly_seen_by_warp,
-                                object_lines + MAX_DRAWN_LINES * warp);
+    Float4* lines = object_lines + MAX_DRAWN_LINES * warp;
+    if (p.scenery.n_agents > 1)
+        render_agent<0, AGENTS | OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest,
+                                             newly_seen_by_warp, lines);
+    else
+        render_agent<0, OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest,
+                                    newly_seen_by_warp, lines);
 }

@@ -45,15 +45,14 @@ HD void add_objects(EnvScenery& scenery, const ObjectsParams& o, int env, const 
     scenery.line_object = o.line_object;
 }
 
-// What is drawn beside walls, at most: nothing, agents, or agents and objects.
+// What is drawn beside walls, a bit each.
 constexpr int AGENTS = 1;
 constexpr int OBJECTS = 2;
 
 // The first wall's index among an environment's lines.
 template <int drawn>
 HD int first_static_line(const EnvScenery& scenery) {
-    return drawn == OBJECTS ? scenery.n_agent_lines + scenery.n_object_lines
-                            : scenery.n_agent_lines;
+    return drawn & OBJECTS ? scenery.n_agent_lines + scenery.n_object_lines : scenery.n_agent_lines;
 }
 
 // A line hit by rays: its start and direction in the camera's frame, and its texels. `kind`: 0 of a
@@ -67,7 +66,7 @@ struct Surface {
 template <int drawn>
 HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const Pose& camera,
                       int l) {
-    if (drawn == OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(scenery)) {
+    if (drawn & OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(scenery)) {
         int i = l - scenery.n_agent_lines;
         Float4 line = scenery.object_lines[i];  // may be in shared memory
         float ax, ay, bx, by;
@@ -75,7 +74,7 @@ HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const P
         to_camera(camera, line.z, line.w, bx, by);
         return {ax, ay, bx - ax, by - ay, scenery.line_object[i], 1, OBJECTS};
     }
-    int is_agent = drawn && l < scenery.n_agent_lines;
+    int is_agent = drawn & AGENTS && l < scenery.n_agent_lines;
     int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(scenery));
     Float4 line = LOAD((const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i);
     const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;
@@ -158,7 +157,7 @@ HD Colour agent_colour(const EnvScenery& scenery, int first, int width, const Hi
 template <int drawn>
 HD Colour moving_colour(const ObjectsParams& o, const EnvScenery& scenery, const Surface& surface,
                         const Hit& hit) {
-    if (drawn != OBJECTS || surface.kind != OBJECTS)
+    if (!(drawn & OBJECTS) || surface.kind != OBJECTS)
         return agent_colour(scenery, surface.first_texel, surface.width, hit);
     int i = scenery.first_object + surface.first_texel;
     if (scenery.is_drawn) {

@@ -83,8 +83,8 @@ HD int clear_point(const SpawnParams& p, int env, int a, int layout, int first) 
 // Has agent a drop what it carries, where it is.
 HD void drop_all(const ObjectsParams& o, int env, int a) {
     for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++)
-        if (o.carriers[i] == a)
-            o.carriers[i] = -1;
+        if (objects_of(o)[i].carrier == a)
+            objects_of(o)[i].carrier = -1;
 }
 
 // Respawns the masked agents of an environment: at rest, with a random heading, at a random point

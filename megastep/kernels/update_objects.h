@@ -25,17 +25,17 @@ HD float light_on(const SceneryParams& s, int layout, float x, float y) {
 // Moves object i, of all environments', to its carrier, if any, and writes its lines and its texel.
 HD void update_object(const UpdateObjectsParams& p, int i) {
     const ObjectsParams& o = p.objects;
+    const SceneryParams& s = p.scenery;
     int env = i / o.n_objects, k = i % o.n_objects, first = o.line_starts[k];
-    Pose pose = pose_of(o, p.scenery, p.positions, p.angles, env, i);
-    settle(o, p.scenery, pose, p.angles, env, i);
+    int layout = s.layout[env];
+    if ((unsigned int)layout >= (unsigned int)s.n_layouts)
+        layout = 0;  // which is flagged where it is rendered
+    Object object = placed(objects_of(o)[i], s, p.positions, p.angles, env);
+    settle(o, s, object, layout, i);
     Float4* lines = (Float4*)o.lines + env * (long long)o.n_lines;
     for (int l = first; l < o.line_starts[k + 1]; l++)
-        lines[l] = drawn_line(o, p.scenery, p.positions, p.angles, env, -2, l, 0);
+        lines[l] = drawn_line(object, o.shapes[k], l - first);
     const float* rgb = colour_of(o, i);
-    int layout = p.scenery.layout[env],
-        exists = (unsigned int)layout < (unsigned int)p.scenery.n_layouts;
-    float light = o.lit && is_drawn(o, pose, i)
-                      ? light_on(p.scenery, exists ? layout : 0, pose.x, pose.y)
-                      : 1.f;
+    float light = o.lit && is_drawn(object) ? light_on(s, layout, object.x, object.y) : 1.f;
     ((Float4*)o.texels)[i] = {rgb[0], rgb[1], rgb[2], light};
 }

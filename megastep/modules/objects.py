@@ -32,6 +32,8 @@ COLOURS = {
     "orange": "f07010",
     "violet": "6a18b8",
 }
+#: The tensors of a kind.
+TENSORS = "positions", "angles", "sizes", "colours", "visible", "solid", "open", "carriers"
 REACH = 0.05  # metres between surfaces at which an agent touches an object
 _DISC, _CRATE = NUMBERS["disc"], NUMBERS["crate"]
 _INTO_WALL = 0.001  # metres that a door is longer than its opening, on either side
@@ -149,7 +151,7 @@ class Objects:
         points = cached_points(geometries, n_points, 1, radius, self.seed)
         self.points = torch.as_tensor(points, device=core.device)
         self.counts = torch.zeros_like(self.all.carriers)
-        self._mask = torch.zeros_like(self.all.visible)
+        self._mask = torch.zeros_like(self.all.carriers, dtype=torch.bool)
         self.kinds = {
             name: (Doors if isinstance(kinds[name], Door) else Kind)(self, name, slots[name])
             for name in kinds
@@ -186,14 +188,15 @@ class Kind:
 
     def __init__(self, objects: Objects, name: str, slots: slice):
         self._objects, self.name, self.slots = objects, name, slots
-        for tensor in (
-            *("positions", "angles", "sizes", "colours", "visible", "solid", "open", "carriers"),
-        ):
-            setattr(self, tensor, getattr(objects.all, tensor)[:, slots])
         self._agents = torch.arange(objects.core.n_agents, device=objects.core.device)
 
     def __len__(self) -> int:
         return self.slots.stop - self.slots.start
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        if name not in TENSORS:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self._objects.all, name)[:, self.slots]
 
     def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
         """Puts objects at random points in rooms, on no agent and no other object.

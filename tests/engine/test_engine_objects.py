@@ -324,12 +324,14 @@ def test_bad_arguments_are_named(arguments, message):
 
 def test_replaced_and_shrunken_tensors_are_refused():
     scenery, agents = world()
-    with pytest.raises(AttributeError, match="positions of a Objects"):
+    with pytest.raises(AttributeError):
         scenery.objects.positions = torch.zeros(3)
+    with pytest.raises(AttributeError, match="records of a Objects"):
+        scenery.objects.records = torch.zeros(3)
     with pytest.raises(AttributeError):
         scenery.objects = engine.Objects(N, ["disc"], PALETTE)
-    scenery.objects.positions.untyped_storage().resize_(8)
-    with pytest.raises(ValueError, match="objects.positions"):
+    scenery.objects.records.untyped_storage().resize_(8)
+    with pytest.raises(ValueError, match="objects.records"):
         engine.observe(scenery, agents)
 
 

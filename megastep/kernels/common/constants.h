@@ -18,6 +18,7 @@ constexpr int NAN_ACTION = 5;  // a continuous action that is NaN
 constexpr int DISC = 0;
 constexpr int CRATE = 1;
 constexpr int DOOR = 2;
+constexpr int OBJECT_BYTES = 32;  // of a record
 
 // Errors of objects. Their flag holds OBJECT_ERROR_KINDS * (O env + object) + kind.
 constexpr int OBJECT_ERROR_KINDS = 8;

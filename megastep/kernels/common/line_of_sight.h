@@ -35,12 +35,13 @@ HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int e
                                float y, float dx, float dy, float side_x, float side_y) {
     unsigned int cut = 0;
     for (int k = group.rank; k < o.n_objects; k += Group::SIZE) {
-        int i = env * o.n_objects + k, shape = o.shapes[k];
-        if (!is_obstacle(o, i))
+        Object object = objects_of(o)[env * o.n_objects + k];
+        if (!is_obstacle(object))
             continue;
-        Pose pose = pose_of(o, i);
+        int shape = o.shapes[k];
+        Pose pose = pose_at(object.x, object.y, object.angle);
         for (int m = 0; m < n_lines_of(shape); m++) {
-            Float4 side = line_of(shape, m, o.sizes[i], pose);
+            Float4 side = line_of(shape, m, object.size, pose);
             for (int line = 0; line < 3; line++) {
                 float aside = (float)(line - 1);
                 cut |= (unsigned int)cuts(side.x, side.y, side.z, side.w, x, y, dx + aside * side_x,

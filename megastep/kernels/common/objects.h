@@ -5,38 +5,48 @@
 #include "common/math.h"
 #include "common/scenery.h"
 
+// An object, in 32 bytes that are read at once. Python's tensors of objects are views of its
+// fields.
+struct ALIGNED Object {
+    float x, y;             // metres; of a carried object, its carrier's
+    float angle;            // degrees
+    float size;             // metres: radius, or half the length of a side
+    int carrier;            // the agent that carries it; -1: none
+    int colour;             // index into the palette
+    unsigned char visible;  // 0: as if it were not there
+    unsigned char solid;    // 1: stops agents and lines of sight
+    unsigned char open;     // 1: as if it were not there
+    unsigned char unused[5];
+};
+static_assert(sizeof(Object) == OBJECT_BYTES, "Python views its fields");
+
 struct ObjectsParams {
-    const int* shapes;             // (O) DISC, CRATE or DOOR
-    const int* line_starts;        // (O + 1) first line of each object
-    const int* line_object;        // (L) the object of each line
-    const float* palette;          // (P, 3) linear light
-    const float* extents;          // (D, 4) min x, min y, max x, max y of each layout's walls
-    float* positions;              // (N, O, 2) metres; of a carried object, its carrier's
-    float* angles;                 // (N, O) degrees
-    const float* sizes;            // (N, O) metres: radius, or half the length of a side
-    const int* colours;            // (N, O)
-    const unsigned char* visible;  // (N, O) 0: as if it were not there
-    const unsigned char* solid;    // (N, O) 1: stops agents and lines of sight
-    const unsigned char* open;     // (N, O) 1: as if it were not there
-    int* carriers;                 // (N, O) the agent that carries it; -1: none
-    float* lines;                  // (N, L, 4) out; an object that is not there has lines of 0 m
-    float* texels;                 // (N, O, 4) out: red, green, blue, light
-    int* error_flag;               // (1) out: OBJECT_ERROR_KINDS * (O env + object) + kind
-    int n_objects;                 // 0: there are none
+    const int* shapes;       // (O) DISC, CRATE or DOOR
+    const int* line_starts;  // (O + 1) first line of each object
+    const int* line_object;  // (L) the object of each line
+    const float* palette;    // (P, 3) linear light
+    const float* extents;    // (D, 4) min x, min y, max x, max y of each layout's walls
+    float* objects;          // (N, O) records of the struct Object
+    float* lines;            // (N, L, 4) out; an object that is not there has lines of 0 m
+    float* texels;           // (N, O, 4) out: red, green, blue, light
+    int* error_flag;         // (1) out: OBJECT_ERROR_KINDS * (O env + object) + kind
+    int n_objects;           // 0: there are none
     int n_lines;
     int n_colours;
     int lit;  // 1: the layout's lights fall on them, else each has full light
 };
 
+HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
+
 HD void flag_object(const ObjectsParams& o, int i, int kind) {
     *o.error_flag = OBJECT_ERROR_KINDS * i + kind;
 }
 
-HD int is_there(const ObjectsParams& o, int i) { return o.visible[i] && !o.open[i]; }
+HD int is_there(const Object& object) { return object.visible && !object.open; }
 
-// Returns 1 if object i stops agents.
-HD int is_obstacle(const ObjectsParams& o, int i) {
-    return o.solid[i] && is_there(o, i) && o.carriers[i] < 0;
+// Returns 1 if an object stops agents.
+HD int is_obstacle(const Object& object) {
+    return object.solid && is_there(object) && object.carrier < 0;
 }
 
 HD int n_lines_of(int shape) { return shape == DISC ? 6 : shape == CRATE ? 4 : 1; }
@@ -72,14 +82,10 @@ HD Float4 line_of(int shape, int k, float size, const Pose& pose) {
 // as discs of their size.
 HD int is_clear(const ObjectsParams& o, int env, float x, float y, float radius) {
     for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++) {
-        float dx = x - o.positions[2 * i], dy = y - o.positions[2 * i + 1];
-        float apart = radius + o.sizes[i];
-        if (is_obstacle(o, i) && dx * dx + dy * dy < apart * apart)
+        Object object = objects_of(o)[i];
+        float dx = x - object.x, dy = y - object.y, apart = radius + object.size;
+        if (is_obstacle(object) && dx * dx + dy * dy < apart * apart)
             return 0;
     }
     return 1;
-}
-
-HD Pose pose_of(const ObjectsParams& o, int i) {
-    return pose_at(o.positions[2 * i], o.positions[2 * i + 1], o.angles[i]);
 }
