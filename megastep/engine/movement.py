@@ -63,7 +63,7 @@ def physics(
     progress = torch.empty(lanes, device=device)
     kernel = _kernel(n, device)
     if scenery.objects is not None:
-        kernel = "physics_objects"
+        kernel = kernel.replace("physics", "physics_objects")
     threads_per_env = _threads_per_env(n, device)
     launch(
         *(ENGINE, kernel, device, threads_per_env * n),

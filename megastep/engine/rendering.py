@@ -29,6 +29,8 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 MAX_DRAWN_LINES = ENGINE.constants["MAX_DRAWN_LINES"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
+#: Of a line, or of a texel.
+_N_BYTES = 16
 #: Agents are many if they need more threads than this many times those that a GPU runs at once, by
 #: what is faster on an H200.
 UNSPILLED_WAVES = 4
@@ -167,6 +169,8 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, draws_objects=False, *
     n = scenery.n_envs * scenery.n_agents
     kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
     n_per_block = 1 if kernel == "render_split" else BLOCK // WARP
+    if draws_objects:
+        shared += _N_BYTES * (len(scenery.objects.line_object) + scenery.objects.n_objects)
     if scenery.objects is not None:
         kernel = kernel.replace("render", "render_objects")
     launch(

@@ -45,27 +45,16 @@ HD void settle(const ObjectsParams& o, const SceneryParams& s, const Object& obj
         flag_object(o, i, BAD_COLOUR);
 }
 
-// The colour of object i, in full light.
-HD const float* colour_of(const ObjectsParams& o, int i) {
-    int colour = objects_of(o)[i].colour;
-    return o.palette + 3 * ((unsigned int)colour < (unsigned int)o.n_colours ? colour : 0);
+// An object's texel: red, green, blue and light.
+HD Float4 texel_of(const ObjectsParams& o, const Object& object, float light) {
+    int exists = (unsigned int)object.colour < (unsigned int)o.n_colours;
+    const float* rgb = o.palette + 3 * (exists ? object.colour : 0);
+    return {rgb[0], rgb[1], rgb[2], light};
 }
 
-// Line k of a placed object, of 0 m if it is not drawn.
-HD Float4 drawn_line(const Object& object, int shape, int k) {
-    if (!is_drawn(object))
+// Line k of a placed object as agent a sees it, of 0 m if it does not: nobody sees what it carries.
+HD Float4 seen_line(const Object& object, int shape, int k, int a) {
+    if (!is_drawn(object) || object.carrier == a)
         return {0.f, 0.f, 0.f, 0.f};
     return line_of(shape, k, object.size, pose_at(object.x, object.y, object.angle));
-}
-
-// Draws line l of an environment's objects as agent a sees it, who does not see what it carries.
-// `settles`: the object is settled with its first line.
-HD Float4 seen_line(const ObjectsParams& o, const SceneryParams& s, const float* positions,
-                    const float* angles, int env, int layout, int a, int l, int settles) {
-    int k = o.line_object[l], i = env * o.n_objects + k, first = o.line_starts[k];
-    Object object = placed(objects_of(o)[i], s, positions, angles, env);
-    Float4 line = drawn_line(object, o.shapes[k], l - first);
-    if (settles && l == first)
-        settle(o, s, object, layout, i);
-    return object.carrier == a ? Float4{0.f, 0.f, 0.f, 0.f} : line;
 }

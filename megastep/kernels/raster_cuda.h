@@ -136,8 +136,9 @@ DEVICE void raster_group(View<is_split>& v, const Float4* ends, int line, int ac
 // skipped. The others come nearest first, so that groups entirely behind earlier ones can be
 // skipped too.
 template <int drawn, int is_split>
-DEVICE void raster_walls(View<is_split>& v, const SceneryParams& s, const EnvScenery& scenery,
+DEVICE void raster_walls(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
                          float half_width) {
+    const SceneryParams& s = p.scenery;
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
         unsigned int key = ~0u;
         ScreenBounds bounds = {-1.f, 0.f, 0, 0};
@@ -163,7 +164,8 @@ DEVICE void raster_walls(View<is_split>& v, const SceneryParams& s, const EnvSce
                 continue;  // the box is entirely behind earlier ones
             int l = BOX_WALLS * (start + k);
             raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
-                         first_static_line<drawn>(scenery) + l, l + v.warp_lane < scenery.n_walls);
+                         first_static_line<drawn>(p, scenery) + l,
+                         l + v.warp_lane < scenery.n_walls);
         }
     }
 }
@@ -179,15 +181,16 @@ DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvSc
     }
 }
 
-// Rasterises the lines of all objects except those that agent a carries.
+// Rasterises the lines of all objects except those that agent a carries, which have no lines if
+// this kernel has drawn them.
 template <int is_split>
-DEVICE void raster_objects(View<is_split>& v, const ObjectsParams& o, const EnvScenery& scenery,
-                           int a) {
-    for (int first = 0; first < scenery.n_object_lines; first += WARP) {
-        int l = first + v.warp_lane;
-        int active = l < scenery.n_object_lines;
-        if (active && !scenery.is_drawn)
-            active = objects_of(o)[scenery.first_object + o.line_object[l]].carrier != a;
-        raster_group(v, scenery.object_lines + l, scenery.n_agent_lines + first, active);
+DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
+                           const ObjectScenery& objects, int env, int a) {
+    const ObjectsParams& o = p.objects;
+    for (int first = 0; first < o.n_lines; first += WARP) {
+        int l = first + v.warp_lane, active = l < o.n_lines;
+        if (active && !p.draws_objects)
+            active = objects_of(o)[env * o.n_objects + o.line_object[l]].carrier != a;
+        raster_group(v, objects.lines + l, scenery.n_agent_lines + first, active);
     }
 }

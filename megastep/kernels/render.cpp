@@ -61,7 +61,7 @@ struct Scratch {
     std::vector<float> sums;
     std::vector<unsigned short> halves;
     Rays rays;
-    std::vector<Float4> object_lines;
+    std::vector<Float4> objects;
 };
 
 // Rasterises a near-clipped line, which is invisible where it is within the radius.
@@ -140,12 +140,12 @@ static void find_runs(const std::vector<int>& index, int res, std::vector<Run>& 
     }
 }
 
-static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
-                          Rays& rays) {
+static void find_surfaces(const RenderParams& p, const EnvScenery& scenery,
+                          const ObjectScenery& objects, const Pose& camera, Rays& rays) {
     for (auto [line, first, end] : rays.runs) {
         Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
         if (line >= 0)
-            surface = surface_of<AGENTS | OBJECTS>(p.scenery, scenery, camera, line);
+            surface = surface_of<AGENTS | OBJECTS>(p, scenery, camera, line, objects);
         int n = end - first;
         std::fill_n(&rays.ax[first], n, surface.ax);
         std::fill_n(&rays.ay[first], n, surface.ay);
@@ -185,9 +185,9 @@ static void find_hits(const RenderParams& p, const Screen& screen, Rays& rays) {
     }
 }
 
-// As wall_colour, with a vector of all components.
-static void wall_samples(const SceneryParams& s, Rays& rays, int first, int end) {
-    const AnyFour* texels = (const AnyFour*)s.texels;
+// As colour_at, with a vector of all components.
+static void wall_samples(const void* of, Rays& rays, int first, int end) {
+    const AnyFour* texels = (const AnyFour*)of;
     const int *left = rays.left.data(), *right = rays.right.data();
     const float *weight = rays.weight.data(), *facing = rays.facing.data();
     const float* depth = rays.depth.data();
@@ -209,32 +209,25 @@ static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int 
     }
 }
 
-static void object_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays, int first,
-                           int end) {
-    for (int r = first; r < end; r++) {
-        Surface surface = {0.f, 0.f, 0.f, 0.f, rays.first_texel[r], 1, OBJECTS};
-        Colour colour = moving_colour<OBJECTS>(p.objects, scenery, surface, {0.f, rays.facing[r]});
-        rays.samples[r] = Four{colour.red, colour.green, colour.blue, rays.depth[r]};
-    }
-}
-
-static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays) {
+static void find_samples(const RenderParams& p, const EnvScenery& scenery,
+                         const ObjectScenery& objects, Rays& rays) {
     for (auto [line, first, end] : rays.runs) {
         if (line < 0)
             std::fill_n(&rays.samples[first], end - first, Four{});
         else if (line < scenery.n_agent_lines)
             agent_samples(scenery, rays, first, end);
-        else if (line < first_static_line<OBJECTS>(scenery))
-            object_samples(p, scenery, rays, first, end);
+        else if (line < first_static_line<OBJECTS>(p, scenery))
+            wall_samples(objects.texels, rays, first, end);
         else
-            wall_samples(p.scenery, rays, first, end);
+            wall_samples(p.scenery.texels, rays, first, end);
     }
 }
 
 // Returns the number of newly seen texels. Nearly all were seen before, so blocks of rays are
 // tested for others first.
-static int mark_all_seen(const EnvScenery& scenery, Rays& rays, unsigned int* seen) {
-    int newly_seen = 0, first_line = first_static_line<OBJECTS>(scenery);
+static int mark_all_seen(const RenderParams& p, const EnvScenery& scenery, Rays& rays,
+                         unsigned int* seen) {
+    int newly_seen = 0, first_line = first_static_line<OBJECTS>(p, scenery);
     int first_texel = scenery.first_texel;
     const int *index = rays.index.data(), *texel = rays.texel.data();
     for (int block = 0; block < (int)rays.index.size(); block += BLOCK_RAYS) {
@@ -317,8 +310,9 @@ static int agent_ray_of(const std::vector<int>& index, int res, int n_agent_line
 }
 
 // Returns the number of newly seen texels.
-static int render_view(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
-                       int view, int a, unsigned int* seen, Scratch& scratch) {
+static int render_view(const RenderParams& p, const EnvScenery& scenery,
+                       const ObjectScenery& objects, const Pose& camera, int view, int env, int a,
+                       unsigned int* seen, Scratch& scratch) {
     const SceneryParams& s = p.scenery;
     Screen screen = screen_of(p);
     Rays& rays = scratch.rays;
@@ -328,32 +322,32 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
         raster_lines(
             camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
             [&](int l) { return l / s.n_model == a; }, scratch);
-    if (scenery.n_object_lines)
+    if (p.objects.n_lines)
         raster_lines(
-            camera, screen, p, (const float*)scenery.object_lines, scenery.n_object_lines,
+            camera, screen, p, (const float*)objects.lines, p.objects.n_lines,
             scenery.n_agent_lines,
             [&](int l) {
-                int i = scenery.first_object + scenery.line_object[l];
-                return !scenery.is_drawn && objects_of(p.objects)[i].carrier == a;
+                int i = env * p.objects.n_objects + p.objects.line_object[l];
+                return !p.draws_objects && objects_of(p.objects)[i].carrier == a;
             },
             scratch);
     raster_lines(
         camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
-        first_static_line<OBJECTS>(scenery), [](int) { return false; }, scratch);
+        first_static_line<OBJECTS>(p, scenery), [](int) { return false; }, scratch);
     if (p.centre_line)
         p.centre_line[view] = rays.index[p.res / 2];
     if (p.agent_ray)
         p.agent_ray[view] = agent_ray_of(rays.index, p.res, scenery.n_agent_lines);
     find_runs(rays.index, p.res, rays.runs);
-    find_surfaces(p, scenery, camera, rays);
+    find_surfaces(p, scenery, objects, camera, rays);
     find_hits(p, screen, rays);
     if (p.rgb || p.screen || p.depth)
-        find_samples(p, scenery, rays);
+        find_samples(p, scenery, objects, rays);
     if (p.indices || p.screen || p.locations || p.dots || p.distances)
         write_rays(p, screen, view, rays);
     if (p.rgb || p.depth)
         write_pixels(p, view, rays.samples, scratch);
-    return seen ? mark_all_seen(scenery, rays, seen) : 0;
+    return seen ? mark_all_seen(p, scenery, rays, seen) : 0;
 }
 
 static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
@@ -364,14 +358,12 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     int layout = layout_of(s, env, p.error_flag);
     EnvScenery scenery = env_scenery(s, env, layout);
     if (p.draws_objects) {
-        scratch.object_lines.resize(p.objects.n_lines);
+        scratch.objects.resize(p.objects.n_lines + p.objects.n_objects);
         for (int l = 0; l < p.objects.n_lines; l++)
-            scratch.object_lines[l] =
-                seen_line(p.objects, s, p.positions, p.angles, env, layout, a, l, a == 0);
+            draw_line(p, env, layout, a, l, scratch.objects.data());
     }
-    if (p.objects.n_objects)
-        add_objects(scenery, p.objects, env,
-                    p.draws_objects ? scratch.object_lines.data() : nullptr);
+    ObjectScenery objects =
+        object_scenery(p.objects, env, p.draws_objects ? scratch.objects.data() : nullptr);
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);
     if (p.imu)
@@ -382,7 +374,8 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
             seen[i] = 0u;
     for (int c = 0; c < p.n_cameras; c++) {
         Pose camera = pose_at(x, y, angle + p.yaws[c]);
-        newly_seen += render_view(p, scenery, camera, agent * p.n_cameras + c, a, seen, scratch);
+        newly_seen += render_view(p, scenery, objects, camera, agent * p.n_cameras + c, env, a,
+                                  seen, scratch);
     }
     if (p.newly_seen)
         p.newly_seen[agent] = newly_seen;

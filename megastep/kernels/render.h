@@ -29,6 +29,20 @@ HD float depth_reading(float distance, float radius, float inv_max_depth) {
     return 1.f - clamp((distance - radius) * inv_max_depth, 0.f, 1.f);
 }
 
+// Draws line l of an environment's objects as agent a sees it into `drawn`, and with an object's
+// first line its texel, after all lines. The first of the agents settles the objects.
+HD void draw_line(const RenderParams& p, int env, int layout, int a, int l, Float4* drawn) {
+    const ObjectsParams& o = p.objects;
+    int k = o.line_object[l], i = env * o.n_objects + k, first = o.line_starts[k];
+    Object object = placed(objects_of(o)[i], p.scenery, p.positions, p.angles, env);
+    drawn[l] = seen_line(object, o.shapes[k], l - first, a);
+    if (l != first)
+        return;
+    drawn[o.n_lines + k] = texel_of(o, object, 1.f);
+    if (a == 0)
+        settle(o, p.scenery, object, layout, i);
+}
+
 // What a ray contributes to its pixel.
 struct RaySample {
     float red, green, blue, depth;
@@ -59,16 +73,19 @@ HD void write_miss(const RenderParams& p, long long ray) {
 // time.
 template <int full_res, int drawn>
 HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvScenery& scenery,
-                       const Surface& surface, int view, unsigned int* seen, int r,
-                       float inverse_depth, int& newly_seen) {
+                       const Surface& surface, const ObjectScenery& objects, int view,
+                       unsigned int* seen, int r, float inverse_depth, int& newly_seen) {
     float y = ray_slope(screen, r), length = p.ray_lengths[r];
     float distance = length * RECIPROCAL(inverse_depth);
     int first = surface.first_texel, width = surface.width;
     Hit hit = hit_of(surface, y, length);
     RaySample sample = {0.f, 0.f, 0.f, depth_reading(distance, screen.radius, p.inv_max_depth)};
     if (p.rgb || (full_res && p.screen)) {
-        Colour colour = surface.kind ? moving_colour<drawn>(p.objects, scenery, surface, hit)
-                                     : wall_colour(p.scenery, first, width, hit);
+        int is_agent = drawn & OBJECTS ? surface.kind == AGENTS : surface.kind;
+        int is_object = drawn & OBJECTS && surface.kind == OBJECTS;
+        const Float4* texels = is_object ? objects.texels : (const Float4*)p.scenery.texels;
+        Colour colour = is_agent ? agent_colour(scenery, first, width, hit)
+                                 : colour_at(texels, first, width, hit);
         sample.red = colour.red;
         sample.green = colour.green;
         sample.blue = colour.blue;

@@ -30,10 +30,22 @@ DEVICE float quarter_of_sum(const RaySample& ray, int warp_lane) {
     return (second ? two : one) + __shfl_xor_sync(FULL_WARP, second ? one : two, 2);
 }
 
+// Where a kernel draws an environment's objects: after the nearest lines in shared memory.
+DEVICE Float4* drawn_objects(const RenderParams& p, NearestLine* nearest) {
+    return (Float4*)(nearest + whole_tiles(p.res));
+}
+
+template <int drawn>
+DEVICE ObjectScenery objects_for(const RenderParams& p, int env, NearestLine* nearest) {
+    if (!(drawn & OBJECTS))
+        return {0, 0};
+    return object_scenery(p.objects, env, p.draws_objects ? drawn_objects(p, nearest) : 0);
+}
+
 // Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels.
 template <int full_res, int drawn, int is_split>
 DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScenery& scenery,
-                  int view, unsigned int* seen, int& newly_seen) {
+                  int env, int view, unsigned int* seen, int& newly_seen) {
     int subsample = p.subsample, warp_lane = v.warp_lane;
     int first = is_split ? TILE * v.tiles.first : 0;
     int res = is_split ? mini(p.res, TILE * v.tiles.end) : p.res;
@@ -52,9 +64,10 @@ DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScene
             if (full_res)
                 p.indices[ray] = nearest.line;
             if (nearest.line >= 0) {
-                Surface surface = surface_of<drawn>(p.scenery, scenery, v.camera, nearest.line);
-                sample = shade_ray<full_res, drawn>(p, v.screen, scenery, surface, view, seen, r,
-                                                    nearest.inverse, newly_seen);
+                ObjectScenery objects = objects_for<drawn>(p, env, v.nearest);
+                Surface surface = surface_of<drawn>(p, scenery, v.camera, nearest.line, objects);
+                sample = shade_ray<full_res, drawn>(p, v.screen, scenery, surface, objects, view,
+                                                    seen, r, nearest.inverse, newly_seen);
             } else if (full_res) {
                 write_miss(p, ray);
             }
@@ -85,8 +98,7 @@ DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, 
 
 template <int full_res, int drawn, int is_split>
 DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelSpan* spans,
-                         NearestLine* nearest, int* newly_seen_by_warp,
-                         Float4* object_lines = nullptr) {
+                         NearestLine* nearest, int* newly_seen_by_warp) {
     const SceneryParams& s = p.scenery;
     int warp = threadIdx.x / WARP;
     int rank = is_split ? threadIdx.x : warp_lane, n_threads = is_split ? BLOCK : WARP;
@@ -97,18 +109,9 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     Screen screen = screen_of(p);
     int layout = layout_of(s, env, p.error_flag);
     EnvScenery scenery = env_scenery(s, env, layout);
-    if (drawn & OBJECTS) {
-        const Float4* lines = nullptr;
-        if (p.draws_objects) {
-            lines = object_lines;
-            int settles = a == 0 && rank < WARP;
-            for (int l = warp_lane; l < p.objects.n_lines; l += WARP)
-                object_lines[l] =
-                    seen_line(p.objects, s, p.positions, p.angles, env, layout, a, l, settles);
-            __syncwarp();
-        }
-        add_objects(scenery, p.objects, env, lines);
-    }
+    if (drawn & OBJECTS && p.draws_objects && rank == warp_lane)
+        for (int l = warp_lane; l < p.objects.n_lines; l += WARP)
+            draw_line(p, env, layout, a, l, drawn_objects(p, nearest));
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
     if (rank == 0)
         flag_nonfinite(p.error_flag, env, x, y, angle);
@@ -120,7 +123,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     Tiles tiles = {0, 0};
     if (is_split) {
         tiles = half_of_screen(p.res, warp);
-        __syncthreads();  // `seen` is clear
+        __syncthreads();  // `seen` is clear, and objects are drawn
     }
     int reads_both = is_split && (p.centre_line || p.agent_ray);  // halves of `nearest`
     for (int c = 0; c < p.n_cameras; c++) {
@@ -131,8 +134,8 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         if (drawn & AGENTS && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
         if (drawn & OBJECTS)
-            raster_objects(v, p.objects, scenery, a);
-        raster_walls<drawn>(v, s, scenery, p.half_width);
+            raster_objects(v, p, scenery, objects_for<drawn>(p, env, nearest), env, a);
+        raster_walls<drawn>(v, p, scenery, p.half_width);
         __syncwarp();
         if (reads_both)
             __syncthreads();
@@ -147,7 +150,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         }
         if (reads_both)
             __syncthreads();
-        shade<full_res, drawn>(p, v, scenery, view, seen, newly_seen);
+        shade<full_res, drawn>(p, v, scenery, env, view, seen, newly_seen);
     }
     if (!p.newly_seen)
         return;
@@ -174,18 +177,15 @@ DEVICE void render_by_warps(const RenderParams& p) {
         return;
     PixelSpan* warp_spans = spans + WARP * warp;
     NearestLine* nearest = shared + whole_tiles(p.res) * warp;
-    if (with_objects) {
-        __shared__ Float4 object_lines[with_objects ? BLOCK / WARP * MAX_DRAWN_LINES : 1];
-        Float4* lines = object_lines + MAX_DRAWN_LINES * warp;
-        if (may_write_all && p.indices)
-            render_agent<1, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0,
-                                                 lines);
-        else if (p.scenery.n_agents > 1)
-            render_agent<0, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0,
-                                                 lines);
-        else
-            render_agent<0, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0, lines);
-    } else if (may_write_all && p.indices)
+    if (with_objects && p.draws_objects)  // whose lines and texels follow
+        nearest += 2 * (p.objects.n_lines + p.objects.n_objects) * warp;
+    if (with_objects && may_write_all && p.indices)
+        render_agent<1, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else if (with_objects && p.scenery.n_agents > 1)
+        render_agent<0, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else if (with_objects)
+        render_agent<0, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else if (may_write_all && p.indices)
         render_agent<1, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
     else if (p.scenery.n_agents > 1)
         render_agent<0, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);

@@ -6,14 +6,12 @@ KERNEL BOUNDS(18) render_objects_split(RenderParams p) {
     extern __shared__ NearestLine nearest[];
     __shared__ PixelSpan spans[BLOCK];
     __shared__ int newly_seen_by_warp[BLOCK / WARP];
-    __shared__ Float4 object_lines[BLOCK / WARP * MAX_DRAWN_LINES];
-    int warp_lane = threadIdx.x % WARP, warp = threadIdx.x / WARP;
+    int warp_lane = threadIdx.x % WARP;
     PixelSpan* warp_spans = spans + (threadIdx.x - warp_lane);
-    Float4* lines = object_lines + MAX_DRAWN_LINES * warp;
     if (p.scenery.n_agents > 1)
         render_agent<0, AGENTS | OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest,
-                                             newly_seen_by_warp, lines);
+                                             newly_seen_by_warp);
     else
         render_agent<0, OBJECTS, 1>(p, blockIdx.x, warp_lane, warp_spans, nearest,
-                                    newly_seen_by_warp, lines);
+                                    newly_seen_by_warp);
 }

@@ -11,9 +11,6 @@ struct EnvScenery {
     const float* agent_textures;
     const float* agent_light;
     int first_box, first_wall, n_walls, n_agent_lines, first_texel;
-    int n_object_lines, is_drawn, first_object;
-    const Float4* object_lines;
-    const int* line_object;
 };
 
 HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
@@ -26,23 +23,21 @@ HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
             first,
             s.wall_starts[layout + 1] - first,
             n_agent_lines,
-            s.texel_starts[first],
-            0,
-            0,
-            0,
-            nullptr,
-            nullptr};
+            s.texel_starts[first]};
 }
 
-// Adds an environment's objects to its scenery. Their lines come between the agents' and the walls.
-// `drawn`: the lines, if they are drawn for the agent that sees them; else update_objects has drawn
-// them.
-HD void add_objects(EnvScenery& scenery, const ObjectsParams& o, int env, const Float4* drawn) {
-    scenery.n_object_lines = o.n_lines;
-    scenery.object_lines = drawn ? drawn : (const Float4*)o.lines + env * (long long)o.n_lines;
-    scenery.is_drawn = drawn != nullptr;
-    scenery.first_object = env * o.n_objects;
-    scenery.line_object = o.line_object;
+// The lines of an environment's objects, and a texel (red, green, blue, light) of each object.
+struct ObjectScenery {
+    const Float4 *lines, *texels;
+};
+
+// As update_objects has drawn them. A kernel that draws them itself passes `drawn`, to where it has
+// put the lines, and the texels after them; else null.
+HD ObjectScenery object_scenery(const ObjectsParams& o, int env, const Float4* drawn) {
+    if (drawn)
+        return {drawn, drawn + o.n_lines};
+    return {(const Float4*)o.lines + env * (long long)o.n_lines,
+            (const Float4*)o.texels + env * (long long)o.n_objects};
 }
 
 // What is drawn beside walls, a bit each.
@@ -51,8 +46,8 @@ constexpr int OBJECTS = 2;
 
 // The first wall's index among an environment's lines.
 template <int drawn>
-HD int first_static_line(const EnvScenery& scenery) {
-    return drawn & OBJECTS ? scenery.n_agent_lines + scenery.n_object_lines : scenery.n_agent_lines;
+HD int first_static_line(const RenderParams& p, const EnvScenery& scenery) {
+    return drawn & OBJECTS ? scenery.n_agent_lines + p.objects.n_lines : scenery.n_agent_lines;
 }
 
 // A line hit by rays: its start and direction in the camera's frame, and its texels. `kind`: 0 of a
@@ -64,23 +59,23 @@ struct Surface {
 
 // Line l of an environment: agents' come first, then objects', then walls.
 template <int drawn>
-HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const Pose& camera,
-                      int l) {
-    if (drawn & OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(scenery)) {
-        int i = l - scenery.n_agent_lines;
-        Float4 line = scenery.object_lines[i];  // may be in shared memory
-        float ax, ay, bx, by;
-        to_camera(camera, line.x, line.y, ax, ay);
-        to_camera(camera, line.z, line.w, bx, by);
-        return {ax, ay, bx - ax, by - ay, scenery.line_object[i], 1, OBJECTS};
-    }
+HD Surface surface_of(const RenderParams& p, const EnvScenery& scenery, const Pose& camera, int l,
+                      const ObjectScenery& objects) {
+    const SceneryParams& s = p.scenery;
     int is_agent = drawn & AGENTS && l < scenery.n_agent_lines;
-    int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(scenery));
-    Float4 line = LOAD((const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i);
+    int is_object = drawn & OBJECTS && !is_agent && l < first_static_line<drawn>(p, scenery);
+    int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(p, scenery));
+    const Float4* line = (const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i;
+    if (is_object)
+        line = objects.lines + (l - scenery.n_agent_lines);
+    Float4 ends = LOAD(line);
     const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;
     float ax, ay, bx, by;
-    to_camera(camera, line.x, line.y, ax, ay);
-    to_camera(camera, line.z, line.w, bx, by);
+    to_camera(camera, ends.x, ends.y, ax, ay);
+    to_camera(camera, ends.z, ends.w, bx, by);
+    if (is_object)
+        return {ax, ay,     bx - ax, by - ay, p.objects.line_object[l - scenery.n_agent_lines],
+                1,  OBJECTS};
     return {ax, ay, bx - ax, by - ay, starts[0], starts[1] - starts[0], is_agent};
 }
 
@@ -134,9 +129,9 @@ HD Colour blend(const Float4 left, const Float4 right, float weight, float facin
             mix(left.z, right.z, weight) * light};
 }
 
-HD Colour wall_colour(const SceneryParams& s, int first, int width, const Hit& hit) {
+// The colour where a ray hits a line whose texels are `texels`.
+HD Colour colour_at(const Float4* texels, int first, int width, const Hit& hit) {
     Filter f = filter_at(hit.location, width);
-    const Float4* texels = (const Float4*)s.texels;
     return blend(LOAD(texels + (first + f.left)), LOAD(texels + (first + f.right)), f.weight,
                  hit.facing);
 }
@@ -150,21 +145,4 @@ HD Colour agent_colour(const EnvScenery& scenery, int first, int width, const Hi
     Filter f = filter_at(hit.location, width);
     return blend(agent_texel(scenery, first + f.left), agent_texel(scenery, first + f.right),
                  f.weight, hit.facing);
-}
-
-// The colour where a ray hits an agent or an object. An object has one texel, which all its lines
-// show.
-template <int drawn>
-HD Colour moving_colour(const ObjectsParams& o, const EnvScenery& scenery, const Surface& surface,
-                        const Hit& hit) {
-    if (!(drawn & OBJECTS) || surface.kind != OBJECTS)
-        return agent_colour(scenery, surface.first_texel, surface.width, hit);
-    int i = scenery.first_object + surface.first_texel;
-    if (scenery.is_drawn) {
-        const float* rgb = colour_of(o, i);
-        return {rgb[0] * hit.facing, rgb[1] * hit.facing, rgb[2] * hit.facing};
-    }
-    Float4 texel = LOAD((const Float4*)o.texels + i);
-    float light = texel.w * hit.facing;
-    return {texel.x * light, texel.y * light, texel.z * light};
 }

@@ -4,6 +4,8 @@
 #include "light.h"
 #include "params.h"
 
+constexpr int NOBODY = -2;  // no agent, nor a carrier
+
 // The light at a point, as light_at of light_cpu.h.
 HD float light_on(const SceneryParams& s, int layout, float x, float y) {
     float sum = AMBIENT;
@@ -34,8 +36,7 @@ HD void update_object(const UpdateObjectsParams& p, int i) {
     settle(o, s, object, layout, i);
     Float4* lines = (Float4*)o.lines + env * (long long)o.n_lines;
     for (int l = first; l < o.line_starts[k + 1]; l++)
-        lines[l] = drawn_line(object, o.shapes[k], l - first);
-    const float* rgb = colour_of(o, i);
+        lines[l] = seen_line(object, o.shapes[k], l - first, NOBODY);
     float light = o.lit && is_drawn(object) ? light_on(s, layout, object.x, object.y) : 1.f;
-    ((Float4*)o.texels)[i] = {rgb[0], rgb[1], rgb[2], light};
+    ((Float4*)o.texels)[i] = texel_of(o, object, light);
 }
