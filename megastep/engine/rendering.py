@@ -27,10 +27,9 @@ from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
 __all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
-MAX_DRAWN_LINES = ENGINE.constants["MAX_DRAWN_LINES"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
-#: Of a line, or of a texel.
-_N_BYTES = 16
+#: Of an object's line, or its texel, in shared memory.
+LINE_BYTES = 16
 #: Agents are many if they need more threads than this many times those that a GPU runs at once, by
 #: what is faster on an H200.
 UNSPILLED_WAVES = 4
@@ -94,7 +93,7 @@ def observe(
     """Renders what training needs, in one pass and without full-resolution tensors.
 
     Equals :func:`render` followed by the sensors of :mod:`~megastep.modules`. With one agent per
-    environment, ``scenery.lines`` is not updated, nor are few unlit objects' lines.
+    environment, ``scenery.lines`` is not updated, nor are unlit objects' lines.
 
     Args:
         subsample: rays per pixel, a divisor of ``agents.res``; at most 32.
@@ -132,19 +131,12 @@ def observe(
         imu=torch.empty((n, a, 3), dtype=half, device=device) if imu else None,
         newly_seen=torch.empty(lanes, dtype=int32, device=device) if seen_fields else None,
     )
-    draws_objects = _draws_objects(scenery)
-    if not draws_objects:
+    if scenery.objects is not None and scenery.objects.lit:
         update_objects(scenery, agents)
     moving = state_params(scenery, agents, "velocity", "angvelocity") if imu else {}
     optional = {**moving, **seen_fields, **out._asdict()}
-    _render(scenery, agents, subsample, max_depth, draws_objects, **optional)
+    _render(scenery, agents, subsample, max_depth, **optional)
     return out
-
-
-def _draws_objects(scenery):
-    """Returns True if the kernel that renders also draws the objects: few lines, unlit."""
-    objects = scenery.objects
-    return objects is not None and not objects.lit and len(objects.line_object) <= MAX_DRAWN_LINES
 
 
 def _per_camera(lanes, agents):
@@ -162,16 +154,15 @@ def _seen_fields(scenery, seen, clear_mask):
     return dict(seen=address, clear_mask=mask, n_words=n_words)
 
 
-def _render(scenery, agents, subsample=1, max_depth=10.0, draws_objects=False, **outputs):
+def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     res, device = agents.res, scenery.device
     half_width = math.tan(math.radians(agents.fov / 2))
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
     n = scenery.n_envs * scenery.n_agents
     kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
     n_per_block = 1 if kernel == "render_split" else BLOCK // WARP
-    if draws_objects:
-        shared += _N_BYTES * (len(scenery.objects.line_object) + scenery.objects.n_objects)
     if scenery.objects is not None:
+        shared += LINE_BYTES * (len(scenery.objects.line_object) + scenery.objects.n_objects)
         kernel = kernel.replace("render", "render_objects")
     launch(
         *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared * n_per_block)),
@@ -195,7 +186,6 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, draws_objects=False, *
         inv_subsample=1 / subsample,
         inv_max_depth=1 / max_depth,
         objects=object_params(scenery),
-        draws_objects=int(draws_objects),
         **{**_OPTIONAL, **outputs},
     )
     check_on_cpu(agents)

@@ -3,5 +3,4 @@
 
 constexpr int MAX_RES = 1024;          // rays per camera: 32 tiles of 32 pixels
 constexpr int MAX_SUBSAMPLE = 32;      // rays per pixel: at most one warp
-constexpr int MAX_DRAWN_LINES = 64;    // of objects that a kernel that renders draws itself
 constexpr int NEAREST_LINE_BYTES = 8;  // of shared memory per ray, while rendering

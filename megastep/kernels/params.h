@@ -77,7 +77,6 @@ struct RenderParams {
     int* newly_seen;                  // (N, A) out: texels newly marked in seen
     int n_words;
     ObjectsParams objects;
-    int draws_objects;  // 1: objects are moved and drawn here, unlit; 0: by update_objects before
 };
 
 struct SpawnParams {

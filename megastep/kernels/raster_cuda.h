@@ -181,16 +181,12 @@ DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvSc
     }
 }
 
-// Rasterises the lines of all objects except those that agent a carries, which have no lines if
-// this kernel has drawn them.
+// Rasterises the lines of all objects, as drawn by draw_line.
 template <int is_split>
 DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
-                           const ObjectScenery& objects, int env, int a) {
-    const ObjectsParams& o = p.objects;
-    for (int first = 0; first < o.n_lines; first += WARP) {
-        int l = first + v.warp_lane, active = l < o.n_lines;
-        if (active && !p.draws_objects)
-            active = objects_of(o)[env * o.n_objects + o.line_object[l]].carrier != a;
-        raster_group(v, objects.lines + l, scenery.n_agent_lines + first, active);
+                           const Float4* objects) {
+    for (int first = 0; first < p.objects.n_lines; first += WARP) {
+        int l = first + v.warp_lane;
+        raster_group(v, objects + l, scenery.n_agent_lines + first, l < p.objects.n_lines);
     }
 }

@@ -140,8 +140,8 @@ static void find_runs(const std::vector<int>& index, int res, std::vector<Run>& 
     }
 }
 
-static void find_surfaces(const RenderParams& p, const EnvScenery& scenery,
-                          const ObjectScenery& objects, const Pose& camera, Rays& rays) {
+static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, const Float4* objects,
+                          const Pose& camera, Rays& rays) {
     for (auto [line, first, end] : rays.runs) {
         Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
         if (line >= 0)
@@ -209,15 +209,15 @@ static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int 
     }
 }
 
-static void find_samples(const RenderParams& p, const EnvScenery& scenery,
-                         const ObjectScenery& objects, Rays& rays) {
+static void find_samples(const RenderParams& p, const EnvScenery& scenery, const Float4* objects,
+                         Rays& rays) {
     for (auto [line, first, end] : rays.runs) {
         if (line < 0)
             std::fill_n(&rays.samples[first], end - first, Four{});
         else if (line < scenery.n_agent_lines)
             agent_samples(scenery, rays, first, end);
         else if (line < first_static_line<OBJECTS>(p, scenery))
-            wall_samples(objects.texels, rays, first, end);
+            wall_samples(objects + p.objects.n_lines, rays, first, end);
         else
             wall_samples(p.scenery.texels, rays, first, end);
     }
@@ -310,9 +310,8 @@ static int agent_ray_of(const std::vector<int>& index, int res, int n_agent_line
 }
 
 // Returns the number of newly seen texels.
-static int render_view(const RenderParams& p, const EnvScenery& scenery,
-                       const ObjectScenery& objects, const Pose& camera, int view, int env, int a,
-                       unsigned int* seen, Scratch& scratch) {
+static int render_view(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
+                       int view, int a, unsigned int* seen, Scratch& scratch) {
     const SceneryParams& s = p.scenery;
     Screen screen = screen_of(p);
     Rays& rays = scratch.rays;
@@ -322,15 +321,10 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery,
         raster_lines(
             camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
             [&](int l) { return l / s.n_model == a; }, scratch);
-    if (p.objects.n_lines)
-        raster_lines(
-            camera, screen, p, (const float*)objects.lines, p.objects.n_lines,
-            scenery.n_agent_lines,
-            [&](int l) {
-                int i = env * p.objects.n_objects + p.objects.line_object[l];
-                return !p.draws_objects && objects_of(p.objects)[i].carrier == a;
-            },
-            scratch);
+    const Float4* objects = scratch.objects.data();
+    raster_lines(
+        camera, screen, p, (const float*)objects, p.objects.n_lines, scenery.n_agent_lines,
+        [](int) { return false; }, scratch);
     raster_lines(
         camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
         first_static_line<OBJECTS>(p, scenery), [](int) { return false; }, scratch);
@@ -357,13 +351,9 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     int layout = layout_of(s, env, p.error_flag);
     EnvScenery scenery = env_scenery(s, env, layout);
-    if (p.draws_objects) {
-        scratch.objects.resize(p.objects.n_lines + p.objects.n_objects);
-        for (int l = 0; l < p.objects.n_lines; l++)
-            draw_line(p, env, layout, a, l, scratch.objects.data());
-    }
-    ObjectScenery objects =
-        object_scenery(p.objects, env, p.draws_objects ? scratch.objects.data() : nullptr);
+    scratch.objects.resize(p.objects.n_lines + p.objects.n_objects);
+    for (int l = 0; l < p.objects.n_lines; l++)
+        draw_line(p, env, layout, a, l, scratch.objects.data());
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);
     if (p.imu)

@@ -30,22 +30,16 @@ DEVICE float quarter_of_sum(const RaySample& ray, int warp_lane) {
     return (second ? two : one) + __shfl_xor_sync(FULL_WARP, second ? one : two, 2);
 }
 
-// Where a kernel draws an environment's objects: after the nearest lines in shared memory.
-DEVICE Float4* drawn_objects(const RenderParams& p, NearestLine* nearest) {
-    return (Float4*)(nearest + whole_tiles(p.res));
-}
-
+// Where objects are drawn: after the nearest lines in shared memory.
 template <int drawn>
-DEVICE ObjectScenery objects_for(const RenderParams& p, int env, NearestLine* nearest) {
-    if (!(drawn & OBJECTS))
-        return {0, 0};
-    return object_scenery(p.objects, env, p.draws_objects ? drawn_objects(p, nearest) : 0);
+DEVICE Float4* drawn_objects(const RenderParams& p, NearestLine* nearest) {
+    return drawn & OBJECTS ? (Float4*)(nearest + whole_tiles(p.res)) : 0;
 }
 
 // Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels.
 template <int full_res, int drawn, int is_split>
 DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScenery& scenery,
-                  int env, int view, unsigned int* seen, int& newly_seen) {
+                  int view, unsigned int* seen, int& newly_seen) {
     int subsample = p.subsample, warp_lane = v.warp_lane;
     int first = is_split ? TILE * v.tiles.first : 0;
     int res = is_split ? mini(p.res, TILE * v.tiles.end) : p.res;
@@ -64,7 +58,7 @@ DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScene
             if (full_res)
                 p.indices[ray] = nearest.line;
             if (nearest.line >= 0) {
-                ObjectScenery objects = objects_for<drawn>(p, env, v.nearest);
+                const Float4* objects = drawn_objects<drawn>(p, v.nearest);
                 Surface surface = surface_of<drawn>(p, scenery, v.camera, nearest.line, objects);
                 sample = shade_ray<full_res, drawn>(p, v.screen, scenery, surface, objects, view,
                                                     seen, r, nearest.inverse, newly_seen);
@@ -109,9 +103,9 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     Screen screen = screen_of(p);
     int layout = layout_of(s, env, p.error_flag);
     EnvScenery scenery = env_scenery(s, env, layout);
-    if (drawn & OBJECTS && p.draws_objects && rank == warp_lane)
+    if (drawn & OBJECTS && rank == warp_lane)
         for (int l = warp_lane; l < p.objects.n_lines; l += WARP)
-            draw_line(p, env, layout, a, l, drawn_objects(p, nearest));
+            draw_line(p, env, layout, a, l, drawn_objects<drawn>(p, nearest));
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
     if (rank == 0)
         flag_nonfinite(p.error_flag, env, x, y, angle);
@@ -134,7 +128,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         if (drawn & AGENTS && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
         if (drawn & OBJECTS)
-            raster_objects(v, p, scenery, objects_for<drawn>(p, env, nearest), env, a);
+            raster_objects(v, p, scenery, drawn_objects<drawn>(p, nearest));
         raster_walls<drawn>(v, p, scenery, p.half_width);
         __syncwarp();
         if (reads_both)
@@ -150,7 +144,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         }
         if (reads_both)
             __syncthreads();
-        shade<full_res, drawn>(p, v, scenery, env, view, seen, newly_seen);
+        shade<full_res, drawn>(p, v, scenery, view, seen, newly_seen);
     }
     if (!p.newly_seen)
         return;
@@ -177,7 +171,7 @@ DEVICE void render_by_warps(const RenderParams& p) {
         return;
     PixelSpan* warp_spans = spans + WARP * warp;
     NearestLine* nearest = shared + whole_tiles(p.res) * warp;
-    if (with_objects && p.draws_objects)  // whose lines and texels follow
+    if (with_objects)  // whose lines and texels follow
         nearest += 2 * (p.objects.n_lines + p.objects.n_objects) * warp;
     if (with_objects && may_write_all && p.indices)
         render_agent<1, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);

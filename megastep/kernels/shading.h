@@ -26,20 +26,6 @@ HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
             s.texel_starts[first]};
 }
 
-// The lines of an environment's objects, and a texel (red, green, blue, light) of each object.
-struct ObjectScenery {
-    const Float4 *lines, *texels;
-};
-
-// As update_objects has drawn them. A kernel that draws them itself passes `drawn`, to where it has
-// put the lines, and the texels after them; else null.
-HD ObjectScenery object_scenery(const ObjectsParams& o, int env, const Float4* drawn) {
-    if (drawn)
-        return {drawn, drawn + o.n_lines};
-    return {(const Float4*)o.lines + env * (long long)o.n_lines,
-            (const Float4*)o.texels + env * (long long)o.n_objects};
-}
-
 // What is drawn beside walls, a bit each.
 constexpr int AGENTS = 1;
 constexpr int OBJECTS = 2;
@@ -57,25 +43,25 @@ struct Surface {
     int first_texel, width, kind;
 };
 
-// Line l of an environment: agents' come first, then objects', then walls.
+// Line l of an environment: agents' come first, then objects', then walls. `objects`: as drawn by
+// draw_line.
 template <int drawn>
 HD Surface surface_of(const RenderParams& p, const EnvScenery& scenery, const Pose& camera, int l,
-                      const ObjectScenery& objects) {
+                      const Float4* objects) {
     const SceneryParams& s = p.scenery;
-    int is_agent = drawn & AGENTS && l < scenery.n_agent_lines;
-    int is_object = drawn & OBJECTS && !is_agent && l < first_static_line<drawn>(p, scenery);
-    int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(p, scenery));
-    const Float4* line = (const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i;
-    if (is_object)
-        line = objects.lines + (l - scenery.n_agent_lines);
-    Float4 ends = LOAD(line);
-    const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;
     float ax, ay, bx, by;
-    to_camera(camera, ends.x, ends.y, ax, ay);
-    to_camera(camera, ends.z, ends.w, bx, by);
-    if (is_object)
-        return {ax, ay,     bx - ax, by - ay, p.objects.line_object[l - scenery.n_agent_lines],
-                1,  OBJECTS};
+    if (drawn & OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(p, scenery)) {
+        int i = l - scenery.n_agent_lines;
+        to_camera(camera, objects[i].x, objects[i].y, ax, ay);
+        to_camera(camera, objects[i].z, objects[i].w, bx, by);
+        return {ax, ay, bx - ax, by - ay, p.objects.line_object[i], 1, OBJECTS};
+    }
+    int is_agent = drawn & AGENTS && l < scenery.n_agent_lines;
+    int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(p, scenery));
+    Float4 line = LOAD((const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i);
+    const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;
+    to_camera(camera, line.x, line.y, ax, ay);
+    to_camera(camera, line.z, line.w, bx, by);
     return {ax, ay, bx - ax, by - ay, starts[0], starts[1] - starts[0], is_agent};
 }
 
@@ -129,9 +115,9 @@ HD Colour blend(const Float4 left, const Float4 right, float weight, float facin
             mix(left.z, right.z, weight) * light};
 }
 
-// The colour where a ray hits a line whose texels are `texels`.
-HD Colour colour_at(const Float4* texels, int first, int width, const Hit& hit) {
+HD Colour wall_colour(const SceneryParams& s, int first, int width, const Hit& hit) {
     Filter f = filter_at(hit.location, width);
+    const Float4* texels = (const Float4*)s.texels;
     return blend(LOAD(texels + (first + f.left)), LOAD(texels + (first + f.right)), f.weight,
                  hit.facing);
 }
@@ -145,4 +131,10 @@ HD Colour agent_colour(const EnvScenery& scenery, int first, int width, const Hi
     Filter f = filter_at(hit.location, width);
     return blend(agent_texel(scenery, first + f.left), agent_texel(scenery, first + f.right),
                  f.weight, hit.facing);
+}
+
+// An object has one texel, which all its lines show.
+HD Colour object_colour(const Float4& texel, float facing) {
+    float light = texel.w * facing;
+    return {texel.x * light, texel.y * light, texel.z * light};
 }

@@ -314,7 +314,7 @@ def test_more_objects_than_fit_are_named(device):
         (dict(shapes=["ball"]), "shapes must be disc or crate or door"),
         (dict(shapes=[]), "shapes must hold at least one"),
         (dict(palette=[[1.0, 0]]), "palette must be an array"),
-        (dict(shapes=["disc"] * 1025), "must be an integer from 1 to 1024"),
+        (dict(shapes=["disc"] * 257), "must be an integer from 1 to 256"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
