@@ -364,8 +364,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
             seen[i] = 0u;
     for (int c = 0; c < p.n_cameras; c++) {
         Pose camera = pose_at(x, y, angle + p.yaws[c]);
-        newly_seen += render_view(p, scenery, objects, camera, agent * p.n_cameras + c, env, a,
-                                  seen, scratch);
+        newly_seen += render_view(p, scenery, camera, agent * p.n_cameras + c, a, seen, scratch);
     }
     if (p.newly_seen)
         p.newly_seen[agent] = newly_seen;
