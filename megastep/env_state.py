@@ -157,7 +157,7 @@ class EnvState:
         """Returns {path: an earlier path} of tensors that are the same."""
         first, aliases = {}, {}
         for path, leaf in arrays.items():
-            key = _place(leaf)
+            key = _identity(leaf)
             if leaf.numel() and first.setdefault(key, path) != path:
                 aliases[path] = first[key]
         return aliases
@@ -225,7 +225,7 @@ class EnvState:
                 self._replace(path, _as_kind(value, state["kinds"][path]))
         for path, first in state["aliases"].items():
             same, now = node_at(self.root, first), node_at(self.root, path)
-            if _place(same) != _place(now):
+            if _identity(same) != _identity(now):
                 self._replace(path, same)
 
     def _set_value(self, path, value):
@@ -362,7 +362,7 @@ def _name(path):
     return path.removeprefix(".env").lstrip(".")
 
 
-def _place(leaf):
+def _identity(leaf):
     """Returns what is equal for tensors that are the same."""
     if not isinstance(leaf, torch.Tensor):
         return id(leaf)
@@ -373,11 +373,11 @@ def _digest(tensor):
     """Returns a number that differs if a tensor has other bytes or these in another order."""
     data = tensor.detach().contiguous().view(-1).view(torch.uint8)
     data = data.view(torch.int32) if len(data) % 4 == 0 else data
-    places = torch.arange(1, _CHUNK + 1, device=data.device) * _FACTOR
-    places = places.to(torch.int32) | 1  # odd, so each bit counts
+    factors = torch.arange(1, _CHUNK + 1, device=data.device) * _FACTOR
+    factors = factors.to(torch.int32) | 1  # odd, so each bit counts
     total = torch.zeros((), dtype=torch.int64, device=data.device)
     for chunk in data.split(_CHUNK):  # all modulo a power of 2
-        total = total * _FACTOR + (chunk * places[: len(chunk)]).sum(dtype=torch.int64)
+        total = total * _FACTOR + (chunk * factors[: len(chunk)]).sum(dtype=torch.int64)
     return int(total)
 
 

@@ -146,7 +146,7 @@ class VectorProcesses:
         code = process.exitcode
         if code in (None, -signal.SIGKILL):
             raise MemoryError(
-                "a process that steps environments was killed, perhaps for want of memory"
+                "a process that steps environments was killed, perhaps because memory ran out"
             )
         how = f"with exit code {code}" if code >= 0 else f"by {signal.Signals(-code).name}"
         raise EnvError(

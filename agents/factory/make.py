@@ -226,7 +226,7 @@ def share_threads(width: int) -> None:
 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
     learner = construct(settings, policy=policy, seed=seed, graph=True)
-    with errors(f"{settings.name} is no learner: "):
+    with errors(f"{settings.name} is not a learner: "):
         check_learner(learner)
         try:
             checkpoint_format.check_plain(learner.state_dict(), "state_dict")
@@ -279,7 +279,7 @@ def make_opponents(
     Raises:
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
     """
-    shares = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
+    options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot):
         return None
     bot = None
@@ -290,7 +290,7 @@ def make_opponents(
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
             engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")
-        return Opponents(env, policy, bot, seed=seed, **shares)
+        return Opponents(env, policy, bot, seed=seed, **options)
 
 
 def make_bot(name: str | None, settings: Env, env: Any) -> Any:

@@ -101,7 +101,7 @@ def make_trainer(
                 annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
                 profiler=Profiler(folder, cfg.profile, device) if cfg.profile else None,
             )
-        improves = Trainer(
+        trainer = Trainer(
             opponents or env,
             policy,
             learner,
@@ -119,9 +119,9 @@ def make_trainer(
             **writers,
         )
         if cfg.resume:
-            improves.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
-            improves.lost += differing(loaded.made_with, made_with)
-    return improves
+            trainer.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
+            trainer.lost += differing(loaded.made_with, made_with)
+    return trainer
 
 
 def differing(before: dict[str, Any], now: dict[str, Any]) -> list[str]:

@@ -54,7 +54,7 @@ def test_resumed_processes_begin_new_episodes(here, capsys):
     assert train.main(words) == 0
     assert "Checkpoints cannot hold" not in capsys.readouterr().err
     assert train.main(["resume=run", "more_samples=32"]) == 0
-    assert "its environments were not saved, so new episodes begin" in capsys.readouterr().out
+    assert "environments were not saved, so new episodes start" in capsys.readouterr().out
     samples = [row["samples"] for row in json_lines.read(here / "run/metrics.jsonl")]
     assert samples == [32, 64, 96]
 
