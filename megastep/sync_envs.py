@@ -92,6 +92,8 @@ class SyncEnvs:
         ValueError: the environments have different spaces.
     """
 
+    max_episode_steps: int | None = None
+
     def __init__(
         self,
         make: Callable[[], Any],

@@ -38,6 +38,8 @@ class VectorProcesses:
         n_processes: number of processes. Default: one per core, shared among the ranks of a host.
     """
 
+    max_episode_steps: int | None = None
+
     def __init__(self, make: Callable[..., SyncEnvs], n_envs: int, n_processes: int | None = None):
         import loky
         from gymnasium.vector.utils import create_empty_array
@@ -153,9 +155,11 @@ class VectorProcesses:
             f"the process that steps environments {rows.start} to {rows.stop - 1} was ended {how}"
         )
 
-    def _news(self, of_processes) -> dict[str, list]:
+    def _news(self, of_processes) -> dict:
         """Returns the news of all environments."""
-        news = {"failures": [one for part in of_processes for one in part.get("failures", ())]}
+        news: dict = {
+            "failures": [one for part in of_processes for one in part.get("failures", ())]
+        }
         if any("numbers" in part for part in of_processes):
             n_envs = self.rows[-1].stop
             news["numbers"] = {name: np.full(n_envs, np.nan) for name in self.names}
@@ -192,7 +196,8 @@ def _serve(pipe, make, rows) -> None:
             if command == "close":
                 return
     with contextlib.suppress(Exception):
-        envs.close()
+        if not isinstance(envs, Exception):
+            envs.close()
 
 
 def _answer(envs, command, argument) -> object:
@@ -211,7 +216,7 @@ def _answer(envs, command, argument) -> object:
     return envs.render()
 
 
-def _attempt(function, *arguments, **more) -> object:
+def _attempt(function, *arguments, **more) -> Any:
     """Returns what a function returns, or its error, in a form that can be sent."""
     try:
         return function(*arguments, **more)

@@ -134,8 +134,8 @@ def first_episodes(
         return world, state
 
     changed = draws, returns, lengths, metrics
-    max_steps = optional(env, "max_episode_steps") if max_steps is None else max_steps
-    step_until(done, step, world, state, env, (policy,), changed, max_steps)
+    most: int = optional(env, "max_episode_steps") if max_steps is None else max_steps
+    step_until(done, step, world, state, env, (policy,), changed, most)
     return arrdict(
         returns=returns,
         lengths=lengths,

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -53,7 +54,10 @@ def run(cfg: settings.Record) -> Path:
             undo.callback(path.unlink, missing_ok=True)
         # a video is the last thing that a run should fail for
         problem = f"The video {path} could not be made: "
-        with env_failures.told(env_settings, folder), user_errors(problem, (Exception,)):
+        with (
+            env_failures.told(cast("settings.Env", env_settings), folder),
+            user_errors(problem, (Exception,)),
+        ):
             recording.film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
         undo.pop_all()
     console.say(f"Filmed {cfg.steps} steps: {path}")

@@ -203,7 +203,8 @@ def sizes_of(env: types.Env) -> tuple[int, int]:
         return math.prod(space.shape) * getattr(space, "n_actions", 1)
 
     sides = env.obs_space, env.action_space
-    return tuple(sum(map(size, spaces.leaves(side).values())) for side in sides)
+    n_inputs, n_outputs = (sum(map(size, spaces.leaves(side).values())) for side in sides)
+    return n_inputs, n_outputs
 
 
 def make_policy(

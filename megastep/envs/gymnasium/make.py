@@ -28,7 +28,7 @@ def vector_env(
     vectorization: str,
     restart_failed: int = 0,
     films: bool = False,
-) -> "VectorEnv | VectorProcesses":
+) -> "VectorEnv | SyncEnvs | VectorProcesses":
     """Returns a vector environment. The step after an episode's end resets it.
 
     Args are those of :class:`~megastep.envs.gymnasium.env.Gymnasium`.
