@@ -38,7 +38,8 @@ class World(Protocol):
 
     def __iter__(self) -> Iterator[str]: ...
 
-    def get(self, key: str, default: Any = None) -> Any: ...
+    def get(self, key: str, default: Any = None) -> Any:
+        """Returns an entry, or the default if it is absent."""
 
 
 @runtime_checkable

@@ -111,6 +111,7 @@ class Arena:
         warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> Any:
+        """Returns the duels of two players, those of all ranks."""
         policies = player.policy, opponent.policy
         with factory.errors():
             played = duels.play(self.env, *policies, self.seed, self.cfg.greedy, slots=self.slots)

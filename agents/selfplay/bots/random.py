@@ -16,6 +16,7 @@ class RandomActions:
         self.action_space = action_space
 
     def initial(self, n_lanes: int, device: torch.device | str) -> arrdict:
+        """Returns a state that says how many lanes there are."""
         return arrdict(lane=torch.zeros(n_lanes, device=device))
 
     def __call__(

@@ -1,0 +1,86 @@
+"""Builds the site with Sphinx: `make docs` writes it to docs/_build."""
+
+import os
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
+
+import reference  # noqa: E402
+
+from megastep.agents import package  # noqa: E402
+
+# The repository of edit links and of links to files outside docs/, such as
+# https://github.com/NAME/megastep. Without one, such files are named and not linked.
+REPOSITORY = next(
+    (
+        re.sub(r"\.git$", "", os.environ[name])
+        for name in ("MEGASTEP_REPOSITORY", "READTHEDOCS_GIT_CLONE_URL")
+        if os.environ.get(name, "").startswith("https://")
+    ),
+    "",
+)
+
+project = "megastep"
+author = copyright = "the megastep authors"
+release = version = package.version().split()[-1]
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.linkcode"]
+exclude_patterns = ["_build"]
+myst_heading_anchors = 4
+suppress_warnings = ["misc.highlighting_failure"]
+html_theme = "furo"
+html_title = "megastep"
+html_static_path = []
+html_theme_options = {"source_repository": f"{REPOSITORY}/", "source_branch": "main"}
+html_theme_options |= {"source_directory": "docs/"}
+html_theme_options = html_theme_options if REPOSITORY else {}
+html_copy_source = False
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+default_role = "code"  # docstrings write `name`
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_custom_sections = [
+    *("Observation", "Actions", "Reward", "Episode end"),
+    ("Metrics", "params_style"),
+]
+
+
+def linkcode_resolve(domain, info):
+    """Returns where the source of a name is, on its line."""
+    path, line = reference.source_of(info["module"], info["fullname"])
+    return f"{REPOSITORY}/blob/main/{path}#L{line}" if REPOSITORY and path else None
+
+
+def prepare(app, name, source):
+    """Puts generated blocks into a page, and the repository's address before files outside docs/."""
+    folder = (ROOT / "docs" / name).parent
+
+    def linked(match):
+        path, _, anchor = match[2].partition("#")
+        target = (folder / path).resolve()
+        if target.is_relative_to(ROOT / "docs") or not path:
+            return match[0]
+        kind = "tree" if target.is_dir() else "blob"
+        url = f"{REPOSITORY}/{kind}/main/{target.relative_to(ROOT)}{anchor and '#' + anchor}"
+        return f"[{match[1]}]({url})" if REPOSITORY else match[1]
+
+    text = reference.expand(source[0])
+    source[0] = re.sub(r"\[([^\]]*)\]\((?!\w+:|#)([^)\s]+)\)", linked, text)
+
+
+def write_llms(app, error):
+    """Writes llms.txt, a list of the pages with their first sentences, and llms-full.txt."""
+    if not error and app.builder.name == "html":
+        for file, text in reference.llms(Path(app.srcdir)).items():
+            (Path(app.outdir) / file).write_text(text)
+
+
+def setup(app):
+    app.connect("source-read", prepare)
+    app.connect("autodoc-process-signature", lambda app, *args: reference.plain(*args[4:]))
+    app.connect("build-finished", write_llms)
