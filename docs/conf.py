@@ -27,9 +27,10 @@ project = "megastep"
 author = copyright = "the megastep authors"
 release = version = package.version().split()[-1]
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.linkcode"]
+extensions = ["myst_parser", "sphinx.ext.linkcode"]
 exclude_patterns = ["_build"]
 myst_heading_anchors = 4
+myst_enable_extensions = ["colon_fence"]
 suppress_warnings = ["misc.highlighting_failure"]
 html_theme = "furo"
 html_title = "megastep"
@@ -38,16 +39,8 @@ html_theme_options = {"source_repository": f"{REPOSITORY}/", "source_branch": "m
 html_theme_options |= {"source_directory": "docs/"}
 html_theme_options = html_theme_options if REPOSITORY else {}
 html_copy_source = False
+toc_object_entries = False  # hundreds, which every page's sidebar would be searched for
 
-autodoc_member_order = "bysource"
-autodoc_typehints_format = "short"
-default_role = "code"  # docstrings write `name`
-napoleon_numpy_docstring = False
-napoleon_use_ivar = True
-napoleon_custom_sections = [
-    *("Observation", "Actions", "Reward", "Episode end"),
-    ("Metrics", "params_style"),
-]
 
 
 def linkcode_resolve(domain, info):
@@ -82,5 +75,4 @@ def write_llms(app, error):
 
 def setup(app):
     app.connect("source-read", prepare)
-    app.connect("autodoc-process-signature", lambda app, *args: reference.plain(*args[4:]))
     app.connect("build-finished", write_llms)

@@ -16,6 +16,7 @@ import inspect
 import operator
 import pkgutil
 import re
+import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator
@@ -57,7 +58,7 @@ REPORTERS = {
 INTERNAL = re.compile(
     r"megastep\.(__main__|cache|colour|imports|kernels|agents\.(cli|console|distributed\.(?!pooling)"
     r"\w+|factory|launch|package|pretrained|runs|networks\.(kernels|\w+_cpu)|storage\.\w*kernels"
-    r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.pointgoal\.(?!env)\w+)\b"
+    r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.\w+\.(?!(env|bot)\b)\w+)\b"
 )
 
 
@@ -130,7 +131,8 @@ def undescribed() -> list[str]:
         for name, one in public(module).items():
             path = f"{module.__name__}.{name}"
             own = methods(one) if inspect.isclass(one) else {}
-            found += [path] if _is_code(one) and not inspect.getdoc(one) else []
+            text = inspect.getdoc(one) if callable(one) else comment_on(module.__name__, name)
+            found += [] if text else [path]
             found += [f"{path}.{k}" for k in own if not inspect.getdoc(getattr(one, k))]
     return found
 
@@ -140,39 +142,113 @@ def _is_code(value):
 
 
 def api(root: str) -> str:
-    """Returns the documentation of a module or package, for Sphinx: a heading per module."""
+    """Returns the documentation of a module or package: a heading per module, and a directive of
+    Sphinx's Python domain per public name.
+    """
     lines = []
     for module in modules(root):
-        names = public(module)
-        if not names:
-            continue
-        lines += [f"## {module.__name__}", "", "```{eval-rst}"]
-        lines += [f".. automodule:: {module.__name__}", ""]
-        for name, one in names.items():
-            kind = "class" if inspect.isclass(one) else "function" if callable(one) else "data"
-            if issubclass(type(one), type) and issubclass(one, BaseException):
-                kind = "exception"
-            lines += [f".. auto{kind}:: {module.__name__}.{name}"]
-            lines += ["   :members:", ""] if inspect.isclass(one) else [""]
-        lines += ["```", ""]
+        if names := public(module):
+            lines += [f"## {module.__name__}", "", markdown(module.__doc__), ""]
+            for name, one in names.items():
+                lines += _object(module.__name__, name, one, "::::")
     return "\n".join(lines)
 
 
+def _object(module, name, one, fence):
+    """Returns the lines about a class, with its methods, a function or a constant."""
+    kind, arguments = "data", ""
+    if inspect.isclass(one):
+        kind = "exception" if issubclass(one, BaseException) else "class"
+    elif callable(one):
+        kind = "method" if "." in name else "function"
+    elif isinstance(one, property):
+        kind = "property"
+    called = kind in ("class", "function", "method")
+    arguments = _signature(one, kind == "method") if called else ""
+    text = comment_on(module, name) if kind == "data" else inspect.getdoc(one)
+    text = markdown(text, _hints(one) if called else {})
+    lines = [f"{fence}{{py:{kind}}} {name}{arguments}", f":module: {module}"]
+    lines += [f":value: {one!r}"] if kind == "data" and isinstance(one, (int, float)) else []
+    lines += ["", text, ""]
+    for key, below in methods(one).items() if inspect.isclass(one) else ():
+        below = below if isinstance(below, property) else getattr(one, key)
+        lines += _object(module, f"{name}.{key}", below, fence[1:])
+    return [*lines, fence, ""]
+
+
+def _signature(one, is_method):
+    """Returns the arguments of a class or function with their defaults, without types."""
+    try:
+        parameters = [*inspect.signature(one).parameters.values()]
+    except (TypeError, ValueError):  # of a built-in class
+        return ""
+    parameters = [p.replace(annotation=p.empty) for p in parameters if p.name != "self"]
+    plain = [p.replace(default=_Plain(p.default)) if p.default is not p.empty else p for p in parameters]
+    return str(inspect.Signature(plain))
+
+
+class _Plain:
+    """A default as signatures show it."""
+
+    def __init__(self, value):
+        text = getattr(value, "__name__", None) or repr(value)
+        self.text = text if len(text) <= 40 and "<" not in text and "\n" not in text else "..."
+
+    def __repr__(self):
+        return self.text
+
+
+def _hints(one):
+    """Returns the types of the arguments as text, without bounds, which the page of settings has."""
+    function = one.__init__ if inspect.isclass(one) else one
+    try:
+        hints = typing.get_type_hints(function)
+    except (AttributeError, NameError, TypeError):
+        return {}
+    return {name: re.sub(r"\b(?:\w+\.)+(?=\w)", "", inspect.formatannotation(h)) for name, h in hints.items()}
+
+
+def markdown(text: str | None, hints: dict[str, str] | None = None) -> str:
+    """Returns a docstring as Markdown.
+
+    Args:
+        text: what is indented below a line `Title:` becomes a list, if each of its entries begins
+            with a name and a colon.
+        hints: the types of arguments.
+    """
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.cleandoc(text or ""))
+    text = re.sub(r"``([^`]+)``", r"`\1`", re.sub(r"::$", ":", text, flags=re.M))
+
+    def listed(match):
+        title, body = match[1], textwrap.dedent(match[2]).strip()
+        entries = re.findall(r"^\S.*(?:\n(?: +.*|(?=\n)))*", body, re.M)
+        pairs = [re.fullmatch(r"([\w.*`(), ]+): (.*)", e, re.S) for e in entries]
+        if all(pairs) and title not in ("Returns", "Yields"):
+            rows = []
+            for pair in pairs:
+                name = pair[1].replace("`", "")
+                kind = f" (`{hints[name]}`)" if hints and name in hints else ""
+                rows.append(f"- **{name}**{kind}: {' '.join(pair[2].split())}")
+            body = "\n".join(rows)
+        return f"\n**{title}**\n\n{body}\n"
+
+    return re.sub(r"^(\S[^\n]*):\n((?:    .*\n|\n)+)", listed, f"{text}\n", flags=re.M).rstrip()
+
+
+@functools.cache
+def comment_on(module: str, name: str) -> str:
+    """Returns the comment at a constant, above it or behind it, in its module or another."""
+    own = Path(importlib.import_module(module).__file__)
+    for path in (own, *sorted(own.parents[1].rglob("*.py"))):
+        found = re.search(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", path.read_text(), re.M)
+        if found and (text := found[2] or re.sub(r"^#:? ?", "", found[1], flags=re.M)):
+            return text
+    return ""
+
+
 def documentation(module: str) -> str:
-    """Returns the docstring of a module, for Sphinx."""
-    return f"```{{eval-rst}}\n.. automodule:: {module}\n   :no-index:\n```"
-
-
-def plain(signature: str | None, returns: str | None) -> tuple[str | None, str | None]:
-    """Returns a signature without the bounds of its types, which the page of settings has."""
-    while signature and (match := re.search(r"Annotated\[", signature)):
-        depth, end, comma = 1, match.end(), 0
-        while depth:
-            comma = comma or (end if depth == 1 and signature[end] == "," else 0)
-            depth += (signature[end] in "[(") - (signature[end] in "])")
-            end += 1
-        signature = signature[: match.start()] + signature[match.end() : comma] + signature[end:]
-    return signature, returns
+    """Returns the docstring of a module."""
+    return markdown(importlib.import_module(module).__doc__)
 
 
 def source_of(module: str, name: str) -> tuple[str, int]:
@@ -470,7 +546,7 @@ def llms(docs: Path) -> dict[str, str]:
     text.
     """
     index = (docs / "index.md").read_text()
-    groups = re.findall(r":caption: (.*)\n:hidden:\n\n((?:\S+\n)+)", index)
+    groups = re.findall(r":caption: (.*)\n:hidden:\n\n((?:[\w/-]+\n)+)", index)
     summary = re.search(r"^(megastep simulates.*?)\n\n", index, re.M | re.S)[1]
     lines, texts = ["# megastep", "", f"> {' '.join(summary.split())}"], []
     for caption, names in groups:

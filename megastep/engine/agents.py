@@ -18,7 +18,7 @@ __all__ = [
 
 AGENT_WIDTH = 0.15  # metres
 AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # of the disc around a square of that width
-MAX_RES = ENGINE.constants["MAX_RES"]
+MAX_RES = ENGINE.constants["MAX_RES"]  # rays per camera
 
 
 class Agents(SetOnce):
