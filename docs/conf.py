@@ -67,10 +67,9 @@ def prepare(app, name, source):
 
 
 def write_llms(app, error):
-    """Writes llms.txt, a list of the pages with their first sentences, and llms-full.txt."""
+    """Writes llms.txt, a list of the pages with their first sentences."""
     if not error and app.builder.name == "html":
-        for file, text in reference.llms(Path(app.srcdir)).items():
-            (Path(app.outdir) / file).write_text(text)
+        (Path(app.outdir) / "llms.txt").write_text(reference.llms(Path(app.srcdir)))
 
 
 def setup(app):

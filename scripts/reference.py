@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import math
 import operator
 import pkgutil
 import re
@@ -205,7 +206,8 @@ def _hints(one):
         hints = typing.get_type_hints(function)
     except (AttributeError, NameError, TypeError):
         return {}
-    return {name: re.sub(r"\b(?:\w+\.)+(?=\w)", "", inspect.formatannotation(h)) for name, h in hints.items()}
+    texts = {k: re.sub(r"\b(?:\w+\.)+(?=\w)", "", inspect.formatannotation(h)) for k, h in hints.items()}
+    return {name: text for name, text in texts.items() if len(text) <= 60}
 
 
 def markdown(text: str | None, hints: dict[str, str] | None = None) -> str:
@@ -318,7 +320,9 @@ def settings_of_script(script: str) -> list[Setting]:
         if key.split(".")[0] not in groups and not dataclasses.is_dataclass(field.annotation):
             default = field.get_default(call_default_factory=True)
             values = (tree.get(key, default) for tree in (gpu, cpu))
-            rows.append(_row(key, field, *values, comments.get(key, "")))
+            meaning = re.sub(r"<(.*?)>", lambda m: m[1].upper(), comments.get(key, ""))
+            meaning = re.sub(r"docs/([\w/-]+\.md)", r"[\1](../\1)", meaning)
+            rows.append(_row(key, field, *values, meaning))
     return rows
 
 
@@ -396,10 +400,17 @@ def kind_of(field: FieldInfo) -> str:
         options = typing.get_args(field.annotation)
     names = {name for one in _validators(field) for name in one}
     words = [_word(one, names) for one in options if one is not NoneType]
-    text, bounds = " or ".join(words), allowed(field)
+    text, bounds = " or ".join(words), re.sub(r"\d+(,\d{3}){3,}", _power, allowed(field))
     bounds = "" if bounds == "any finite number" else f", {bounds}"
     limits = [f", at most `{one.key}`" for one in field.metadata if isinstance(one, AtMost)]
     return text + bounds + "".join(limits)
+
+
+def _power(match):
+    """Returns a large number as a power, in which bounds are meant."""
+    n = int(match[0].replace(",", ""))
+    base = 2 if n & (n - 1) == 0 else 10
+    return f"{base}^{round(math.log(n, base))}"
 
 
 def _validators(field):
@@ -541,25 +552,23 @@ def expand(text: str) -> str:
     return re.sub(r"^```\{generated\} (.*)\n```$", generated, text, flags=re.M)
 
 
-def llms(docs: Path) -> dict[str, str]:
-    """Returns llms.txt, the pages by title with their first sentences, and llms-full.txt, their
-    text.
-    """
+def llms(docs: Path) -> str:
+    """Returns llms.txt: the pages by title, with their first sentences."""
     index = (docs / "index.md").read_text()
     groups = re.findall(r":caption: (.*)\n:hidden:\n\n((?:[\w/-]+\n)+)", index)
     summary = re.search(r"^(megastep simulates.*?)\n\n", index, re.M | re.S)[1]
-    lines, texts = ["# megastep", "", f"> {' '.join(summary.split())}"], []
+    lines = ["# megastep", "", f"> {' '.join(summary.split())}"]
     for caption, names in groups:
         lines += ["", f"## {caption}", ""]
         for name in names.split():
             text = expand((docs / f"{name}.md").read_text())
             title, _, body = text.removeprefix("# ").partition("\n")
             lines.append(f"- [{title}]({name}.html): {_first_sentence_of(body)}")
-            texts.append(text)
-    return {"llms.txt": "\n".join(lines) + "\n", "llms-full.txt": "\n\n".join(texts)}
+    return "\n".join(lines) + "\n"
 
 
 def _first_sentence_of(body):
-    paragraph = re.search(r"^(?![!#|`\n:-]).+(?:\n.+)*", body, re.M)
+    body = re.sub(r"^```.*?^```", "", body, flags=re.M | re.S)
+    paragraph = re.search(r"^(?![!#|\n:-]).+(?:\n.+)*", body, re.M)
     text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(paragraph[0].split()))
     return re.split(r"(?<=\.) (?=[A-Z])", text)[0]

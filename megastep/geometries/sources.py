@@ -159,7 +159,7 @@ def maze(
         split: training, test or all.
         seed: which geometries of the split are drawn, and in which order.
         size: cells per side.
-        corridor: width of the corridors, in metres.
+        corridor: width of the corridors, in metres, at least 0.32, so that agents fit.
         thickness: thickness of the walls, in metres.
         braid: fraction of the dead ends that is opened: 0 leaves a perfect maze.
     """

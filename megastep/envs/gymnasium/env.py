@@ -53,8 +53,8 @@ class Gymnasium(VectorizedEnv):
         kwargs: arguments of the environment's constructor.
         wrappers: import paths of Gymnasium's wrappers, ``package.module:Wrapper``, put around every
             environment in this order.
-        vectorization: sync steps all environments in this process, async each in a process of its
-            own; own uses the vector environment that comes with the task, which steps them at once.
+        vectorization: who steps them: sync, this process, one after the other; async, processes,
+            one per core, each with its share; own, the environment's own vector environment.
         seed: each environment is reset with a seed of its own, which derives from this one.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
