@@ -15,7 +15,7 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-slow test-nightly lint setup lock clean
+.PHONY: train test test-slow test-nightly lint docs setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
@@ -35,6 +35,9 @@ lint: $(SETUP)             ## check style and formatting of Python and kernels
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
+
+docs: $(SETUP)             ## build the site in docs/_build; warnings are errors
+	$(PYTHON) -m sphinx -W --keep-going -q docs docs/_build
 
 setup: $(SETUP)            ## create .venv
 
@@ -56,4 +59,4 @@ lock:                      ## resolve the versions in requirements/ anew; needs 
 	$(BASE) scripts/lock.py
 
 clean:                     ## delete .venv, build folders and caches
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv docs/_build build dist *.egg-info .pytest_cache .ruff_cache

@@ -42,7 +42,6 @@ html_copy_source = False
 toc_object_entries = False  # hundreds, which every page's sidebar would be searched for
 
 
-
 def linkcode_resolve(domain, info):
     """Returns where the source of a name is, on its line."""
     path, line = reference.source_of(info["module"], info["fullname"])
@@ -50,7 +49,7 @@ def linkcode_resolve(domain, info):
 
 
 def prepare(app, name, source):
-    """Puts generated blocks into a page, and the repository's address before files outside docs/."""
+    """Puts generated blocks into a page, and the repository before files outside docs/."""
     folder = (ROOT / "docs" / name).parent
 
     def linked(match):

@@ -82,7 +82,7 @@ def section(text: str | None, title: str) -> dict[str, str]:
 
 
 def described(one: Any, title: str) -> dict[str, str]:
-    """Returns {name: description} of a section of a class or function; those of base classes, too."""
+    """Returns {name: description} of a section of a class, with its bases, or of a function."""
     kinds = reversed(one.__mro__) if inspect.isclass(one) else [one]
     sections = [section(kind.__doc__, title) for kind in kinds]
     return functools.reduce(operator.or_, sections)
@@ -184,8 +184,8 @@ def _signature(one, is_method):
     except (TypeError, ValueError):  # of a built-in class
         return ""
     parameters = [p.replace(annotation=p.empty) for p in parameters if p.name != "self"]
-    plain = [p.replace(default=_Plain(p.default)) if p.default is not p.empty else p for p in parameters]
-    return str(inspect.Signature(plain))
+    defaults = (p.empty if p.default is p.empty else _Plain(p.default) for p in parameters)
+    return str(inspect.Signature([p.replace(default=d) for p, d in zip(parameters, defaults)]))
 
 
 class _Plain:
@@ -200,13 +200,14 @@ class _Plain:
 
 
 def _hints(one):
-    """Returns the types of the arguments as text, without bounds, which the page of settings has."""
+    """Returns the types of the arguments as text, without the bounds of settings."""
     function = one.__init__ if inspect.isclass(one) else one
     try:
         hints = typing.get_type_hints(function)
     except (AttributeError, NameError, TypeError):
         return {}
-    texts = {k: re.sub(r"\b(?:\w+\.)+(?=\w)", "", inspect.formatannotation(h)) for k, h in hints.items()}
+    texts = {name: inspect.formatannotation(hint) for name, hint in hints.items()}
+    texts = {name: re.sub(r"\b(?:\w+\.)+(?=\w)", "", text) for name, text in texts.items()}
     return {name: text for name, text in texts.items() if len(text) <= 60}
 
 
@@ -241,8 +242,9 @@ def markdown(text: str | None, hints: dict[str, str] | None = None) -> str:
 def comment_on(module: str, name: str) -> str:
     """Returns the comment at a constant, above it or behind it, in its module or another."""
     own = Path(importlib.import_module(module).__file__)
+    definition = re.compile(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", re.M)
     for path in (own, *sorted(own.parents[1].rglob("*.py"))):
-        found = re.search(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", path.read_text(), re.M)
+        found = definition.search(path.read_text())
         if found and (text := found[2] or re.sub(r"^#:? ?", "", found[1], flags=re.M)):
             return text
     return ""
@@ -449,11 +451,12 @@ def unexplained() -> list[str]:
 # ---- Metrics ----
 
 
+@functools.cache
 def metrics() -> dict[str, dict[str, str]]:
     """Returns {title: {metric: meaning}} of all that reports metrics."""
     tables = {k: described(import_object(path), "Metrics") for k, path in REPORTERS.items()}
     for group, prefix in (("env", "episode/"), ("learner", "")):
-        for member, path in components.members(group).items():
+        for path in components.members(group).values():
             found = described(import_object(path), "Metrics")
             kind = import_object(path).__name__
             if found:
@@ -481,7 +484,8 @@ def _settings_table(rows):
     has_cpu = any(row.cpu for row in rows)
     head = ["setting", "type", "default", "CPU", "meaning"]
     cells = [[*row[:3], *([row.cpu] if has_cpu else []), row.meaning] for row in rows]
-    return table(head if has_cpu else [*head[:3], head[4]], cells) if rows else "It has no settings."
+    head = head if has_cpu else [*head[:3], head[4]]
+    return table(head, cells) if rows else "It has no settings."
 
 
 def _settings_page(group):
@@ -525,9 +529,8 @@ def _exit_codes():
 
 
 def _cores():
-    return table(
-        ["`agent.core=`", "what it is"], [[f"`{k}`", first_sentence(one)] for k, one in CORES.items()]
-    )
+    rows = [[f"`{name}`", first_sentence(kind)] for name, kind in CORES.items()]
+    return table(["`agent.core=`", "what it is"], rows)
 
 
 #: What the words of a generated block make.

@@ -6,12 +6,13 @@ import re
 import shlex
 
 import pytest
+import reference
 
 from megastep import envs
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
-PAGES = [*ROOT.glob("*.md"), *DOCS.glob("*.md"), *DOCS.glob("lab/*.md")]
+PAGES = [*ROOT.glob("*.md"), *DOCS.glob("*.md"), *DOCS.glob("*/*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.
 NEEDS_FILES = (
     r"resume=|rerun=|init=|my_package|cores:|encoders:|my_a2c:|safe:|rover:|convoy:|my_rooms:|my_sqlite:"
@@ -41,9 +42,10 @@ def test_command_composes(page, script, arguments, tmp_path, monkeypatch, capsys
     assert code == 0, capsys.readouterr().err
 
 
+@functools.cache
 def headings(page):
     """Returns a page's anchors as GitHub names them."""
-    titles = re.findall(r"^#+ (.*)", page.read_text(), re.M)
+    titles = re.findall(r"^#+ (.*)", reference.expand(page.read_text()), re.M)
     return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
 
 

@@ -82,11 +82,12 @@ class Deathmatch(SceneryEnv):
         wound_cost: cost per wound, a hit received.
         kill_reward: reward per kill.
         death_cost: cost of a death, also of one by drain.
-        aim_reward: reward for bringing another agent from the edge of the view to its centre. What an
-            agent gains as its target nears the centre, it loses as it leaves, so that watching a
+        aim_reward: reward for bringing another agent from the edge of the view to its centre. What
+            an agent gains as its target nears the centre, it loses as it leaves, so that watching a
             target without killing it pays nothing (after Ng, Harada and Russell 1999, "Policy
             invariance under reward transformations", but without discount).
-        search_reward: reward per 64 wall texels seen for the first time in the episode, as in Explorer.
+        search_reward: reward per 64 wall texels seen for the first time in the episode, as in
+            Explorer.
         hearing: metres at which the sound of another agent fades. 0: agents are deaf.
         res: rays of an agent's camera.
         subsample: rays per pixel.
