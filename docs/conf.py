@@ -62,6 +62,8 @@ def prepare(app, name, source):
         return f"[{match[1]}]({url})" if REPOSITORY else match[1]
 
     text = reference.expand(source[0])
+    if name == "decisions/README":  # a page for each, which its own links lead to
+        text += "\n```{toctree}\n:hidden:\n:glob:\n\n*\n```\n"
     source[0] = re.sub(r"\[([^\]]*)\]\((?!\w+:|#)([^)\s]+)\)", linked, text)
 
 

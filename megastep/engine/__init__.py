@@ -9,7 +9,7 @@ The step of a game is an operation too, in the environment's package, for exampl
 """
 
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_flag
-from megastep.engine.devices import device, fit, set_threads, threads
+from megastep.engine.devices import device, fit, free_memory, set_threads, threads
 from megastep.engine.lighting import bake
 from megastep.engine.movement import physics
 from megastep.engine.outputs import Observation, Physics, Render
@@ -34,6 +34,7 @@ __all__ = [
     "check_flag",
     "device",
     "fit",
+    "free_memory",
     "observe",
     "physics",
     "render",

@@ -18,9 +18,8 @@ import yaml
 
 QUOTES = paths.LAB / "quoted.yaml"
 ROWS = paths.ROOT / "agents" / "cli" / "reproductions.yaml"
-#: The pages that quote: all but the lab notes, which are the evidence, and the decisions.
+#: The pages that quote: all but the lab notes, which are the evidence.
 PAGES = [paths.ROOT / "README.md", *sorted((paths.ROOT / "docs").glob("*.md"))]
-PAGES = [path for path in PAGES if path.name != "decisions.md"]
 MARKED = re.compile(r"(<!-- quote: ([\w-]+) -->)(.*?)(<!-- end -->)", re.S)
 
 

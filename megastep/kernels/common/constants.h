@@ -1,5 +1,5 @@
-// Constants that every program shares. Python reads this file too: one constant per line, a plain
-// number each.
+// Constants that all kernel libraries share. Python reads this file too: one constant per line,
+// a plain number each.
 #pragma once
 
 constexpr int BLOCK = 64;      // threads per block, in every launch
