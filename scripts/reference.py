@@ -482,9 +482,8 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def _settings_table(rows):
     has_cpu = any(row.cpu for row in rows)
-    head = ["setting", "type", "default", "CPU", "meaning"]
-    cells = [[*row[:3], *([row.cpu] if has_cpu else []), row.meaning] for row in rows]
-    head = head if has_cpu else [*head[:3], head[4]]
+    head = ["setting", "meaning", "type", "default", "CPU"][: 4 + has_cpu]
+    cells = [[row.key, row.meaning, row.kind, row.default, row.cpu][: 4 + has_cpu] for row in rows]
     return table(head, cells) if rows else "It has no settings."
 
 
