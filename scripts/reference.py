@@ -120,9 +120,13 @@ def public(module: ModuleType) -> dict[str, Any]:
 
 
 def methods(kind: type) -> dict[str, Any]:
-    """Returns the public methods and properties that a class defines."""
+    """Returns the public methods and properties that a class defines, but for those that it
+    describes under `Attributes:`.
+    """
     plain = types.FunctionType, property, classmethod, staticmethod
-    return {k: v for k, v in vars(kind).items() if k[0] != "_" and isinstance(v, plain)}
+    attributes = described(kind, "Attributes")
+    found = {k: v for k, v in vars(kind).items() if k[0] != "_" and isinstance(v, plain)}
+    return {name: value for name, value in found.items() if name not in attributes}
 
 
 def undescribed() -> list[str]:

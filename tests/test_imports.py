@@ -36,9 +36,10 @@ SIMULATOR = (
 )
 ENGINE = (
     ("checks", "outputs", "state_tree", "views"),
+    ("objects",),
     ("agents", "devices", "scenery"),
     ("launch_params",),
-    ("lighting", "movement", "spawning", "texels"),
+    ("lighting", "movement", "object_updates", "spawning", "texels"),
     ("rendering",),
 )
 AGENTS = (

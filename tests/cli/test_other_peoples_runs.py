@@ -36,7 +36,7 @@ def env_id(name):
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
 def test_failed_environment_ends_the_run_with_all_saved(here, vectorization, capsys):
-    words = [*WORDS, env_id("Crash"), "samples=9600", "folder=run", "seed=2"]
+    words = [*WORDS, env_id("Crash"), "samples=9600", "folder=run", "seed=2", "learner.n_steps=32"]
     assert train.main([*words, f"env.vectorization={vectorization}"]) == 4
     (line,) = capsys.readouterr().err.splitlines()
     text = "OddCrash-v0: environment {} failed: OSError: simulator does not answer. Its traceback "
@@ -46,10 +46,10 @@ def test_failed_environment_ends_the_run_with_all_saved(here, vectorization, cap
     trace = (here / "run/env_error.txt").read_text()
     assert trace.startswith("Traceback") and "odd_envs.py" in trace
     assert "sync_envs" not in trace and trace.endswith("OSError: simulator does not answer\n")
-    words = ["resume=run", "samples=480", "env.restart_failed=50"]
+    words = ["resume=run", "samples=640", "env.restart_failed=50"]
     assert train.main(words) == 0
     rows = json_lines.read(here / "run/metrics.jsonl")
-    assert rows[-1]["samples"] == 480 and sum(row.get("episode/restarts", 0) for row in rows) > 0
+    assert rows[-1]["samples"] == 640 and sum(row.get("episode/restarts", 0) for row in rows) > 0
 
 
 def test_failure_before_training_leaves_the_traceback(here, capsys):

@@ -43,7 +43,7 @@ def test_packed_structs_have_the_compilers_layout(library, tmp_path):
     """A compiler reads every field of every packed struct with the value that was packed."""
     structs = headers.struct_fields(library.sources(".h"))
     assert structs.keys() == vars(library.params).keys()
-    packed, code = {}, '#include "common/scenery.h"\n#include "params.h"\n'
+    packed, code = {}, '#include "common/objects.h"\n#include "params.h"\n'
     for name, fields in structs.items():
         values = {field: position + 1 for position, (field, _) in enumerate(fields)}
         values |= {field: bytes(int(kind[2:-1])) for field, kind in fields if kind[-1] == "s"}
