@@ -15,7 +15,13 @@ from typing import Any
 
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
+from megastep.agents.runs import (
+    agent_file,
+    checkpoint,
+    checkpoint_format,
+    formats,
+    strange_files,
+)
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
@@ -84,7 +90,8 @@ def locked(folder: Path) -> Iterator[None]:
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
         lock.acquire()
-        path.write_text(str(os.getpid()))
+        with open(path, "w", opener=strange_files.opener) as file:
+            file.write(str(os.getpid()))
     except filelock.Timeout:
         with user_errors(f"The run folder {folder} is in use, or was just now: "):
             pid = path.read_text()  # its last owner may just be deleting it
@@ -142,12 +149,15 @@ def find(name: str) -> Path:
             comes first.
 
     Raises:
-        UserError: naming the nearest run and the nearest pretrained agent.
+        UserError: naming the nearest run and the nearest pretrained agent; or what leads out of
+            the run's folder, or is no file.
     """
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
-        return folders[-1]
+        path = folders[-1]
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
+        is_in_run = path.parent.name in ("checkpoints", "snapshots")
+        strange_files.check_folder(folder_of(path) if is_in_run else path)
         return path
     if agent_file.is_agent_file(path) and os.path.isfile(path):
         return path
@@ -187,16 +197,18 @@ def load_checkpoint(
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
-    with contextlib.suppress(AttributeError, KeyError, TypeError):  # a planted one holds anything
-        for key in REMOVED:
-            loaded.config["train"].pop(key, None)
+    config = loaded.config
+    with user_errors(f"The configuration in {loaded.path} is no run's: "):
+        formats.check(formats.Config, config)
+    for key in REMOVED:
+        config["train"].pop(key, None)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "
             f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
             "trust it, add trust=true"
         )
-    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(loaded.config))
+    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(config))
 
 
 def resume_command(folder: Path, key: str = "resume") -> str:
