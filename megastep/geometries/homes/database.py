@@ -78,10 +78,8 @@ def _unpack(content, n_homes):
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = {entry.filename: entry for entry in archive.infolist()}
-            if (
-                sum(entry.file_size for entry in entries.values())
-                > n_homes * MAX_EACH + MAX_HEADERS
-            ):
+            n_bytes = sum(entry.file_size for entry in entries.values())
+            if n_bytes > n_homes * MAX_EACH + MAX_HEADERS:
                 raise ValueError(f"it unpacks to more than {n_homes:,} homes can have")
             arrays = {name: files.read_array(archive, entries[f"{name}.npy"]) for name in NAMES}
     except (*files.UNREADABLE, KeyError) as error:
