@@ -39,6 +39,13 @@ def launched() -> Launched | None:
     return Launched(*map(int, texts))
 
 
+def token() -> str:
+    """Returns the name of this job, by which its keys in a store begin: random where `ranks=`
+    started it, and otherwise torchrun's `--rdzv-id`.
+    """
+    return os.environ.get("TORCHELASTIC_RUN_ID", "")
+
+
 def rank() -> int:
     """Returns the number of the rank that this process is, 0 for a process of its own."""
     place = launched()

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.environment import hostname, launched
+from megastep.agents.distributed.environment import hostname, launched, token
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
@@ -68,7 +68,8 @@ def start(seconds: float = START_SECONDS) -> None:
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # torchrun may keep the store when it starts the ranks again, with addresses of the dead in it
-    keys = distributed.PrefixStore(f"ranks {place.attempt} {next(_STARTS)}", _store())
+    name = f"ranks {token()} {place.attempt} {next(_STARTS)}"
+    keys = distributed.PrefixStore(name, _store())
     distributed.init_process_group(
         backend, store=keys, rank=place.rank, world_size=place.n_ranks, timeout=wait
     )
@@ -101,7 +102,7 @@ def store(name: str) -> distributed.Store:
     Args:
         name: of a set of keys.
     """
-    return distributed.PrefixStore(f"megastep {name}", _connection())
+    return distributed.PrefixStore(f"megastep {token()} {name}", _connection())
 
 
 def stop() -> None:

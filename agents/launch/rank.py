@@ -12,7 +12,7 @@ from typing import NoReturn, TypeVar
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.launch import endings, launcher, signals
+from megastep.agents.launch import endings, launcher, signals, started
 
 #: Seconds that a rank with an error gives rank 0 to tell of the same one, and to save.
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
@@ -70,14 +70,19 @@ class Team:
         """Tells where the run is, for those who end it or start it again."""
         self.folder = folder
         if environment.rank() == 0:
-            self.store.set("run", str(folder))
             if launcher.JOB in os.environ:
                 Path(os.environ[launcher.JOB], launcher.RUN).write_text(str(folder))
+            else:
+                started.leave_proof(self.store, folder)
 
     def earlier_folder(self) -> Path | None:
         """Returns the run that was trained before torchrun started the ranks again."""
-        is_again = environment.launched().attempt > 0 and self.store.check(["run"])
-        return Path(self.store.get("run").decode()) if is_again else None
+        if environment.launched().attempt == 0:
+            return None
+        if launcher.JOB in os.environ:  # a folder that is this user's alone
+            path = Path(os.environ[launcher.JOB], launcher.RUN)
+            return Path(path.read_text()) if path.exists() else None
+        return started.proven_folder(self.store)
 
     def end(self, problem: str | None) -> NoReturn:
         """Ends this process in the middle of training, since a rank is lost.
@@ -98,6 +103,11 @@ class Team:
             seconds: how long to wait for rank 0 to leave as well.
         """
         self.watch.leave(seconds)
+
+    def finish(self) -> None:
+        """Forgets the run, which is done."""
+        if environment.rank() == 0 and self.folder is not None:
+            started.remove_proof(self.folder)
 
 
 @contextlib.contextmanager
@@ -143,6 +153,7 @@ def joined() -> Iterator[Team | None]:
         raise SystemExit(code) from None
     finally:
         _team = None
+    team.finish()
     team.leave()
     if has_joined:
         process_group.stop()

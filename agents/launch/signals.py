@@ -1,5 +1,6 @@
-"""Ctrl-C, SIGTERM and SIGHUP. The first signal stops the work in good order, the second ends the
-program at once. The exit code is 128 + the signal's number.
+"""Ctrl-C, SIGTERM, SIGHUP, and SIGUSR1 and SIGUSR2, with which clusters announce that a job ends.
+The first signal stops the work in good order, a second Ctrl-C or SIGTERM ends the program at once.
+The exit code is 128 + the signal's number.
 """
 
 import contextlib
@@ -14,7 +15,11 @@ from typing import NoReturn, TextIO
 from megastep.agents import package
 from megastep.agents.distributed import environment
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: The signals of people, which end the program at once when they are repeated.
+QUITTING = (signal.SIGINT, signal.SIGTERM)
+#: The signals of clusters: SIGTERM often follows them.
+ANNOUNCING = (signal.SIGUSR1, signal.SIGUSR2)
+SIGNALS = (*QUITTING, *ANNOUNCING, signal.SIGHUP)
 #: Seconds within which a repeated signal counts as the same one: `timeout` and closing terminals
 #: send two.
 SAME = 0.3
@@ -56,20 +61,22 @@ def handled(
     on_second: Callable[[int], None] = lambda number: None,
 ) -> Iterator[list[int]]:
     """Calls `on_first(number)` at the first signal. Another Ctrl-C or SIGTERM ends the program,
-    after `on_second(number)`.
+    after `on_second(number)`, unless only SIGUSR1 or SIGUSR2 came before it.
 
     Ending harms nothing: checkpoints are renamed into place when whole. Yields a list that gets the
     number of the first signal.
     """
-    numbers, ends_after = [], time.monotonic()
+    numbers, ends_after = [], None
 
     def handle(number, frame):
         nonlocal ends_after
+        is_repeated = ends_after is not None and time.monotonic() > ends_after
+        if ends_after is None and number not in ANNOUNCING:
+            ends_after = time.monotonic() + SAME
         if not numbers:
             numbers.append(number)
-            ends_after = time.monotonic() + SAME
             on_first(number)
-        elif number != signal.SIGHUP and time.monotonic() > ends_after:
+        elif number in QUITTING and is_repeated:
             on_second(number)
             os._exit(128 + number)
 
@@ -126,7 +133,7 @@ def _install(handler: Callable) -> dict[int, object]:
     if threading.current_thread() is not threading.main_thread():
         return {}
     is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    return {n: signal.signal(n, handler) for n in SIGNALS[: 2 if is_ignored else 3]}
+    return {n: signal.signal(n, handler) for n in SIGNALS[: -1 if is_ignored else None]}
 
 
 def _write(stream: TextIO | None, line: str) -> None:

@@ -51,23 +51,34 @@ def make(path: Path) -> Path:
                 return folder
 
 
-def new(name: str, folder: str | None = None) -> Path:
+def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
     """Returns the folder of a new run: `folder`, which must be new or empty, or by default one
     called after the time and `name`.
+
+    Args:
+        is_again: as for `check_free`.
     """
     if folder is None:
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
-    check_free(folder)
+    check_free(folder, is_again)
     return Path(folder) if os.path.exists(folder) else make(Path(folder))
 
 
-def check_free(name: str | None) -> None:
-    """Raises UserError if the folder of a new run is not empty, or cannot be read."""
+def check_free(name: str | None, is_again: bool = False) -> None:
+    """Raises UserError if the folder of a new run is not empty, or cannot be read.
+
+    Args:
+        is_again: it may be that of a run which ended before it saved anything.
+    """
     folder = Path(name or "")
     with user_errors(CANNOT.format(shortened(folder))):
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
     # Hydra writes .hydra/ and a log before the job of a sweep starts
-    if [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]:
+    used = [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]
+    if is_again and used:
+        strange_files.check_folder(folder)
+        used = used if not {"lock", "config.yaml"} & {path.name for path in used} else []
+    if used:
         raise UserError(
             f"The run folder {folder} is not empty; choose another with folder=, or continue "
             f"its run: {resume_command(folder)}"

@@ -35,6 +35,13 @@ class Numbers(_Model):
     seconds: _Number = 0.0
 
 
+class Progress(_Model):
+    """The numbers at the top of the state of a run, as its manifest repeats them."""
+
+    samples: _Count
+    seconds: _Number
+
+
 class Counts(_Model):
     """The counts in the state of a run that can be resumed."""
 

@@ -1,16 +1,21 @@
 """Runs that strangers have made: links out of them, special files, odd contents."""
 
+import hashlib
+import json
 import os
 import shutil
 import socket
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
+import torch
 
 from megastep.agents.cli import evaluate, inspect, train
 from megastep.agents.errors import UserError
-from tests.helpers.tiny import TINY, UPDATE
+from megastep.agents.runs import checkpoint, checkpoint_format
+from tests.helpers.tiny import TINY, UPDATE, changed
 
 COMMANDS = [
     (train.main, ["resume=run", f"more_samples={UPDATE}"]),
@@ -125,3 +130,105 @@ def test_a_special_file_in_place_of_an_argument_is_refused(kind, tmp_path, monke
         code, err = outcome(main, one, capsys)
         assert code == 2 and "Traceback" not in err, (one, err)
         assert time.monotonic() - began < 5, one
+
+
+# ---- Odd contents with the right SHA-256 ----
+
+
+def planted(run, change_config=lambda tree: tree, change_state=lambda state: state):
+    """Replaces the checkpoints of a run by one with another configuration and state."""
+    loaded = checkpoint.load_latest(run / "checkpoints")
+    shutil.rmtree(run / "checkpoints")
+    config, state = change_config(loaded.config), change_state(loaded.state)
+    checkpoint.save(run / "checkpoints", 2 * UPDATE, state, config)
+
+
+@pytest.mark.parametrize("key", ["name", "spaces", "train"])
+def test_control_characters_of_a_file_are_never_printed(run, key, capsys):
+    evil = "\x1b]0;owned\x07\x9b31m\u202e\r"
+
+    def change(tree):
+        if key == "name":
+            tree["train"]["env"]["name"] = f"megastep.envs.{evil}:A"
+        elif key == "spaces":
+            tree["spaces"] = {f"obs{evil}": evil}
+        else:
+            tree["train"][evil] = evil
+        return tree
+
+    planted(run, change)
+    for main, words in COMMANDS:
+        _, text = outcome(main, words, capsys)
+        assert not {*evil} & {*text} - {"]", "0", ";", *"owned", *"31m"}, text
+
+
+ODD = {
+    "a list": lambda tree: tree | {"train": []},
+    "no spaces": lambda tree: {"train": tree["train"]},
+    "spaces of numbers": lambda tree: tree | {"spaces": {"obs": 3}},
+    "learner is text": lambda tree: changed(tree, "train.learner", "ppo"),
+    "samples are text": lambda tree: changed(tree, "train.samples", "many"),
+    "width is infinite": lambda tree: changed(tree, "train.agent.width", float("inf")),
+    "seed is huge": lambda tree: changed(tree, "train.seed", 10**400),
+    "logger is null": lambda tree: changed(tree, "train.logger", None),
+    "environment is deep": lambda tree: changed(tree, "train.env.kwargs", nested(500)),
+}
+
+
+def nested(n):
+    tree = []
+    for _ in range(n):
+        tree = [tree]
+    return tree
+
+
+@pytest.mark.parametrize("change", ODD.values(), ids=ODD)
+def test_an_odd_configuration_is_one_sentence(run, change, capsys):
+    planted(run, change)
+    for main, words in COMMANDS[:2]:
+        code, text = outcome(main, words, capsys)
+        assert code == 2 and "Traceback" not in text and text.count("\n") == 1, text
+        assert "run/checkpoints/step_64" in text, text
+
+
+STATES = {
+    "no counts": lambda state: {k: v for k, v in state.items() if k != "updates"},
+    "text": lambda state: state | {"samples": "64"},
+    "no policy": lambda state: {k: v for k, v in state.items() if k != "policy"},
+    "a list": lambda state: state | {"policy": [1]},
+    "no learner": lambda state: state | {"learner": {}},
+    "a NaN of the learner": lambda state: state | {"learner": {"w": torch.tensor(torch.nan)}},
+    "no statistics": lambda state: state | {"episode_stats": 3},
+    "a sparse weight": lambda state: state | {"policy": sparse(state["policy"])},
+}
+
+
+def sparse(weights):
+    name = next(name for name, weight in weights.items() if weight.dim() == 2)
+    return weights | {name: weights[name].to_sparse()}
+
+
+@pytest.mark.parametrize("change", STATES.values(), ids=STATES)
+@pytest.mark.filterwarnings("ignore:.*sparse")
+def test_an_odd_state_is_one_sentence(run, change, capsys):
+    planted(run, change_state=change)
+    code, text = outcome(*COMMANDS[0], capsys)
+    assert code == 2 and "Traceback" not in text and text.count("\n") == 1, text
+    assert "run/checkpoints/step_64" in text, text
+
+
+def test_a_compressed_state_is_refused(run, capsys):
+    path = run / "checkpoints/step_64/state.pt"
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part)
+    manifest = json.loads(path.with_name("manifest.json").read_bytes())
+    content = path.read_bytes()
+    entry = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    manifest["files"]["state.pt"] = entry
+    del manifest["sha256"]
+    path.with_name("manifest.json").write_bytes(checkpoint_format.sealed(manifest))
+    code, text = outcome(*COMMANDS[1], capsys)
+    assert code == 2 and "its parts are compressed" in text, text
