@@ -38,6 +38,7 @@ RESUMABLE = (
     "dry_run",
     "logger",
     "finish",
+    "env.restart_failed",
 )
 
 
