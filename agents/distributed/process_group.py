@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.environment import hostname, rank_info
+from megastep.agents.distributed.environment import hostname, rank_info, token
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
@@ -74,7 +74,8 @@ def start(seconds: float = START_SECONDS) -> None:
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # a new prefix: after a restart the store may still hold addresses of the ended ranks
-    keys = distributed.PrefixStore(f"ranks {info.attempt} {next(_STARTS)}", _store())
+    name = f"ranks {token()} {info.attempt} {next(_STARTS)}"
+    keys = distributed.PrefixStore(name, _store())
     distributed.init_process_group(
         backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
     )
@@ -107,7 +108,7 @@ def store(name: str) -> distributed.Store:
     Args:
         name: prefix of its keys.
     """
-    return distributed.PrefixStore(f"megastep {name}", _connection())
+    return distributed.PrefixStore(f"megastep {token()} {name}", _connection())
 
 
 def stop() -> None:

@@ -115,7 +115,7 @@ def _read_header(start):
     return reader(file, max_header_size=MAX_HEADER)
 
 
-def _read_array(archive, entry):
+def read_array(archive, entry):
     """Returns the array of a zip entry. Raises ValueError if its header contradicts its size."""
     if entry.flag_bits & 1:
         raise ValueError("is encrypted")
@@ -138,7 +138,7 @@ def _read_geometry(archive, entries):
     g = dotdict()
     for key, entry in sorted(entries.items()):
         try:
-            g[key] = _read_array(archive, entry)
+            g[key] = read_array(archive, entry)
         except UNREADABLE as error:
             raise ValueError(f"{key!r} cannot be read: {_clause(error)}") from error
     return geometry.validate_geometry(g)

@@ -216,6 +216,8 @@ def _part(name: str, part: Any) -> _Part:
         raise ValueError(f"{name}: weight={weight!r} is not an integer from 1 to 1,000")
     if not isinstance(mirror, bool):
         raise ValueError(f"{name}: mirror={mirror!r} is neither true nor false")
+    if function is files and not Path(str(options["path"])).is_file():  # before others are made
+        raise ValueError(f"{name}: there is no file {str(options['path'])!r}")
     return _Part(function, options, weight, mirror)
 
 
