@@ -47,7 +47,7 @@ class PettingZoo(VectorizedEnv):
         n_envs: number of environments, N.
         id: import path of the function that makes one, such as
             ``pettingzoo.sisl.multiwalker_v9:parallel_env``.
-        kwargs: its arguments.
+        kwargs: arguments of that function.
         seed: each environment is reset with a seed of its own, which derives from this one.
         device: where worlds and actions are. Default: a GPU if there is one.
     """

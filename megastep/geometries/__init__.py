@@ -21,7 +21,8 @@ from megastep.geometry import centers, indices, masks
 
 __all__ = ["SOURCES", "SPLITS", "centers", "indices", "masks", "sample"]
 
-SPLITS = ("training", "test", "all")
+SPLITS = ("training", "test", "all")  # parts of a source
+#: The sources by name.
 SOURCES = {name: getattr(sources, name) for name in sources.__all__}
 
 
