@@ -70,8 +70,11 @@ def mutate(tree, draw, values):
 
 
 def seal(path, manifest):
-    manifest.pop("sha256", None)
-    path.write_bytes(checkpoint_format.sealed(manifest))
+    if isinstance(manifest, dict):
+        manifest.pop("sha256", None)
+        path.write_bytes(checkpoint_format.sealed(manifest))
+    else:
+        path.write_text(json.dumps(manifest))
 
 
 def change_run(folder, draw):
