@@ -105,6 +105,22 @@ def test_every_flipped_bit_is_detected(folder, file, every):
     assert checkpoint.load_latest(folder).step == 30
 
 
+@pytest.mark.filterwarnings("error")
+def test_run_that_is_trained_meanwhile_replaces_its_checkpoints(folder, monkeypatch):
+    real, tried = checkpoint_format.read, []
+
+    def read(path, *arguments):
+        tried.append(path.name)
+        if len(tried) == 1:
+            checkpoint.save(folder, 40, state(40), CONFIG, keep_checkpoints=2)
+            for old in ("step_20", "step_30"):
+                shutil.rmtree(folder / old, ignore_errors=True)
+        return real(path, *arguments)
+
+    monkeypatch.setattr(checkpoint_format, "read", read)
+    assert checkpoint.load_latest(folder).step == 40 and tried == ["step_30", "step_40"]
+
+
 def test_error_if_every_checkpoint_is_damaged(folder):
     for n in (30, 20):
         os.truncate(folder / f"step_{n}" / "state.pt", 100)
