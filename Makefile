@@ -34,9 +34,10 @@ test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour
 test-gpu: $(SETUP)         ## run the tests that need a GPU
 	$(PYTHON) -m pytest -q -m cuda
 
-lint: $(SETUP)             ## check style and formatting of Python and kernels
+lint: $(SETUP)             ## check style, formatting and types of Python, and the format of kernels
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(PYTHON) -m pyright --pythonpath $(PYTHON)
 	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
 
 docs: $(SETUP)             ## build the site in docs/_build; warnings are errors

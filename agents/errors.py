@@ -53,7 +53,7 @@ class ConfigErrors(UserError):
         self.errors = list(errors)
         super().__init__(self.errors)
 
-    def __str__(self):
+    def __str__(self) -> str:
         head = f"{len(self.errors)} error{'s' * (len(self.errors) > 1)} in the configuration"
         return "\n  ".join([head, *(f"{key}: {shortened(text, 400)}" for key, text in self.errors)])
 

@@ -29,6 +29,10 @@ class ValueOutput(nn.Module):
         min_scale: smallest standard deviation; returns that vary less count as constant.
     """
 
+    mean: torch.Tensor  # ()
+    scale: torch.Tensor
+    count: torch.Tensor
+
     def __init__(self, width: int, min_scale: float = 1e-3):
         super().__init__()
         self.linear = nn.Linear(width, 1)

@@ -26,7 +26,7 @@ SPLITS = ("training", "test", "all")  # parts of a source
 SOURCES = {name: getattr(sources, name) for name in sources.__all__}
 
 
-def _require_known(kind, name, allowed):
+def _require_known(kind, name, allowed) -> None:
     """Raises ValueError, with the nearest allowed name, unless `name` is one of `allowed`."""
     if name not in allowed:
         nearest = difflib.get_close_matches(str(name), allowed, 1, 0)

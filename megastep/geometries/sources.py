@@ -36,7 +36,7 @@ SUITE = {  # the parts of `suite`
 }
 
 
-def _split_range(count, split):
+def _split_range(count, split) -> range:
     """Returns the indices of a split, as a range into a database of `count` geometries. A single
     geometry is in every split.
     """
@@ -48,7 +48,7 @@ def _split_range(count, split):
     }[split]
 
 
-def _draw_indices(count, n, split, seed):
+def _draw_indices(count, n, split, seed) -> list[int]:
     """Returns n indices into a database of `count`: a random permutation of the split, repeated."""
     members = _split_range(count, split)
     random = np.random.RandomState(seed % 2**32)  # numpy never changes what it draws
@@ -84,7 +84,7 @@ def column(
 
 
 @functools.lru_cache(maxsize=2)
-def _load(path, modified):
+def _load(path, modified) -> list[dotdict]:
     return npz.load(path)
 
 
@@ -97,8 +97,8 @@ def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str)
         seed: which geometries of the split are drawn, and in which order.
         path: the file.
     """
-    path = Path(path)
-    database = _load(path, path.stat().st_mtime_ns if path.exists() else 0)
+    file = Path(path)
+    database = _load(file, file.stat().st_mtime_ns if file.exists() else 0)
     return [database[i] for i in _draw_indices(len(database), n, split, seed)]
 
 
@@ -139,7 +139,7 @@ def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdi
         split: training, test or all.
         seed: which geometries of the split are drawn, and in which order.
     """
-    return files(n, split, seed, path=BENCH)
+    return files(n, split, seed, path=str(BENCH))
 
 
 @checked
@@ -183,7 +183,7 @@ class _Part(NamedTuple):
     mirror: bool
 
 
-def _part(name: str, part: Any) -> _Part:
+def _part(name: str, part: object) -> _Part:
     """Returns a part of `mixed`.
 
     Raises:
@@ -216,6 +216,8 @@ def _part(name: str, part: Any) -> _Part:
         raise ValueError(f"{name}: weight={weight!r} is not an integer from 1 to 1,000")
     if not isinstance(mirror, bool):
         raise ValueError(f"{name}: mirror={mirror!r} is neither true nor false")
+    if function is files and not Path(str(options["path"])).is_file():  # before others are made
+        raise ValueError(f"{name}: there is no file {str(options['path'])!r}")
     return _Part(function, options, weight, mirror)
 
 

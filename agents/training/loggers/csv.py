@@ -38,17 +38,17 @@ class CSV:
     def close(self) -> None:
         """Does nothing: every row is in the file."""
 
-    def _table(self, file):
+    def _table(self, file) -> csv.DictWriter:
         return csv.DictWriter(file, self.columns, lineterminator="\n")
 
-    def _read(self):
+    def _read(self) -> list[dict[str, str]]:
         """Returns the rows of the file, without a last one that a kill cut short."""
         if not self.path.exists():
             return []
         lines = self.path.read_text().splitlines(keepends=True)
         return list(csv.DictReader(line for line in lines if line.endswith("\n")))
 
-    def _replace(self, rows):
+    def _replace(self, rows) -> None:
         """Writes the file as a whole."""
         text = io.StringIO()
         self._table(text).writeheader()

@@ -23,7 +23,7 @@ class TensorBoard:
             queue.SimpleQueue(),
         )
 
-    def _write_reports(self):
+    def _write_reports(self) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
 

@@ -4,7 +4,7 @@ N environments of A agents. Each agent is a lane: B = N A.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -20,6 +20,9 @@ from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import MAX_AGENTS, TALLY_ROWS, deathmatch_step, privileged_size
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Deathmatch"]
 
@@ -155,7 +158,7 @@ class Deathmatch(SceneryEnv):
             self.obs_space["sound"] = spaces.MultiVector(1, 3)
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
         self.privileged_space = spaces.MultiVector(1, n_privileged) if privileged else None
-        self.rules = dict(
+        self.rules: dict = dict(
             damage=damage,
             recovery=recovery / fps,
             drain=drain / fps,
@@ -173,9 +176,10 @@ class Deathmatch(SceneryEnv):
         engine.fit(n_envs, n_agents * bytes_per_lane, self.device)
         self.search_reward, self.seen = search_reward, None
         if search_reward:
-            on = dict(dtype=torch.int32, device=self.device)
-            self.seen = torch.zeros((n_envs, n_agents, words), **on)
-        n_lanes, on = n_envs * n_agents, dict(device=self.device)
+            shape = n_envs, n_agents, words
+            self.seen = torch.zeros(shape, dtype=torch.int32, device=self.device)
+        on: dict = dict(device=self.device)
+        n_lanes = n_envs * n_agents
         self.health = torch.ones(n_lanes, **on)
         self.tally = torch.zeros((TALLY_ROWS, n_lanes), **on)
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, **on)
@@ -205,7 +209,7 @@ class Deathmatch(SceneryEnv):
         self.movement(dict(actions=actions))
         return self._world()
 
-    def _world(self):
+    def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, renders, and lets the agents hit each other."""
         self.spawner(self.ended)
         view = self._view(**self._search_arguments())
@@ -222,6 +226,7 @@ class Deathmatch(SceneryEnv):
         )
         reward = step.reward
         if self.seen is not None:
+            assert view.newly_seen is not None
             search = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
             reward = reward + search.masked_fill_(step.reset, 0.0)
         truncated, metrics = step.truncated, step.metrics
@@ -241,11 +246,12 @@ class Deathmatch(SceneryEnv):
             world["privileged"] = step.privileged
         return world
 
-    def _end_rounds(self, step):
+    def _end_rounds(self, step) -> tuple[torch.Tensor, torch.Tensor]:
         """Ends every episode of the environments whose round is over, but not while one begins.
 
         Returns `truncated` and the metrics with those episodes in them.
         """
+        assert self.round_ages is not None
         shape = self.n_envs, self.n_agents
         over = self.round_ages.add_(1) >= self.rules["limit"]
         over &= ~step.reset.view(shape).any(1)
@@ -257,14 +263,14 @@ class Deathmatch(SceneryEnv):
         self.ended |= over
         return step.truncated | (over & ~step.terminal), metrics
 
-    def _search_arguments(self):
+    def _search_arguments(self) -> dict[str, torch.Tensor]:
         """The arguments of observe that count newly seen texels, if search_reward is not 0."""
         if self.seen is None:
             return {}
         starts = self.ended.view(self.n_envs, self.n_agents)
         return dict(seen=self.seen, clear_mask=starts)
 
-    def _view(self, **search):
+    def _view(self, **search) -> engine.Observation:
         return engine.observe(
             self.core.scenery,
             self.core.agents,
@@ -275,7 +281,7 @@ class Deathmatch(SceneryEnv):
             **search,
         )
 
-    def _images(self, view):
+    def _images(self, view) -> arrdict:
         """The images and the IMU of a view, by lane: (B, 1, ...)."""
         lanes = self.n_envs * self.n_agents
         return arrdict(
@@ -292,6 +298,7 @@ class Deathmatch(SceneryEnv):
         """
         lanes = slice(e * self.n_agents, (e + 1) * self.n_agents)
         view, n_model = self._view(), len(self.core.scenery.model)
+        assert view.centre_line is not None
         line = view.centre_line[e]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
         images = self._images(view)
@@ -306,7 +313,7 @@ class Deathmatch(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
         each agent to its target, and each agent's health, RGB and depth.
         """

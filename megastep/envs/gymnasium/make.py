@@ -5,11 +5,15 @@ import difflib
 import functools
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from megastep.imports import import_object, search_current_folder
 from megastep.sync_envs import SyncEnvs, make_env, names_of_numbers
 from megastep.vector_processes import VectorProcesses
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+    from gymnasium.vector import VectorEnv
 
 __all__ = ["vector_env"]
 
@@ -24,7 +28,7 @@ def vector_env(
     vectorization: str,
     restart_failed: int = 0,
     films: bool = False,
-) -> Any:
+) -> "VectorEnv | SyncEnvs | VectorProcesses":
     """Returns a vector environment. The step after an episode's end resets it.
 
     Args are those of :class:`~megastep.envs.gymnasium.env.Gymnasium`.
@@ -38,7 +42,7 @@ def vector_env(
         raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
     spec = _spec(id)
     try:
-        wrappers = [import_object(name) for name in wrappers]
+        functions = [import_object(name) for name in wrappers]
     except ValueError as error:
         raise ValueError(f"env.wrappers: {error}") from None
     try:
@@ -49,14 +53,14 @@ def vector_env(
                     "environment has not; use env.vectorization=sync or async"
                 )
             make_vec = functools.partial(gymnasium.make_vec, spec)
-            return _checked(id, _own(make_vec, spec, wrappers, n_envs, kwargs))
+            return _checked(id, _own(make_vec, spec, functions, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
         settings = {"disable_env_checker": True, **kwargs}
-        example = make_env(spec, wrappers, settings)
+        example = make_env(spec, functions, settings)
         max_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
         if films and "rgb_array" in (example.metadata.get("render_modes") or ()):
             settings = {"render_mode": "rgb_array", **settings}
-        make_one = functools.partial(make_env, spec, wrappers, settings)
+        make_one = functools.partial(make_env, spec, functions, settings)
         make = functools.partial(SyncEnvs, make_one, restart_failed=restart_failed)
         if vectorization == "sync":
             vector = make(n_envs=n_envs, names=names_of_numbers(example))
@@ -77,7 +81,7 @@ def vector_env(
         ) from error
 
 
-def _spec(id):
+def _spec(id) -> "EnvSpec":
     """Returns the specification of an environment, whose package is imported if it names one."""
     import gymnasium
 
@@ -103,7 +107,7 @@ def _spec(id):
     return gymnasium.registry[name]
 
 
-def _own(make, spec, wrappers, n_envs, kwargs):
+def _own(make, spec, wrappers, n_envs, kwargs) -> "VectorEnv":
     if wrappers:
         raise ValueError(
             "env.wrappers go around single environments, which its own vector environment has "
@@ -114,7 +118,7 @@ def _own(make, spec, wrappers, n_envs, kwargs):
     return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs)
 
 
-def _checked(id, env):
+def _checked(id: str | None, env: "VectorEnv") -> "VectorEnv":
     from gymnasium.vector import AutoresetMode
 
     mode = env.metadata.get("autoreset_mode")
@@ -127,7 +131,7 @@ def _checked(id, env):
     return env
 
 
-def _line(error):
+def _line(error) -> str:
     """Returns the first line of an error, without what Gymnasium adds to it."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return line.partition(" was raised from the environment creator")[0]

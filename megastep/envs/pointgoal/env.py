@@ -4,7 +4,7 @@ N environments of one agent, so B = N lanes.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -19,6 +19,9 @@ from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["PointGoal"]
 
@@ -115,7 +118,9 @@ class PointGoal(SceneryEnv):
         self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
-        self.rules = dict(bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH)
+        self.rules: dict = dict(
+            bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH
+        )
         self.goals = goal_fields(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns
@@ -152,7 +157,7 @@ class PointGoal(SceneryEnv):
         """Takes one step with ``decision.actions``. Returns a world."""
         return self._world(self.movement(decision).progress)
 
-    def _world(self, free=None):
+    def _world(self, free=None) -> arrdict:
         """Respawns agents whose episode has ended, renders, and computes rewards and flags."""
         self.spawner(self.ended)
         obs = self._view()
@@ -183,7 +188,7 @@ class PointGoal(SceneryEnv):
             world["privileged"] = arrdict(way=step.privileged)
         return world
 
-    def _view(self):
+    def _view(self) -> arrdict:
         """Returns the observation without the goal."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
         return arrdict(images(view), imu=view.imu)
@@ -203,7 +208,7 @@ class PointGoal(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan with the goal,
         and the agent's RGB and depth.
         """
