@@ -174,6 +174,27 @@ def seal_file(path):
     seal(path.parent, files=files)
 
 
+@pytest.mark.parametrize(
+    "name", ["../../secret", "rank0.pt", "xrank1.pt", "rank1.pt.x", "/etc/hosts"]
+)
+def test_manifest_names_no_other_files(folder, name):
+    (folder.parent / "secret").write_bytes(b"")
+    entry = {"sha256": hashlib.sha256(b"").hexdigest(), "bytes": 0}
+    files = json.loads((folder / "step_30/manifest.json").read_text())["files"]
+    seal(folder / "step_30", files=files | {name: entry})
+    with pytest.warns(UserWarning, match="manifest.json cannot be read.*using step_20"):
+        assert checkpoint.load_latest(folder).step == 20
+
+
+@pytest.mark.parametrize("name", ["config.json", "state.pt"])
+def test_manifest_names_what_is_read(folder, name):
+    files = json.loads((folder / "step_30/manifest.json").read_text())["files"]
+    del files[name]
+    seal(folder / "step_30", files=files)
+    with pytest.warns(UserWarning, match="manifest.json cannot be read.*using step_20"):
+        assert checkpoint.load_latest(folder).step == 20
+
+
 @pytest.mark.parametrize("version, commit", [(4, "e9908db"), (1, "e17fabe")])
 def test_earlier_format_names_the_commit_that_reads_it(folder, version, commit):
     seal(folder / "step_30", format=version)
