@@ -4,6 +4,7 @@ a full disk or a closed pipe, never ends the work.
 
 import contextlib
 import os
+import re
 import sys
 import textwrap
 import threading
@@ -60,9 +61,20 @@ def open_streams() -> None:
         setattr(sys, name, TolerantStream(stream))
 
 
+#: What a terminal acts upon instead of showing it: control characters but tab and newline, and
+#: those that turn the direction of what follows.
+CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
+def visible(text: str) -> str:
+    """Returns a text that may be from a stranger's file, with control characters as `\\x1b`."""
+    return CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
+
+
 def say(text: str, file: TextIO | None = None) -> None:
     if is_silent and file is None:
         return
+    text = visible(text)
     print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
 
 

@@ -250,12 +250,18 @@ class OpponentPool(Protocol):
     env: Env  # without the opponents
     scripted: Any  # the bot, or None
 
-    def refresh_snapshots(self, policy: Actor, n_updates: int) -> None: ...
+    def refresh_snapshots(self, policy: Actor, n_updates: int) -> None:
+        """Replaces the oldest snapshot by the policy if it is time to."""
 
     def pop_win_rates(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]
-    ) -> dict[str, float]: ...
+    ) -> dict[str, float]:
+        """Returns the fraction won against each kind of opponent since the last call."""
+        ...
 
-    def state_dict(self) -> StateDict: ...
+    def state_dict(self) -> StateDict:
+        """Returns everything that changes."""
+        ...
 
-    def load_state_dict(self, state: StateDict) -> None: ...
+    def load_state_dict(self, state: StateDict) -> None:
+        """Continues from a `state_dict`."""

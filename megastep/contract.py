@@ -30,6 +30,7 @@ INTEGERS = tuple(
     getattr(torch, f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)
 )
 RESERVED = "count", "window", "return", "length", "return_std"  # reported of every episode
+#: Required attributes of an environment, and what each is.
 ATTRIBUTES = {
     "n_envs": "the number of environments, N",
     "device": "the device that the tensors are on",

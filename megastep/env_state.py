@@ -5,6 +5,8 @@ what the environments of users keep besides tensors.
 import collections
 import contextlib
 import enum
+import functools
+import inspect
 import pathlib
 import random
 import re
@@ -250,6 +252,8 @@ class EnvState:
         parent, step = node_at(self.root, _parent(path)), path[len(_parent(path)) :]
         if parent is None:
             raise ValueError(f"it has no {_name(path)}")
+        if not _is_state(self.root, parent, step, value):
+            raise ValueError(f"{_name(path)} is not state of the environment")
         if _is_list(parent) and step == f"[{len(parent)}]":
             parent.append(value)
         else:
@@ -311,6 +315,24 @@ def _bytes(tensor) -> bytes:
 
 def _is_ours(node) -> bool:
     return type(node).__module__.startswith(("megastep.", "torch."))
+
+
+def _is_state(root, parent, step, value) -> bool:
+    """Returns whether a step from a node leads to what may be replaced by a saved value: files may
+    come from strangers, and name methods.
+    """
+    now = dict(children(parent)).get(step)
+    if parent is root or (_is_ours(parent) and _is_plain(value) and not _is_dict(parent)):
+        return False
+    if not isinstance(now, (*_STATEFUL, *_NUMBERS, *_CONTAINERS)):
+        return False
+    if step.startswith("["):
+        return True
+    name = step[1:]
+    of_class = inspect.getattr_static(type(parent), name, None)
+    kinds = (*_STATEFUL, *_NUMBERS, *_CONTAINERS, functools.cached_property)
+    is_data = isinstance(of_class, kinds)
+    return is_data and not (name.startswith("__") and name.endswith("__"))
 
 
 def _is_object(node) -> bool:

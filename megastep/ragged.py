@@ -146,6 +146,7 @@ class RaggedNumpy(Ragged):
         return RaggedTorch(torch.as_tensor(vals), torch.as_tensor(self.widths))
 
     def numpyify(self) -> "RaggedNumpy":
+        """Returns itself."""
         return self
 
 
@@ -175,9 +176,11 @@ class RaggedTorch(Ragged):
 
     @property
     def device(self) -> torch.device:
+        """The device of ``vals``."""
         return self.vals.device
 
     def torchify(self) -> "RaggedTorch":
+        """Returns itself."""
         return self
 
     def numpyify(self) -> RaggedNumpy:
@@ -194,12 +197,15 @@ class RaggedTorch(Ragged):
         return RaggedTorch(vals, self.widths.to(vals.device))
 
     def cpu(self) -> "RaggedTorch":
+        """Returns it on the CPU."""
         return self.to("cpu")
 
     def cuda(self, device: torch.device | str = "cuda") -> "RaggedTorch":
+        """Returns it on a GPU."""
         return self.to(device)
 
     def clone(self) -> "RaggedTorch":
+        """Returns a copy with tensors of its own."""
         return RaggedTorch(self.vals.clone(), self.widths.clone())
 
 

@@ -13,9 +13,13 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import gymnasium
+    from gymnasium.envs.registration import EnvSpec
 
 __all__ = [
     "EnvError",
@@ -63,7 +67,9 @@ def one_line(error: BaseException) -> str:
     return ": ".join(filter(None, [type(error).__name__, line[:300]]))
 
 
-def make_env(spec: Any, wrappers: Sequence[Callable], settings: Mapping[str, Any]) -> Any:
+def make_env(
+    spec: "EnvSpec", wrappers: Sequence[Callable], settings: Mapping[str, Any]
+) -> "gymnasium.Env":
     """Returns an environment of Gymnasium by its specification, inside wrappers."""
     import gymnasium
 
@@ -96,7 +102,7 @@ class SyncEnvs:
 
     def __init__(
         self,
-        make: Callable[[], Any],
+        make: "Callable[[], gymnasium.Env]",
         n_envs: int,
         restart_failed: int = 0,
         names: Sequence[str] = (),
@@ -162,7 +168,7 @@ class SyncEnvs:
         flags = self.terminated.copy(), self.truncated.copy()
         return self._observations(latest), self.rewards.copy(), *flags, self._news(numbers)
 
-    def render(self) -> list[Any]:
+    def render(self) -> list:
         """Returns a frame of every environment."""
         return [env.render() for env in self.envs]
 
@@ -170,7 +176,7 @@ class SyncEnvs:
         """Closes every environment. Raises the first error, once all are closed."""
         close_all(self.envs)
 
-    def _observations(self, latest) -> Any:
+    def _observations(self, latest) -> object:
         from gymnasium.vector.utils import concatenate
 
         self.batch = concatenate(self.single_observation_space, latest, self.batch)
@@ -181,14 +187,14 @@ class SyncEnvs:
         news = {"numbers": numbers, "failures": failures}
         return {key: value for key, value in news.items() if value}
 
-    def _last(self, i) -> Any:
+    def _last(self, i) -> object:
         """Returns a copy of the last observation of an environment."""
         from gymnasium.vector.utils import batch_space, iterate
 
         rows = iterate(batch_space(self.single_observation_space, len(self.envs)), self.batch)
         return copy.deepcopy(next(itertools.islice(rows, i, None)))
 
-    def _reset(self, i, seed=None) -> Any:
+    def _reset(self, i, seed=None) -> object:
         while True:
             if self.is_new[i]:  # draws that no other environment has
                 number = [int(self.seeds[i]), int(self.restarts[i])]
@@ -217,7 +223,7 @@ class SyncEnvs:
         self.is_new[i] = True
 
 
-def close_all(envs: Sequence[Any]) -> None:
+def close_all(envs: "Sequence[gymnasium.Env]") -> None:
     """Closes environments. Raises the first error once all are closed, a TimeoutError at once."""
     errors = []
     for env in envs:
@@ -234,7 +240,7 @@ def close_all(envs: Sequence[Any]) -> None:
 # ---- Numbers of an episode's last info ----
 
 
-def numbers_of(info: Any) -> dict[str, float]:
+def numbers_of(info: object) -> dict[str, float]:
     """Returns the numbers of an `info` by key, without those in dicts and arrays of several."""
     values = {}
     for key, value in info.items() if isinstance(info, Mapping) else ():
@@ -246,7 +252,7 @@ def numbers_of(info: Any) -> dict[str, float]:
     return values
 
 
-def names_of_numbers(env: Any, seed: int = 0) -> list[str]:
+def names_of_numbers(env: "gymnasium.Env", seed: int = 0) -> list[str]:
     """Plays an episode with random actions, of at most `PROBE_STEPS` and `PROBE_SECONDS`. Returns
     the keys of the numbers in its last `info`, `is_success` first. Closes the environment.
 

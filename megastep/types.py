@@ -41,7 +41,8 @@ class World(Protocol):
 
     def __iter__(self) -> Iterator[str]: ...
 
-    def get(self, key: str, default: Tree = None, /) -> Tree: ...
+    def get(self, key: str, default: Tree = None, /) -> Tree:
+        """Returns an entry, or the default if it is absent."""
 
 
 @runtime_checkable

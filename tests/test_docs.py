@@ -6,12 +6,13 @@ import re
 import shlex
 
 import pytest
+import reference
 
 from megastep import envs
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
-FOLDERS = DOCS, DOCS / "lab", DOCS / "decisions"
+FOLDERS = DOCS, DOCS / "lab", DOCS / "decisions", DOCS / "reference"
 PAGES = [page for folder in (ROOT, *FOLDERS) for page in folder.glob("*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.
 NEEDS_FILES = (
@@ -42,9 +43,10 @@ def test_command_composes(page, script, arguments, tmp_path, monkeypatch, capsys
     assert code == 0, capsys.readouterr().err
 
 
+@functools.cache
 def headings(page):
     """Returns a page's anchors as GitHub names them."""
-    titles = re.findall(r"^#+ (.*)", page.read_text(), re.M)
+    titles = re.findall(r"^#+ (.*)", reference.expand(page.read_text()), re.M)
     return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
 
 

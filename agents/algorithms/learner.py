@@ -99,6 +99,10 @@ class GradientLearner:
         weight_decay: Adam's weight decay, of parameters of two or more axes whose name contains
             "weight": those of layers, but no biases and no standard deviations.
 
+    Metrics:
+        loss/grad_norm: norm of the gradient before it is clipped.
+        loss/skipped_steps: gradient steps skipped because of non-finite numbers.
+
     Attributes:
         steps: the `GradientSteps` of the policy's parameters.
         check: finds non-finite numbers in rollouts and counts skipped updates.

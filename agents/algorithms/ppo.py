@@ -55,6 +55,16 @@ class PPO(GradientLearner):
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
         seed: seed of the minibatch order.
 
+    Metrics:
+        loss/policy: policy loss.
+        loss/value: value loss, in units of the return's variance.
+        loss/entropy: entropy of the policy; of continuous actions the differential entropy, which
+            may be negative.
+        loss/auxiliary: auxiliary loss of predicting the privileged observation.
+        loss/kl: KL divergence from the acting policy, in nats.
+        loss/clip_fraction: fraction of ratios beyond `clip`.
+        loss/explained_variance: fraction of the returns' variance that the value explains.
+
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic. `check` names the number and counts the updates skipped in a row.
     """

@@ -85,6 +85,15 @@ class R2D2(GradientLearner):
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
         seed: seed of replay sampling.
 
+    Metrics:
+        loss/td: squared TD error, in rescaled values.
+        loss/td_error: mean absolute TD error.
+        loss/q: mean Q-value of the actions taken, in units of reward.
+        loss/staleness: mean age of the replayed sequences, in updates.
+        loss/effective_samples: effective sample size of the importance weights, as a fraction.
+        loss/priority_max: largest priority of the stored sequences.
+        loss/priority_mean: mean priority of the stored sequences.
+
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic, and is never drawn. `state_dict` does not include the replay buffer, which has one
     of its own.

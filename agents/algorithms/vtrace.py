@@ -77,6 +77,22 @@ class VTrace(GradientLearner):
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
         seed: seed of the minibatch order and of replay sampling.
 
+    Metrics:
+        loss/policy: policy loss.
+        loss/value: value loss, in units of the return's variance.
+        loss/entropy: entropy of the policy; of continuous actions the differential entropy, which
+            may be negative.
+        loss/auxiliary: auxiliary loss of predicting the privileged observation.
+        loss/kl: KL divergence from the acting policy, in nats.
+        loss/clip_fraction: fraction of ratios beyond `rho_clip`.
+        loss/explained_variance: fraction of the returns' variance that the value explains.
+        loss/advantage: root mean square of the advantages, in standard deviations of the return.
+        loss/rho: mean clipped ratio.
+        loss/effective_samples: effective sample size as a fraction: near 1, samples are as good as
+            on-policy ones.
+        loss/replayed_NAME: kl, rho, clip_fraction and effective_samples of replayed sequences.
+        loss/staleness: with replay, mean age of the replayed sequences, in updates.
+
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic. `check` names the number and counts the updates skipped in a row.
 

@@ -11,6 +11,7 @@ one. A learner of a user has the blocks of the built-in learner that it derives 
 """
 
 import functools
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from types import NoneType
@@ -20,6 +21,7 @@ from hydra.core import plugins
 from hydra.plugins.config_source import ConfigSource
 from omegaconf import DictConfig, OmegaConf
 
+from megastep.agents.cli import config_files
 from megastep.agents.factory import check, components, settings
 from megastep.agents.launch import gpu
 from megastep.imports import import_object
@@ -120,6 +122,10 @@ def _laid(below, above) -> Any:
 def _with_blocks(load_config) -> Callable:
     @functools.wraps(load_config)
     def load(source, config_path) -> "ConfigResult":
+        if source.scheme() == "file":
+            path = os.path.join(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
+            if os.path.exists(path):  # Hydra tells of those that do not
+                config_files.check(path)
         result = load_config(source, config_path)
         if OmegaConf.is_dict(result.config) and any(name in result.config for name in applied):
             result.config = OmegaConf.create(merged(plain(result.config)))

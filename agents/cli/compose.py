@@ -8,10 +8,11 @@ Jobs of sweeps compose in the same way, in whichever process they run.
 
 import copy
 import functools
+import itertools
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -21,8 +22,14 @@ from hydra.core import config_store, global_hydra, plugins
 from hydra.core.override_parser import overrides_parser, types
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf, grammar_parser
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    GrammarParseError,
+    OmegaConfBaseException,
+)
+from omegaconf.grammar_parser import OmegaConfGrammarParser  # pyright: ignore[reportPrivateImportUsage]
 
 from megastep.agents import package
 from megastep.agents.cli import blocks
@@ -49,8 +56,15 @@ OPEN = {
 }
 #: The learner whose blocks are tried first where none is typed.
 GUESS = "ppo"
+#: Resolvers that settings may call: none that reads what is not in the configuration, or reads its
+#: argument as a value that may call others.
+RESOLVERS = ("now", "oc.dict.keys", "oc.dict.values", "oc.select", "python_version")
+ENVIRONMENT = ("oc.env", "env")
 #: What Hydra raises for words that it cannot use.
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
+#: What files of configurations raise beside these: Hydra and YAML have no errors of their own for
+#: defaults that are no list or lead back to their own file, and for numbers of 5,000 digits.
+FILE_ERRORS = (*HYDRA_ERRORS, ValueError, TypeError, LookupError, RecursionError)
 STORE = config_store.ConfigStore.instance()
 # Hydra copies its sources of files time and again, and in them this one, which took a third of a
 # second: there is only one
@@ -160,8 +174,7 @@ class Composer:
         """
         overrides = self.parse(words)
         config, errors = self.config(overrides)
-        cure = "is an environment variable, and would be written to config.yaml; type its value"
-        secret = [(k, cure) for k, value in check.leaves(own(config)) if "${oc.env:" in str(value)]
+        secret = [*refused_resolvers(own(config))]
         try:
             typed = [key for key in map(key_of, overrides) if not key.startswith("hydra")]
             tree = self.script.prepare(own(config, resolve=not secret), typed)
@@ -236,7 +249,7 @@ class Composer:
             )
             config = copy.deepcopy(self.composed(*groups, device=device, learner=learner))
             blocks.fit(config, learner)
-        except HYDRA_ERRORS as error:
+        except FILE_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
             text = shortened(text, 400)
@@ -285,6 +298,46 @@ class Composer:
 def key_of(override: types.Override) -> str:
     """The key or group@package of a word, without the sign before it."""
     return override.get_key_element().lstrip("+~")
+
+
+def refused_resolvers(tree: check.Tree) -> Iterator[tuple[str, str]]:
+    """Yields (key, sentence) of values that call a resolver which is not one of `RESOLVERS`, as
+    OmegaConf's grammar reads them: in any part of a value, with any blanks.
+    """
+    for key, value in check.leaves(tree):
+        for name in dict.fromkeys(itertools.chain(*map(resolvers_in, strings_in(value)))):
+            if name in ENVIRONMENT:
+                cure = "would be written to config.yaml; type its value"
+                yield key, f"is an environment variable, and {cure}"
+            elif name not in RESOLVERS:
+                cure = f"settings may call {', '.join(RESOLVERS)}; type the value"
+                yield key, f"calls {shortened(repr(name), 60)}; {cure}"
+
+
+def strings_in(value: object) -> Iterator[str]:
+    """Yields the texts in nested lists and dicts."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, (list, dict)):
+        for part in [*value, *value.values()] if isinstance(value, dict) else value:
+            yield from strings_in(part)
+
+
+def resolvers_in(text: str) -> Iterator[str]:
+    """Yields the names of the resolvers that a value calls, those in arguments of others too.
+
+    What cannot be read is no call: resolving it is an error.
+    """
+    stack = []
+    if "${" in text:
+        with suppress(GrammarParseError):
+            stack.append(grammar_parser.parse(text))
+    while stack:
+        node = stack.pop()
+        if isinstance(node, OmegaConfGrammarParser.InterpolationResolverContext):
+            if (resolver := node.resolverName()) is not None:
+                yield resolver.getText()
+        stack += getattr(node, "children", None) or []
 
 
 def is_import_path(value: object) -> bool:

@@ -14,6 +14,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -37,6 +38,7 @@ from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
+from megastep.agents.launch.again import AUTO
 from megastep.agents.runs import folders, scores
 from megastep.agents.runs.atomic_files import write_atomically
 
@@ -61,7 +63,7 @@ OmegaConf.register_new_resolver(
 # ---- Before the first job ----
 
 
-def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list[Any], Any]:
+def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list, Any]:
     """Returns (the words of each job that is known beforehand; their settings, all of them checked;
     Hydra's configuration of the first).
 
@@ -225,9 +227,13 @@ class Job:
             folder=hydra.runtime.output_dir,
         )
         words += [word for word in hydra.overrides.hydra if "searchpath" in word]
-        if self.path(f"{number}.json").exists():  # it started before joblib lost a worker
-            row = self.recorded(number)
-        elif hydra.runtime.choices["hydra/launcher"] != "joblib":
+        launcher = hydra.runtime.choices["hydra/launcher"]
+        if self.path(f"{number}.json").exists():
+            # it started before joblib lost a worker, or a cluster starts it again
+            earlier = self.recorded(number)
+            is_over = launcher == "joblib" or earlier["state"] == DONE
+            row = earlier if is_over else self.run(row, words, is_again=True)
+        elif launcher != "joblib":
             row = self.run(row, words)
         elif not self.path("stopped").exists():
             row = self.start_apart(row, words)
@@ -251,8 +257,23 @@ class Job:
             console.say(f"Job {row['number']} {LOST}", sys.stderr)
         return row
 
-    def run(self, row: "Row", words: list[str]) -> "Row":
-        """Runs a job in this process. Returns what became of it."""
+    def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
+        """Runs a job in this process. Returns what became of it.
+
+        In a job of submitit's, SIGUSR1 and SIGUSR2 get to its own handler once the job is saved,
+        and it has the job started again.
+
+        Args:
+            is_again: it was started before, and continues from what it saved.
+        """
+        try:
+            return self._run(row, words, is_again)
+        except signals.Interrupted as stop:
+            if stop.args[0] in signals.ANNOUNCING and "SUBMITIT_EXECUTOR" in os.environ:
+                signal.raise_signal(stop.args[0])
+            raise
+
+    def _run(self, row, words, is_again) -> "Row":
         began, number, result = time.monotonic(), row["number"], None
         if os.getpid() != self.process:  # its lines are among those of others
             warnings.showwarning, console.prefix = console.warn, f"job {number}: "
@@ -266,6 +287,8 @@ class Job:
                     if composer.note:
                         console.say(composer.note)
                     cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
+                    if is_again:  # not for evaluations, which begin again
+                        cfg = settings.changed(cfg, resume=AUTO)
                     grouped = {
                         label: settings.changed(one, group=Path(self.folder).name)
                         for label, one in getattr(cfg, "logger", {}).items()

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeVar
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.environment import hostname, rank_info
+from megastep.agents.distributed.environment import hostname, rank_info, token
 
 if TYPE_CHECKING:
     from torch.distributed import Store, TCPStore  # pyright: ignore[reportPrivateImportUsage]
@@ -79,7 +79,8 @@ def start(seconds: float = START_SECONDS) -> None:
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # a new prefix: after a restart the store may still hold addresses of the ended ranks
-    keys = _prefixed(f"ranks {info.attempt} {next(_STARTS)}", _store())
+    name = f"ranks {token()} {info.attempt} {next(_STARTS)}"
+    keys = _prefixed(name, _store())
     distributed.init_process_group(
         backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
     )
@@ -113,7 +114,7 @@ def store(name: str) -> Store:
     Args:
         name: prefix of its keys.
     """
-    return _prefixed(f"megastep {name}", _connection())
+    return _prefixed(f"megastep {token()} {name}", _connection())
 
 
 def _prefixed(name: str, keys: Store) -> Store:

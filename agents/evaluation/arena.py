@@ -118,6 +118,7 @@ class Arena:
         warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> "arrdict":
+        """Returns the duels of two players, those of all ranks."""
         policies = player.policy, opponent.policy
         with factory.errors():
             limit = self.cfg.max_steps or duels.MAX_STEPS

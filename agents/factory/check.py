@@ -42,10 +42,12 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
             if line["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
                 text = _unknown(path, [*fields, *names])
             else:
-                while ".".join(path) not in fields:  # inside a list, or an option of a union
+                # inside a list, or an option of a union
+                while len(path) > 1 and ".".join(path) not in fields:
                     path.pop()
-                text = sentence(line, fields[".".join(path)], line["input"])
-            errors.setdefault(".".join(path), text)
+                field = fields.get(".".join(path))
+                text = sentence(line, field, line["input"]) if field else line["msg"]
+            errors.setdefault(".".join(path) or "configuration", text)
         raise ConfigErrors(errors.items()) from None
 
 

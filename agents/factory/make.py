@@ -4,13 +4,13 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
 from megastep import contract, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
-from megastep.agents.errors import ConfigErrors, UserError, user_errors
+from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import check
 from megastep.agents.factory.settings import (
     Agent,
@@ -376,7 +376,9 @@ def load_weights(policy: Policy, env: types.Env, loaded: checkpoint.Checkpoint) 
             "Choose the env it was trained in"
         )
     assert loaded.state is not None
-    weights, own = loaded.state["policy"], policy.state_dict()
+    weights, own = cast(dict, loaded.state.get("policy")), policy.state_dict()
+    with errors(f"{loaded.path} cannot be used: "):
+        check_weights(weights, own)
     if policy.critic is None:
         weights = {k: v for k, v in weights.items() if not k.startswith(TRAINING_ONLY)}
     elif agent_file.is_agent_file(loaded.path):
@@ -385,6 +387,22 @@ def load_weights(policy: Policy, env: types.Env, loaded: checkpoint.Checkpoint) 
     with user_errors(f"{loaded.path} needs an agent with {agent}: ", (RuntimeError,)):
         policy.load_state_dict(weights)
     return policy
+
+
+def check_weights(weights: Any, own: Mapping[str, torch.Tensor]) -> None:
+    """Raises ValueError for what are no weights: other numbers than a policy's own are, which would
+    be converted without a word, and NaN and infinity.
+    """
+    if not isinstance(weights, Mapping) or not all(isinstance(name, str) for name in weights):
+        raise ValueError("its weights are no tensors by name")
+    for name, weight in weights.items():
+        if not isinstance(weight, torch.Tensor) or weight.layout != torch.strided:
+            raise ValueError(f"its {shortened(name, 60)} is no dense tensor")
+        dtype = own[name].dtype if name in own else weight.dtype
+        if weight.dtype != dtype and not (weight.is_floating_point() and dtype.is_floating_point):
+            raise ValueError(f"its {name} is {weight.dtype}, and the policy's is {dtype}")
+        if not weight.isfinite().all():
+            raise ValueError(f"its {shortened(name, 60)} has a NaN or an infinity")
 
 
 def _nbytes(env) -> int:

@@ -215,6 +215,8 @@ def missing_sources(tree: "Config") -> list[tuple[str, str]]:
     match tree.get("geometry"):
         case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
             return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
+        case {"name": components.SUITE, "plans": str(path)} if not os.path.isfile(path):
+            return [("geometry.plans", f"there is no file {path!r}; give an .npz of floor plans")]
         case {"name": components.MIXED | components.SUITE, "parts": dict(parts)}:
             try:
                 import_object(components.CHECK_PARTS)(parts)

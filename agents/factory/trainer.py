@@ -2,11 +2,12 @@
 another.
 """
 
+import contextlib
 import functools
 import math
 import random
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,9 @@ import numpy as np
 import torch
 
 from megastep.agents import console, factory, package
+from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.distributed import process_group
-from megastep.agents.errors import UserError
+from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, settings
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.runs import (
@@ -23,6 +25,7 @@ from megastep.agents.runs import (
     annealing,
     checkpoint,
     folders,
+    formats,
     provenance,
     repeat,
     saver,
@@ -77,6 +80,12 @@ def make_trainer(
         path = folders.find(start)
         loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
+        if cfg.resume:
+            state = loaded.state or {}
+            with state_errors(loaded.path):
+                formats.check(formats.Counts, {k: state.get(k) for k in formats.COUNTS})
+                if name := nonfinite_leaf(state["learner"]):
+                    raise ValueError(f"learner.{name} has a NaN or an infinity")
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
@@ -124,9 +133,23 @@ def make_trainer(
             **writers,
         )
         if cfg.resume:
-            trainer.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
+            with state_errors(loaded.path):
+                trainer.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
             trainer.lost += differing(loaded.made_with, made_with)
     return trainer
+
+
+@contextlib.contextmanager
+def state_errors(path: Path) -> Iterator[None]:
+    """Turns what the state of a checkpoint raises where it is restored into a UserError."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, RuntimeError) and memory_problem(error):
+            raise
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        problem = f"{kind}{shortened(error, 300)}"
+        raise UserError(f"The state in {path} is not this run's: {problem}") from error
 
 
 def differing(before: "Row", now: "Row") -> list[str]:

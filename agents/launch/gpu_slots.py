@@ -11,7 +11,7 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors
@@ -21,11 +21,13 @@ from megastep.agents.launch import gpu, launcher
 if TYPE_CHECKING:
     from contextlib import ExitStack
 
+T = TypeVar("T", bound=settings.Common)
+
 #: Environment variable with the GPUs that a process may use.
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
-def check(jobs: Sequence[Any], hydra: Any) -> str | None:
+def check(jobs: Sequence, hydra: Any) -> str | None:
     """Checks that every job has a GPU per rank, before the first job starts.
 
     Args:
@@ -89,7 +91,7 @@ def idle(n_ranks: int, n_gpus: int, is_parallel: bool) -> str | None:
 
 
 @contextlib.contextmanager
-def taken(cfg: Any) -> Iterator[Any]:
+def taken(cfg: T) -> Iterator[T]:
     """Takes the slot with the fewest jobs for the duration of the context.
 
     Ranks are separate processes and see only the GPUs of their slot. For a job in this process, the
@@ -116,7 +118,7 @@ def taken(cfg: Any) -> Iterator[Any]:
         yield cfg
 
 
-def _has_ranks(cfg) -> bool:
+def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
 
 
@@ -156,7 +158,7 @@ def _lock(names) -> "ExitStack | None":
         return stack.pop_all()
 
 
-def _on_gpu(cfg: Any, number: int, stack: contextlib.ExitStack) -> Any:
+def _on_gpu(cfg: T, number: int, stack: contextlib.ExitStack) -> T:
     """Makes a GPU the current device until the stack closes. Returns settings that use it."""
     import torch
 

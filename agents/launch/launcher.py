@@ -213,6 +213,9 @@ def launch_ranks(n_ranks: int, n_restarts: int) -> None:
     from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
+    from megastep.agents.launch import loopback
+
+    loopback.register()
     # its messages repeat the ranks' errors, which are reported in one sentence
     logger = logging.getLogger("torch.distributed")
     logger.handlers, logger.propagate = [logging.NullHandler()], False
@@ -221,9 +224,8 @@ def launch_ranks(n_ranks: int, n_restarts: int) -> None:
         max_nodes=1,
         nproc_per_node=n_ranks,
         run_id=uuid.uuid4().hex,
-        rdzv_backend="c10d",
-        rdzv_endpoint="localhost:0",
-        local_addr="localhost",
+        rdzv_backend=loopback.BACKEND,
+        local_addr=loopback.ADDRESS,
         max_restarts=n_restarts,
         monitor_interval=0.1,
         logs_specs=DefaultLogsSpecs(log_dir=os.devnull),

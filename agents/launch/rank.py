@@ -12,7 +12,7 @@ from typing import NoReturn, TypeVar
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.launch import endings, launcher, signals
+from megastep.agents.launch import endings, launcher, signals, started
 
 #: Seconds that a rank waits for rank 0 to end after an error, and after a signal (it saves).
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
@@ -72,16 +72,21 @@ class Team:
         """Publishes the run folder to the launcher and to restarted ranks."""
         self.folder = folder
         if environment.rank() == 0:
-            self.store.set("run", str(folder))
             if launcher.JOB in os.environ:
                 Path(os.environ[launcher.JOB], launcher.RUN).write_text(str(folder))
+            else:
+                started.leave_proof(self.store, folder)
 
     def earlier_folder(self) -> Path | None:
         """Returns the run folder of the previous attempt if torchrun restarted the ranks."""
         info = environment.rank_info()
         assert info is not None
-        is_again = info.attempt > 0 and self.store.check(["run"])
-        return Path(self.store.get("run").decode()) if is_again else None
+        if info.attempt == 0:
+            return None
+        if launcher.JOB in os.environ:  # a folder that is this user's alone
+            path = Path(os.environ[launcher.JOB], launcher.RUN)
+            return Path(path.read_text()) if path.exists() else None
+        return started.proven_folder(self.store)
 
     def end(self, problem: str | None) -> NoReturn:
         """Exits at once, because a rank was lost.
@@ -102,6 +107,11 @@ class Team:
             seconds: how long to wait for rank 0 to leave, too.
         """
         self.watch.leave(seconds)
+
+    def finish(self) -> None:
+        """Forgets the run, which is done."""
+        if environment.rank() == 0 and self.folder is not None:
+            started.remove_proof(self.folder)
 
 
 @contextlib.contextmanager
@@ -148,6 +158,7 @@ def joined() -> Iterator[Team | None]:
         raise SystemExit(code) from None
     finally:
         _team = None
+    team.finish()
     team.leave()
     if has_joined:
         process_group.stop()

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import itertools
+import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +27,7 @@ from megastep.agents.errors import (
 from megastep.agents.evaluation import evaluate, record
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
-from megastep.agents.launch import dry_run, launcher, rank, rank_checks, signals
+from megastep.agents.launch import again, dry_run, launcher, rank, rank_checks, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
@@ -49,12 +50,13 @@ def with_more(cfg: settings.Train) -> settings.Train:
 
 def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
     """Returns the run folder, locked, and the path to resume from (None for a new run)."""
-    folder = (
-        folders.folder_of(folders.find(cfg.resume))
-        if cfg.resume
-        else folders.new(settings.run_name(cfg), cfg.folder)
-    )
+    if is_new := cfg.resume in (None, again.AUTO):
+        folder = folders.new(settings.run_name(cfg), cfg.folder, cfg.resume == again.AUTO)
+    else:
+        folder = folders.folder_of(folders.find(cfg.resume))
     locks.enter_context(folders.locked(folder))
+    if is_new:
+        return folder, None
     if cfg.resume and process_group.n_ranks() > 1:  # all ranks from the same intact checkpoint
         return folder, str(folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).path)
     return folder, cfg.resume
@@ -87,13 +89,20 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     def show(trainer) -> None:
         progress.show(*progress_of(trainer))
 
+    if cfg.resume == again.AUTO:
+        start = together(lambda: again.automatic(cfg))
+        if start.is_done:
+            console.say(f"The run in {start.folder} has had its budget.")
+            return start.folder
+        cfg = start.cfg
+    is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(str(cfg.folder)))
     rank_checks.check_start(cfg)
     cfg = rank_checks.started_again(cfg, team)
     with contextlib.ExitStack() as locks:
         with contextlib.ExitStack() as undo:
             with signals.deferred():
                 folder, resume = from_rank_0(lambda: open_folder(cfg, locks))
-                if is_first and not cfg.resume:
+                if is_first and is_new:
                     undo.callback(shutil.rmtree, folder, ignore_errors=True)
             token = rank_checks.check_shared(folder)
             if team:

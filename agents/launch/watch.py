@@ -19,6 +19,8 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+from pydantic import TypeAdapter
+
 from megastep.agents.distributed import environment, process_group
 
 #: Seconds between heartbeats.
@@ -55,6 +57,9 @@ class Heartbeat(NamedTuple):
     is_exempt: bool
     has_left: bool
     host: str
+
+
+HEARTBEAT = TypeAdapter(Heartbeat)
 
 
 class LossDetector:
@@ -191,4 +196,9 @@ class Watch:
 
     def _heartbeat_of(self, rank) -> Heartbeat | None:
         name = f"heartbeat {rank}"
-        return Heartbeat(*json.loads(self.store.get(name))) if self.store.check([name]) else None
+        if not self.store.check([name]):
+            return None
+        try:
+            return HEARTBEAT.validate_json(self.store.get(name))
+        except ValueError:  # which no rank has written
+            return None

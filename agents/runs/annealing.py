@@ -8,9 +8,10 @@ import math
 from array import array
 from pathlib import Path
 
+from megastep.agents.runs import strange_files
 from megastep.agents.runs.atomic_files import AppendedFile
 
-FILE = "annealing.f64"
+FILE, MAX_BYTES = "annealing.f64", 2**32
 
 
 def read(folder: Path | str) -> array:
@@ -19,7 +20,7 @@ def read(folder: Path | str) -> array:
     """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
-        data = path.read_bytes()
+        data = strange_files.read_bytes(path, MAX_BYTES)
         factors.frombytes(data[: len(data) // factors.itemsize * factors.itemsize])
     return factors
 

@@ -10,6 +10,8 @@ import socket
 import time
 from pathlib import Path
 
+from megastep.agents.runs import strange_files
+
 #: Age in seconds at which temporary files of other machines are deleted, whose processes cannot be
 #: checked from here.
 ABANDONED = 24 * 3600
@@ -112,7 +114,7 @@ class AppendedFile:
         n_bytes: length to truncate it to first; None keeps all.
 
     Raises:
-        OSError: the file cannot be opened or cut.
+        OSError: the file cannot be opened or cut, or is a link.
 
     Attributes:
         unwritten: bytes still to write.
@@ -120,7 +122,7 @@ class AppendedFile:
 
     def __init__(self, path: Path, n_bytes: int | None = None):
         self.path, self.unwritten = path, bytearray()
-        self.file = open(path, "ab", buffering=0)
+        self.file = open(path, "ab", buffering=0, opener=strange_files.opener)
         if n_bytes is not None:
             self.file.truncate(n_bytes)
 

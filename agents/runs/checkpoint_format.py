@@ -23,11 +23,13 @@ import os
 import pickle
 import re
 import time
+import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from megastep.agents.runs import trust
+from megastep.agents.errors import memory_problem, shortened
+from megastep.agents.runs import formats, strange_files, trust
 from megastep.agents.runs.atomic_files import sync_folder
 
 if TYPE_CHECKING:
@@ -45,7 +47,7 @@ MIGRATED = 6
 PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
 _RANK_FILE = re.compile(r"rank[1-9]\d*\.pt")
 _LOGGERS = "megastep.agents.training.loggers"
-_CHUNK = 2**24  # bytes
+_CHUNK = _MAX_JSON = 2**24  # bytes
 
 
 class CheckpointError(RuntimeError):
@@ -259,10 +261,10 @@ def read(
         verify(path, manifest)
     else:
         verify(path, manifest, [*parts, "config.json"])
-    text = (path / "config.json").read_bytes()
     try:
+        text = strange_files.read_bytes(path / "config.json", _MAX_JSON)
         config = json.loads(text)
-    except (ValueError, RecursionError):
+    except (OSError, ValueError, RecursionError):
         raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is not JSON") from None
     checkpoint = Checkpoint(
         path,
@@ -286,17 +288,33 @@ def _load(path, device) -> Any:
     import torch
 
     try:
-        return torch.load(path, map_location=device, weights_only=True)
+        with open(path, "rb", opener=strange_files.opener) as file:
+            _check_zip(file)
+        state = torch.load(path, map_location=device, weights_only=True)
+        if not isinstance(state, dict):
+            raise ValueError("it is no dict")
+        return state
     except pickle.UnpicklingError:
         raise DamagedCheckpoint(
             f"Checkpoint {path.parent} is refused: {path.name} holds more than tensors and "
             "numbers, so loading it could run code"
         ) from None
-    except (RuntimeError, EOFError, ValueError) as error:
+    except Exception as error:  # of a planted file, there is no end to what unpickling raises
+        if memory_problem(error):
+            raise
         raise DamagedCheckpoint(
-            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read "
-            f"({str(error).splitlines()[0]})"
+            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read ({shortened(error)})"
         ) from None
+
+
+def _check_zip(file) -> None:
+    """Raises ValueError for a zip file whose parts are compressed, which `torch.save` never does: a
+    small one may unpack to more than there is memory.
+    """
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            if any(entry.compress_size != entry.file_size for entry in archive.infolist()):
+                raise ValueError("its parts are compressed")
 
 
 def _migrated(state, manifest) -> dict:
@@ -351,7 +369,7 @@ def verify(path: Path, manifest: Row, names: Iterable[str] | None = None) -> Non
 
 def _digest(path) -> str:
     digest = hashlib.sha256()
-    with open(path, "rb") as file:
+    with open(path, "rb", opener=strange_files.opener) as file:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
     return digest.hexdigest()
@@ -365,16 +383,23 @@ def read_manifest(path: Path) -> Row:
         CheckpointError: it has an unknown format.
     """
     try:
-        data = (path / "manifest.json").read_bytes()
+        data = strange_files.read_bytes(path / "manifest.json", _MAX_JSON)
         manifest = json.loads(data)
         version = manifest["format"]
         body = {key: value for key, value in manifest.items() if key != "sha256"}
-        is_intact = data == sealed(body)
+        is_intact = data == sealed(body) and isinstance(version, (int, str))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         version, is_intact = None, False
-    if is_intact:
+    if is_intact and version in (FORMAT, MIGRATED):
+        try:
+            formats.check(formats.Manifest, manifest)
+        except ValueError as error:
+            raise DamagedCheckpoint(
+                f"Checkpoint {path} is damaged: manifest.json: {error}"
+            ) from None
         others = {*manifest["files"]} - {"config.json", "state.pt", *PARTS}
         is_intact = all(map(_RANK_FILE.fullmatch, others))  # a forged manifest may name any path
+        is_intact &= {"config.json", "state.pt"} <= {*manifest["files"]}
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest):
         raise DamagedCheckpoint(

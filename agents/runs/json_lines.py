@@ -9,10 +9,13 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from megastep.agents.runs import formats, strange_files
 from megastep.agents.runs.atomic_files import AppendedFile, write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
+
+MAX_BYTES = 2**32
 
 
 class JsonLines:
@@ -56,13 +59,13 @@ def truncate_after(path: Path | str, step: int) -> None:
         return
     lines = (line + b"\n" for row, line in _intact_lines(path) if row["samples"] <= step)
     data = b"".join(lines)
-    if data != path.read_bytes():
+    if data != strange_files.read_bytes(path, MAX_BYTES):
         write_atomically(path, data)
 
 
 def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
     """Returns (object, bytes) of each intact line."""
-    *lines, last = path.read_bytes().split(b"\n")
+    *lines, last = strange_files.read_bytes(path, MAX_BYTES).split(b"\n")
     rows = [(_parsed(line), line) for line in [*lines, last]]
     damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]
     if damaged:
@@ -74,8 +77,7 @@ def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
 def _parsed(line: bytes) -> "Row | None":
     """Returns a line's object, or None if it is damaged."""
     try:
-        row = json.loads(line)
-    except ValueError:
+        formats.check(formats.Row, row := json.loads(line))
+    except (ValueError, RecursionError):
         return None
-    is_intact = isinstance(row, dict) and isinstance(row.get("samples"), int)
-    return row if is_intact else None
+    return row

@@ -198,7 +198,11 @@ class Opponents:
     ) -> dict[str, float]:
         """Returns the fraction of decided pairs that were won since the last call. Synchronises.
 
-        Keys are metric names. A kind of opponent without a decided pair is absent.
+        A kind of opponent without a decided pair is absent.
+
+        Metrics:
+            episode/won/KIND: fraction of pairs won against past snapshots (past) or the bot (bot)
+                since the last report, of those that were decided.
 
         Args:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.

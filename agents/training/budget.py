@@ -78,6 +78,7 @@ class Stopwatch:
 
     @property
     def is_running(self) -> bool:
+        """Whether the time counts."""
         return self.started is not None
 
     @property

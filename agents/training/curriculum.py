@@ -130,14 +130,17 @@ class Curriculum:
     def stats(self) -> dict[str, float]:
         """Returns numbers for a report. Synchronises.
 
-        - `curriculum/effective_homes`: exponential of the entropy of the draws: D if all are alike
-        - `curriculum/unseen`: fraction of homes in which no episode has ended yet
-        - `curriculum/fewest_episodes`: of all homes, since training began
-        - `curriculum/score`: mean score
-        - `curriculum/outcome`, `curriculum/worst`: running outcome, the mean over all homes alike
-          and over the worst 5 % of them; 0 in an unseen home
-        - `curriculum/outcome/SOURCE`, `curriculum/drawn/SOURCE`: the mean over the homes of a
-          source, and the fraction of draws in them
+        Metrics:
+            curriculum/effective_homes: exponential of the entropy of the draws: the number of homes
+                if draws are uniform, 1 if one home is always drawn.
+            curriculum/unseen: fraction of homes in which no episode has ended yet.
+            curriculum/fewest_episodes: episodes that ended in the home with the fewest.
+            curriculum/score: mean score; with `sfl`, mean learnability.
+            curriculum/outcome: mean running outcome, all homes weighted alike; 0 in an unseen home.
+            curriculum/worst: the same over the worst 5 % of homes.
+            curriculum/outcome/SOURCE: with `geometry=mixed`, mean running outcome in the homes of a
+                source.
+            curriculum/drawn/SOURCE: with `geometry=mixed`, fraction of draws in those homes.
         """
         weights = self.cumulative.double().diff(prepend=self.cumulative.new_zeros(1).double())
         drawn = weights / weights.sum()

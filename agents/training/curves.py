@@ -1,11 +1,13 @@
 """Learning curves of a run, drawn from its JSON lines."""
 
+import io
 import warnings
 from collections import defaultdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents.runs import json_lines
+from megastep.agents.runs.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -58,7 +60,8 @@ def plot_curves(folder: Path | str) -> None:
         for axes in grid.flat[len(panels) :]:
             axes.set_axis_off()
         figure.supxlabel("samples", fontsize="medium")
-        figure.savefig(folder / "curves.png", dpi=80)
+        figure.savefig(image := io.BytesIO(), dpi=80)
+        write_atomically(folder / "curves.png", image.getvalue())
     except OSError as error:
         warnings.warn(f"curves.png cannot be drawn ({error.strerror})", stacklevel=2)
 

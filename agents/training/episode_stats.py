@@ -220,15 +220,18 @@ class EpisodeStats:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.
 
         Means are over the episodes that ended since the last call and, if those are fewer than
-        `MIN_EPISODES`, those of earlier calls, a call at a time. A dict of
+        `MIN_EPISODES`, those of earlier calls, a call at a time. They are absent if there are none.
 
-        - `episode/count`: episodes that ended since the last call
-        - `episode/window`: episodes that the means are over; absent, like the means, if it is 0
-        - `episode/return`, `episode/length` and `episode/NAME` for each metric: the means; a metric
-          is absent if every episode was left out of it
-        - `episode/return_std`: standard deviation of the return
-        - all but the last for each group and each source, such as `episode/return/leader` and
-          `episode/success/maze`
+        Metrics:
+            episode/count: episodes that ended since the last report.
+            episode/window: episodes that the means are over.
+            episode/return: mean return.
+            episode/return_std: standard deviation of the return.
+            episode/length: mean number of steps.
+            episode/NAME: mean of a metric of the environment, over the episodes in which it is
+                finite.
+            episode/NAME/GROUP: the same, but for `return_std`, in the lanes of a role (leader) or
+                of a kind of opponent (now, past, bot), or in the floor plans of a source (maze).
         """
         reports = sum_over_ranks(self.sums.T).tolist()
         self.sums.zero_()

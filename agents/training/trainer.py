@@ -290,7 +290,24 @@ class Trainer:
     def log(self, losses: dict[str, torch.Tensor]) -> None:
         """Writes the metrics of all ranks since the last report. Synchronises.
 
-        A loss that is NaN has no value, as no gradient step was taken; it is left out.
+        A loss that is NaN has no value, as no gradient step was taken; it is left out. Rates and
+        times leave out the first update, which compiles.
+
+        Metrics:
+            samples: environment steps so far, over all lanes that learn.
+            updates: updates so far.
+            lr: learning rate.
+            anneal: what the learning rate falls with.
+            eval/NAME: what an evaluation in training measured.
+            perf/rate: samples per second since the last report.
+            perf/seconds: seconds of training so far.
+            perf/collect: seconds of collecting since the last report, on a GPU of the GPU; with
+                `learner.lag`, as far as the learner waits for it.
+            perf/update: seconds of updates, in the same way.
+            perf/rest: seconds of everything else: statistics, logging, checkpoints.
+            perf/memory_allocated: on a GPU, bytes of tensors.
+            perf/memory_reserved: on a GPU, bytes that PyTorch has reserved.
+            perf/memory_peak: on a GPU, the most bytes of tensors so far.
 
         Raises the errors that `env.check()` does, and DriftError if the ranks' weights differ.
         """

@@ -20,9 +20,9 @@ __all__ = [
     *("check", "check_flag", "check_on_cpu", "check_flag_on_cpu"),
 ]
 
-AGENT_WIDTH = 0.15  # metres
-AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # of the disc around a square of that width
-MAX_RES = ENGINE.constants["MAX_RES"]
+AGENT_WIDTH = 0.15  # metres, of the square that an agent is drawn as
+AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # metres, of the disc around a square of that width
+MAX_RES = ENGINE.constants["MAX_RES"]  # rays per camera
 
 
 class Agents(SetOnce):

@@ -79,7 +79,7 @@ class Objects(SetOnce):
         palette: Any,
         lit: bool = False,
         names: Sequence[str] | None = None,
-        device: Any = "cpu",
+        device: torch.device | str = "cpu",
     ):
         device = checks.device("device", device)
         n = checks.integer("n_envs", n_envs, 1)

@@ -72,6 +72,7 @@ class JoinedRagged(RaggedTorch):
 
     @property
     def device(self) -> torch.device:
+        """The device of the tensors."""
         return self._parts[0][0].device
 
     def __getitem__(self, index: int | slice) -> torch.Tensor | Ragged:

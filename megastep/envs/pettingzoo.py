@@ -47,7 +47,7 @@ class PettingZoo(VectorizedEnv):
         n_envs: number of environments, N.
         id: import path of the function that makes one, such as
             ``pettingzoo.sisl.multiwalker_v9:parallel_env``.
-        kwargs: its arguments.
+        kwargs: arguments of that function.
         seed: each environment is reset with a seed of its own, which derives from this one.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
@@ -95,7 +95,7 @@ class ParallelEnvs:
         ValueError: if the spaces of two agents differ, or agents come later.
     """
 
-    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, Any]):
+    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, object]):
         from gymnasium.vector.utils import batch_space, create_empty_array
 
         parameters = inspect.signature(make).parameters

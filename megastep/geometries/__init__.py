@@ -21,7 +21,8 @@ from megastep.geometry import centers, indices, masks
 
 __all__ = ["SOURCES", "SPLITS", "centers", "indices", "masks", "sample"]
 
-SPLITS = ("training", "test", "all")
+SPLITS = ("training", "test", "all")  # parts of a source
+#: The sources by name.
 SOURCES = {name: getattr(sources, name) for name in sources.__all__}
 
 
@@ -36,7 +37,7 @@ def _require_known(kind, name, allowed) -> None:
 
 
 def sample(
-    name: str, n: int, split: str = "training", seed: int = 1, **options: Any
+    name: str, n: int, split: str = "training", seed: int = 1, **options: object
 ) -> list[dotdict]:
     """Returns n geometries from a source. Equal arguments give equal geometries.
 

@@ -119,7 +119,7 @@ def _read_header(start) -> tuple[tuple[int, ...], bool, np.dtype]:
     return reader(file, max_header_size=MAX_HEADER)
 
 
-def _read_array(archive, entry) -> np.ndarray:
+def read_array(archive, entry) -> np.ndarray:
     """Returns the array of a zip entry. Raises ValueError if its header contradicts its size."""
     if entry.flag_bits & 1:
         raise ValueError("is encrypted")
@@ -142,7 +142,7 @@ def _read_geometry(archive, entries) -> dict:
     g = dotdict()
     for key, entry in sorted(entries.items()):
         try:
-            g[key] = _read_array(archive, entry)
+            g[key] = read_array(archive, entry)
         except UNREADABLE as error:
             raise ValueError(f"{key!r} cannot be read: {_clause(error)}") from error
     return geometry.validate_geometry(g)

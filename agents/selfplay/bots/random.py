@@ -14,6 +14,7 @@ class RandomActions:
         self.action_space = action_space
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns a state that says how many lanes there are."""
         return arrdict(lane=torch.zeros(n_lanes, device=device))
 
     def __call__(

@@ -77,6 +77,7 @@ class Loggers:
         self.metrics.file.sync()
 
     def close(self) -> None:
+        """Closes the files and every logger."""
         for lines in self.metrics, self.perf:
             self._call_lines(lines, "close")
         self._call_others("close")
@@ -106,13 +107,13 @@ class NoLogger:
     def write(
         self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]
     ) -> None:
-        pass
+        """Does nothing."""
 
     def sync(self) -> None:
-        pass
+        """Does nothing."""
 
     def close(self) -> None:
-        pass
+        """Does nothing."""
 
 
 def first_line(error: Exception) -> str:

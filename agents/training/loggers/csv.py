@@ -26,6 +26,7 @@ class CSV:
             self._replace([row for row in rows if int(row["samples"]) <= step])
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
+        """Appends a row. A metric that no row had before rewrites the file."""
         row = {"samples": step, **values}
         if not row.keys() <= {*self.columns}:
             self.columns = list(dict.fromkeys([*self.columns, *row]))
@@ -35,7 +36,7 @@ class CSV:
                 self._table(file).writerow(row)
 
     def close(self) -> None:
-        pass
+        """Does nothing: every row is in the file."""
 
     def _table(self, file) -> csv.DictWriter:
         return csv.DictWriter(file, self.columns, lineterminator="\n")

@@ -65,8 +65,10 @@ class Deathmatch(SceneryEnv):
         Terminal at health 0, for that agent alone. Truncated after ``limit`` steps.
 
     Metrics:
-        ``kills``: shared among the agents that hit the target in its last step. ``deaths``.
-        ``damage``: health taken from others. ``accuracy``: the fraction of steps with a hit.
+        ``kills``: kills, each shared among the agents that hit the target in its last step.
+        ``deaths``: 1 if the episode ended by death, else 0.
+        ``damage``: health taken from others.
+        ``accuracy``: fraction of steps with a hit.
 
     Args:
         n_envs: number of environments.
@@ -79,16 +81,17 @@ class Deathmatch(SceneryEnv):
         drain: health lost per second.
         health_per_hit: health gained by an agent that hits.
         limit: steps after which an episode is truncated.
-        hit_reward: per hit.
-        wound_cost: per hit received.
-        kill_reward: per kill.
-        death_cost: per death.
-        aim_reward: for bringing another agent from the edge of the view to its centre. What an
-            agent gains as its target nears the centre, it loses as it leaves, so that watching a
+        hit_reward: reward per hit, a step with another agent at the middle ray of the view.
+        wound_cost: cost per wound, a hit received.
+        kill_reward: reward per kill.
+        death_cost: cost of a death, also of one by drain.
+        aim_reward: reward for bringing another agent from the edge of the view to its centre. What
+            an agent gains as its target nears the centre, it loses as it leaves, so that watching a
             target without killing it pays nothing (after Ng, Harada and Russell 1999, "Policy
             invariance under reward transformations", but without discount).
-        search_reward: per 64 wall texels seen for the first time in the episode, as in Explorer.
-        hearing: metres at which sounds of other agents fade. 0: agents are deaf.
+        search_reward: reward per 64 wall texels seen for the first time in the episode, as in
+            Explorer.
+        hearing: metres at which the sound of another agent fades. 0: agents are deaf.
         res: rays of an agent's camera.
         subsample: rays per pixel.
         fov: field of view in degrees.

@@ -1,7 +1,5 @@
 """Frames that environments of other packages render, as images."""
 
-from typing import Any
-
 import numpy as np
 
 __all__ = ["as_frame"]
@@ -10,7 +8,7 @@ __all__ = ["as_frame"]
 MAX_FRACTION = 1.5
 
 
-def as_frame(rendered: Any) -> np.ndarray:
+def as_frame(rendered: object) -> np.ndarray:
     """Returns a rendered frame as (H, W, 3) uint8.
 
     Args:

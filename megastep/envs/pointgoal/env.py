@@ -56,10 +56,12 @@ class PointGoal(SceneryEnv):
         Terminal within 0.2 m of the goal (success). Truncated after ``limit`` steps.
 
     Metrics:
-        ``success``: 1 if the goal was reached. ``spl``: success weighted by path length (Anderson
-        et al. 2018): 0 without success, else the length of the shortest path divided by the length
-        walked, at most 1. ``soft_spl``: the same with the fraction of the distance covered in place
-        of success (Datta et al. 2020). ``collisions``: steps that a wall cut short.
+        ``success``: 1 if the goal was reached.
+        ``spl``: success weighted by path length (Anderson et al. 2018): 0 without success, else the
+            length of the shortest path divided by the length walked, at most 1.
+        ``soft_spl``: the same with the fraction of the distance covered in place of success (Datta
+            et al. 2020).
+        ``collisions``: steps that a wall cut short.
 
     Args:
         n_envs: number of environments.
