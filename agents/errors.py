@@ -71,7 +71,7 @@ def user_errors(
         raise UserError(prefix + shortened(error, 400)) from error
 
 
-def memory_problem(error: MemoryError | RuntimeError) -> str | None:
+def memory_problem(error: Exception) -> str | None:
     """Returns what Python or PyTorch says of too little memory; None if the error is another."""
     if isinstance(error, MemoryError):
         return "Out of memory"

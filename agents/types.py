@@ -257,9 +257,11 @@ class OpponentPool(Protocol):
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]
     ) -> dict[str, float]:
         """Returns the fraction won against each kind of opponent since the last call."""
+        ...
 
     def state_dict(self) -> StateDict:
         """Returns everything that changes."""
+        ...
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`."""

@@ -37,7 +37,7 @@ def _require_known(kind, name, allowed) -> None:
 
 
 def sample(
-    name: str, n: int, split: str = "training", seed: int = 1, **options: Any
+    name: str, n: int, split: str = "training", seed: int = 1, **options: object
 ) -> list[dotdict]:
     """Returns n geometries from a source. Equal arguments give equal geometries.
 
