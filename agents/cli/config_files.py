@@ -3,6 +3,7 @@ may stand for more than there is memory, or never end.
 """
 
 import os
+from pathlib import Path
 
 import yaml
 from hydra.errors import ConfigCompositionException

@@ -8,7 +8,6 @@ in the same order (the same objects, not copies).
 
 import difflib
 import inspect
-from typing import Any
 
 import numpy as np
 
