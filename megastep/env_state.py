@@ -5,10 +5,13 @@ what the environments of users keep besides tensors.
 import collections
 import contextlib
 import enum
+import functools
+import inspect
 import pathlib
 import random
 import re
 import types as python_types
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,9 +19,12 @@ import torch
 
 from megastep.engine.state_tree import OPAQUE, children, is_expanded, node_at, rebind, walk
 from megastep.read_only import ReadOnlyTensor
+from megastep.types import Env
 
 __all__ = ["EnvState"]
 
+#: A part of the state by name, such as the arrays, by path.
+State = dict[str, dict[str, Any]]
 _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
 _NUMBERS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
@@ -52,7 +58,7 @@ class EnvState:
         host_only: it is used for `host_state` only, so no large tensor is read.
     """
 
-    def __init__(self, env: Any, bot: Any = None, host_only: bool = False):
+    def __init__(self, env: Env, bot: object = None, host_only: bool = False):
         self.env, device = env, torch.device(env.device)
         generators = dict(torch=torch.default_generator)
         if device.type == "cuda":
@@ -73,7 +79,7 @@ class EnvState:
 
     # ---- Saving ----
 
-    def state_dict(self) -> dict[str, dict[str, Any]]:
+    def state_dict(self) -> State:
         """Returns the state by path. Tensors share their memory with the environment; all else is
         a copy, in types that `torch.load(weights_only=True)` reads.
         """
@@ -83,8 +89,7 @@ class EnvState:
                 generators[path] = _generator_state(leaf)
             elif isinstance(leaf, np.ndarray):
                 if _is_savable(leaf):
-                    arrays[path] = torch.from_numpy(np.array(leaf, order="C"))
-                    kinds[path] = "numpy"
+                    arrays[path], kinds[path] = _copied(leaf)
             elif not isinstance(leaf, ReadOnlyTensor):
                 arrays[path], kinds[path] = leaf.detach(), leaf.device.type
         values = {path: _encoded(node) for path, node in self._plain_values()}
@@ -100,9 +105,9 @@ class EnvState:
         arrays = {path: leaf for path, leaf in arrays.items() if path not in unchanged}
         return state | dict(arrays=arrays, aliases=aliases, unchanged=unchanged)
 
-    def host_state(self) -> dict[str, dict[str, Any]]:
+    def host_state(self) -> State:
         """Returns the part of the state that is not in tensors, for `restore_host`."""
-        arrays, generators, frozen = {}, {}, {}
+        arrays, kinds, generators, frozen = {}, {}, {}, {}
         is_on_gpu = torch.device(self.env.device).type == "cuda"
         for path, (_, _, leaf) in walk(self.root, _STATEFUL).items():
             is_frozen = is_on_gpu and getattr(leaf, "device", None) == torch.device("cpu")
@@ -112,22 +117,22 @@ class EnvState:
                     frozen |= {path: _bytes(state)} if is_frozen else {}
                 elif isinstance(leaf, np.ndarray):
                     if _is_savable(leaf):
-                        arrays[path] = torch.from_numpy(np.array(leaf, order="C"))
+                        arrays[path], kinds[path] = _copied(leaf)
                 elif is_frozen and leaf.nbytes < _LARGE and not isinstance(leaf, ReadOnlyTensor):
                     frozen[path] = _bytes(leaf)
-        state = dict(kinds=dict.fromkeys(arrays, "numpy"), arrays=arrays, generators=generators)
+        state = dict(kinds=kinds, arrays=arrays, generators=generators)
         state["values"] = {path: _encoded(node) for path, node in self._plain_values()}
         state |= dict(n_items=self._members()["lengths"], frozen=frozen)
         none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
         return state | none
 
-    def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
+    def restore_host(self, state: State) -> None:
         """Restores a `host_state` in the same process: of plain values, those that have changed."""
         now = {path: repr(_encoded(node)) for path, node in self._plain_values()}
         values = {k: value for k, value in state["values"].items() if now.get(k) != repr(value)}
         self._load(state | {"values": values})
 
-    def changed_on_host(self, before: dict[str, dict[str, Any]]) -> str | None:
+    def changed_on_host(self, before: State) -> str | None:
         """Returns the name of something that has changed since an earlier `host_state` and that no
         CUDA graph repeats: a plain value, an array, the length of a list, a generator of NumPy or
         Python, and a tensor or a generator on the CPU where the environment is on a GPU. None if
@@ -135,14 +140,14 @@ class EnvState:
         """
         if not any(True for _ in self._nodes_of_user()):
             return None
-        before, now = map(_comparable, (before, self.host_state()))
-        changed = sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
+        was, now = _comparable(before), _comparable(self.host_state())
+        changed = sorted(path for path in {*was, *now} if was.get(path) != now.get(path))
         if not changed:
             return None
         is_global = re.match(r"\.generators\['(\w+)'\]", changed[0])
         return f"the global generator of {is_global[1]}" if is_global else _name(changed[0])
 
-    def _members(self):
+    def _members(self) -> State:
         """Returns the classes of objects, the lengths of lists and the keys of dicts that hold
         tensors or objects.
         """
@@ -154,18 +159,18 @@ class EnvState:
             keys={path: _encoded([*node]) for path, node in nodes if _is_dict(node)},
         )
 
-    def _aliases(self, arrays):
+    def _aliases(self, arrays) -> dict[str, str]:
         """Returns {path: an earlier path} of tensors that are the same."""
         first, aliases = {}, {}
         for path, leaf in arrays.items():
-            key = _place(leaf)
+            key = _identity(leaf)
             if leaf.numel() and first.setdefault(key, path) != path:
                 aliases[path] = first[key]
         return aliases
 
     # ---- Restoring ----
 
-    def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores a `state_dict`, whose tensors may be on any device. Tensors change in place, so
         that whatever refers to them sees it.
 
@@ -184,7 +189,7 @@ class EnvState:
             ) from error
 
     @torch.no_grad()
-    def _load(self, state):
+    def _load(self, state) -> None:
         for path, length in state["lengths"].items():
             if not _is_list(node_at(self.root, path)):
                 self._replace(path, [])
@@ -209,8 +214,9 @@ class EnvState:
                 raise ValueError(f"{_name(path)} was a {name} and is a {now}")
         for path, value in state["arrays"].items():
             now, owner = leaves.get(path), node_at(self.root, _parent(path))
-            is_fixed = isinstance(now, torch.Tensor) and _is_ours(owner) and not _is_dict(owner)
-            if is_fixed and now.shape != value.shape:  # of another version of megastep
+            is_fixed = _is_ours(owner) and not _is_dict(owner)
+            # of another version of megastep
+            if isinstance(now, torch.Tensor) and is_fixed and now.shape != value.shape:
                 shapes = f"was {tuple(value.shape)} and is {tuple(now.shape)}"
                 raise ValueError(f"the shape of {_name(path)} {shapes}")
         for path, value in state["generators"].items():
@@ -219,21 +225,21 @@ class EnvState:
                 raise ValueError(f"{_name(path)} is no longer the kind of generator that was saved")
         fits = {path for path, value in state["arrays"].items() if _fits(leaves.get(path), value)}
         for path in fits:
-            torch.as_tensor(leaves[path]).copy_(state["arrays"][path])
+            _as_tensor(leaves[path]).copy_(state["arrays"][path])
         for path, value in state["arrays"].items():
             # what has no such tensor yet, or began as one tensor with another
             if path not in fits or not _equal(leaves[path], value):
                 self._replace(path, _as_kind(value, state["kinds"][path]))
         for path, first in state["aliases"].items():
             same, now = node_at(self.root, first), node_at(self.root, path)
-            if _place(same) != _place(now):
+            if _identity(same) != _identity(now):
                 self._replace(path, same)
 
-    def _set_value(self, path, value):
+    def _set_value(self, path, value) -> None:
         now, value = node_at(self.root, path), _decoded(value)
         if isinstance(now, enum.Enum):
-            value = type(now)[value]
-        if isinstance(now, (list, collections.deque)) and type(now) is type(value):
+            self._replace(path, type(now)[value])
+        elif isinstance(now, (list, collections.deque)) and type(now) is type(value):
             now.clear()
             now.extend(value)
         elif isinstance(now, (dict, set)) and type(now) is type(value):
@@ -242,10 +248,12 @@ class EnvState:
         else:
             self._replace(path, value)
 
-    def _replace(self, path, value):
+    def _replace(self, path, value) -> None:
         parent, step = node_at(self.root, _parent(path)), path[len(_parent(path)) :]
         if parent is None:
             raise ValueError(f"it has no {_name(path)}")
+        if not _is_state(self.root, parent, step, value):
+            raise ValueError(f"{_name(path)} is not state of the environment")
         if _is_list(parent) and step == f"[{len(parent)}]":
             parent.append(value)
         else:
@@ -261,7 +269,7 @@ class EnvState:
             if not self._is_reached(path, node)
         ]
 
-    def _is_reached(self, path, node):
+    def _is_reached(self, path, node) -> bool:
         if isinstance(node, np.ndarray):
             return _is_savable(node)
         if isinstance(node, _CONSTANT):
@@ -269,13 +277,13 @@ class EnvState:
         is_known = isinstance(node, (*_STATEFUL, *_NUMBERS, list, tuple, dict, collections.deque))
         return is_known or _is_plain(node) or hasattr(node, "__dict__")
 
-    def _plain_values(self):
+    def _plain_values(self) -> Iterator[tuple[str, Any]]:
         """Yields (path, value) of plain values but those of megastep's own objects, which never
         change or are addresses.
         """
         return ((path, node) for path, node in self._nodes_of_user() if _is_plain(node))
 
-    def _nodes_of_user(self):
+    def _nodes_of_user(self) -> Iterator[tuple[str, Any]]:
         """Yields (path, node) of what is below objects of a class that is not megastep's."""
         visited, stack = set(), [("", self.root, False)]
         while stack:
@@ -291,7 +299,7 @@ class EnvState:
             stack += [(path + step, child, is_users) for step, child in reversed(children(node))]
 
 
-def _comparable(host_state):
+def _comparable(host_state) -> dict[str, object]:
     """Returns {path: what is equal for equal values}."""
     same = {path: repr(value) for path, value in host_state["values"].items()}
     same |= {path: array.numpy().tobytes() for path, array in host_state["arrays"].items()}
@@ -301,85 +309,126 @@ def _comparable(host_state):
     return same | host_state["frozen"]
 
 
-def _bytes(tensor):
+def _bytes(tensor) -> bytes:
     return tensor.detach().contiguous().view(-1).view(torch.uint8).numpy().tobytes()
 
 
-def _is_ours(node):
+def _is_ours(node) -> bool:
     return type(node).__module__.startswith(("megastep.", "torch."))
 
 
-def _is_object(node):
+def _is_state(root, parent, step, value) -> bool:
+    """Returns whether a step from a node leads to what may be replaced by a saved value: files may
+    come from strangers, and name methods.
+    """
+    now = dict(children(parent)).get(step)
+    if parent is root or (_is_ours(parent) and _is_plain(value) and not _is_dict(parent)):
+        return False
+    if not isinstance(now, (*_STATEFUL, *_NUMBERS, *_CONTAINERS)):
+        return False
+    if step.startswith("["):
+        return True
+    name = step[1:]
+    of_class = inspect.getattr_static(type(parent), name, None)
+    kinds = (*_STATEFUL, *_NUMBERS, *_CONTAINERS, functools.cached_property)
+    is_data = isinstance(of_class, kinds)
+    return is_data and not (name.startswith("__") and name.endswith("__"))
+
+
+def _is_object(node) -> bool:
     return hasattr(node, "__dict__") and not isinstance(node, (*_STATEFUL, *_CONSTANT))
 
 
-def _is_list(node):
+def _is_list(node) -> bool:
     return isinstance(node, (list, collections.deque))
 
 
-def _is_dict(node):
+def _is_dict(node) -> bool:
     return isinstance(node, dict) and _is_plain([*node])
 
 
-def _is_plain(node):
+def _is_plain(node) -> bool:
     if type(node) in _CONTAINERS:
         parts = [*node, *node.values()] if type(node) is dict else node
         return all(map(_is_plain, parts))
     return isinstance(node, _NUMBERS)
 
 
-def _is_savable(array):
-    return array.dtype.kind in "biufc" and array.dtype.itemsize <= 16
+def _is_savable(array) -> bool:
+    return _is_of_numbers(array.dtype) or (array.dtype.kind in "SUmM" and array.dtype.itemsize > 0)
 
 
-def _parent(path):
+def _is_of_numbers(dtype) -> bool:
+    """Returns whether PyTorch has this type of NumPy's."""
+    is_long = dtype.itemsize > 16 or dtype == np.longdouble
+    return dtype.kind in "biufc" and not is_long and dtype.isnative
+
+
+def _as_tensor(leaf) -> torch.Tensor:
+    """Returns a tensor, or an array as a tensor that shares its memory: of characters or times, as
+    bytes on a last axis.
+    """
+    if isinstance(leaf, torch.Tensor):
+        return leaf
+    is_of_numbers = _is_of_numbers(leaf.dtype)
+    return torch.from_numpy(leaf if is_of_numbers else leaf[..., None].view(np.uint8))
+
+
+def _copied(array) -> tuple[torch.Tensor, str]:
+    """Returns a copy of an array as a tensor, and the kind from which `_as_kind` makes it again."""
+    kind = "numpy" if _is_of_numbers(array.dtype) else f"numpy {array.dtype.str}"
+    return _as_tensor(np.array(array, order="C")), kind
+
+
+def _parent(path) -> str:
     """Returns a path without its last step."""
     return re.sub(r"(\.[^.\[\]]+|\[('[^']*'|[^\]]*)\])$", "", path)
 
 
-def _name(path):
+def _name(path) -> str:
     return path.removeprefix(".env").lstrip(".")
 
 
-def _place(leaf):
+def _identity(leaf) -> object:
     """Returns what is equal for tensors that are the same."""
     if not isinstance(leaf, torch.Tensor):
         return id(leaf)
     return leaf.device, leaf.data_ptr(), leaf.shape, leaf.stride(), leaf.dtype
 
 
-def _digest(tensor):
+def _digest(tensor) -> int:
     """Returns a number that differs if a tensor has other bytes or these in another order."""
     data = tensor.detach().contiguous().view(-1).view(torch.uint8)
     data = data.view(torch.int32) if len(data) % 4 == 0 else data
-    places = torch.arange(1, _CHUNK + 1, device=data.device) * _FACTOR
-    places = places.to(torch.int32) | 1  # odd, so each bit counts
+    factors = torch.arange(1, _CHUNK + 1, device=data.device) * _FACTOR
+    factors = factors.to(torch.int32) | 1  # odd, so each bit counts
     total = torch.zeros((), dtype=torch.int64, device=data.device)
     for chunk in data.split(_CHUNK):  # all modulo a power of 2
-        total = total * _FACTOR + (chunk * places[: len(chunk)]).sum(dtype=torch.int64)
+        total = total * _FACTOR + (chunk * factors[: len(chunk)]).sum(dtype=torch.int64)
     return int(total)
 
 
-def _fits(leaf, value):
+def _fits(leaf, value) -> bool:
     """Returns whether a tensor or array can take a saved value in place."""
     if isinstance(leaf, np.ndarray):
         is_usable = _is_savable(leaf) and leaf.flags.writeable and min(leaf.strides, default=0) >= 0
-        return is_usable and _fits(torch.from_numpy(leaf), value)
+        return is_usable and _fits(_as_tensor(leaf), value)
     if not isinstance(leaf, torch.Tensor):
         return False
     return leaf.shape == value.shape and leaf.dtype == value.dtype and not is_expanded(leaf)
 
 
-def _equal(leaf, value):
+def _equal(leaf, value) -> bool:
     # as bytes, since NaN is not equal to itself
-    pair = (torch.as_tensor(one).cpu().contiguous().view(-1) for one in (leaf, value))
+    pair = (_as_tensor(one).cpu().contiguous().view(-1) for one in (leaf, value))
     return torch.equal(*(one.view(torch.uint8) for one in pair))
 
 
-def _as_kind(value, kind):
+def _as_kind(value, kind) -> np.ndarray | torch.Tensor:
     """Returns a saved tensor as what it was: an array, or a tensor on a kind of device."""
-    if kind == "numpy":
-        return value.cpu().numpy().copy()
+    if kind.startswith("numpy"):
+        array, dtype = value.cpu().numpy().copy(), kind.removeprefix("numpy ")
+        return array if dtype == kind else array.view(dtype)[..., 0]
     has_device = kind != "cuda" or torch.cuda.is_available()
     return value.to(kind if has_device else "cpu", copy=True)
 
@@ -387,7 +436,7 @@ def _as_kind(value, kind):
 # ---- Plain values and generators, in types that a file without code can hold ----
 
 
-def _encoded(value):
+def _encoded(value) -> Any:
     if isinstance(value, np.generic):
         return {"numpy": (value.dtype.str, value.tobytes().hex())}
     if isinstance(value, enum.Enum):
@@ -410,7 +459,7 @@ def _encoded(value):
     return next((kind(value) for kind in kinds if isinstance(value, kind)), value)
 
 
-def _decoded(value):
+def _decoded(value) -> Any:
     if isinstance(value, list):
         return [*map(_decoded, value)]
     match value:
@@ -433,7 +482,7 @@ def _decoded(value):
     return value
 
 
-def _generator_state(generator):
+def _generator_state(generator) -> Any:
     if isinstance(generator, torch.Generator):
         return generator.get_state()
     if isinstance(generator, random.Random):
@@ -443,7 +492,7 @@ def _generator_state(generator):
     return _encoded(_without_arrays(generator.bit_generator.state))
 
 
-def _set_generator_state(generator, state):
+def _set_generator_state(generator, state) -> bool:
     """Returns False if the state is that of another kind of generator."""
     try:
         if isinstance(generator, torch.Generator):
@@ -459,14 +508,14 @@ def _set_generator_state(generator, state):
     return True
 
 
-def _without_arrays(state):
+def _without_arrays(state) -> object:
     """Returns the state of one of NumPy's generators as plain values."""
     if isinstance(state, dict):
         return {key: _without_arrays(value) for key, value in state.items()}
     return (state.dtype.name, state.tolist()) if isinstance(state, np.ndarray) else state
 
 
-def _with_arrays(state):
+def _with_arrays(state) -> Any:
     if isinstance(state, dict):
         return {key: _with_arrays(value) for key, value in state.items()}
     return np.array(state[1], state[0]) if isinstance(state, tuple) else state

@@ -32,23 +32,27 @@ class World(Protocol):
     """The dict of tensors that ``reset`` and ``step`` return: an
     :class:`~megastep.arrdict.arrdict` with a leading axis B, whose keys are also attributes.
 
+    Keys:
+        obs: per ``env.obs_space``.
+        reward: (B,) float32, of the transition that led here.
+        reset: (B,) bool: the first observation of an episode.
+        terminal: (B,) bool: the episode ended here by its own rule.
+        truncated: (B,) bool: a time limit ended the episode here.
+
     Optional keys:
         metrics: dict of (B,) float32, statistics of an episode, read on its last step only.
         learns: (B,) bool, lanes whose transitions are used for learning. Default: all.
         privileged: per ``env.privileged_space``, inputs of the critic that no agent observes.
     """
 
-    obs: Tree  # per env.obs_space
-    reward: torch.Tensor  # (B,) float32, of the transition that led here
-    reset: torch.Tensor  # (B,) bool: the first observation of an episode
-    terminal: torch.Tensor  # (B,) bool: the episode ended here by its own rule
-    truncated: torch.Tensor  # (B,) bool: a time limit ended the episode here
+    def __getattr__(self, name: str) -> Tree: ...
 
-    def __getitem__(self, key: str) -> Any: ...
+    def __getitem__(self, key: str, /) -> Tree: ...
 
     def __iter__(self) -> Iterator[str]: ...
 
-    def get(self, key: str, default: Any = None) -> Any: ...
+    def get(self, key: str, default: Tree = None, /) -> Tree:
+        """Returns an entry, or the default if it is absent."""
 
 
 @runtime_checkable
@@ -74,6 +78,9 @@ class Env(Protocol):
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``. Default: None, there is none.
         close(): ends what it started, such as processes. Called after training. Default: none.
+        pop_restarts(): returns how many environments were made anew after an error since the last
+            call, which reports have as ``episode/restarts``. Default: None, none ever is.
+        max_episode_steps: steps at which an evaluation cuts an episode off. Default: 100,000.
         desync(): gives every lane a random age, as if its episode had been going on for some steps.
             Training calls it after ``reset``, so that lanes do not end their episodes in the same
             steps. Default: none.
@@ -87,9 +94,11 @@ class Env(Protocol):
 
     def reset(self) -> World:
         """Starts a new episode in every lane. Returns the first world."""
+        ...
 
     def step(self, decision: Mapping) -> World:
         """Takes one step by ``decision["actions"]``, (B, ...) per leaf of the action space."""
+        ...
 
 
 #: Optional attributes of an environment, with their defaults.
@@ -99,6 +108,8 @@ DEFAULTS: dict[str, Any] = {
     "capturable": True,
     "resumable": True,
     "close": lambda: None,
+    "pop_restarts": lambda: None,
+    "max_episode_steps": 100_000,
     "check": lambda: None,
     "layout": None,
     "weigh_layouts": None,
@@ -114,7 +125,7 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
-def optional(owner: Any, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
+def optional(owner: object, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
     """Returns an optional attribute of an environment, or its default.
 
     Args:
@@ -142,6 +153,7 @@ class PolicyLike(Protocol):
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> Tree:
         """Returns the hidden state of ``n_lanes`` lanes at the start of an episode."""
+        ...
 
     def __call__(
         self,
@@ -158,6 +170,7 @@ class PolicyLike(Protocol):
             sample: draw from the action distribution; otherwise take the most likely action.
             generator: random number generator of the draws.
         """
+        ...
 
 
 def is_stored(tensor: torch.Tensor) -> bool:

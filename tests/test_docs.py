@@ -6,12 +6,14 @@ import re
 import shlex
 
 import pytest
+import reference
 
 from megastep import envs
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
-PAGES = [*ROOT.glob("*.md"), *DOCS.glob("*.md"), *DOCS.glob("lab/*.md")]
+FOLDERS = DOCS, DOCS / "lab", DOCS / "decisions", DOCS / "reference"
+PAGES = [page for folder in (ROOT, *FOLDERS) for page in folder.glob("*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.
 NEEDS_FILES = (
     r"resume=|rerun=|init=|my_package|cores:|encoders:|my_a2c:|safe:|rover:|convoy:|my_rooms:|my_sqlite:"
@@ -41,9 +43,10 @@ def test_command_composes(page, script, arguments, tmp_path, monkeypatch, capsys
     assert code == 0, capsys.readouterr().err
 
 
+@functools.cache
 def headings(page):
     """Returns a page's anchors as GitHub names them."""
-    titles = re.findall(r"^#+ (.*)", page.read_text(), re.M)
+    titles = re.findall(r"^#+ (.*)", reference.expand(page.read_text()), re.M)
     return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
 
 
@@ -61,6 +64,17 @@ def test_links_and_images_exist(page):
 def test_every_environment_has_a_section():
     titles = re.findall(r"^## (\w+)$", (DOCS / "environments.md").read_text(), re.M)
     assert set(envs.ENVS) <= {title.lower() for title in titles}
+
+
+def test_every_decision_is_a_short_page_of_the_index():
+    index, *pages = sorted((DOCS / "decisions").glob("*.md"))  # README.md is the first
+    rows = re.findall(r"^\| \[(.+)\]\((.+)\) \|", index.read_text(), re.M)
+    texts = {page.name: page.read_text() for page in pages}
+    assert sorted(rows) == sorted((text.splitlines()[0][2:], name) for name, text in texts.items())
+    for name, text in texts.items():
+        parts = re.findall(r"^\*\*(\w+)\.\*\*", text, re.M)
+        assert parts == ["Context", "Decision", "Consequence"], name
+        assert text.count("\n") <= 25, name
 
 
 @functools.cache
@@ -90,4 +104,4 @@ def test_tests_of_all_faults_exist():
             # every case of a test may have a mark of its own
             is_of_tier = marks == {tier} - {""} or not marks and f"mark.{tier}" in decorators
             assert is_of_tier, (fault, path, name)
-    assert len(rows) == 56
+    assert len(rows) == 71

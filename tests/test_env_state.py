@@ -38,6 +38,8 @@ class Env:
         self.place_of_two, self.nested, self.total = (3, 4), [[1]], 0.0
         self.colour, self.key, self.by_name = Colour.RED, b"a", {"a": torch.zeros(1), 2: Inner()}
         self.one, self.other = torch.zeros(2), torch.zeros(2)
+        self.letters, self.lines = np.array([b"a", b"b"]), np.array([["a", "bc"]])
+        self.times = np.array(["2020-01-01"], "M8[D]")
 
     def draw(self):
         return (
@@ -53,6 +55,7 @@ class Env:
     def step(self):
         self.place += torch.tensor([1, torch.nan, torch.inf])
         self.wind[0] += 1
+        self.letters[0], self.lines[0, 0], self.times = b"c", "d", self.times + self.n
         self.n, self.name = self.n + 1, "wild"
         self.seen.add(self.n + 5)
         self.pages = {"b": None}
@@ -84,6 +87,7 @@ def facts(env):
         env.key,
         sorted(map(str, env.by_name)),
     )
+    more = *more, env.letters.tolist(), env.lines.tolist(), env.times.tolist()
     rest = env.later_array, env.later_list, env.by_name[2].n, env.one, env.other
     return [*(torch.as_tensor(one).tolist() for one in arrays), *plain, *more, *rest, kinds]
 
@@ -119,7 +123,7 @@ def test_what_cannot_be_saved_is_named():
     env = Env()
     assert EnvState(env).unreachable() == []
     env.counter, env.nodes, env.objects = iter([1]), {object()}, np.array([env])
-    env.words, env.span = np.array(["a"]), range(2)
+    env.words, env.span = np.zeros(1, "i4,f4"), range(2)
     env.fixed = (1, 2.0, b"bytes", range(3), slice(1), torch.float16, np.float32(1), len)
     state = EnvState(env)
     names = ["counter (list_iterator)", "nodes (set)", "objects (ndarray)", "words (ndarray)"]
@@ -180,6 +184,36 @@ def test_state_of_another_version_is_refused_and_changes_nothing():
     with pytest.raises(ValueError, match=r"the shape of tally was \(3, 8\) and is \(4, 8\)"):
         env_state.load_state_dict(state)
     assert torch.equal(env.tally, before)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [".env.step", ".env.draw", ".env.__class__", ".env.by_name[2].__init__", ".env", ".generators"]
+    + [".env.helper", ".bot", ".env.__dict__", ".env.frames.append", ".env.__doc__", ".env.length"],
+)
+@pytest.mark.parametrize("value", [5, torch.zeros(1)])
+def test_what_is_no_state_is_never_set(path, value, monkeypatch):
+    monkeypatch.setattr(Env, "length", property(lambda env: 3), raising=False)
+    env = Env()
+    env.helper = env.draw
+    env_state, before = EnvState(env), str(facts(env))
+    saved, attributes = env_state.state_dict(), vars(env).copy()
+    kind = (
+        {"values": {path: 5}} if value == 5 else {"arrays": {path: value}, "kinds": {path: "cpu"}}
+    )
+    with pytest.raises(ValueError, match=r"is not state of the environment|it has no"):
+        env_state.load_state_dict(saved | kind)
+    assert str(facts(env)) == before and vars(env).keys() == attributes.keys()
+    assert type(env) is Env and env.helper == env.draw and env.step() is not None
+
+
+def test_no_plain_value_of_megasteps_own_objects_is_set():
+    env = envs.Deathmatch(2, [toys.box()], device="cpu")
+    env.reset()
+    env_state = EnvState(env)
+    for name in ("step", "limit", "n_envs", "n_agents", "unheard_of"):
+        with pytest.raises(ValueError, match=f"{name} is not state"):
+            env_state.load_state_dict(env_state.state_dict() | {"values": {f".env.{name}": 5}})
 
 
 def test_state_of_a_gpu_is_restored_without_one():

@@ -2,7 +2,7 @@
 
 import torch
 
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.kernels.build.launch import WARP, launch
 
 _MAX_COUNTED = 16_384  # keys; counting takes the square of their number
@@ -25,8 +25,8 @@ def order(keys: torch.Tensor) -> torch.Tensor:
     return keys.argsort(stable=True)
 
 
-def _order_on_gpu(keys):
+def _order_on_gpu(keys) -> torch.Tensor:
     """Does `order` in one kernel."""
     n, result = len(keys), torch.empty_like(keys, dtype=torch.int64)
-    launch(PROGRAM, "order", keys.device, n * WARP, keys=keys, order=result, n=n)
+    launch(LIBRARY, "order", keys.device, n * WARP, keys=keys, order=result, n=n)
     return result

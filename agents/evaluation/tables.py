@@ -16,7 +16,7 @@ from megastep.agents.runs.typed_json import encoded
 INTERVAL = "95 % interval"
 
 
-class Place(NamedTuple):
+class Labels(NamedTuple):
     """Where a run is evaluated.
 
     Attributes:
@@ -40,14 +40,15 @@ class Place(NamedTuple):
         return f"{self.env}: {what}{homes}{self.choice}"
 
 
-def place(env: Env, geometry: Geometry, homes: list, split: str) -> Place:
+def labels(env: Env, geometry: Geometry, homes: list, split: str) -> Labels:
+    """Returns how tables name an environment and its homes."""
     if not homes:
-        return Place(env_name(env), env_name(env), "")
+        return Labels(env_name(env), env_name(env), "")
     path = Path(getattr(geometry, "path", None) or "")
     is_ours = geometry.name.startswith("megastep.")
     name = label(geometry.name) if is_ours else geometry.name
     choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
-    return Place(env_name(env), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
+    return Labels(env_name(env), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
 
 
 def write_table(
@@ -104,6 +105,7 @@ RATINGS = {
 
 
 def cells(row: dict) -> dict[str, str]:
+    """Returns the cells of an agent's evaluation, by column."""
     cut, metrics = f", {row['unfinished']} cut short" if row["unfinished"] else "", {}
     for name, metric in row["metrics"].items():
         texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 2 * ["none"]
@@ -128,6 +130,7 @@ def part_of(row: dict) -> str:
 
 
 def duel_cells(row: dict) -> dict[str, str]:
+    """Returns the cells of an opponent's duels, by column."""
     against = f"{row['against']}{part_of(row).replace(': ', ', as ')}"
     row = row | {"against": against, "homes": row["homes"] or "none"}
     return {key: form.format_map(row) for key, form in DUELS.items()}

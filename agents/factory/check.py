@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 from pydantic_core import PydanticSerializationError, to_jsonable_python
@@ -16,9 +16,10 @@ from megastep.settings import sentence
 Tree = dict[str, Any]
 #: Types of what files and words hold, beside lists and dicts.
 SCALARS = (str, int, float, bool, type(None))
+T = TypeVar("T")
 
 
-def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
+def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
     """Returns the settings of dataclass `kind` from nested dicts.
 
     Args:
@@ -40,10 +41,12 @@ def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
             if line["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
                 text = _unknown(path, [*fields, *names])
             else:
-                while ".".join(path) not in fields:  # inside a list, or an option of a union
+                # inside a list, or an option of a union
+                while len(path) > 1 and ".".join(path) not in fields:
                     path.pop()
-                text = sentence(line, fields[".".join(path)], line["input"])
-            errors.setdefault(".".join(path), text)
+                field = fields.get(".".join(path))
+                text = sentence(line, field, line["input"]) if field else line["msg"]
+            errors.setdefault(".".join(path) or "configuration", text)
         raise ConfigErrors(errors.items()) from None
 
 
@@ -81,7 +84,7 @@ def as_tree(chosen: Any, prefix: str = "") -> Tree:
             del tree[name]
 
 
-def _plain(value, prefix=""):
+def _plain(value, prefix="") -> Any:
     """Returns a value as JSON has it, but with keys, infinity and NaN as they are."""
     if dataclasses.is_dataclass(value):
         return as_tree(value, prefix)
@@ -92,7 +95,7 @@ def _plain(value, prefix=""):
     return value if type(value) in SCALARS else to_jsonable_python(value)
 
 
-def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def fields_of(kind: type, tree: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yields (dotted key, pydantic's field) of every setting, and of every group of settings.
 
     `tree` names the members of groups: which keys `env.` has depends on `env.name`.
@@ -100,7 +103,7 @@ def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, An
     for name, field in kind.__pydantic_fields__.items():
         yield prefix + name, field
         value = tree.get(name) if isinstance(tree, dict) else None
-        members = {f"{prefix}{name}": value}
+        members: Tree = {f"{prefix}{name}": value}
         if name == "logger" and isinstance(value, dict):
             members = {f"{prefix}logger.{label}": one for label, one in value.items()}
             yield from ((key, field) for key in members)
@@ -109,7 +112,7 @@ def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, An
             if name in settings.IMPORTED:
                 with contextlib.suppress(KeyError, TypeError, ValueError):
                     below = settings.kind_of(name, str(member["name"]))
-            if dataclasses.is_dataclass(below):
+            if isinstance(below, type) and dataclasses.is_dataclass(below):
                 yield from fields_of(below, member, f"{key}.")
 
 
@@ -128,10 +131,10 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
     return f"did you mean {keys[near[0]]}?" if near else "--cfg job prints all keys"
 
 
-#: Keys of earlier versions, with what took their place.
+#: Keys of earlier versions, and what replaced them.
 GONE = {
     "preset": "values follow device=cpu or device=cuda, and what you type wins",
-    "nonfinite_replay": "a NaN is met again by resuming, with the command that is printed",
+    "nonfinite_replay": "resuming reproduces a NaN; the warning has the command",
 }
 
 

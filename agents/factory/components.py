@@ -35,10 +35,12 @@ OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
 ENVS, SOURCES = "megastep.envs", "megastep.geometries.sources"
 LEARNERS, LOGGERS = "megastep.agents.algorithms", "megastep.agents.training.loggers"
 #: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
-#: are passed by the program, `missing` are defaults, and the others are settings beside them.
+#: are passed by megastep, `missing` are defaults, and the others are settings beside them.
 ARGUMENTS = {
     "env": dict(
-        reserved=("geometries", "seed", "device", "privileged"), missing={"n_envs": 128}, name=str
+        reserved=("geometries", "seed", "device", "privileged", "films"),
+        missing={"n_envs": 128},
+        name=str,
     ),
     "geometry": dict(reserved=("split",), missing={"n": 512, "seed": 1}, name=str),
     "learner": dict(
@@ -137,11 +139,11 @@ def _files(group: str) -> dict[str, str]:
     return {member: tree["name"] for member, tree in trees.items() if "name" in tree}
 
 
-def _takes_geometries(env):
+def _takes_geometries(env) -> bool:
     return "geometries" in parameters_of(import_object(env))
 
 
-def _sources():
+def _sources() -> str:
     """A hash of whatever decides how arguments are read and stored."""
     folders = Path(megastep.__file__).parent, package.CONFIGS.parent
     files = {path for folder in folders for path in folder.rglob("*.py")}

@@ -3,14 +3,15 @@
 import copy
 import functools
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
-from megastep import contract, engine, scene, spaces
+from megastep import contract, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
-from megastep.agents.errors import ConfigErrors, UserError, user_errors
+from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import check
 from megastep.agents.factory.settings import (
     Agent,
@@ -33,10 +34,17 @@ from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.capture import state_tree
 from megastep.imports import import_object
 from megastep.settings import parameters_of
-from megastep.types import n_lanes, optional
+from megastep.types import PolicyLike, n_lanes, optional
+
+if TYPE_CHECKING:
+    from megastep.agents import types as agent_types
+    from megastep.agents.factory.settings import Member
+    from megastep.agents.storage.collector import Collector
 
 #: Number of environments in which the memory of one is measured.
 PROBE = 65
+#: A network of fewer bytes, and for fewer numbers in a row, is not in the check of memory.
+LARGE, FEW = 2**28, 4096
 #: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
 #: What the library raises for bad arguments, files and devices, and for too little memory.
@@ -56,7 +64,7 @@ KINDS = (
 errors = functools.partial(user_errors, kinds=KINDS)
 
 
-def construct(settings: Any, constructor: Callable | None = None, **arguments: Any) -> Any:
+def construct(settings: "Member", constructor: Callable | None = None, **arguments: Any) -> Any:
     """Calls a class or function with those of the settings and arguments that it takes.
 
     A setting that a class passes on to its base class as one of its `**kwargs` is left out if it
@@ -125,7 +133,7 @@ def spread(homes: list[dict], n_envs: int) -> list[dict]:
     return scene.spread(homes, n_envs) if homes else []
 
 
-def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
+def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> types.Env:
     """Returns a small environment of the same kind, which tells spaces and sizes.
 
     Raises:
@@ -140,7 +148,9 @@ def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
     return sample
 
 
-def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **arguments: Any) -> None:
+def check_memory(
+    env: Env, sample: types.Env, learner: object, geometries: list, **arguments: Any
+) -> None:
     """Raises UserError with the number that fits, if there are too many environments, or too many
     observations in a replay buffer, for the memory.
 
@@ -164,13 +174,61 @@ def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **argume
                 engine.fit(env.n_envs, n_bytes, sample.device)
 
 
-def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None) -> Policy:
-    """Returns a policy on the environment's device; without a `critic` it can only act."""
+def check_network(agent: Agent, env: types.Env, n_rows: int, is_learning: bool) -> None:
+    """Raises UserError with the size of the spaces if a network for them does not fit into memory.
+
+    Args:
+        n_rows: observations that it reads at once.
+    """
+    n_inputs, n_outputs = sizes_of(env)
+    n_features = n_inputs
+    if agent.encoder == "cnn":  # about as many as pixels, however many channels there are
+        images = [x for x in spaces.leaves(env.obs_space).values() if hasattr(x, "H")]
+        n_features -= sum((x.C - 1) * x.n_agents * x.H * x.W for x in images)
+    # weights and their initialisation, gradients and the two moments of Adam
+    n_bytes = 4 * agent.width * (n_features + n_outputs) * (5 if is_learning else 2)
+    # one-hot observations, probabilities and their gradients, beyond what `check_memory` counts
+    n_many = max(0, n_features + n_outputs - FEW)
+    n_bytes += 4 * n_rows * n_many * (4 if is_learning else 2)
+    if n_bytes > LARGE and n_bytes > 0.95 * (free := engine.free_memory(env.device)):
+        raise UserError(
+            f"{getattr(env, 'id', type(env).__name__)} has {n_inputs:,} numbers to observe and "
+            f"{n_outputs:,} actions, for which a network of agent.width={agent.width} needs "
+            f"{n_bytes / 1e9:.1f} GB, but {free / 1e9:.1f} GB are free on {env.device}; choose a "
+            "smaller width, fewer environments, or an environment with smaller spaces"
+        )
+
+
+def sizes_of(env: types.Env) -> tuple[int, int]:
+    """Returns the numbers that a network reads and gives: of integers, one for each value."""
+
+    def size(space) -> int:
+        return math.prod(space.shape) * getattr(space, "n_actions", 1)
+
+    sides = env.obs_space, env.action_space
+    n_inputs, n_outputs = (sum(map(size, spaces.leaves(side).values())) for side in sides)
+    return n_inputs, n_outputs
+
+
+def make_policy(
+    agent: Agent,
+    env: types.Env,
+    seed: int = 1,
+    critic: str | None = None,
+    n_rows: int | None = None,
+) -> Policy:
+    """Returns a policy on the environment's device; without a `critic` it can only act.
+
+    Args:
+        n_rows: observations that it will read at once. Default: one of each lane of `env`.
+    """
     if torch.device(env.device).type == "cpu":
         share_threads(agent.width)
+    check_network(agent, env, n_rows or n_lanes(env), critic is not None)
     with errors():
         spaces = env.obs_space, env.action_space, optional(env, "privileged_space")
-        return Policy(*spaces, seed=seed, **vars(agent) | {"critic": critic}).to(env.device)
+        arguments: dict = vars(agent) | {"critic": critic}
+        return Policy(*spaces, seed=seed, **arguments).to(env.device)
 
 
 def share_threads(width: int) -> None:
@@ -182,9 +240,9 @@ def share_threads(width: int) -> None:
     torch.set_num_threads(max(1, min(n_threads, width // 128)))
 
 
-def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
+def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_types.Learner":
     learner = construct(settings, policy=policy, seed=seed, graph=True)
-    with errors(f"{settings.name} is no learner: "):
+    with errors(f"{settings.name} is not a learner: "):
         check_learner(learner)
         try:
             checkpoint_format.check_plain(learner.state_dict(), "state_dict")
@@ -201,7 +259,7 @@ def make_curriculum(settings: Curriculum, geometries: list[dict]) -> Callable | 
         return None
     sources = sources_of(geometries)
 
-    def make(env, learner, rollout):
+    def make(env, learner, rollout) -> "Collector":
         return construct(settings, env=env, learner=learner, rollout=rollout, sources=sources)
 
     return make
@@ -226,7 +284,7 @@ def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
 
 
 def make_opponents(
-    cfg: Train, env: Any, sample: Any, policy: Policy, seed: int = 1
+    cfg: Train, env: types.Env, sample: types.Env, policy: Policy, seed: int = 1
 ) -> Opponents | None:
     """Returns the environment with opponents in it, None if there are to be none.
 
@@ -237,7 +295,7 @@ def make_opponents(
     Raises:
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
     """
-    shares = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
+    options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot):
         return None
     bot = None
@@ -248,10 +306,10 @@ def make_opponents(
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
             engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")
-        return Opponents(env, policy, bot, seed=seed, **shares)
+        return Opponents(env, policy, bot, seed=seed, **options)
 
 
-def make_bot(name: str | None, settings: Env, env: Any) -> Any:
+def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
     """Returns a policy that needs no weights.
 
     It is given the environment's settings that it takes, such as `fov`, and the environment if it
@@ -273,7 +331,7 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
         )
     name = name or f"{where}.bot"
 
-    def check_actions(space, leaf):
+    def check_actions(space, leaf) -> None:
         if len(leaf) != n_lanes(env) or not spaces.are_actions(space, leaf):
             raise ValueError(f"its actions are not those of {space!r}")
 
@@ -285,7 +343,7 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
     return bot
 
 
-def in_env(bot: Any, settings: Env, env: Any) -> Any:
+def in_env(bot: PolicyLike, settings: Env, env: types.Env) -> PolicyLike:
     """Returns the bot for another environment of the same settings: a new one if it takes `env`."""
     takes_env = "env" in inspect.signature(type(bot)).parameters
     return construct(settings, type(bot), env=env) if takes_env else bot
@@ -298,13 +356,13 @@ def config_of(loaded: checkpoint.Checkpoint) -> Train:
         return check.check(Train, loaded.config["train"] | {"logger": {}})
 
 
-def spaces_of(env: Any) -> dict[str, str]:
+def spaces_of(env: types.Env) -> dict[str, str]:
     """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
     tree = {"obs": env.obs_space, "actions": env.action_space}
     return {name: repr(space) for name, space in spaces.leaves(tree).items()}
 
 
-def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Policy:
+def load_weights(policy: Policy, env: types.Env, loaded: checkpoint.Checkpoint) -> Policy:
     """Returns a policy made for `env` with a checkpoint's weights, the critic's too if both have
     one. With the file of an agent, which only acts, the critic keeps the weights that it has.
 
@@ -320,7 +378,10 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Pol
             f"{loaded.path} was trained in another environment{names}: {'; '.join(changes)}. "
             "Choose the env it was trained in"
         )
-    weights, own = loaded.state["policy"], policy.state_dict()
+    assert loaded.state is not None
+    weights, own = cast(dict, loaded.state.get("policy")), policy.state_dict()
+    with errors(f"{loaded.path} cannot be used: "):
+        check_weights(weights, own)
     if policy.critic is None:
         weights = {k: v for k, v in weights.items() if not k.startswith(TRAINING_ONLY)}
     elif agent_file.is_agent_file(loaded.path):
@@ -331,5 +392,21 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Pol
     return policy
 
 
-def _nbytes(env):
+def check_weights(weights: Any, own: Mapping[str, torch.Tensor]) -> None:
+    """Raises ValueError for what are no weights: other numbers than a policy's own are, which would
+    be converted without a word, and NaN and infinity.
+    """
+    if not isinstance(weights, Mapping) or not all(isinstance(name, str) for name in weights):
+        raise ValueError("its weights are no tensors by name")
+    for name, weight in weights.items():
+        if not isinstance(weight, torch.Tensor) or weight.layout != torch.strided:
+            raise ValueError(f"its {shortened(name, 60)} is no dense tensor")
+        dtype = own[name].dtype if name in own else weight.dtype
+        if weight.dtype != dtype and not (weight.is_floating_point() and dtype.is_floating_point):
+            raise ValueError(f"its {name} is {weight.dtype}, and the policy's is {dtype}")
+        if not weight.isfinite().all():
+            raise ValueError(f"its {shortened(name, 60)} has a NaN or an infinity")
+
+
+def _nbytes(env) -> int:
     return sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())

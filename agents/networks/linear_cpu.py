@@ -5,7 +5,7 @@ engine's threads. `torch.nn.functional.linear` is the same in PyTorch.
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
+from megastep.agents.networks.kernels.library import LIBRARY, is_built_for_cpu
 from megastep.engine.devices import threads
 from megastep.kernels.build.launch import launch
 
@@ -42,7 +42,7 @@ def matmul(
     if out is None:
         out = torch.empty(len(a), b.shape[1])
     launch(
-        *(CORES, "matmul", a.device, 0),
+        *(LIBRARY, "matmul", a.device, 0),
         a=a,
         b=b,
         bias=None if bias is None else bias.contiguous(),
@@ -66,7 +66,7 @@ class CpuLinear(torch.autograd.Function):
     """A linear layer, with a ReLU: parts (..., in) that count as concatenated -> (..., out)."""
 
     @staticmethod
-    def forward(ctx, weight, bias, has_relu, *parts):
+    def forward(ctx, weight, bias, has_relu, *parts) -> torch.Tensor:
         ctx.has_relu, lead, last = has_relu, parts[0].shape[:-1], len(parts) - 1
         parts = [part.reshape(-1, part.shape[-1]) for part in parts]
         weights = weight.split([part.shape[1] for part in parts], 1)
@@ -79,13 +79,14 @@ class CpuLinear(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d):
+    def backward(ctx, d) -> tuple[torch.Tensor | None, ...]:
         weight, *saved = ctx.saved_tensors
         parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
         lead, d = d.shape[:-1], d.reshape(-1, len(weight))
         if ctx.has_relu:
             d = torch.ops.aten.threshold_backward(d, *activated, 0)
-        d_weight, d_parts = torch.empty_like(weight), [None] * len(parts)
+        d_parts: list[torch.Tensor | None] = [None] * len(parts)
+        d_weight = torch.empty_like(weight)
         sizes = [part.shape[1] for part in parts]
         rows = zip(parts, weight.split(sizes, 1), d_weight.split(sizes, 1), strict=True)
         for i, (part, its_weight, its_gradient) in enumerate(rows):

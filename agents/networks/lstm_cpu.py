@@ -6,7 +6,7 @@ T time, B lanes, W width. `megastep.agents.networks.lstm` has the same as PyTorc
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
+from megastep.agents.networks.kernels.library import LIBRARY, is_built_for_cpu
 from megastep.agents.networks.linear_cpu import matmul
 from megastep.engine.devices import threads
 from megastep.kernels.build.launch import launch
@@ -23,7 +23,9 @@ class CpuSequence(torch.autograd.Function):
     """`lstm._Sequence` in float32: the same arguments, results and gradients."""
 
     @staticmethod
-    def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
+    def forward(
+        ctx, x, input_weight, bias, weight, reset, output, cell
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         inputs = x, input_weight, bias, weight, reset, output, cell
         x, input_weight, bias, weight, reset, output, cell = (one.contiguous() for one in inputs)
         gates = x.new_empty((*x.shape[:2], 4 * x.shape[2]))
@@ -31,7 +33,7 @@ class CpuSequence(torch.autograd.Function):
         last_cell = torch.empty_like(cell)
         n_steps, n_lanes, width = x.shape
         launch(
-            *(CORES, "lstm_sequence_forward", x.device, 0),
+            *(LIBRARY, "lstm_sequence_forward", x.device, 0),
             x=x,
             input_weight=input_weight,
             bias=bias,
@@ -54,13 +56,17 @@ class CpuSequence(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_outputs, d_last_cell):
+    def backward(
+        ctx, d_outputs, d_last_cell
+    ) -> tuple[
+        torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, None, torch.Tensor, torch.Tensor
+    ]:
         x, input_weight, weight, reset, gates, hiddens, cells = ctx.saved_tensors
         d_gates, d_x = torch.empty_like(gates), torch.empty_like(x)
         d_output, d_cell = torch.empty_like(d_last_cell), torch.empty_like(d_last_cell)
         n_steps, n_lanes, width = x.shape
         launch(
-            *(CORES, "lstm_sequence_backward", x.device, 0),
+            *(LIBRARY, "lstm_sequence_backward", x.device, 0),
             input_weight=input_weight,
             weight=weight,
             reset=reset,

@@ -4,6 +4,7 @@ B lanes; `...` any further axes.
 """
 
 from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 import torch
 from torch import nn
@@ -12,6 +13,12 @@ from megastep import spaces
 from megastep.agents.networks.kernels import moments as kernels
 from megastep.agents.types import Moments
 from megastep.types import Space
+
+
+class _Statistics(Protocol):
+    mean: torch.Tensor
+    scale: torch.Tensor
+    min_scale: float
 
 
 class RunningNorm(nn.Module):
@@ -25,6 +32,10 @@ class RunningNorm(nn.Module):
         space: leaf space of an image or a vector.
         min_scale: smallest divisor, so that nearly constant inputs are not amplified.
     """
+
+    mean: torch.Tensor
+    scale: torch.Tensor
+    count: torch.Tensor  # ()
 
     def __init__(self, space: Space, min_scale: float = 1e-2):
         super().__init__()
@@ -117,17 +128,17 @@ def add_moments(
         norm.add(n_lanes if is_counted is None else n_lanes * is_counted, mean, variance)
 
 
-def _is_fused(norm):
+def _is_fused(norm) -> bool:
     return norm.mean.is_cuda and norm.mean.dtype == torch.float32
 
 
-def _is_readable(leaf):
+def _is_readable(leaf) -> bool:
     is_float = leaf.dtype in (torch.float16, torch.float32)
     return leaf.is_cuda and is_float and leaf.is_contiguous()
 
 
 def mix_moments(
-    norm: nn.Module, mean: torch.Tensor, variance: torch.Tensor, rate: torch.Tensor
+    norm: _Statistics, mean: torch.Tensor, variance: torch.Tensor, rate: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns mean and scale of a mixture: the norm's moments with weight 1 - rate, `mean` and
     `variance` with weight rate.

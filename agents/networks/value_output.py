@@ -9,7 +9,7 @@ from torch import nn
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.kernels import heads as kernels
 from megastep.agents.networks.kernels import moments as statistics
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.precision import compute_dtype
@@ -28,6 +28,10 @@ class ValueOutput(nn.Module):
         width: number of features.
         min_scale: smallest standard deviation; returns that vary less count as constant.
     """
+
+    mean: torch.Tensor  # ()
+    scale: torch.Tensor
+    count: torch.Tensor
 
     def __init__(self, width: int, min_scale: float = 1e-3):
         super().__init__()

@@ -1,64 +1,72 @@
-"""An agent in one file: its acting weights, and what rebuilds its environment and policy.
+"""Agent files: a trained agent in one file, with its environment's and policy's configuration.
 
-The format is safetensors (https://github.com/huggingface/safetensors). The metadata of its header,
-texts by name, holds
+The format is safetensors (https://github.com/huggingface/safetensors). The metadata in its header
+maps names to strings:
 
-    format    of what follows, `FORMAT`
-    config    as config.json of a checkpoint, JSON (`typed_json`)
-    facts     what made the agent, such as samples, seconds, command and commit, JSON
-    tables    its evaluations: a list of {title, command, rows}, JSON
-    sha256    of the bytes after the header, which are those of all tensors
+    format    version of this metadata, `FORMAT`
+    config    config.json of a checkpoint
+    facts     how the agent was trained, such as samples, seconds, command and commit; JSON
+    tables    its evaluations: a list of {title, command, rows}; JSON
+    sha256    hash of the whole file, with zeros in place of these 64 digits
 
-Weights are float16, statistics float32. Reading without a device does not import PyTorch.
+Weights are float16, statistics float32. Without a device, reading does not import PyTorch. In files
+of format 1, `sha256` is the hash of all bytes after the header, those of the tensors.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import numpy as np
 import safetensors
 
 from megastep.agents.errors import shortened
-from megastep.agents.runs import trust, typed_json
+from megastep.agents.runs import formats, strange_files, trust, typed_json
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
 
 if TYPE_CHECKING:
     import torch
 
+    from megastep.agents.types import Config, Row
+
 SUFFIX = ".safetensors"
-FORMAT = "1"
-#: Names of dtypes by safetensors' names.
+FORMAT, FIRST_FORMAT = "2", "1"
+#: NumPy's name of each dtype by safetensors' name.
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I64": "int64"}
-_MAX_HEADER = 2**24  # bytes
+_MAX_HEADER, _MAX_BYTES = 2**24, 2**31
+#: The digest in a header. Texts in the header have their quotes escaped.
+_SEAL = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 
 
 def is_agent_file(path: Path) -> bool:
-    """Returns True if a path names the file of an agent."""
+    """Returns True if a path has the suffix of agent files."""
     return path.suffix == SUFFIX
 
 
 def write(
     path: Path,
     tensors: Mapping[str, torch.Tensor],
-    config: dict[str, Any],
-    facts: Mapping[str, Any],
-    tables: Sequence[dict[str, Any]] = (),
+    config: Config,
+    facts: Mapping[str, object],
+    tables: Sequence[Row] = (),
 ) -> None:
-    """Writes the file of an agent, whole or not at all.
+    """Writes an agent file atomically.
 
     Args:
-        tensors: the policy's state, of the dtypes that the file shall have; on the CPU.
-        config: as a checkpoint's.
-        facts: plain values by name; `samples` is among them.
-        tables: its evaluations.
+        path: the file.
+        tensors: the policy's state, on the CPU, in the dtypes to store.
+        config: configuration as in a checkpoint.
+        facts: plain values by name, among them `samples`.
+        tables: evaluations.
 
     Raises:
-        ValueError: a tensor has another dtype than those of `DTYPES`.
+        ValueError: a dtype is not in `DTYPES`.
         OSError: the file cannot be written.
     """
     from safetensors.numpy import save
@@ -67,28 +75,37 @@ def write(
     for name, array in arrays.items():
         if array.dtype.name not in DTYPES.values():
             allowed = ", ".join(DTYPES.values())
-            raise ValueError(f"{name} is {array.dtype}, and files of agents hold {allowed}")
-    _, data = _split(save(arrays))
-    metadata = {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
+            raise ValueError(f"{name} is {array.dtype}, but agent files hold {allowed}")
+    metadata = {"format": FORMAT, "sha256": "0" * 64}
     for name, value in (("config", config), ("facts", dict(facts)), ("tables", [*tables])):
         metadata[name] = typed_json.dumps(value)
-    write_atomically(path, save(arrays, metadata))
+    write_atomically(path, sealed(save(arrays, metadata)))
 
 
-def _split(content):
-    """Returns the header of a file, and the bytes of its tensors."""
+def sealed(content: bytes) -> bytes:
+    """Returns the bytes of a file with its SHA-256 in place of the one in its header."""
+    match = _SEAL.search(content)
+    assert match is not None
+    start, end = match.span(1)
+    digest = hashlib.sha256(content[:start] + b"0" * 64 + content[end:]).hexdigest()
+    return content[:start] + digest.encode() + content[end:]
+
+
+def _split(content) -> tuple[bytes, bytes]:
+    """Returns the header of a file and the bytes of its tensors."""
     end = 8 + int.from_bytes(content[:8], "little")
     return content[8:end], content[end:]
 
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
-    """Loads an agent as a checkpoint with the policy's state alone.
+    """Loads an agent file as a checkpoint that has only the policy's state.
 
     Args:
-        device: where the tensors go; None leaves out the state, and does not import PyTorch.
+        path: the file.
+        device: device of the tensors; None loads no state and does not import PyTorch.
 
     Raises:
-        DamagedCheckpoint: the file is damaged, or no agent's.
+        DamagedCheckpoint: the file is damaged or not an agent file.
         CheckpointError: a later version of megastep wrote it.
     """
     metadata, entries = _read(path)
@@ -103,19 +120,21 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
     )
 
 
-def read_metadata(path: Path) -> dict[str, Any]:
-    """Returns `config`, `facts` and `tables` of the file of an agent, and `untrusted`, the import
-    paths outside megastep in its configuration.
+def read_metadata(path: Path) -> Row:
+    """Returns `config`, `facts` and `tables` of an agent file, and `untrusted`: the import paths
+    outside megastep in its configuration.
 
-    Raises: as `read`.
+    Raises:
+        CheckpointError: as `read`.
     """
     return _read(path)[0]
 
 
-def _read(path):
-    """Returns what `read_metadata` does, and dtype, shape and bytes of each tensor by name."""
+def _read(path) -> tuple[Row, Row]:
+    """Returns the result of `read_metadata`, and dtype, shape and bytes of each tensor by name."""
     try:
-        content = path.read_bytes()
+        # a typed path may be a link, as in caches of downloaded files
+        content = strange_files.read_bytes(path.resolve(), _MAX_BYTES)
     except OSError as error:
         raise DamagedCheckpoint(f"{path} cannot be read ({error.strerror})") from None
     header, data = _split(content)
@@ -125,38 +144,47 @@ def _read(path):
         entries = dict(sorted(safetensors.deserialize(content)))
         texts = json.loads(header)["__metadata__"]
         version = texts["format"]
-        if version == FORMAT:
-            if hashlib.sha256(data).hexdigest() != texts["sha256"]:
-                raise ValueError("its tensors do not match their SHA-256")
+        if version in (FORMAT, FIRST_FORMAT):
+            if not _is_intact(content, data, texts):
+                raise ValueError("its bytes do not match their SHA-256")
             if any(entry["dtype"] not in DTYPES for entry in entries.values()):
                 raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
-            metadata = {
-                name: typed_json.loads(texts[name]) for name in ("config", "facts", "tables")
-            }
-            if type(metadata["facts"]["samples"]) is not int:
-                raise ValueError("its number of samples is none")
+            names = "config", "facts", "tables"
+            metadata = {name: typed_json.loads(texts[name]) for name in names}
+            formats.check(formats.Facts, metadata["facts"])
+            formats.check(formats.Tables, metadata["tables"])
             if not {"train", "spaces"} <= metadata["config"].keys():
-                raise ValueError("its configuration is not whole")
+                raise ValueError("incomplete configuration")
+            for name, array in _arrays(entries):
+                if array.dtype.kind == "f" and not np.isfinite(array).all():
+                    raise ValueError(f"{shortened(name, 60)} has a NaN or an infinity")
             metadata["untrusted"] = tuple(trust.foreign_names(texts["config"].encode()))
             return metadata, entries
     except safetensors.SafetensorError as error:
         problem = shortened(error)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        problem = str(error) if type(error) is ValueError else "its header is not an agent's"
+        problem = str(error) if type(error) is ValueError else "unexpected header"
     else:
         raise CheckpointError(
             f"{path} has format {version!r}, and this version of megastep reads {FORMAT}. Update "
             "megastep"
         )
-    raise DamagedCheckpoint(f"{path} is damaged, or no agent of megastep: {problem}")
+    raise DamagedCheckpoint(f"{path} is damaged or not an agent file of megastep: {problem}")
 
 
-def _tensors(entries, device):
-    import numpy as np
+def _is_intact(content, data, texts) -> object:
+    if texts["format"] == FIRST_FORMAT:
+        return hashlib.sha256(data).hexdigest() == texts["sha256"]
+    return _SEAL.search(content, 0, len(content) - len(data)) and sealed(content) == content
+
+
+def _arrays(entries) -> Iterator[tuple[str, np.ndarray]]:
+    """Yields (name, array) of tensors."""
+    for name, entry in entries.items():
+        yield name, np.frombuffer(entry["data"], DTYPES[entry["dtype"]]).reshape(entry["shape"])
+
+
+def _tensors(entries, device) -> dict:
     import torch
 
-    tensors = {}
-    for name, entry in entries.items():
-        array = np.frombuffer(entry["data"], DTYPES[entry["dtype"]]).reshape(entry["shape"])
-        tensors[name] = torch.tensor(array, device=device)
-    return tensors
+    return {name: torch.tensor(array, device=device) for name, array in _arrays(entries)}

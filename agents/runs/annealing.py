@@ -1,6 +1,6 @@
-"""The record of how the learning rate fell: its factor in each update, a float64 each.
+"""The annealing record: the learning rate's factor in each update, one float64 each.
 
-What the clock decided is in it, so a run can be repeated: `megastep rerun RUN`.
+With `seconds=` the factors depend on the clock; the record lets `megastep rerun` repeat such a run.
 """
 
 import contextlib
@@ -8,19 +8,27 @@ import math
 from array import array
 from pathlib import Path
 
+from megastep.agents.runs import strange_files
 from megastep.agents.runs.atomic_files import AppendedFile
 
-FILE = "annealing.f64"
+FILE, MAX_BYTES = "annealing.f64", 2**32
+#: Updates of earlier versions, at most, that are not recorded.
+MAX_MISSING = 10**7
 
 
 def read(folder: Path | str) -> array:
-    """Returns the factors of a run's updates, in order; none if there is no record. NaN stands for
-    those of an earlier version, which recorded none.
+    """Returns the factor of each update of a run; empty without a record. NaN marks updates by
+    versions that recorded none.
+
+    Raises:
+        ValueError: there is another number than NaN and those from 0 to 1.
     """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
-        data = path.read_bytes()
+        data = strange_files.read_bytes(path, MAX_BYTES)
         factors.frombytes(data[: len(data) // factors.itemsize * factors.itemsize])
+    if not all(0 <= factor <= 1 or math.isnan(factor) for factor in factors):
+        raise ValueError(f"{path} is damaged: factors of the learning rate are from 0 to 1")
     return factors
 
 
@@ -29,32 +37,35 @@ class AnnealingRecord:
 
     Args:
         folder: the run folder.
-        n_updates: updates that the run has had. Later factors are removed; missing ones, of a run
-            that an earlier version began, are NaN.
+        n_updates: updates of the run so far. Factors of later updates are removed; missing factors
+            become NaN.
 
     Raises:
         OSError: the file cannot be written.
+        ValueError: there is another record, or a forged number of updates.
     """
 
     def __init__(self, folder: Path | str, n_updates: int = 0):
         n_kept = min(n_updates, len(read(folder)))
         self.file = AppendedFile(Path(folder) / FILE, n_kept * array("d").itemsize)
+        if n_updates - n_kept > MAX_MISSING:
+            raise ValueError(f"{folder} has had no {n_updates:,} updates, as its checkpoint says")
         for _ in range(n_kept, n_updates):
             self.append(math.nan)
 
     def append(self, factor: float) -> None:
-        """Adds the factor of an update. It is written with the next report."""
+        """Appends the factor of an update, in memory until the next `flush`."""
         self.file.unwritten += array("d", [factor]).tobytes()
 
     def flush(self) -> None:
-        """Writes what was added."""
+        """Writes the appended factors."""
         self.file.flush()
 
     def sync(self) -> None:
-        """Writes what was added and flushes it to disk."""
+        """Writes the appended factors and flushes them to disk."""
         self.file.sync()
 
     def close(self) -> None:
-        """Writes what was added, if the disk has room for it."""
+        """Writes the appended factors, if the disk has room, and closes the file."""
         with contextlib.suppress(OSError):
             self.file.close()

@@ -1,9 +1,8 @@
-"""The checkpoints of a run: one folder `step_<N>` per checkpoint, N environment steps.
+"""The checkpoints of a run: a folder `step_<N>` for each, after N environment steps.
 
-A checkpoint is written to a temporary folder, flushed to disk, verified and renamed into place. A
-reader sees a whole checkpoint or none, and damage is reported (:mod:`checkpoint_format`). No
-checkpoint is overwritten: a second one of the same step is `step_<N>-2`, and the first is deleted
-after the second is verified.
+A checkpoint is written to a temporary folder, flushed to disk, verified and renamed, so a reader
+sees a complete checkpoint or none. Damage is detected (:mod:`checkpoint_format`). A second
+checkpoint of the same step is `step_<N>-2`; the first is deleted once the second is verified.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs import checkpoint_format
 from megastep.agents.runs.atomic_files import delete_leftovers, sync_folder, temporary_path
@@ -27,6 +26,8 @@ from megastep.agents.runs.checkpoint_format import (
 
 if TYPE_CHECKING:
     import torch
+
+    from megastep.agents.types import Config, Row, StateDict
 
 _NAME = re.compile(r"step_\d+(-\d+)?")
 
@@ -46,13 +47,13 @@ __all__ = [
 def save(
     folder: Path | str,
     step: int,
-    state: dict[str, Any],
-    config: dict[str, Any],
+    state: StateDict,
+    config: Config,
     keep_checkpoints: int = 2,
     score: float | None = None,
-    made_with: dict[str, Any] | None = None,
+    made_with: Row | None = None,
     replay_seconds: float | None = None,
-    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
+    add_files: Callable[[Path], Row] = lambda path: {},
 ) -> Path:
     """Writes a checkpoint and deletes old ones. Returns its folder.
 
@@ -60,16 +61,17 @@ def save(
         folder: the run's `checkpoints` folder.
         step: environment steps so far, of all lanes.
         state: dicts and lists of tensors and numbers.
-        config: the run's configuration, as JSON.
-        keep_checkpoints: number of latest steps kept, besides the one with the highest score.
-        score: for example the mean return, higher is better; None if unknown.
-        made_with: what the numbers depend on besides the configuration, such as versions.
-        replay_seconds: a replay buffer that takes longer to write is left out.
+        config: the run's configuration, JSON.
+        keep_checkpoints: number of latest steps to keep, besides the one with the highest score.
+        score: such as the mean return, higher is better; None if unknown.
+        made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
+        replay_seconds: leaves out a replay buffer that takes longer to write; None for no limit.
         add_files: as for `checkpoint_format.write`.
 
     Raises:
-        OSError: the disk is full or not writable. Nothing has changed.
-        DamagedCheckpoint: the disk returns other bytes than were written. Nothing has changed.
+        OSError: the disk is full or not writable. Other checkpoints are unchanged.
+        DamagedCheckpoint: the disk does not return the bytes written. Other checkpoints are
+            unchanged.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -79,7 +81,7 @@ def save(
         checkpoint_format.write(
             temporary, step, state, config, score, made_with, replay_seconds, add_files
         )
-        # verified before any old one is deleted
+        # verify before deleting any old one
         manifest = checkpoint_format.read_manifest(temporary)
         with checkpoint_format.verified(temporary, manifest, manifest["files"]):
             pass
@@ -102,13 +104,14 @@ def load_latest(
 ) -> Checkpoint:
     """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
 
-    Warns about each damaged checkpoint that is skipped.
+    Warns of each damaged checkpoint that it skips.
 
     Args:
-        device: where what was learnt goes; all else goes to the CPU. None leaves out the state, and
-            does not import PyTorch.
-        is_whole: loads environments and replay buffer, too.
-        rank: whose state is loaded, see `checkpoint_format.read`.
+        folder: a `checkpoints` folder or one checkpoint.
+        device: device of weights and optimizer; the rest is loaded to the CPU. None loads no state
+            and does not import PyTorch.
+        is_whole: also loads environments and replay buffer.
+        rank: the rank whose state is loaded, see `checkpoint_format.read`.
 
     Raises:
         GoneCheckpoint: its run has deleted the one at `folder`.
@@ -137,11 +140,11 @@ def load_latest(
 
 
 def set_aside_after(folder: Path | str, step: int) -> None:
-    """Renames the checkpoints after `step` to `step_<N>.aside`, for a run that resumes from `step`.
+    """Renames checkpoints after `step` to `step_<N>.aside`, when a run resumes from `step`.
 
-    `save` deletes each one when the run reaches its step again.
+    `save` deletes them once the run reaches their step again.
     """
-    for path in list_checkpoints(folder):  # the newest last: it stays the latest until then
+    for path in list_checkpoints(folder):  # the newest last, so that it stays the latest meanwhile
         if step_of(path) > step:
             aside = path.with_name(f"{path.name}.aside")
             _delete(aside)
@@ -160,13 +163,15 @@ def step_of(path: Path) -> int:
 
 
 def _step_and_number(path: Path) -> tuple[int, int]:
-    """Returns a checkpoint's step, and its number among the checkpoints of that step, from 1."""
-    step, number = re.match(r"step_(\d+)(?:-(\d+))?", path.name).groups()
+    """Returns a checkpoint's step, and its number among those of that step, from 1."""
+    match = re.match(r"step_(\d+)(?:-(\d+))?", path.name)
+    assert match is not None
+    step, number = match.groups()
     return int(step), int(number or 1)
 
 
 def _next_name(folder: Path, step: int) -> str:
-    """Returns `step_<N>`, or `step_<N>-2` and so on if that step has checkpoints."""
+    """Returns `step_<N>`, or `step_<N>-2` and so on if the step has checkpoints already."""
     pairs = map(_step_and_number, list_checkpoints(folder))
     last = max((number for other_step, number in pairs if other_step == step), default=0)
     return f"step_{step}-{last + 1}" if last else f"step_{step}"
@@ -175,14 +180,14 @@ def _next_name(folder: Path, step: int) -> str:
 def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
     """Deletes old checkpoints, and set-aside ones up to `step`.
 
-    Keeps the last `keep_checkpoints` steps, the step with the best score and the last one with a
-    replay buffer. Of each step only the last checkpoint is kept.
+    Keeps the last `keep_checkpoints` steps, the step with the best score and the last step with a
+    replay buffer; of each step, only the last checkpoint.
     """
     checkpoints = list_checkpoints(folder)
     last_of_each_step = list({step_of(path): path for path in checkpoints}.values())
-    scores = {path: _score(path) for path in last_of_each_step}
-    scored = [path for path in last_of_each_step if scores[path] is not None]
-    best = max(scored, key=scores.get, default=None)
+    scored = [(path, _score(path)) for path in last_of_each_step]
+    scores = {path: score for path, score in scored if score is not None}
+    best = max(scores, key=scores.__getitem__, default=None)
     with_replay = [path for path in last_of_each_step if (path / "replay.pt").exists()]
     kept = {*last_of_each_step[-keep_checkpoints:], best, *with_replay[-1:]}
     aside = [path for path in folder.glob("step_*.aside") if step_of(path) <= step]
@@ -198,7 +203,7 @@ def _score(path: Path) -> float | None:
 
 
 def _delete(path: Path) -> None:
-    """Deletes a checkpoint. If killed, leaves a temporary folder and no damaged checkpoint."""
+    """Deletes a checkpoint. If killed midway, leaves a temporary folder, not a damaged one."""
     leftover = temporary_path(path)
     try:
         os.replace(path, leftover)

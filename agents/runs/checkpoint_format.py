@@ -1,17 +1,17 @@
-"""The format of one checkpoint: a folder of these files.
+"""The format of a checkpoint: a folder of these files.
 
-    manifest.json  size and SHA-256 of each other file and of itself, so any damaged byte is found;
-                   format, step, score, what it was made with, and the numbers at the top of the
-                   state, such as samples and seconds
-    config.json    the run's configuration
-    state.pt       what was learnt, and all else that is small
-    world.pt       the environments, and what the policy remembers of their episodes
-    replay.pt      the replay buffer, if there is one and it was saved
-    rank1.pt       of a run with several ranks: all of the state of rank 1 but the policy's weights,
-                   which ranks share; and so on. The other files are rank 0's
+    manifest.json  size and SHA-256 of every file and of itself, to detect damage; format, step,
+                   score, versions and device, and the counters of the state, such as samples
+    config.json    the run's configuration; infinity is {"$float": "inf"}, and a dict whose keys are
+                   no strings {"$dict": [[0, 1.0]]}
+    state.pt       weights, optimizer, statistics and everything else that is small
+    world.pt       environments and the actor state (observations and hidden states)
+    replay.pt      the replay buffer, if it was saved
+    rank1.pt, ...  with several ranks: the state of each other rank without the policy's weights,
+                   which are equal on all ranks. The files above are rank 0's
 
-All but the first two hold plain dicts of tensors, numbers and strings. A run that is resumed reads
-all; to evaluate needs `state.pt` alone. JSON is read without PyTorch.
+The .pt files hold plain dicts of tensors, numbers and strings. Resuming reads all files; evaluation
+only `state.pt`. JSON is read without PyTorch.
 """
 
 from __future__ import annotations
@@ -25,31 +25,35 @@ import os
 import pickle
 import re
 import time
+import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from megastep.agents.runs import trust, typed_json
+from megastep.agents.errors import memory_problem, shortened
+from megastep.agents.runs import formats, strange_files, trust, typed_json
 from megastep.agents.runs.atomic_files import sync_folder
 
 if TYPE_CHECKING:
     import torch
 
-#: The format number. Increase it whenever older readers would misread a new checkpoint, or newer
-#: readers an old one, and add the last commit of the old format to `READERS`.
+    from megastep.agents.types import Config, Row, StateDict
+
+#: The format number. Increase it if older readers would misread a checkpoint, or this version an
+#: older one, and add the last commit of the replaced format to `READERS`.
 FORMAT = 7
-#: Commits of megastep that read the older formats. The last one is migrated, see `_migrated`.
+#: Commits that read the older formats. `MIGRATED` is read here, see `_migrated`.
 READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db", 5: "916221d"}
 MIGRATED = 6
-#: The keys of a state that are in files of their own.
+#: Files other than state.pt, and the keys of the state that they hold.
 PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
 _RANK_FILE = re.compile(r"rank[1-9]\d*\.pt")
 _LOGGERS = "megastep.agents.training.loggers"
-_CHUNK = 2**24  # bytes
+_CHUNK = _MAX_JSON = 2**24  # bytes
 
 
 class CheckpointError(RuntimeError):
-    """No checkpoint can be used. The message names each one tried, its problem, and the cure."""
+    """No checkpoint can be used. The message names each one tried, its problem and the cure."""
 
 
 class DamagedCheckpoint(CheckpointError):
@@ -73,26 +77,26 @@ class Checkpoint:
     Attributes:
         path: its folder.
         step: environment steps of all lanes before it was saved.
-        numbers: the numbers at the top of the state.
+        numbers: counters of the state, such as samples and seconds.
         config: the run's configuration, as saved.
-        made_with: what the numbers depend on besides the configuration: versions, device, threads.
+        made_with: versions, device and threads that the numbers depend on.
         state: dicts of tensors and numbers, as saved; None if it was not loaded.
-        untrusted: import paths outside megastep that it names, if this user did not make it.
-        n_ranks: ranks whose state it holds.
+        untrusted: import paths outside megastep in `config`; empty if this user wrote it.
+        n_ranks: number of ranks whose state it holds.
     """
 
     path: Path
     step: int
     numbers: dict[str, float]
-    config: dict[str, Any]
-    made_with: dict[str, Any]
-    state: dict[str, Any] | None = None
+    config: Config
+    made_with: Row
+    state: StateDict | None = None
     untrusted: tuple[str, ...] = ()
     n_ranks: int = 1
 
 
 def rank_file(rank: int) -> str:
-    """Returns the name of the file with a rank's state."""
+    """Returns the file name of a rank's state, for ranks other than 0."""
     return f"rank{rank}.pt"
 
 
@@ -102,19 +106,20 @@ def rank_file(rank: int) -> str:
 def write(
     path: Path,
     step: int,
-    state: dict[str, Any],
-    config: dict[str, Any],
+    state: StateDict,
+    config: Config,
     score: float | None,
-    made_with: dict[str, Any] | None = None,
+    made_with: Row | None = None,
     replay_seconds: float | None = None,
-    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
+    add_files: Callable[[Path], Row] = lambda path: {},
 ) -> None:
     """Writes a checkpoint into a new folder and flushes it to disk.
 
     Args:
-        replay_seconds: `replay.pt` is left out if it takes longer; None for no limit.
-        add_files: puts the files of other ranks into the folder. Returns their entries in the
-            manifest, by name.
+        path, step, state, config, score, made_with: as for `checkpoint.save`.
+        replay_seconds: leaves out `replay.pt` if it takes longer to write; None for no limit.
+        add_files: puts the files of other ranks into the folder; returns their manifest entries by
+            name.
     """
     import torch
 
@@ -137,7 +142,7 @@ def write(
     files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
     files |= add_files(path)
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
-    manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
+    manifest: dict = dict(format=FORMAT, step=step, score=score, numbers=numbers)
     manifest |= dict(torch=torch.__version__, made_with=made_with or {}, files=files)
     manifest["signature"] = trust.sign(text)
     text = sealed(manifest)
@@ -145,14 +150,11 @@ def write(
     sync_folder(path)
 
 
-def write_state(
-    path: Path, state: dict[str, Any], replay_seconds: float | None = None
-) -> dict[str, Any]:
-    """Writes a rank's whole state into one file and flushes it to disk. Returns its entry in the
-    manifest.
+def write_state(path: Path, state: StateDict, replay_seconds: float | None = None) -> Row:
+    """Writes a rank's state into one file and flushes it to disk. Returns its manifest entry.
 
     Args:
-        replay_seconds: if it takes longer, the replay buffer is left out; None for no limit.
+        replay_seconds: leaves out the replay buffer if the file takes longer; None for no limit.
     """
     import torch
 
@@ -166,12 +168,16 @@ def write_state(
         return _write_file(path, functools.partial(torch.save, state))
 
 
-def check_plain(tree: Any, name: str) -> None:
-    """Raises TypeError for what loading without code refuses. It allows tensors, numbers, strings
-    and None, and lists, tuples and dicts of these.
+def check_plain(tree: object, name: str) -> None:
+    """Checks that a tree can be loaded without running code: it may hold tensors, numbers, strings,
+    None, and lists, tuples and dicts of these.
 
     Args:
-        name: of the tree, for the message.
+        tree: what to check.
+        name: the tree's name in messages.
+
+    Raises:
+        TypeError: naming the path of anything else.
     """
     if isinstance(tree, dict):
         for key, part in tree.items():
@@ -189,14 +195,14 @@ def check_plain(tree: Any, name: str) -> None:
 
 
 class _TooLate(Exception):
-    """A file took longer to write than it may."""
+    """A file took longer to write than its deadline."""
 
 
 class _HashedFile:
-    """A file that counts and hashes what is written to it.
+    """A file that counts and hashes the bytes written to it.
 
     Attributes:
-        error: the first error. `torch.save` would hide it behind others, so nothing is raised.
+        error: the first error. Not raised, since `torch.save` would replace it by another.
     """
 
     def __init__(self, file: BinaryIO, deadline: float | None):
@@ -221,10 +227,8 @@ class _HashedFile:
         pass
 
 
-def _write_file(
-    path: Path, write: Callable[[Any], Any], deadline: float | None = None
-) -> dict[str, Any]:
-    """Writes a file and flushes it to disk. Returns its entry in the manifest."""
+def _write_file(path: Path, write: Callable[[Any], object], deadline: float | None = None) -> Row:
+    """Writes a file and flushes it to disk. Returns its manifest entry."""
     with open(path, "wb") as file:
         hashed = _HashedFile(file, deadline)
         write(hashed)
@@ -235,8 +239,8 @@ def _write_file(
     return {"sha256": hashed.sha256.hexdigest(), "bytes": hashed.n_bytes}
 
 
-def sealed(manifest: dict[str, Any]) -> bytes:
-    """Returns the text of a manifest, with its own SHA-256 added."""
+def sealed(manifest: Row) -> bytes:
+    """Returns a manifest as JSON, with its own SHA-256 added."""
     digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
     return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
 
@@ -247,17 +251,18 @@ def sealed(manifest: dict[str, Any]) -> bytes:
 def read(
     path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
 ) -> Checkpoint:
-    """Loads a checkpoint. Opens what it reads at once, so that it is read to its end if the run
-    deletes it meanwhile.
+    """Loads a checkpoint. Opens all files before it reads any, so that it can read them to their
+    end if the run deletes them meanwhile.
 
     Args:
-        device: where the tensors of `state.pt` go; None: verifies everything and loads no state.
-        is_whole: loads the other parts of this rank, too, onto the CPU; rank 0 verifies everything.
-        rank: whose state is loaded. One without a file gets that in rank 0's `state.pt`.
+        path: the checkpoint's folder.
+        device: device of the tensors in `state.pt`; None verifies all files and loads no state.
+        is_whole: also loads the rank's other files, to the CPU; rank 0 verifies all files.
+        rank: the rank whose state is loaded; without a file of its own, only rank 0's `state.pt`.
 
     Raises:
-        DamagedCheckpoint: a file is missing or damaged, or could run code when loaded.
-        GoneCheckpoint: it was deleted before everything was open.
+        DamagedCheckpoint: a file is missing, damaged, or could run code when loaded.
+        GoneCheckpoint: it was deleted before all files were open.
         CheckpointError: another version of megastep wrote it.
     """
     manifest = read_manifest(path)
@@ -269,11 +274,13 @@ def read(
     is_verified = device is None or (is_whole and rank == 0)
     names = manifest["files"] if is_verified else [*parts, "config.json"]
     with verified(path, manifest, names) as files:
-        text = files["config.json"].read()
+        text = files["config.json"].read(_MAX_JSON + 1)
         try:
+            if len(text) > _MAX_JSON:
+                raise ValueError("it is too long")
             config = typed_json.loads(text)
         except (ValueError, RecursionError):
-            problem = f"Checkpoint {path} is damaged: config.json is no JSON"
+            problem = f"Checkpoint {path} is damaged: config.json is not JSON"
             raise DamagedCheckpoint(problem) from None
         checkpoint = Checkpoint(
             path,
@@ -293,26 +300,42 @@ def read(
     return dataclasses.replace(checkpoint, state=_migrated(state, manifest))
 
 
-def _load(path, file, device):
-    """Returns the state in an open file."""
+def _load(path, file, device) -> Any:
+    """Returns the state in an open file. Raises DamagedCheckpoint."""
     import torch
 
     try:
-        return torch.load(file, map_location=device, weights_only=True)
+        _check_zip(file)
+        file.seek(0)
+        state = torch.load(file, map_location=device, weights_only=True)
+        if not isinstance(state, dict):
+            raise ValueError("it is no dict")
+        return state
     except pickle.UnpicklingError:
         raise DamagedCheckpoint(
             f"Checkpoint {path.parent} is refused: {path.name} holds more than tensors and "
             "numbers, so loading it could run code"
         ) from None
-    except (RuntimeError, EOFError, ValueError) as error:
+    except Exception as error:  # of a planted file, there is no end to what unpickling raises
+        if memory_problem(error):
+            raise
         raise DamagedCheckpoint(
-            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read "
-            f"({str(error).splitlines()[0]})"
+            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read ({shortened(error)})"
         ) from None
 
 
-def _migrated(state, manifest):
-    """Returns a state of the last format as one of this format."""
+def _check_zip(file) -> None:
+    """Raises ValueError for a zip file whose parts are compressed, which `torch.save` never does: a
+    small one may unpack to more than there is memory.
+    """
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            if any(entry.compress_size != entry.file_size for entry in archive.infolist()):
+                raise ValueError("its parts are compressed")
+
+
+def _migrated(state, manifest) -> dict:
+    """Returns a state of format `MIGRATED` or `FORMAT` in `FORMAT`."""
     import torch
     from torch.nn.functional import pad
 
@@ -320,7 +343,7 @@ def _migrated(state, manifest):
         return state
     if "learner" in state and "optimizer" in state["learner"]:
         state["learner"].setdefault("check", torch.zeros(2, dtype=torch.float64))
-    if stats := state.get("episode_stats"):  # no episode was left out of a metric
+    if stats := state.get("episode_stats"):  # which counted no episodes left out of a metric
         n_metrics = len(stats["sums"]) - 4
         stats["sums"] = pad(stats["sums"], (0, 0, 0, n_metrics))
         stats["windows"] = [
@@ -329,9 +352,9 @@ def _migrated(state, manifest):
     return state | {"samples_at_report": state.get("samples", 0)}
 
 
-def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
-    """Returns a configuration with loggers by label. Before there were several, `train.logger` had
-    the keys of W&B, or of none, and TensorBoard was always written.
+def with_loggers(config: Config) -> Config:
+    """Returns a configuration with loggers by label. In older ones, `train.logger` is W&B or none,
+    and TensorBoard is implied.
     """
     match config:
         case {"train": {"logger": {"name": "none" | "wandb" as name, **keys}} as train}:
@@ -343,21 +366,22 @@ def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def verified(
-    path: Path, manifest: dict[str, Any], names: Iterable[str]
-) -> Iterator[dict[str, BinaryIO]]:
+def verified(path: Path, manifest: Row, names: Iterable[str]) -> Iterator[dict[str, BinaryIO]]:
     """Opens files of a checkpoint and compares each with the SHA-256 in its manifest.
 
     Yields:
         The open files by name, each at its beginning.
 
-    Raises: as `read`.
+    Raises:
+        DamagedCheckpoint: a file is missing or differs.
+        GoneCheckpoint: the checkpoint was deleted before all were open.
     """
     with contextlib.ExitStack() as stack:
         files = {}
         for name in names:
             with _readable(path, name):
-                files[name] = stack.enter_context(open(path / name, "rb"))
+                file = open(path / name, "rb", opener=strange_files.opener)
+                files[name] = stack.enter_context(file)
         for name, file in files.items():
             with _readable(path, name):
                 digest = _digest(file)
@@ -368,7 +392,7 @@ def verified(
 
 
 @contextlib.contextmanager
-def _readable(path, name):
+def _readable(path, name) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -379,7 +403,7 @@ def _readable(path, name):
         ) from None
 
 
-def _digest(file):
+def _digest(file) -> str:
     digest = hashlib.sha256()
     while chunk := file.read(_CHUNK):
         digest.update(chunk)
@@ -387,22 +411,32 @@ def _digest(file):
     return digest.hexdigest()
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
-    """Returns a checkpoint's manifest, which must equal what `sealed` writes to the last byte.
+def read_manifest(path: Path) -> Row:
+    """Returns a checkpoint's manifest.
 
-    Raises: as `read`.
+    Raises:
+        DamagedCheckpoint: it is not, byte for byte, what `sealed` writes.
+        GoneCheckpoint: there is no such checkpoint any more.
+        CheckpointError: it has an unknown format.
     """
     try:
-        data = (path / "manifest.json").read_bytes()
+        data = strange_files.read_bytes(path / "manifest.json", _MAX_JSON)
         manifest = json.loads(data)
         version = manifest["format"]
         body = {key: value for key, value in manifest.items() if key != "sha256"}
-        is_intact = data == sealed(body)
+        is_intact = data == sealed(body) and isinstance(version, (int, str))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         version, is_intact = None, False
-    if is_intact:
+    if is_intact and version in (FORMAT, MIGRATED):
+        try:
+            formats.check(formats.Manifest, manifest)
+        except ValueError as error:
+            raise DamagedCheckpoint(
+                f"Checkpoint {path} is damaged: manifest.json: {error}"
+            ) from None
         others = {*manifest["files"]} - {"config.json", "state.pt", *PARTS}
-        is_intact = all(map(_RANK_FILE.fullmatch, others))  # a planted one may name any file
+        is_intact = all(map(_RANK_FILE.fullmatch, others))  # a forged manifest may name any path
+        is_intact &= {"config.json", "state.pt"} <= {*manifest["files"]}
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest or path.exists()):
         raise GoneCheckpoint(path)

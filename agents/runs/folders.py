@@ -1,4 +1,4 @@
-"""Run folders: new ones, existing ones by name, and their locks."""
+"""Run folders: creating, finding and locking them."""
 
 import contextlib
 import dataclasses
@@ -11,19 +11,28 @@ import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
+from megastep.agents.runs import (
+    agent_file,
+    checkpoint,
+    checkpoint_format,
+    formats,
+    strange_files,
+)
 from megastep.agents.runs.atomic_files import check_room, make_folders, remove_folders
 
+if TYPE_CHECKING:
+    import torch
+
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
-#: One line for each start of a run: its folder.
+#: The folder of each start of a run, one per line.
 STARTED = RUNS / "started.txt"
-#: Settings of earlier runs that no longer exist, and changed nothing that a run learns.
+#: Settings in older runs that no longer exist and had no effect on learning.
 REMOVED = ("nonfinite_replay",)
-#: The beginning of an error's message.
+#: Prefix of error messages.
 CANNOT = "{} cannot be written; choose another with folder=: "
 
 
@@ -31,38 +40,50 @@ CANNOT = "{} cannot be written; choose another with folder=: "
 
 
 def for_file(name: str) -> str:
-    """Returns a name without what a file's cannot have."""
+    """Returns a name with characters that file names cannot have replaced by `-`."""
     return re.sub(r"[^\w.-]", "-", name)
 
 
 def make(path: Path) -> Path:
-    """Makes a new folder and returns it; a taken name gets -2, -3, ..."""
+    """Creates a folder and returns it; if it exists, `path`-2, -3, ..."""
     with user_errors(CANNOT.format(shortened(path))):
         check_room(path)
         made = make_folders(path.parent)
         try:
             for number in itertools.count(1):
                 folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-                with contextlib.suppress(FileExistsError):  # another program may have just taken it
+                with contextlib.suppress(FileExistsError):  # taken, perhaps by another process
                     folder.mkdir()
                     return folder
         except OSError:
             remove_folders(made)
             raise
+    raise AssertionError("counting never ends")
 
 
-def new(name: str, folder: str | None = None) -> Path:
-    """Returns the folder of a new run: `folder`, which must be new or empty, or by default one
-    called after the time and `name`.
+def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
+    """Returns the folder of a new run.
+
+    Args:
+        name: end of the default folder's name, which starts with the time.
+        folder: a folder that is empty or does not exist; None for the default in `RUNS`.
+        is_again: as for `check_free`.
+
+    Raises:
+        UserError: the folder is not empty or cannot be written.
     """
     if folder is None:
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
-    check_free(folder)
+    check_free(folder, is_again)
     return Path(folder) if os.path.exists(folder) else make(Path(folder))
 
 
-def check_free(name: str | None) -> None:
-    """Raises UserError if the folder of a new run is not empty, or cannot be read."""
+def check_free(name: str | None, is_again: bool = False) -> None:
+    """Raises UserError if the folder of a new run is not empty or cannot be read.
+
+    Args:
+        is_again: it may be that of a run which ended before it saved anything.
+    """
     folder = Path(name or "")
     if os.path.islink(folder) and not os.path.exists(folder):
         target = os.readlink(folder)
@@ -71,7 +92,11 @@ def check_free(name: str | None) -> None:
         check_room(folder)
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
     # Hydra writes .hydra/ and a log before the job of a sweep starts
-    if [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]:
+    used = [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]
+    if is_again and used:
+        strange_files.check_folder(folder)
+        used = used if not {"lock", "config.yaml"} & {path.name for path in used} else []
+    if used:
         text = f"The run folder {folder} is not empty; choose another with folder="
         if checkpoint.list_checkpoints(folder / "checkpoints"):
             text = f"{text}, or continue its run: {resume_command(folder)}"
@@ -80,24 +105,24 @@ def check_free(name: str | None) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keeps other processes from training in a run folder.
+    """Locks a run folder, so that no other process trains in it.
 
-    The system holds the lock for as long as this process lives, so none is ever stale: neither
-    after kill -9, nor when another process gets the number in the file.
+    The system releases the lock when this process ends, even by kill -9, so locks are never stale.
 
     Raises:
-        UserError: naming the process that trains there, or that the folder cannot be written.
+        UserError: another process, which is named, trains there; or the folder cannot be written.
     """
-    import filelock  # which takes a while
+    import filelock  # slow to import
 
-    # its last owner may just be deleting it
+    # the timeout is for a last owner that is just deleting it
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
         lock.acquire()
-        path.write_text(str(os.getpid()))
+        with open(path, "w", opener=strange_files.opener) as file:
+            file.write(str(os.getpid()))
     except filelock.Timeout:
         with user_errors(f"The run folder {folder} is in use, or was just now: "):
-            pid = path.read_text()  # its last owner may just be deleting it
+            pid = path.read_text()  # fails if the last owner has just deleted it
         raise UserError(
             f"The run folder {folder} is in use by process {pid}; wait for it, or stop it: "
             f"kill {pid}"
@@ -110,13 +135,13 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)  # while it is locked, so that it is not another's
+        path.unlink(missing_ok=True)  # still locked, so it cannot be another process's
         lock.release()
 
 
 def record_start(folder: Path) -> None:
-    """Notes that training starts in a folder now. `latest` follows these notes, since folders'
-    times change with whatever is written there, and clocks are moved.
+    """Records that training starts in a folder. `latest` is the last one recorded, since
+    modification times are unreliable.
     """
     with console.warned(f"{STARTED} cannot be written, so `latest` will not find {folder}: "):
         RUNS.mkdir(exist_ok=True)
@@ -128,8 +153,8 @@ def record_start(folder: Path) -> None:
 
 
 def known() -> list[Path]:
-    """Returns the runs here, and those elsewhere that were started here; the one started or resumed
-    last comes last.
+    """Returns the folders of all runs in or started from the current folder, ordered by when they
+    were last started or resumed.
     """
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
@@ -139,30 +164,32 @@ def known() -> list[Path]:
 
 
 def pretrained() -> dict[str, Path]:
-    """Returns the files of the agents that come with megastep, by name."""
+    """Returns the agent files that come with megastep, by name."""
     files = sorted(package.PRETRAINED.glob(f"*{agent_file.SUFFIX}"))
     return {path.stem: path for path in files}
 
 
 def find(name: str) -> Path:
-    """Returns an existing run's folder, one of its checkpoints, or the file of an agent.
+    """Returns the path of a run folder, a checkpoint or an agent file.
 
     Args:
-        name: a path, `latest`, or the name of a pretrained agent; what is at a path of that name
-            comes first.
+        name: a path, `latest`, or the name of a pretrained agent; an existing path has priority.
 
     Raises:
-        UserError: naming the nearest run and the nearest pretrained agent.
+        UserError: nothing is found. Names the most similar run and pretrained agent. Or a link in a
+            run leaves its folder, or something in it is no file.
     """
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
-        return folders[-1]
+        path = folders[-1]
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
+        is_in_run = path.parent.name in ("checkpoints", "snapshots")
+        strange_files.check_folder(folder_of(path) if is_in_run else path)
         return path
     if agent_file.is_agent_file(path) and os.path.isfile(path):
         return path
     if os.path.exists(path):
-        problem = "is no run, with a folder checkpoints"
+        problem = "is not a run: it has no folder checkpoints"
         if name in agents:
             raise UserError(f"{name} {problem}; rename it to use the pretrained agent {name}")
     elif name in agents:
@@ -179,38 +206,45 @@ def find(name: str) -> Path:
 
 
 def load_checkpoint(
-    path: Path, trust: bool, device: Any = None, is_whole: bool = False, rank: int = 0
+    path: Path,
+    trust: bool,
+    device: "torch.device | str | None" = None,
+    is_whole: bool = False,
+    rank: int = 0,
 ) -> checkpoint.Checkpoint:
-    """Returns the checkpoint of a run or an agent found with `find`, on a device; without one, all
-    but its state, and PyTorch is not imported. Warns of damaged ones it skips.
+    """Loads the latest intact checkpoint of a run, or an agent file. Warns of damaged checkpoints.
 
     Args:
-        trust: whether a run that another user made may name modules to import.
-        is_whole: loads environments and replay buffer, too, as for a run that is resumed.
-        rank: whose environments and replay buffer.
+        path: from `find`.
+        trust: whether to allow import paths outside megastep in a run that another user made.
+        device: device of the state; None loads no state and does not import PyTorch.
+        is_whole: also loads environments and replay buffer, to resume.
+        rank: the rank whose environments and replay buffer are loaded.
 
     Raises:
-        UserError: there is none; or, without `trust`, it names modules and another user made it.
+        UserError: there is no intact checkpoint, or `trust` is needed.
     """
     with user_errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
         if agent_file.is_agent_file(path):
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
-    with contextlib.suppress(AttributeError, KeyError, TypeError):  # a planted one holds anything
-        for key in REMOVED:
-            loaded.config["train"].pop(key, None)
+    config = loaded.config
+    with user_errors(f"The configuration in {loaded.path} is no run's: "):
+        formats.check(formats.Config, config)
+    for key in REMOVED:
+        config["train"].pop(key, None)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "
             f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
             "trust it, add trust=true"
         )
-    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(loaded.config))
+    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(config))
 
 
 def resume_command(folder: Path, key: str = "resume") -> str:
-    """Returns the command that resumes a run or, with the key `rerun`, repeats it."""
+    """Returns the command that resumes a run, or with the key `rerun` repeats it."""
     # quoted for the shell and for Hydra where needed
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
@@ -225,13 +259,15 @@ def to_continue(folder: Path) -> str:
 
 
 def checkpoints_of(path: Path) -> Path:
-    """A checkpoint, which its run may have deleted, or the folder of a run's checkpoints."""
+    """Returns the `checkpoints` folder of a run; a checkpoint, which its run may have deleted, is
+    returned as it is.
+    """
     return path / "checkpoints" if (path / "checkpoints").exists() else path
 
 
 def folder_of(path: Path) -> Path:
-    """The folder of the run that a path belongs to. The results of an agent's file, which may be
-    where nobody writes, go to a folder of their own, which need not exist.
+    """Returns the run folder of a path from `find`. For an agent file, which may be read-only,
+    returns a folder in `RUNS` for its results, which may not exist yet.
     """
     if agent_file.is_agent_file(path):
         return RUNS / f"pretrained-{path.stem}"
@@ -239,5 +275,5 @@ def folder_of(path: Path) -> Path:
 
 
 def name_of(path: Path) -> str:
-    """What tables call the agent at a path: the name of its run's folder, or of its file."""
+    """Returns the agent's name in tables: that of its run folder or agent file."""
     return path.stem if agent_file.is_agent_file(path) else folder_of(path).name

@@ -1,20 +1,26 @@
-"""Files of JSON lines: one object per line, with the environment steps so far as `samples`.
+"""JSON Lines files: one object per line, with the environment steps so far as `samples`.
 
-A killed run loses no line, and a damaged line does not affect others.
+A killed run loses no complete line, and a damaged line does not affect others.
 """
 
 import json
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
+from megastep.agents.runs import formats, strange_files
 from megastep.agents.runs.atomic_files import AppendedFile, write_atomically
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
+
+MAX_BYTES = 2**32
 
 
 class JsonLines:
-    """A file that lines are appended to. Each line is flushed when it is written; lines that a full
-    disk refuses are written with the next one.
+    """Appends lines to a file, unbuffered. Lines that a full disk refuses are written with the next
+    line.
     """
 
     def __init__(self, path: Path | str):
@@ -22,7 +28,7 @@ class JsonLines:
         self.file = AppendedFile(self.path)
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
-        """Appends a line of numbers and strings. Writes NaN and infinity as null."""
+        """Appends a line. NaN and infinity become null."""
         json_values = {
             key: value if isinstance(value, str) or math.isfinite(value) else None
             for key, value in values.items()
@@ -33,18 +39,17 @@ class JsonLines:
         self.file.close()
 
 
-def read(path: Path | str) -> list[dict[str, Any]]:
-    """Returns the objects of a file.
+def read(path: Path | str) -> "list[Row]":
+    """Returns the objects in a file.
 
-    Skips damaged lines with a warning. Skips a last line that a crash cut short silently.
+    Skips damaged lines with a warning, and silently a last line that a crash cut short.
     """
     return [row for row, _ in _intact_lines(Path(path))]
 
 
 def truncate_after(path: Path | str, step: int) -> None:
-    """Removes the lines after `step` environment steps, which a resumed run writes again.
-
-    Removes damaged lines too. Does nothing if there is no such file.
+    """Removes the lines after `step` environment steps, which a resumed run writes again, and
+    damaged lines. Does nothing if the file does not exist.
 
     Raises:
         OSError: there is no space for a copy. The file is unchanged.
@@ -54,13 +59,13 @@ def truncate_after(path: Path | str, step: int) -> None:
         return
     lines = (line + b"\n" for row, line in _intact_lines(path) if row["samples"] <= step)
     data = b"".join(lines)
-    if data != path.read_bytes():
+    if data != strange_files.read_bytes(path, MAX_BYTES):
         write_atomically(path, data)
 
 
-def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
-    """Returns the intact lines, each as an object and as its bytes."""
-    *lines, last = path.read_bytes().split(b"\n")
+def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
+    """Returns (object, bytes) of each intact line."""
+    *lines, last = strange_files.read_bytes(path, MAX_BYTES).split(b"\n")
     rows = [(_parsed(line), line) for line in [*lines, last]]
     damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]
     if damaged:
@@ -69,11 +74,10 @@ def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
     return [(row, line) for row, line in rows if row is not None]
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
+def _parsed(line: bytes) -> "Row | None":
     """Returns a line's object, or None if it is damaged."""
     try:
-        row = json.loads(line)
-    except ValueError:
+        formats.check(formats.Row, row := json.loads(line))
+    except (ValueError, RecursionError):
         return None
-    is_intact = isinstance(row, dict) and isinstance(row.get("samples"), int)
-    return row if is_intact else None
+    return row

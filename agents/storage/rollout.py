@@ -1,8 +1,8 @@
 """Rollouts: T steps of B lanes on the device.
 
-T time, B lanes, M lanes of a minibatch. Row t of a rollout is the observation and the action of
-time t. `reward`, `reset`, `terminal` and `truncated` at row t come from the world that followed,
-t+1. So row t is a valid transition unless its `reset` is set.
+T time, B lanes, M lanes of a minibatch. Row t of a rollout has the observation and the action of
+time t. `reward`, `reset`, `terminal` and `truncated` in row t come from the next world, t+1. So row
+t is a valid transition unless its `reset` is set.
 """
 
 import math
@@ -36,12 +36,12 @@ class Rollout:
         n_lanes: B.
         obs_space: space of the observations.
         action_space: space of the actions.
-        state: the policy's hidden state of B lanes, such as `policy.initial(B)`; is copied.
+        state: the policy's hidden state of B lanes, such as `policy.initial(B)`; copied.
         device: device of all tensors.
-        privileged_space: space of what only the critic sees, or None.
+        privileged_space: space of privileged observations, which only the critic sees, or None.
         obs_dtype: dtype of observations, except integers and spaces that name a dtype.
-        learners: bool per lane of the environment, true for the B lanes that are stored. For
-            environments with opponents; None stores every lane.
+        learners: bool per lane of the environment, true for the B lanes to store, in environments
+            with opponents; None stores every lane.
         values: whether to store the critic's values.
 
     Attributes:
@@ -98,33 +98,34 @@ class Rollout:
         self.values = torch.zeros(rows_and_last, device=device) if values else None
         self.logprobs = torch.zeros(rows, device=device)
         self.reward = torch.zeros(rows, device=device)
-        self.metrics, self.layouts = arrdict(), None
+        self.metrics = arrdict()
+        self.layouts: torch.Tensor | None = None
         self.state = clone(state)
 
     # ---- Writing ----
 
     def allocate_metrics(self, world: arrdict) -> None:
-        """Allocates the metrics of worlds like this one. Call once, before the first step."""
+        """Allocates the metrics that this world has. Call once, before the first step."""
         for name in world.get("metrics", {}):
             self.metrics[name] = torch.zeros_like(self.reward)
 
     def allocate_layouts(self) -> None:
-        """Has the layouts of the environment be stored. Call before the first step."""
+        """Makes the rollout store the environments' layouts. Call before the first step."""
         if self.layouts is None:
             self.layouts = torch.zeros_like(self.reward, dtype=torch.int32)
 
     def store_world(self, t: int, world: arrdict) -> arrdict:
-        """Stores the world at time t. Returns it as it was stored, for the policy to act on."""
+        """Stores the world at time t. Returns the stored copy, on which the policy acts."""
         copy_all(self._of_world(t, world))
         return self.world(t)
 
     def store_transition(self, t: int, world: arrdict) -> None:
-        """Stores reward, end of episode and metrics of the world that followed time t."""
+        """Stores reward, episode end and metrics of the world after the action of time t."""
         copy_all(self._of_transition(t, world))
 
-    def store_decision(self, t: int, decision: arrdict) -> None:
-        """Stores the actions of time t, and their log-probabilities if the decision has any. Call
-        it before the environment steps, which may change the actions in place.
+    def store_decision(self, t: int, decision: Mapping) -> None:
+        """Stores the actions of time t, and log-probabilities if the decision has them. Call it
+        before the environment steps, which may change actions in place.
         """
         pairs = _pairs(self.actions, t, decision["actions"])
         if "logprobs" in decision:
@@ -132,8 +133,8 @@ class Rollout:
         copy_all(pairs)
 
     def store_outcome(self, t: int, world: arrdict, layout: torch.Tensor | None = None) -> arrdict:
-        """Stores the world that followed time t: what happened, at t, and what it looks like, at
-        t + 1. Returns that as it was stored.
+        """Stores the world after the action of time t: reward, episode end, metrics in row t, the
+        observation in row t + 1. Returns `world(t + 1)`, the stored observation.
 
         Args:
             layout: (N,) integers, the environments' layouts in that world, if they are stored.
@@ -142,12 +143,13 @@ class Rollout:
         if layout is not None:
             n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
             by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
+            assert self.layouts is not None
             pairs.append((self.layouts[t], self.select_lanes(by_lane)))
         copy_all(pairs)
         return self.world(t + 1)
 
-    def _of_world(self, t, world):
-        """Returns pairs of what is stored of the world at time t."""
+    def _of_world(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Returns (target, source) pairs for the observation of time t."""
         pairs = [*_pairs(self.obs, t, world["obs"]), (self.starts[t], world["reset"])]
         if "learns" in world:
             pairs.append((self.learns[t], world["learns"]))
@@ -155,8 +157,8 @@ class Rollout:
             pairs += _pairs(self.privileged, t, world["privileged"])
         return pairs
 
-    def _of_transition(self, t, world):
-        """Returns pairs of what is stored at time t of the world that followed."""
+    def _of_transition(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Returns (target, source) pairs for row t, from the world after its action."""
         names = "reward", "terminal", "truncated"
         metrics = [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
         return [*((getattr(self, name)[t], world[name]) for name in names), *metrics]
@@ -183,12 +185,12 @@ class Rollout:
 
     def scatter_actions(self, actions: Tree) -> Tree:
         """Returns actions for every lane of the environment: 0 for lanes that are not stored."""
-        if self.lane_indices is None:
+        if self.lane_indices is None or self.learners is None:
             return actions
         n_env_lanes = len(self.learners)
 
         @mapping
-        def scatter(leaf):
+        def scatter(leaf) -> torch.Tensor:
             zeros = leaf.new_zeros(n_env_lanes, *leaf.shape[1:])
             return zeros.index_copy(0, self.lane_indices, leaf)
 
@@ -198,11 +200,11 @@ class Rollout:
 
     @property
     def reset(self) -> torch.Tensor:
-        """(T, B) bool, whether row t's action was ignored because an episode started instead."""
+        """(T, B) bool, true where the action was ignored because a new episode started."""
         return self.starts[1:]
 
     def world(self, t: int) -> arrdict:
-        """Returns what a policy sees at time t: arrdict(obs, reset), and privileged if stored."""
+        """Returns the policy's input at time t: arrdict(obs, reset), and privileged if stored."""
         world = arrdict(obs=self.obs[t], reset=self.starts[t])
         if self.privileged is not None:
             world["privileged"] = self.privileged[t]
@@ -221,6 +223,7 @@ class Rollout:
 
     def transitions(self) -> dict[str, torch.Tensor]:
         """Returns the arguments of `returns.gae`: (T, B) each, and the last value (B,)."""
+        assert self.values is not None
         return dict(
             value=self.values[:-1],
             last_value=self.values[-1],
@@ -279,7 +282,7 @@ def make_rollout(env: Env, policy: Policy, n_steps: int, values: bool = True) ->
 
 
 def bytes_per_step(env: Env, policy: Policy) -> int:
-    """Returns about how many bytes a rollout takes per step and lane."""
+    """Returns the approximate size of a rollout in bytes per step and lane."""
     obs = _bytes(env.obs_space, default_itemsize=2)
     privileged = 0
     if policy.privileged_space:
@@ -301,23 +304,23 @@ def copy_tree(target: Tree, source: Tree) -> None:
         copy_tree(part, source[key])
 
 
-def without_last(tree: Tree | None) -> Tree | None:
+def without_last(tree: Tree) -> Tree:
     """Returns the first T of T+1 rows, those with actions, of a tree of tensors or of None."""
     return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
 
 
-def _pairs(rows, t, tree):
-    """Returns pairs of the leaves of row t and those of a tree."""
+def _pairs(rows, t, tree) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Returns (target, source) pairs of the leaves of row t and of a tree."""
     targets, sources = spaces.leaves(rows), spaces.leaves(tree)
     return [(target[t], sources[path]) for path, target in targets.items()]
 
 
-def _zeros(space, lead, device, dtype=torch.float32):
+def _zeros(space, lead, device, dtype=torch.float32) -> Tree:
     """Returns zeros (*lead, ...) for a space: int64 for integers, else the dtype that the space
     names, else `dtype`.
     """
 
-    def zeros(leaf):
+    def zeros(leaf) -> torch.Tensor:
         is_integer = isinstance(leaf, spaces.MultiDiscrete)
         leaf_dtype = torch.int64 if is_integer else getattr(leaf, "dtype", None) or dtype
         return torch.zeros(*lead, *leaf.shape, dtype=leaf_dtype, device=device)
@@ -325,7 +328,7 @@ def _zeros(space, lead, device, dtype=torch.float32):
     return spaces.map(zeros, space)
 
 
-def _bytes(space, default_itemsize):
+def _bytes(space, default_itemsize) -> int:
     """Returns the bytes of one value of a space, whose leaves may name a dtype."""
     n_bytes = 0
     for leaf in spaces.leaves(space).values():

@@ -2,23 +2,27 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from megastep.engine import checks
+from megastep.engine.objects import check_objects
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
+
+if TYPE_CHECKING:
+    from megastep.engine.objects import Objects
 
 __all__ = [
     *("AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents"),
     *("check", "check_flag", "check_on_cpu", "check_flag_on_cpu"),
 ]
 
-AGENT_WIDTH = 0.15  # metres
-AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # of the disc around a square of that width
-MAX_RES = ENGINE.constants["MAX_RES"]
+AGENT_WIDTH = 0.15  # metres, of the square that an agent is drawn as
+AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # metres, of the disc around a square of that width
+MAX_RES = ENGINE.constants["MAX_RES"]  # rays per camera
 
 
 class Agents(SetOnce):
@@ -55,7 +59,7 @@ class Agents(SetOnce):
         fps: float = 10.0,
         cameras: Sequence[float] | None = None,
         radius: float = AGENT_RADIUS,
-        device: Any = "cpu",
+        device: torch.device | str = "cpu",
     ):
         device = checks.device("device", device)
         n_envs = checks.integer("n_envs", n_envs, 1)
@@ -102,10 +106,13 @@ def check(agents: Agents) -> None:
 
     Raises:
         EngineError: naming an environment with a non-finite position, angle or velocity, with an
-            action that is NaN, or with an action, layout or goal that does not exist.
+            action that is NaN, or with an action, layout or goal that does not exist; or naming
+            an object, see :func:`check_objects`.
     """
     flag = checks.instance("agents", agents, Agents).error_flag
     check_flag(checks.stored("agents.error_flag", flag))
+    if objects := _objects_of(agents):
+        check_objects(objects)
 
 
 def check_flag(error_flag: torch.Tensor) -> None:
@@ -124,6 +131,14 @@ def check_flag(error_flag: torch.Tensor) -> None:
 def check_on_cpu(agents: Agents) -> None:
     """Does what :func:`check` does if the agents are on the CPU, where nothing synchronises."""
     check_flag_on_cpu(agents.error_flag)
+    if agents.error_flag.is_cpu and (objects := _objects_of(agents)):
+        check_objects(objects)
+
+
+def _objects_of(agents) -> "Objects | None":
+    """Returns the objects in the scenery that the agents were last in, or None."""
+    checked = vars(agents).get("_checked")
+    return checked and checked.scenery.objects
 
 
 def check_flag_on_cpu(error_flag: torch.Tensor) -> None:

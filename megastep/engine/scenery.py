@@ -9,15 +9,20 @@ environment's agents, W walls and T texels of all layouts.
 """
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from megastep.engine import checks, views
+from megastep.engine.objects import Objects
 from megastep.engine.views import JoinedRagged
 from megastep.kernels.build.launch import ENGINE
-from megastep.ragged import Ragged
+from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor, SetOnce
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from typing_extensions import Self
 
 __all__ = ["Layouts", "Scenery"]
 
@@ -46,7 +51,12 @@ class Layouts(SetOnce):
     """
 
     def __init__(
-        self, lines: Ragged, textures: Ragged, lights: Ragged, agent_textures: Any, device: Any
+        self,
+        lines: Ragged,
+        textures: Ragged,
+        lights: Ragged,
+        agent_textures: "ArrayLike",
+        device: torch.device,
     ):
         device = checks.device("device", device)
         lines = checks.ragged("lines", lines, ("W", 2, 2), device)
@@ -78,7 +88,7 @@ class Layouts(SetOnce):
         self._boxes = torch.empty((int(self.box_starts[-1]), 4), device=device)
         self.update_bounding_boxes()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.n_layouts
 
     @property
@@ -99,6 +109,18 @@ class Layouts(SetOnce):
         box, ends = box[:, None].expand(-1, 2), self.lines.vals
         self._boxes[:, :2].fill_(torch.inf).scatter_reduce_(0, box, ends.amin(1), "amin")
         self._boxes[:, 2:].fill_(-torch.inf).scatter_reduce_(0, box, ends.amax(1), "amax")
+
+    @cached_property
+    def extents(self) -> torch.Tensor:
+        """(D, 4): min x, min y, max x, max y of each layout's walls as they were at first."""
+        layout = torch.repeat_interleave(
+            torch.arange(self.n_layouts, device=self._boxes.device), self.box_starts.long().diff()
+        )[:, None].expand(-1, 2)
+        extents = self._boxes.new_full((self.n_layouts, 4), torch.inf)
+        extents[:, 2:] = -torch.inf
+        extents[:, :2].scatter_reduce_(0, layout, self._boxes[:, :2], "amin")
+        extents[:, 2:].scatter_reduce_(0, layout, self._boxes[:, 2:], "amax")
+        return extents
 
     @cached_property
     def max_texels(self) -> int:
@@ -126,10 +148,13 @@ class Scenery(SetOnce):
         layout: (N,) int32, the layout that each environment shows. May be written in place.
         agent_lines: (N, A M, 2, 2), written by every render.
         agent_light: (N, K), written by every render.
+        objects: :class:`~megastep.engine.Objects`, or None; may be set once.
 
     Raises:
         TypeError, ValueError: naming the argument that does not fit.
     """
+
+    objects: Objects | None = None
 
     def __init__(
         self,
@@ -137,8 +162,8 @@ class Scenery(SetOnce):
         lights: Ragged,
         lines: Ragged,
         textures: Ragged,
-        model: Any,
-        device: Any = None,
+        model: "ArrayLike",
+        device: torch.device | str | None = None,
     ):
         n_agents = checks.integer("n_agents", n_agents, 0)
         device = None if device is None else checks.device("device", device)
@@ -174,7 +199,12 @@ class Scenery(SetOnce):
 
     @classmethod
     def of_layouts(
-        cls, n_agents: int, layouts: Layouts, model: Any, model_widths: Any, layout: Any
+        cls,
+        n_agents: int,
+        layouts: Layouts,
+        model: "ArrayLike",
+        model_widths: "ArrayLike",
+        layout: "ArrayLike",
     ) -> "Scenery":
         """Returns scenery whose environments share layouts.
 
@@ -191,7 +221,7 @@ class Scenery(SetOnce):
         self._set(n_agents, layouts, model, model_widths, layout)
         return self
 
-    def _set(self, n_agents, layouts, model, model_widths, layout):
+    def _set(self, n_agents, layouts, model, model_widths, layout) -> None:
         device = layouts.texels.device
         model = checks.floats("model", model, ("M", 2, 2), device)
         n_lines, n_texels = n_agents * len(model), layouts.agent_textures.shape[1]
@@ -209,7 +239,7 @@ class Scenery(SetOnce):
         self.agent_light = torch.ones((self.n_envs, n_texels), device=device)
         self.reach = float(model.norm(dim=-1).max()) if len(model) else 0.0
 
-    def _stored(self):
+    def _stored(self) -> "Self":
         """Returns self. ValueError if the storage of a tensor that may be written was resized."""
         for name in ("layout", "agent_lines", "agent_light"):
             checks.stored(f"scenery.{name}", getattr(self, name))
@@ -248,11 +278,12 @@ class Scenery(SetOnce):
         Takes the same time however many environments there are.
 
         Returns:
-            (lines (l, 2, 2), one lit texture (w, 3) per line, lights (l, 3)), agents' lines first.
+            (lines (l, 2, 2), one lit texture (w, 3) per line, lights (l, 3)): agents' lines, then
+            objects', then walls.
         """
         e = checks.integer("e", e, -self.n_envs, self.n_envs - 1)
         layouts, d = self._stored().layouts, int(self.layout[e])
-        lines = torch.cat([self.agent_lines[e], layouts.lines[d]])
+        lines = torch.cat([*self._moving_lines(e), layouts.lines[d]])
         first, last = layouts.wall_starts[d : d + 2].tolist()
         bounds = layouts.texel_starts[first : last + 1].tolist()
         model_bounds = self.model_texels.tolist()
@@ -261,31 +292,50 @@ class Scenery(SetOnce):
         walls = texels[:, :3] * texels[:, 3:]
         return (
             lines,
-            (*agents.split(_widths(model_bounds)), *walls.split(_widths(bounds))),
+            (
+                *agents.split(_widths(model_bounds)),
+                *self._of_objects(e),
+                *walls.split(_widths(bounds)),
+            ),
             layouts.lights[d].clone(),
         )
 
+    def _moving_lines(self, e) -> list[torch.Tensor]:
+        # the lines of an environment's agents and objects
+        return (
+            [self.agent_lines[e]]
+            if self.objects is None
+            else [self.agent_lines[e], self.objects.lines[e]]
+        )
 
-def _same(name, what, expected, actual):
+    def _of_objects(self, e) -> tuple[torch.Tensor, ...]:
+        # the lit texel (1, 3) of each line of an environment's objects
+        if self.objects is None:
+            return ()
+        texels = self.objects.texels[e, self.objects.line_object.long()]
+        return (texels[:, :3] * texels[:, 3:]).split(1)
+
+
+def _same(name, what, expected, actual) -> None:
     if expected != actual:
         raise ValueError(f"{name} must have {what}, so {expected}, but {actual} were given")
 
 
-def _widths(bounds):
+def _widths(bounds) -> list[int]:
     return [last - first for first, last in zip(bounds, bounds[1:])]
 
 
-def _fixed(name, tensor):
+def _fixed(name, tensor) -> torch.Tensor:
     return ReadOnlyTensor(
         tensor, f"{name} is read-only, because other tensors depend on it: make another Scenery"
     )
 
 
-def _of_fixed_widths(name, vals, widths):
-    return Ragged(vals, _fixed(f"{name}.widths", widths.clone()))
+def _of_fixed_widths(name, vals, widths) -> RaggedTorch:
+    return RaggedTorch(vals, _fixed(f"{name}.widths", widths.clone()))
 
 
-def _starts(name, widths):
+def _starts(name, widths) -> torch.Tensor:
     """Returns (n + 1,) int32, the start of each subarray and the end of the last one."""
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:

@@ -5,7 +5,7 @@ They step on the CPU, one after the other, even if the learner is on a GPU. B = 
 
 import inspect
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -14,6 +14,9 @@ from pydantic import Field
 from megastep.envs.on_host.env import VectorizedEnv
 from megastep.imports import import_object
 from megastep.settings import checked
+
+if TYPE_CHECKING:
+    import gymnasium
 
 __all__ = ["PettingZoo"]
 
@@ -44,7 +47,7 @@ class PettingZoo(VectorizedEnv):
         n_envs: number of environments, N.
         id: import path of the function that makes one, such as
             ``pettingzoo.sisl.multiwalker_v9:parallel_env``.
-        kwargs: its arguments.
+        kwargs: arguments of that function.
         seed: each environment is reset with a seed of its own, which derives from this one.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
@@ -92,7 +95,7 @@ class ParallelEnvs:
         ValueError: if the spaces of two agents differ, or agents come later.
     """
 
-    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, Any]):
+    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, object]):
         from gymnasium.vector.utils import batch_space, create_empty_array
 
         parameters = inspect.signature(make).parameters
@@ -113,7 +116,7 @@ class ParallelEnvs:
         self.reward = np.zeros((n_envs, len(self.agents)))
         self.terminated = np.zeros(self.reward.shape, bool)
 
-    def _common(self, space_of):
+    def _common(self, space_of) -> "gymnasium.Space":
         first, *others = self.agents
         for agent in others:
             if space_of(agent) != space_of(first):
@@ -152,16 +155,16 @@ class ParallelEnvs:
         for env in self.envs:
             env.close()
 
-    def _begin(self, e, env, seed=None):
+    def _begin(self, e, env, seed=None) -> None:
         self._observe(e, env.reset(seed=seed)[0])
         self.reward[e], self.terminated[e] = 0, False
 
-    def _observe(self, e, observed):
+    def _observe(self, e, observed) -> None:
         for a, agent in enumerate(self.agents):
             if agent in observed:
                 self.latest[e * len(self.agents) + a] = observed[agent]
 
-    def _observations(self):
+    def _observations(self) -> np.ndarray | dict | tuple:
         from gymnasium.vector.utils import concatenate
 
         return concatenate(self.single_observation_space, self.latest, self.batch)

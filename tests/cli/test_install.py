@@ -2,6 +2,7 @@
 the dependencies of this one; and, nightly, in one that downloads them and the OpenAI Agents SDK.
 """
 
+import importlib.metadata
 import os
 import re
 import shutil
@@ -24,14 +25,23 @@ ENVIRONMENT = {key: value for key, value in os.environ.items() if key != "PYTHON
 #: Source folders with files that the wheel must contain, and where it has them.
 PACKAGE_DATA = {
     "configs": ("megastep/agents/configs", {".yaml"}),
-    "agents": ("megastep/agents", {".py", ".h", ".cu", ".cpp", ".safetensors", ".md"}),
-    "megastep": ("megastep", {".py", ".h", ".cu", ".cpp", ".npz", ".json", ".sha256"}),
+    "agents": ("megastep/agents", {".py", ".typed", ".h", ".cu", ".cpp", ".safetensors", ".md"}),
+    "megastep": ("megastep", {".py", ".typed", ".h", ".cu", ".cpp", ".npz", ".json", ".sha256"}),
 }
+
+
+def has_setuptools():
+    try:
+        return int(importlib.metadata.version("setuptools").partition(".")[0]) > 70
+    except importlib.metadata.PackageNotFoundError:
+        return False
 
 
 def build_wheel(source, folder):
     """Builds the wheel of a source folder with pip. Returns its path."""
     command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source]
+    if has_setuptools():  # no need to install another one
+        command.append("--no-build-isolation")
     subprocess.run(list(map(str, command)), check=True, env=ENVIRONMENT, cwd=folder)
     (wheel,) = folder.glob(f"{DISTRIBUTION}-*.whl")
     return wheel

@@ -9,17 +9,17 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import aligned, aligned_rows
+from megastep.agents.networks.kernels.library import aligned, aligned_rows
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
 # Lambdas with type parameters are device code only if everything is.
 _FLAGS = *FAST_CUDA_FLAGS, "--device-as-default-execution-space"
-PROGRAM = Program(Path(__file__).parent / "convolutions", _FLAGS)
-MAX_CHANNELS = PROGRAM.constants["CONV_INPUTS"]
-CHANNELS = PROGRAM.constants["CONV_CHANNELS"]
+LIBRARY = KernelLibrary(Path(__file__).parent / "convolutions", _FLAGS)
+MAX_CHANNELS = LIBRARY.constants["CONV_INPUTS"]
+CHANNELS = LIBRARY.constants["CONV_CHANNELS"]
 _ROWS, _THREADS, _BLOCKS = (
-    PROGRAM.constants[f"CONV_{name}"] for name in "ROWS THREADS BLOCKS".split()
+    LIBRARY.constants[f"CONV_{name}"] for name in "ROWS THREADS BLOCKS".split()
 )
 ALIGNMENT = 8  # numbers in 16 bytes
 _BARRIER = 16  # bytes of shared memory that count copies
@@ -84,7 +84,7 @@ def conv_forward(
     n_blocks = min(-(-n_rows // _ROWS), _BLOCKS * gpu.multi_processor_count)
     kernel, blocks, sizes = forward_kernel(n_channels, n_columns, n_blocks)
     launch(
-        *(PROGRAM, kernel, rows.device, blocks),
+        *(LIBRARY, kernel, rows.device, blocks),
         rows=rows,
         **{name: aligned(weight) for name, weight in weights.items()},
         features=features,
@@ -114,7 +114,7 @@ def forward_kernel(
     return f"conv_forward_{4 if n_channels <= 4 else 8}", blocks, sizes
 
 
-def _forward_sizes(n_channels, n_columns):
+def _forward_sizes(n_channels, n_columns) -> dict[str, int]:
     """Returns sizes in shared memory, in numbers.
 
     Threads of eight channels and rows read 16 bytes at once, from different banks: a channel takes
@@ -129,7 +129,7 @@ def _forward_sizes(n_channels, n_columns):
     return {name: ALIGNMENT * size for name, size in sizes.items()}
 
 
-def _forward_bytes(channel_size, row_size, feature_size):
+def _forward_bytes(channel_size, row_size, feature_size) -> int:
     return 2 * _ROWS * (2 * row_size + feature_size)
 
 
@@ -170,7 +170,7 @@ def conv_backward(
     sums = rows.new_empty(n_blocks, sum(sizes), dtype=torch.float32)
     kernel, blocks, shared_sizes = backward_kernel(n_channels, n_columns, n_blocks)
     launch(
-        *(PROGRAM, kernel, rows.device, blocks),
+        *(LIBRARY, kernel, rows.device, blocks),
         d_features=d_features,
         features=features,
         rows=rows,
@@ -199,14 +199,14 @@ def backward_kernel(
     return f"conv_backward_{-(-n_channels // 2) * 2}", blocks, sizes
 
 
-def _backward_blocks(n_rows, n_channels, n_columns, gpu):
+def _backward_blocks(n_rows, n_channels, n_columns, gpu) -> int:
     """Returns how many blocks run at once, at most one for each tile of rows."""
     _, n_bytes = _backward_sizes(n_channels, n_columns)
     n_at_once = min(_BLOCKS, gpu.shared_memory_per_multiprocessor // (n_bytes + _RESERVED))
     return max(min(-(-n_rows // _ROWS), n_at_once * gpu.multi_processor_count), 1)
 
 
-def _backward_sizes(n_channels, n_columns):
+def _backward_sizes(n_channels, n_columns) -> tuple[dict[str, int], int]:
     """Returns sizes in shared memory, in numbers, and its bytes.
 
     Rows start in other banks than those that a warp reads with them: those of features an odd

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 
-MAX_OUTPUTS = CORES.constants["DUELLING_OUTPUTS"]
-_STRIP, _THREADS = CORES.constants["DUELLING_STRIP"], CORES.constants["DUELLING_THREADS"]
+MAX_OUTPUTS = LIBRARY.constants["DUELLING_OUTPUTS"]
+_STRIP, _THREADS = LIBRARY.constants["DUELLING_STRIP"], LIBRARY.constants["DUELLING_THREADS"]
 _BLOCK_ROWS = BLOCK // WARP * (WARP // MAX_OUTPUTS)
 
 
@@ -56,19 +56,19 @@ def act(
     n_lanes, device = len(hidden), hidden.device
     actions = torch.empty(n_lanes, shape[0], dtype=torch.int64, device=device)
     logprobs = torch.empty(n_lanes, device=device)
-    results = dict(actions=actions, logprobs=logprobs)
-    options = dict(noise=noise, epsilon=epsilon, usual_epsilon=usual_epsilon)
-    return _forward("act", hidden, parameters, shape, **results, **options), actions, logprobs
+    tensors = dict(noise=noise, epsilon=epsilon, actions=actions, logprobs=logprobs)
+    values = _forward("act", hidden, parameters, shape, usual_epsilon, **tensors)
+    return values, actions, logprobs
 
 
-def _forward(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors):
+def _forward(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors) -> torch.Tensor:
     n_rows, n_features = hidden.shape
     values = torch.empty(n_rows, *shape, device=hidden.device)
     names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"
     optional = dict.fromkeys(("noise", "epsilon", "actions", "logprobs"))
     blocks = Blocks(-(-n_rows // _BLOCK_ROWS))
     launch(
-        *(CORES, f"duelling_{operation}", hidden.device, blocks),
+        *(LIBRARY, f"duelling_{operation}", hidden.device, blocks),
         **dict(zip(names, parameters, strict=True), hidden=hidden, values=values),
         **(optional | tensors),
         n_rows=n_rows,
@@ -105,7 +105,7 @@ def backward(
     d_hidden = torch.empty_like(hidden)
     sums = d_values.new_empty(n_strips, sum(sizes))
     launch(
-        *(CORES, "duelling_backward", hidden.device, Blocks(n_strips, n_parts, _THREADS)),
+        *(LIBRARY, "duelling_backward", hidden.device, Blocks(n_strips, n_parts, _THREADS)),
         hidden=hidden,
         value_weight=value_weight,
         advantage_weight=advantage_weight,

@@ -10,20 +10,24 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
 # Lambdas with type parameters are device code only if everything is.
-PROGRAM = Program(
+LIBRARY = KernelLibrary(
     Path(__file__).parent / "clusters", (*FAST_CUDA_FLAGS, "--device-as-default-execution-space")
 )
 WIDTH = 256
 MIN_STEPS = 2  # for one step, loading the weights takes longer than the products
-MAX_STEPS = PROGRAM.constants["MAX_STEPS"]
-_THREADS = PROGRAM.constants["SEQUENCE_THREADS"]
-_LANES = PROGRAM.constants["SEQUENCE_LANES"]
-_RANKS = WIDTH // PROGRAM.constants["BLOCK_UNITS"]  # blocks of a cluster
-_MEMORY = max(PROGRAM.constants[f"{name}_MEMORY"] for name in ("FORWARD", "BACKWARD"))
+MAX_STEPS = LIBRARY.constants["MAX_STEPS"]
+_THREADS = LIBRARY.constants["SEQUENCE_THREADS"]
+_LANES = LIBRARY.constants["SEQUENCE_LANES"]
+#: Outputs, recurrent inputs, the last output and cell, and what the backward pass needs.
+Unrolled = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, tuple]
+#: Those of the gates, of the bias, and of the output and the cell before the sequence, if needed.
+Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]
+_RANKS = WIDTH // LIBRARY.constants["BLOCK_UNITS"]  # blocks of a cluster
+_MEMORY = max(LIBRARY.constants[f"{name}_MEMORY"] for name in ("FORWARD", "BACKWARD"))
 
 
 def is_supported(x: torch.Tensor) -> bool:
@@ -41,7 +45,7 @@ def is_supported(x: torch.Tensor) -> bool:
     return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= _MEMORY
 
 
-def forward(gates, weight, reset, output, cell, needs_backward, residual=None):
+def forward(gates, weight, reset, output, cell, needs_backward, residual=None) -> Unrolled:
     """Unrolls the recurrence.
 
     Args:
@@ -92,7 +96,7 @@ def forward(gates, weight, reset, output, cell, needs_backward, residual=None):
     return outputs, hiddens, after, last_cell, saved
 
 
-def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
+def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell) -> Gradients:
     """Computes the gradients of `forward`'s gates, output and cell.
 
     Args:
@@ -132,8 +136,8 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
     return d_gates, sum_rows(d_bias), d_last_output, d_last_cell
 
 
-def _where(direction, device, n_clusters):
+def _where(direction, device, n_clusters) -> tuple[KernelLibrary, str, torch.device, Blocks]:
     """Returns the arguments of a launch but its fields."""
-    shared = PROGRAM.constants[f"{direction.upper()}_MEMORY"]
+    shared = LIBRARY.constants[f"{direction.upper()}_MEMORY"]
     blocks = Blocks(_RANKS * n_clusters, threads=_THREADS, shared=shared)
-    return PROGRAM, f"lstm_sequence_{direction}_{WIDTH}", device, blocks
+    return LIBRARY, f"lstm_sequence_{direction}_{WIDTH}", device, blocks

@@ -6,9 +6,11 @@ their gradients are in the compute dtype, `start` and `last` (B, W) are float32,
 bool.
 """
 
+from typing import TYPE_CHECKING
+
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import (
-    CORES,
+from megastep.agents.networks.kernels.library import (
+    LIBRARY,
     kernel,
     n_threads,
     sizes,
@@ -16,11 +18,14 @@ from megastep.agents.networks.kernels.program import (
 )
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
+if TYPE_CHECKING:
+    import torch
+
 _LARGEST_BLOCK = 256  # threads, of `backward`
 _MANY_BLOCKS = 128  # about one per multiprocessor
 
 
-def forward(gates, reset, start, residual, states, outputs, last):
+def forward(gates, reset, start, residual, states, outputs, last) -> None:
     """Computes the last three from the gates and the first state.
 
     Args:
@@ -29,7 +34,7 @@ def forward(gates, reset, start, residual, states, outputs, last):
     """
     operation = "mingru_step" if len(gates) == 1 else "mingru_forward"
     launch(
-        *(CORES, kernel(operation, gates.dtype), start.device, n_threads(start)),
+        *(LIBRARY, kernel(operation, gates.dtype), start.device, n_threads(start)),
         **sizes(start),
         gates=gates,
         reset=reset,
@@ -42,7 +47,9 @@ def forward(gates, reset, start, residual, states, outputs, last):
     )
 
 
-def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual):
+def backward(
+    gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
+) -> "torch.Tensor":
     """Computes the gradients of `forward`'s gates and first state from those of its outputs.
 
     Args:
@@ -62,7 +69,7 @@ def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d
     d_biases = start.new_empty(-(-n_lanes // per_block), gates.shape[-1])
     blocks = Blocks(-(-n_threads(start) // block), threads=block, shared=4 * n_units * block)
     launch(
-        *(CORES, kernel("mingru_backward", gates.dtype), start.device, blocks),
+        *(LIBRARY, kernel("mingru_backward", gates.dtype), start.device, blocks),
         **sizes(start),
         gates=gates,
         reset=reset,

@@ -93,14 +93,14 @@ class Plans:
         self.lengths = torch.cat(
             [pad(part, (0, width - part.shape[1]), value=torch.inf) for part in lengths]
         )
-        on = dict(dtype=torch.float32, device=device)
+        on: dict = dict(dtype=torch.float32, device=device)
         self._corners = torch.tensor([(0, 0), (0, 1), (1, 0), (1, 1)], **on)
         offsets = CELL * SQUARE * torch.tensor(EXITS, **on)
         self.beside = offsets[[max(map(abs, pair)) < 2 for pair in EXITS]]
         exits = [self._exits(plan, part, offsets) for plan, part in enumerate(nodes)]
         self.exits, self.metres = map(torch.cat, zip(*exits))
 
-    def _exits(self, plan, nodes, offsets):
+    def _exits(self, plan, nodes, offsets) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the nodes (m, K) int32 near the nodes of a plan (m, 2), and the lengths (m, K)
         float16 of the straight ways there.
         """
@@ -122,9 +122,9 @@ class Plans:
         """Returns the lengths (n, K) of straight ways from points (n, 2) to others (n, K, 2), more
         if they are narrow, and more than `BLOCKED` if there is a wall.
         """
-        share = torch.linspace(0, 1, n_samples + 1, device=start.device)[1:, None]
+        fraction = torch.linspace(0, 1, n_samples + 1, device=start.device)[1:, None]
         offsets = ends - start[:, None]
-        points = start[:, None, None] + share * offsets[:, :, None]
+        points = start[:, None, None] + fraction * offsets[:, :, None]
         room = self.clearances(plan, points).amin(-1) - self._radius
         lengths = offsets.norm(dim=-1) + NARROW * (WIDE - room).clamp(min=0)
         return lengths + BLOCKED * (room < -TIGHT)
@@ -133,8 +133,8 @@ class Plans:
         """Returns clearances that are interpolated between the centres of cells."""
         corner = points - CELL / 2
         origin = self._origins[plan].view(-1, *[1] * (points.ndim - 2), 2)
-        share = ((corner - origin) / CELL).frac()[..., None, :]
-        weights = torch.where(self._corners > 0, share, 1 - share).prod(-1)
+        fraction = ((corner - origin) / CELL).frac()[..., None, :]
+        weights = torch.where(self._corners > 0, fraction, 1 - fraction).prod(-1)
         beside = corner[..., None, :] + CELL * self._corners
         return (weights * self.clearances(plan, beside)).sum(-1)
 
@@ -142,27 +142,27 @@ class Plans:
         """Returns the nodes (n, ...) in the squares of points (n, ..., 2), -1 if there is none."""
         return self._at(self._squares, plan, points, CELL * SQUARE)
 
-    def _at(self, grids, plan, points, size):
+    def _at(self, grids, plan, points, size) -> torch.Tensor:
         shape = len(plan), *[1] * (points.ndim - 2)
-        place = (points - self._origins[plan].view(*shape, 2)) / size
-        column, row = place.long().unbind(-1)
+        cells = (points - self._origins[plan].view(*shape, 2)) / size
+        column, row = cells.long().unbind(-1)
         height, width = grids.shape[1:]
         row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
         return grids.view(-1)[(plan.view(shape) * height + row) * width + column]
 
 
-def _area(walls):
+def _area(walls) -> float:
     return np.prod(np.ptp(walls, (0, 1)))
 
 
-def _stack(tensors, value=0):
+def _stack(tensors, value=0) -> torch.Tensor:
     """Returns tensors (h, w) of different sizes, padded at their ends by a value, as one."""
     height, width = np.max([tensor.shape for tensor in tensors], 0).tolist()
     ends = [(0, width - tensor.shape[1], 0, height - len(tensor)) for tensor in tensors]
     return torch.stack([pad(tensor, end, value=value) for tensor, end in zip(tensors, ends)])
 
 
-def _surveys(graph, spawns, targets):
+def _surveys(graph, spawns, targets) -> list[tuple]:
     """Returns for each home of a graph origin (2,), clearances (H, W) uint8, squares (h, w) int64,
     nodes (m, 2), targets (l, 2) and lengths (m, l). Nodes are numbered from 0.
 
@@ -184,7 +184,7 @@ def _surveys(graph, spawns, targets):
     return [*zip(origins, clearances, all_squares, nodes, targets, lengths)]
 
 
-def _grid(graph, d):
+def _grid(graph, d) -> tuple[torch.Tensor, ...]:
     """Returns origin and clearances of a home's plan, and of its squares the spot furthest from
     walls: its clearance (h, w), whether an agent fits there (h, w), and where it is (h, w, 2).
     """
@@ -201,7 +201,7 @@ def _grid(graph, d):
     return graph.tensor(low, np.float32), levels, room, room > graph.radius + CLEAR, points[spot]
 
 
-def _best(values, side):
+def _best(values, side) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the highest of the values (H, W) in each square of `side` x `side`, (h, w), and its
     flat index.
     """
@@ -213,12 +213,12 @@ def _best(values, side):
     return highest, row * values.shape[1] + column
 
 
-def _lengths(graph, goals, points):
+def _lengths(graph, goals, points) -> list[torch.Tensor]:
     """Returns the lengths of the shortest paths, (k, g) for each home, from points (k, 2) to goals
     (g, 2). A graph takes equally many of each home, so the last ones are repeated.
     """
 
-    def of_all(parts):
+    def of_all(parts) -> np.ndarray:
         most = max(map(len, parts))
         parts = [part.cpu()[torch.arange(most).clamp(max=len(part) - 1)] for part in parts]
         return torch.stack(parts).numpy() - graph.origins[:, None]

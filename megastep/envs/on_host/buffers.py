@@ -1,5 +1,7 @@
 """Host memory through which worlds reach the learner's device and actions come back."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -19,17 +21,25 @@ class HostBuffers:
         obs_space: space of one lane's observation.
         action_space: space of one lane's actions.
         device: where worlds go and actions come from.
+        metrics: names of the metrics in worlds.
     """
 
     IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
 
-    def __init__(self, n_lanes: int, obs_space: Space, action_space: Space, device: torch.device):
+    def __init__(
+        self,
+        n_lanes: int,
+        obs_space: Space,
+        action_space: Space,
+        device: torch.device,
+        metrics: Sequence[str] = (),
+    ):
         self.device, self.on_gpu = device, device.type == "cuda"
 
-        def empty(dtype, *shape):
+        def empty(dtype, *shape) -> torch.Tensor:
             return torch.empty((n_lanes, *shape), dtype=dtype, pin_memory=self.on_gpu)
 
-        def of_space(space):
+        def of_space(space) -> torch.Tensor:
             dtypes = {spaces.MultiDiscrete: torch.int64, spaces.MultiContinuous: torch.float32}
             return empty(dtypes.get(type(space)) or space.dtype, *space.shape)
 
@@ -37,6 +47,8 @@ class HostBuffers:
         self.world = arrdict(
             obs=spaces.map(of_space, obs_space), reward=empty(torch.float32), **flags
         )
+        if metrics:
+            self.world["metrics"] = arrdict({name: empty(torch.float32) for name in metrics})
         self.actions = spaces.map(of_space, action_space)
         self.arrays = [leaf.numpy() for leaf in leaves(self.world)]
         self.copied = torch.cuda.Event() if self.on_gpu else None
@@ -44,7 +56,7 @@ class HostBuffers:
     def send(self, world: arrdict) -> arrdict:
         """Returns a world of arrays as one of new tensors on the device."""
         pairs = zip(self.arrays, leaves(world), strict=True)
-        if not self.on_gpu:
+        if self.copied is None:
             tensors = (torch.from_numpy(np.array(array, to.dtype)) for to, array in pairs)
             return _tree(world, tensors)
         self.copied.synchronize()  # the last world may still be on its way
@@ -58,7 +70,7 @@ class HostBuffers:
         """Returns actions as arrays, once the device has chosen them. They are valid until the next
         call.
         """
-        if not self.on_gpu:
+        if self.copied is None:
             return spaces.map(lambda _, leaf: leaf.numpy(), self.actions, actions)
         spaces.map(lambda to, leaf: to.copy_(leaf, non_blocking=True), self.actions, actions)
         self.copied.record()
@@ -66,7 +78,7 @@ class HostBuffers:
         return spaces.map(lambda leaf: leaf.numpy(), self.actions)
 
 
-def _tree(like, values):
+def _tree(like, values) -> arrdict:
     """Returns the next values of an iterator as a tree with the keys of another."""
     return arrdict(
         {

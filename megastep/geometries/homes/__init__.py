@@ -21,7 +21,7 @@ SLANTED = 0.08  # fraction of homes with a corner cut off at 45 degrees
 START = 100  # cm; the minimum coordinate of a home
 
 
-def _attempt(count, generator, style):
+def _attempt(count, generator, style) -> list[tuple]:
     """Tries to plan `count` rooms. Returns [(cost, footprint, rooms, contacts, depth, gaps)], or []
     if it fails.
     """
@@ -45,7 +45,7 @@ def _attempt(count, generator, style):
     return [(cost, footprint, rooms, meetings, depth, gaps)]
 
 
-def _best_plan(generator, style):
+def _best_plan(generator, style) -> tuple:
     """Returns the best of a few plans: (cost, footprint, rooms, contacts, depth, gaps).
 
     The number of rooms is drawn once. Plans of few rooms succeed more often, so drawing it again
@@ -63,7 +63,7 @@ def _best_plan(generator, style):
         count -= 1
 
 
-def _doorways(gaps, depth, half_blocked, generator):
+def _doorways(gaps, depth, half_blocked, generator) -> tuple[list, list]:
     """Returns the rectangles in front of doors and openings that stay clear, and the parts of
     their gaps that clutter blocks, in the fraction `half_blocked` of them.
     """
@@ -82,7 +82,9 @@ def _doorways(gaps, depth, half_blocked, generator):
     return clear, blocked
 
 
-def _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator):
+def _furnish(
+    rooms, solids, gaps, depth, lights, triangle, style, generator
+) -> list[tuple[int, int, int, int]]:
     """Returns the furniture of a home: rectangles, none in a room with a slanted corner."""
     clear, blocked = _doorways(gaps, depth, style.half_blocked, generator)
     reach = furniture.BESIDE_LIGHT
@@ -95,6 +97,10 @@ def _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator):
             room.region, solids, clear, style.furniture, generator, style.clutter, blocked
         )
     ]
+
+
+def _metres(segments, shift) -> np.ndarray:
+    return ((np.reshape(segments, (-1, 2, 2)) + shift) / 100).astype(np.float32)
 
 
 def generate(seed: int, outer: bool = True, density: float = 1, clutter: float = 0) -> dotdict:
@@ -111,9 +117,9 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
 
     Returns:
         A geometry with further keys: `rooms`, the kind of each room in the order of the masks'
-        numbers; `areas`, their clear areas in m2; `doors` and `openings`, the widths in metres of
-        the gaps with and without a door; `n_outer`, the number of walls, the last ones, that are
-        the envelope's outer face.
+        numbers; `areas`, their clear areas in m2; `doors` and `openings`, (K, 2, 2) float32, the
+        segments in metres across the gaps with and without a door; `n_outer`, the number of walls,
+        the last ones, that are the envelope's outer face.
     """
     generator, style = PortableGenerator(seed), plan.style(density, clutter)
     _, footprint, rooms, meetings, depth, gaps = _best_plan(generator, style)
@@ -153,7 +159,9 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
     if style.furniture:  # no line marks the cells that are wholly inside it
         y, x = ((np.arange(n) + 0.5) * geometry.RES * 100 for n in masks.shape)
         masks[(masks > 0) & ~walls.are_indoors(grid, x - shift[0], y[::-1] - shift[1])] = 0
-    doors = [[(g.high - g.low) / 100 for g in gaps if g.door is kind] for kind in (True, False)]
+    doors, open_ = (
+        [walls.across(g) for g in gaps if g.door is has_door] for has_door in (True, False)
+    )
     return dotdict(
         id=seed,
         walls=lines[: len(lines) if outer else len(inside)].astype(np.float32),
@@ -162,7 +170,7 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
         res=geometry.RES,
         rooms=[room.kind for room in rooms],
         areas=walls.areas(grid, [room.region for room in rooms]),
-        doors=doors[0],
-        openings=doors[1],
+        doors=_metres(doors, shift),
+        openings=_metres(open_, shift),
         n_outer=len(outside) if outer else 0,
     )

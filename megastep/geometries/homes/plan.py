@@ -106,7 +106,7 @@ def room_count(generator: PortableGenerator, style: Style = NORMAL) -> int:
 
 def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]:
     """Draws `count` rooms: a list of (kind, area in cm2)."""
-    kinds = list(CORE[:count])
+    kinds: list[str] = [*CORE[:count]]
     maximum = {"bedroom": 1 + count // 4, "bath": 1 + count // 6, "lobby": 1, "utility": 1}
     while len(kinds) < count:
         allowed = [kind for kind in KINDS if kinds.count(kind) < maximum.get(kind, count)]
@@ -121,13 +121,13 @@ def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]
     ]
 
 
-def _notch(width, height, share, at_corner, generator):
-    """Draws a notch: a rectangle of about `share` of the bounding box, at a corner or in the middle
-    of a side. Returns None if it does not fit.
+def _notch(width, height, fraction, at_corner, generator) -> regions.Rectangle | None:
+    """Draws a notch: a rectangle of about `fraction` of the bounding box, at a corner or in the
+    middle of a side. Returns None if it does not fit.
     """
     ratio = generator.uniform(0.6, 1.7)
-    across = int(sqrt(share * width * height * ratio)) // STEP * STEP
-    down = int(sqrt(share * width * height / ratio)) // STEP * STEP
+    across = int(sqrt(fraction * width * height * ratio)) // STEP * STEP
+    down = int(sqrt(fraction * width * height / ratio)) // STEP * STEP
     if min(across, down) < MIN_NOTCH or across > width - MIN_NECK or down > height - MIN_NECK:
         return None
     left, low = generator.below(2) * (width - across), generator.below(2) * (height - down)
@@ -139,7 +139,7 @@ def _notch(width, height, share, at_corner, generator):
     return left, low, left + across, low + down
 
 
-def _apart(a, b):
+def _apart(a, b) -> int:
     """Returns the larger of the gaps along x and y between two rectangles, in cm."""
     return max(max(a[0], b[0]) - min(a[2], b[2]), max(a[1], b[1]) - min(a[3], b[3]))
 
@@ -149,19 +149,19 @@ def footprint(total: int, generator: PortableGenerator) -> regions.Region:
     notches. Returns a region.
     """
     aspect = min(max(generator.lognormal(MEDIAN_ASPECT, SIGMA_ASPECT), 1.0), MAX_ASPECT)
-    shares = [generator.uniform(0.03, 0.15) for _ in range(generator.pick(NOTCHES))]
+    fractions = [generator.uniform(0.03, 0.15) for _ in range(generator.pick(NOTCHES))]
     left = 1.0
-    for share in shares:
-        left -= share
+    for fraction in fractions:
+        left -= fraction
     long = sqrt(total * WALLS / left * aspect)
     sides = [max(int(side) // STEP * STEP, MIN_NECK) for side in (long, long / aspect)]
     width, height = sides if generator.chance(0.5) else sides[::-1]
 
     notches = []
-    for share in shares:
+    for fraction in fractions:
         at_corner = generator.chance(AT_CORNER)
         for _ in range(6):
-            notch = _notch(width, height, share, at_corner, generator)
+            notch = _notch(width, height, fraction, at_corner, generator)
             if notch and all(_apart(notch, other) >= MIN_NECK for other in notches):
                 notches.append(notch)
                 break
@@ -173,7 +173,7 @@ def footprint(total: int, generator: PortableGenerator) -> regions.Region:
     )
 
 
-def _without(width, height, notches):
+def _without(width, height, notches) -> list:
     """Returns the box from (0, 0) less the notches, as a region."""
     lines = sorted({0, width, *(x for notch in notches for x in (notch[0], notch[2]))})
     region = []

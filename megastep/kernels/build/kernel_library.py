@@ -1,0 +1,117 @@
+"""A folder of kernels, compiled together for the CPU and for the GPU."""
+
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from megastep.kernels.build import headers
+
+__all__ = ["CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "KernelLibrary"]
+
+#: The folder of the engine's kernels. Its headers in ``common/`` are for all kernel libraries.
+KERNELS = Path(__file__).parents[1]
+#: The C++ compiler's flags. No fused multiply-adds, as below.
+CPU_FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-ffp-contract=off",
+    "-fno-tree-slp-vectorize",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp",
+    "-shared",
+    "-fPIC",
+)
+#: NVRTC's flags, without the architecture. No fused multiply-adds and IEEE division, so that the
+#: GPU computes the same bits as the CPU.
+CUDA_FLAGS = (
+    "--std=c++17",
+    "--fmad=false",
+    "--prec-div=true",
+    "--prec-sqrt=true",
+    "--ftz=false",
+    "--generate-line-info",
+)
+#: NVRTC's flags where no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
+FAST_CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
+
+
+class KernelLibrary:
+    """The kernels in one folder, which are built together when one is first launched.
+
+    The folder holds one ``.cpp`` file per operation for the CPU, one ``.cu`` file for the GPU, or
+    both; headers; ``params.h``, which declares the struct of each launch; and ``constants.h`` if
+    the kernels share constants with Python. Sources include the folder's headers by name and the
+    common ones as ``"common/errors.h"``. :mod:`~megastep.kernels.build.headers` lists the
+    declarations that are read from headers.
+
+    Args:
+        folder: where the sources are.
+        cuda_flags: NVRTC's flags, without the architecture.
+        cpu_flags: the C++ compiler's flags.
+
+    Attributes:
+        constants: {name: number} from ``constants.h``, the folder's and the common one.
+        packers: {struct: function of {field: value} that packs one}, as
+            :func:`~megastep.kernels.build.headers.builder` returns it.
+        params: a function for each struct; ``params.RowParams(n=64, ...)`` packs one that is a
+            field of another.
+        cpu_operations: {operation: struct} of the ``.cpp`` files.
+        cuda_operations: {operation: struct} of the ``.cu`` files.
+        early_operations: those that a GPU may start before the previous kernel has ended: their
+            first statement is ``wait_for_previous();`` of ``common/dependent_launch.h``.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        cuda_flags: tuple[str, ...] = CUDA_FLAGS,
+        cpu_flags: tuple[str, ...] = CPU_FLAGS,
+    ):
+        self.folder, self.cuda_flags, self.cpu_flags = Path(folder), cuda_flags, cpu_flags
+
+    def __repr__(self) -> str:
+        return f"KernelLibrary({str(self.folder)!r})"
+
+    @cached_property
+    def constants(self) -> dict[str, Any]:
+        return headers.constants(self.sources(".h"))
+
+    @cached_property
+    def packers(self) -> dict[str, Callable[[Mapping[str, object]], bytes]]:
+        structs = headers.struct_fields(self.sources(".h"))
+        return {name: headers.builder(name, fields) for name, fields in structs.items()}
+
+    @cached_property
+    def params(self) -> SimpleNamespace:
+        return SimpleNamespace(
+            **{name: partial(_pack, packer) for name, packer in self.packers.items()}
+        )
+
+    @cached_property
+    def cpu_operations(self) -> dict[str, str]:
+        return headers.operations(self.sources(".cpp"))
+
+    @cached_property
+    def cuda_operations(self) -> dict[str, str]:
+        return headers.operations(self.sources(".cu"))
+
+    @cached_property
+    def early_operations(self) -> frozenset[str]:
+        return headers.early_operations(self.sources(".cu"))
+
+    def sources(self, *suffixes: str) -> dict[str, str]:
+        """Returns the text of the files with these suffixes, by the name that includes them.
+
+        The common headers come first, as ``common/...``; then the folder's own files.
+        """
+        files = {f"common/{path.name}": path for path in sorted((KERNELS / "common").iterdir())}
+        files |= {path.name: path for path in sorted(self.folder.iterdir())}
+        return {name: path.read_text() for name, path in files.items() if path.suffix in suffixes}
+
+
+def _pack(packer, /, **fields) -> bytes:
+    return packer(fields)
