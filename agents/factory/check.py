@@ -72,7 +72,7 @@ def as_tree(chosen: Any, prefix: str = "") -> Tree:
             again = settings.as_typed(kind, tree)
             changed = [n for n in fields if repr(getattr(again, n)) != repr(getattr(chosen, n))]
         except ValidationError as error:
-            changed = {line["loc"][0] for line in error.errors()}
+            changed = [*dict.fromkeys(str(line["loc"][0]) for line in error.errors())]
         if not changed:
             return tree
         for name in changed:

@@ -4,6 +4,7 @@ configs/ holds the defaults of a run. The settings of environments, geometries, 
 opponents are the arguments of their constructors, with the bounds and defaults given there.
 """
 
+import copy
 import dataclasses
 import functools
 import inspect
@@ -136,9 +137,15 @@ def _group(group: str) -> object:
 
 
 def changed(settings: T, **changes: object) -> T:
-    """Returns a copy of settings with those of the changes that it has."""
-    known = {k: v for k, v in changes.items() if hasattr(settings, k)}
-    return dataclasses.replace(cast(Any, settings), **known)
+    """Returns a copy of settings with those of the changes that it has.
+
+    Nothing is checked again, since a stranger's default need not be what its annotation says.
+    """
+    result = copy.copy(settings)
+    for name, value in changes.items():
+        if hasattr(settings, name):
+            object.__setattr__(result, name, value)  # of a frozen class
+    return result
 
 
 def takes_geometries(env: "Env") -> bool:

@@ -24,8 +24,21 @@ SEEN = []
 
 
 class Yard(Minimal):
-    def __init__(self, *args, heights=None, prices=None, cap: float = 1.0, **settings):
+    """Takes what strangers take: also defaults that no checkpoint can keep."""
+
+    def __init__(
+        self,
+        *args,
+        heights=None,
+        prices=None,
+        cap: float = 1.0,
+        limit: float = None,
+        pick=max,
+        table=np.zeros(2),  # noqa: B008
+        **settings,
+    ):
         SEEN.append(repr((heights, prices, cap)))
+        assert (limit, pick, table.tolist()) == (None, max, [0.0, 0.0])
         super().__init__(*args, **settings)
         if prices:
             prices.clear()  # a stranger's constructor may use its arguments up
