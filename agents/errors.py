@@ -15,6 +15,8 @@ EXIT_CODES = {
     "traceback is in the run's `env_error.txt`",
     129: "stopped by SIGHUP; a checkpoint was saved",
     130: "stopped by Ctrl-C; a checkpoint was saved",
+    138: "stopped by SIGUSR1; a checkpoint was saved",
+    140: "stopped by SIGUSR2; a checkpoint was saved",
     143: "stopped by SIGTERM; a checkpoint was saved",
 }
 
@@ -69,7 +71,7 @@ def user_errors(
         raise UserError(prefix + shortened(error, 400)) from error
 
 
-def memory_problem(error: MemoryError | RuntimeError) -> str | None:
+def memory_problem(error: Exception) -> str | None:
     """Returns what Python or PyTorch says of too little memory; None if the error is another."""
     if isinstance(error, MemoryError):
         return "Out of memory"

@@ -233,7 +233,9 @@ class SaverLike(Protocol):
     config: Config  # that of the run, and its spaces
 
     @property
-    def is_writing(self) -> bool: ...
+    def is_writing(self) -> bool:
+        """Whether a checkpoint is being written."""
+        ...
 
     def __call__(self, step: int, state: StateDict, score: float | None, is_last: bool) -> None: ...
 
@@ -257,9 +259,11 @@ class OpponentPool(Protocol):
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]
     ) -> dict[str, float]:
         """Returns the fraction won against each kind of opponent since the last call."""
+        ...
 
     def state_dict(self) -> StateDict:
         """Returns everything that changes."""
+        ...
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`."""

@@ -346,7 +346,7 @@ class Captured:
             raise AttributeError(name)
         return getattr(self.env, name)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {"env": self.env, "_step": None}  # a copy records a graph of its own
 
     def step(self, decision: Mapping) -> World:

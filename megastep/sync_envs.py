@@ -68,7 +68,7 @@ def one_line(error: BaseException) -> str:
 
 
 def make_env(
-    spec: "EnvSpec", wrappers: Sequence[Callable], settings: Mapping[str, object]
+    spec: "EnvSpec", wrappers: Sequence[Callable], settings: Mapping[str, Any]
 ) -> "gymnasium.Env":
     """Returns an environment of Gymnasium by its specification, inside wrappers."""
     import gymnasium
@@ -168,7 +168,7 @@ class SyncEnvs:
         flags = self.terminated.copy(), self.truncated.copy()
         return self._observations(latest), self.rewards.copy(), *flags, self._news(numbers)
 
-    def render(self) -> list[Any]:
+    def render(self) -> list:
         """Returns a frame of every environment."""
         return [env.render() for env in self.envs]
 
@@ -176,7 +176,7 @@ class SyncEnvs:
         """Closes every environment. Raises the first error, once all are closed."""
         close_all(self.envs)
 
-    def _observations(self, latest) -> Any:
+    def _observations(self, latest) -> object:
         from gymnasium.vector.utils import concatenate
 
         self.batch = concatenate(self.single_observation_space, latest, self.batch)

@@ -96,7 +96,7 @@ class VectorProcesses:
             _write(self.results, rows, results)
         return self.observations, *self.results, self._news([news for *_, news in answers])
 
-    def render(self) -> list[Any]:
+    def render(self) -> list:
         """Returns a frame of every environment."""
         return [frame for frames in self._ask("render", self.rows) for frame in frames]
 

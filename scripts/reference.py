@@ -55,9 +55,9 @@ REPORTERS = {
     "Self-play": "megastep.agents.selfplay.opponents:Opponents.pop_win_rates",
     "Curricula": "megastep.agents.training.curriculum:Curriculum.stats",
 }
-#: Megastep's own machinery, which nobody needs to import.
+#: Megastep's own machinery, which nobody needs to import; and `cuda`, another name of `engine`.
 INTERNAL = re.compile(
-    r"megastep\.(__main__|cache|colour|imports|kernels|agents\.(cli|console|distributed\.(?!pooling)"
+    r"megastep\.(__main__|cache|cuda|colour|imports|kernels|agents\.(cli|console|distributed\.(?!pooling)"
     r"\w+|factory|launch|package|pretrained|runs|networks\.(kernels|\w+_cpu)|storage\.\w*kernels"
     r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.\w+\.(?!(env|bot)\b)\w+)\b"
 )
@@ -101,8 +101,7 @@ def modules(root: str = "megastep") -> Iterator[ModuleType]:
     yield (module := importlib.import_module(root))
     for found in pkgutil.iter_modules(getattr(module, "__path__", ())):
         name = f"{root}.{found.name}"
-        # megastep.cuda is another name of megastep.engine
-        if not (found.name.startswith("_") or INTERNAL.match(name) or root == "megastep.cuda"):
+        if not (found.name.startswith("_") or INTERNAL.match(name)):
             yield from modules(name)
 
 

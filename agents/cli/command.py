@@ -135,7 +135,7 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
     return 0
 
 
-def _checked(composer: compose.Composer, words: list[str]) -> tuple[Any, Any]:
+def _checked(composer: compose.Composer, words: list[str]) -> tuple:
     """Returns settings that can be run, and the configuration they are from."""
     settings, config = composer.compose(words)
     if config.hydra.mode != RunMode.MULTIRUN:

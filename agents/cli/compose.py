@@ -29,7 +29,7 @@ from omegaconf.errors import (
     GrammarParseError,
     OmegaConfBaseException,
 )
-from omegaconf.grammar_parser import OmegaConfGrammarParser
+from omegaconf.grammar_parser import OmegaConfGrammarParser  # pyright: ignore[reportPrivateImportUsage]
 
 from megastep.agents import package
 from megastep.agents.cli import blocks
@@ -335,7 +335,8 @@ def resolvers_in(text: str) -> Iterator[str]:
     while stack:
         node = stack.pop()
         if isinstance(node, OmegaConfGrammarParser.InterpolationResolverContext):
-            yield node.resolverName().getText()
+            if (resolver := node.resolverName()) is not None:
+                yield resolver.getText()
         stack += getattr(node, "children", None) or []
 
 

@@ -3,6 +3,7 @@ may stand for more than there is memory, or never end.
 """
 
 import os
+from pathlib import Path
 
 import yaml
 from hydra.errors import ConfigCompositionException
@@ -26,7 +27,7 @@ def check(path: str) -> None:
     """
     try:
         # ours, and a user's, may be links: what is typed is trusted
-        content = strange_files.read_bytes(os.path.realpath(path), MAX_BYTES)
+        content = strange_files.read_bytes(Path(os.path.realpath(path)), MAX_BYTES)
         _check_events(content.decode())
     except OSError as error:
         raise ConfigCompositionException(f"{path} cannot be read: {error.strerror}") from None
@@ -48,8 +49,8 @@ def _check_events(text) -> None:
             anchor, n_before = open_nodes.pop()
             sizes[anchor] = n_values - n_before
         elif isinstance(event, yaml.NodeEvent):
-            if event.tag not in TAGS:
-                raise ValueError(f"it has the tag {event.tag!r}")
+            if (tag := getattr(event, "tag", None)) not in TAGS:
+                raise ValueError(f"it has the tag {tag!r}")
             if isinstance(event, yaml.ScalarEvent):
                 sizes[anchor] = 1
                 if event.value.count("${") > MAX_DEPTH:

@@ -63,7 +63,7 @@ OmegaConf.register_new_resolver(
 # ---- Before the first job ----
 
 
-def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list[Any], Any]:
+def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list, Any]:
     """Returns (the words of each job that is known beforehand; their settings, all of them checked;
     Hydra's configuration of the first).
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import torch
 
@@ -46,7 +45,7 @@ class SegmentedGraph:
 
     def __init__(
         self,
-        function: Callable[[], Any],
+        function: Callable,
         stream: torch.cuda.Stream,
         generators: Iterable[torch.Generator] = (),
     ):

@@ -4,7 +4,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
@@ -376,7 +376,7 @@ def load_weights(policy: Policy, env: types.Env, loaded: checkpoint.Checkpoint) 
             "Choose the env it was trained in"
         )
     assert loaded.state is not None
-    weights, own = loaded.state.get("policy"), policy.state_dict()
+    weights, own = cast(dict, loaded.state.get("policy")), policy.state_dict()
     with errors(f"{loaded.path} cannot be used: "):
         check_weights(weights, own)
     if policy.critic is None:

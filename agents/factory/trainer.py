@@ -81,9 +81,10 @@ def make_trainer(
         loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
         if cfg.resume:
+            state = loaded.state or {}
             with state_errors(loaded.path):
-                formats.check(formats.Counts, {k: loaded.state.get(k) for k in formats.COUNTS})
-                if name := nonfinite_leaf(loaded.state["learner"]):
+                formats.check(formats.Counts, {k: state.get(k) for k in formats.COUNTS})
+                if name := nonfinite_leaf(state["learner"]):
                     raise ValueError(f"learner.{name} has a NaN or an infinity")
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")

@@ -87,7 +87,7 @@ def automatic(cfg: settings.Train) -> Start:
     if not has_checkpoint(folder):
         folders.check_free(cfg.folder, is_again=True)
         return Start(cfg, folder)
-    loaded = folders.load_checkpoint(folders.find(cfg.folder), cfg.trust)
+    loaded = folders.load_checkpoint(folders.find(str(cfg.folder)), cfg.trust)
     if errors := [*_differences(loaded.config["train"], check.as_tree(cfg))]:
         raise ConfigErrors(errors)
     numbers = loaded.numbers

@@ -11,7 +11,7 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors
@@ -118,7 +118,7 @@ def taken(cfg: T) -> Iterator[T]:
         yield cfg
 
 
-def _has_ranks(cfg) -> bool:
+def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
 
 

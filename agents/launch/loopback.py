@@ -27,7 +27,7 @@ class Loopback(RendezvousHandler):
         self.run_id, self.n_meetings, self.has_closed = run_id, 0, False
         listener = socket.create_server((ADDRESS, 0))
         self.port = listener.getsockname()[1]
-        self.store = distributed.TCPStore(
+        self.store = distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
             ADDRESS,
             self.port,
             is_master=True,
@@ -42,7 +42,8 @@ class Loopback(RendezvousHandler):
 
     def next_rendezvous(self) -> RendezvousInfo:
         self.n_meetings += 1
-        keys = distributed.PrefixStore(f"{self.run_id} {self.n_meetings}", self.store)
+        name = f"{self.run_id} {self.n_meetings}"
+        keys = distributed.PrefixStore(name, self.store)  # pyright: ignore[reportPrivateImportUsage]
         return RendezvousInfo(keys, 0, 1, RendezvousStoreInfo(ADDRESS, self.port))
 
     def get_backend(self) -> str:

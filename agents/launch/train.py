@@ -57,7 +57,7 @@ def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path,
     locks.enter_context(folders.locked(folder))
     if is_new:
         return folder, None
-    if process_group.n_ranks() > 1:  # all ranks from the same intact checkpoint
+    if cfg.resume and process_group.n_ranks() > 1:  # all ranks from the same intact checkpoint
         return folder, str(folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).path)
     return folder, cfg.resume
 
@@ -95,7 +95,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             console.say(f"The run in {start.folder} has had its budget.")
             return start.folder
         cfg = start.cfg
-    is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(cfg.folder))
+    is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(str(cfg.folder)))
     rank_checks.check_start(cfg)
     cfg = rank_checks.started_again(cfg, team)
     with contextlib.ExitStack() as locks:

@@ -84,7 +84,9 @@ def write(
 
 def sealed(content: bytes) -> bytes:
     """Returns the bytes of a file with its SHA-256 in place of the one in its header."""
-    start, end = _SEAL.search(content).span(1)
+    match = _SEAL.search(content)
+    assert match is not None
+    start, end = match.span(1)
     digest = hashlib.sha256(content[:start] + b"0" * 64 + content[end:]).hexdigest()
     return content[:start] + digest.encode() + content[end:]
 

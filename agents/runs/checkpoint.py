@@ -109,12 +109,15 @@ def load_latest(
     folder = Path(folder)
     if (folder / "manifest.json").exists():
         return checkpoint_format.read(folder, device, is_whole, rank)
-    messages = []
-    for path in reversed(list_checkpoints(folder)):
+    messages, tried = [], set()
+    # a run that is being trained replaces its checkpoints meanwhile
+    while paths := [path for path in list_checkpoints(folder) if path not in tried]:
+        tried.add(path := paths[-1])
         try:
             checkpoint = checkpoint_format.read(path, device, is_whole, rank)
         except DamagedCheckpoint as error:
-            messages.append(str(error))
+            if path.exists():
+                messages.append(str(error))
             continue
         for message in messages:
             warnings.warn(f"{message}; using {path.name} instead", stacklevel=2)

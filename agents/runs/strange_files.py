@@ -71,7 +71,7 @@ def check_folder(folder: Path) -> None:
                     )
             elif entry.is_dir(follow_symlinks=False):
                 folders.append(entry.path)
-            elif not entry.is_file(follow_symlinks=False):
+            elif not entry.is_file(follow_symlinks=False) and os.path.lexists(entry.path):
                 raise UserError(f"{name} is neither a file nor a folder; delete it")
         if n_entries > MAX_ENTRIES:
             raise UserError(f"{shortened(folder)} holds more than {MAX_ENTRIES:,} files")

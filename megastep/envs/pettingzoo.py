@@ -95,7 +95,7 @@ class ParallelEnvs:
         ValueError: if the spaces of two agents differ, or agents come later.
     """
 
-    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, Any]):
+    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, object]):
         from gymnasium.vector.utils import batch_space, create_empty_array
 
         parameters = inspect.signature(make).parameters

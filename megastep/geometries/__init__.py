@@ -8,7 +8,6 @@ in the same order (the same objects, not copies).
 
 import difflib
 import inspect
-from typing import Any
 
 import numpy as np
 
@@ -37,7 +36,7 @@ def _require_known(kind, name, allowed) -> None:
 
 
 def sample(
-    name: str, n: int, split: str = "training", seed: int = 1, **options: Any
+    name: str, n: int, split: str = "training", seed: int = 1, **options: object
 ) -> list[dotdict]:
     """Returns n geometries from a source. Equal arguments give equal geometries.
 

@@ -288,8 +288,9 @@ def test_submitit_job_of_two_ranks(here):
 def test_preempted_submitit_job_continues_its_checkpoint(here):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     total = f"samples={400 * UPDATE}"
-    job = here / "mine/0_seed=1"
+    job = here / "mine/job"
     words = [*SMALL, "-m", "seed=1", total, "hydra/launcher=submitit_local", "hydra.sweep.dir=mine"]
+    words += ["hydra.sweep.subdir=job"]
     process = start("train", *words, "checkpoint_seconds=0.2", cwd=here)
     wait_until(lambda: [*job.glob("checkpoints/step_*")], process)
     (row,) = (here / "mine/.jobs").glob("*/0.json")

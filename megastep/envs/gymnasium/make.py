@@ -5,7 +5,7 @@ import difflib
 import functools
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from megastep.imports import import_object, search_current_folder
 from megastep.sync_envs import SyncEnvs, make_env, names_of_numbers
@@ -23,7 +23,7 @@ INSTALL = "pip install 'megastep-flatland[gymnasium]'"
 def vector_env(
     id: str | None,
     n_envs: int,
-    kwargs: Mapping[str, Any],
+    kwargs: Mapping[str, object],
     wrappers: Sequence[str],
     vectorization: str,
     restart_failed: int = 0,
