@@ -247,7 +247,7 @@ def comment_on(module: str, name: str) -> str:
     own = Path(importlib.import_module(module).__file__)
     definition = re.compile(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", re.M)
     for path in (own, *sorted(own.parents[1].rglob("*.py"))):
-        found = definition.search(path.read_text())
+        found = definition.search(path.read_text(errors="replace"))
         if found and (text := found[2] or re.sub(r"^#:? ?", "", found[1], flags=re.M)):
             return text
     return ""
