@@ -117,9 +117,7 @@ def test_sweep_folders_and_table(here, capsys):
 def test_failed_jobs(here, capsys, more):
     words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine", *more]
     assert train.main(words) == 1
-    failed = (
-        "FAILED: payer:Payer failed: RuntimeError: by chance. Its traceback is in mine/{}_env.mo"
-    )
+    failed = "FAILED: payer:Payer failed: RuntimeError: by chance. Its traceback is in mine/{}_env"
     states = [row["state"] for row in rows("mine")]
     assert states[1] == "done"
     assert all(states[k].startswith(failed.format(k)) for k in (0, 2)), states
