@@ -233,7 +233,9 @@ class SaverLike(Protocol):
     config: Config  # that of the run, and its spaces
 
     @property
-    def is_writing(self) -> bool: ...
+    def is_writing(self) -> bool:
+        """Whether a checkpoint is being written."""
+        ...
 
     def __call__(self, step: int, state: StateDict, score: float | None, is_last: bool) -> None: ...
 

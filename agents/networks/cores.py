@@ -30,7 +30,9 @@ from megastep.imports import resolve
 class RecurrentCore(Protocol):
     """A recurrent core, as the head of this file says."""
 
-    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict: ...
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the hidden state of B lanes at the start of an episode."""
+        ...
 
     def __call__(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, **options: bool

@@ -22,7 +22,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import safetensors
 
 from megastep.agents.errors import shortened
@@ -31,6 +30,7 @@ from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
     from megastep.agents.types import Config, Row
@@ -137,6 +137,8 @@ def _read(path) -> tuple[Row, Row]:
         content = strange_files.read_bytes(path.resolve(), _MAX_BYTES)
     except OSError as error:
         raise DamagedCheckpoint(f"{path} cannot be read ({error.strerror})") from None
+    import numpy as np  # not where commands only look for a run
+
     header, data = _split(content)
     try:
         if len(header) > _MAX_HEADER:
@@ -180,6 +182,8 @@ def _is_intact(content, data, texts) -> object:
 
 def _arrays(entries) -> Iterator[tuple[str, np.ndarray]]:
     """Yields (name, array) of tensors."""
+    import numpy as np
+
     for name, entry in entries.items():
         yield name, np.frombuffer(entry["data"], DTYPES[entry["dtype"]]).reshape(entry["shape"])
 

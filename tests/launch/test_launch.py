@@ -403,6 +403,33 @@ def test_torchrun(here):
     assert err.count("ranks: 3 is not") == 1
 
 
+KILLED = """
+import os
+from pathlib import Path
+from megastep.envs import Minimal
+
+class Killed(Minimal):
+    def step(self, decision):
+        first = os.environ.get("TORCHELASTIC_RESTART_COUNT") == "0"
+        saved = [p for p in Path("run/checkpoints").glob("step_*") if p.name[5:].isdecimal()]
+        if first and os.environ["RANK"] == "1" and saved:
+            os.kill(os.getpid(), 9)
+        return super().step(decision)
+"""
+
+
+@pytest.mark.nightly
+def test_torchrun_goes_on_in_the_folder_that_proves_itself(here):
+    (here / "killed.py").write_text(KILLED)
+    words = ["env=killed:Killed", *TINY[1:], "checkpoint_seconds=0.2", f"samples={100 * UPDATE}"]
+    script = str(ROOT / "train.py")
+    code, out, err = torchrun(here, "--max-restarts=1", script, *words)
+    assert code == 0 and out.count("Training on 2 x cpu in run\n") == 2, (out, err)
+    rows = json_lines.read(here / "run" / "metrics.jsonl")
+    assert [row["updates"] for row in rows] == [*range(1, 101)]
+    assert not (here / "run" / ".started").exists()
+
+
 DIFFERING = """
 import os, sys
 from megastep.agents.cli import train

@@ -24,7 +24,7 @@ from megastep.dotdict import dotdict
 from megastep.geometries import files, homes
 
 COUNT = 5_000
-NAMES = ("walls", "lights", "masks", "widths")
+NAMES = ("walls", "lights", "doors", "masks", "widths")
 #: Bytes of a home and of the headers of arrays, at most; the homes of the package have 3.8 kB.
 MAX_EACH, MAX_HEADERS = 1 << 16, 1 << 12
 PATH = Path(__file__).parents[1] / "data" / "homes.npz"
