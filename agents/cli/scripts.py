@@ -211,7 +211,8 @@ The most common words:
   env=pong             another environment with the same spaces: after self-play, the tracker
   greedy=true          the most likely actions instead of sampled ones
   episodes=256         fewer episodes
-  baseline=false       no row for random actions
+  baseline=random,bot  further rows for others in its homes: random, bot, explorer, hunter, walker,
+                       an import path, another run; none for none
   against=RUN,bot      duels instead: with other runs or checkpoints, the environment's bot, hunter,
                        explorer, walker, random, or an import path
   ratings=true         ratings of the run's snapshots, by duels of each with each"""
@@ -242,8 +243,10 @@ def without_training(tree: Tree, typed: list[str]) -> Tree:
 
 
 def names_in_list(word: str) -> str:
-    """Returns `against=a,b` as the list that it means here, not the sweep that it is to Hydra."""
-    return re.sub(r"^against=(?!\[|null$)(.*)", r"against=[\1]", word)
+    """Returns `against=a,b` as the list that it means here, not the sweep that it is to Hydra; and
+    `baseline=a,b`.
+    """
+    return re.sub(r"^(against|baseline)=(?!\[|null$)(.*)", r"\1=[\2]", word)
 
 
 TRAIN = Script("train", settings.Train, TRAIN_HELP, check_training, prepare_training)

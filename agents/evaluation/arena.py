@@ -53,7 +53,7 @@ def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpo
 def find_player(
     name: str, run: checkpoint.Checkpoint, env_settings: settings.Env | None, env: Env, trust: bool
 ) -> Player:
-    """Returns who is to meet the agent of `run` in `env`.
+    """Returns who is to meet the agent of `run` in `env`, or to be compared with it there.
 
     Args:
         name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
@@ -62,19 +62,23 @@ def find_player(
         trust: import what a run that another user made names.
 
     Raises:
-        UserError: if nobody can be met there, or this player cannot play there.
+        UserError: if this player cannot play there.
     """
-    if optional(env, "n_agents") < 2:
-        raise UserError(
-            f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
-            "one here; choose another with env= and its settings"
-        )
     if name == "bot":
         name = factory.config_of(run).opponents.bot_class or name
     if name in ("bot", *BOTS) or (":" in name and not Path(name).exists()):
         assert env_settings is not None
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
+
+
+def check_duels(env: Env) -> None:
+    """Raises UserError if nobody can be met in an environment."""
+    if optional(env, "n_agents") < 2:
+        raise UserError(
+            f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
+            "one here; choose another with env= and its settings"
+        )
 
 
 class Arena:
@@ -96,6 +100,7 @@ class Arena:
         self.cfg, self.run, env = cfg, run, settings.changed(env, **FOR_TWO)
         where = dict(seed=cfg.seed, device=device)
         sample = factory.make_sample(env, homes, **where)
+        check_duels(sample)
         self.others = [find_player(name, run, env, sample, cfg.trust) for name in cfg.against or ()]
         self.agent = load_player(run, sample, run)
         n_agents = optional(sample, "n_agents")

@@ -45,6 +45,7 @@ def run(cfg: settings.Record) -> Path:
     if cfg.run:
         policy = arena.load_player(loaded, env, loaded).policy
     if cfg.against is not None:
+        arena.check_duels(env)
         opponent = arena.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
         console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)

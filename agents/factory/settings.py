@@ -372,12 +372,20 @@ def _given(run: T | None) -> T:
     return run
 
 
+def _players(names: object) -> object:
+    """Returns the names of `baseline=`: `true` is random actions; `false` and `none` are nobody."""
+    if isinstance(names, bool) or names in (None, "none"):
+        return ("random",) * (names is True)
+    names = [names] if isinstance(names, str) else names
+    return tuple(names) if isinstance(names, list) else names
+
+
 @frozen
 class Evaluate(Played):
     run: Annotated[str, BeforeValidator(_given)]
     episodes: Count
     max_steps: Count | None = None  # None: the environment's own limit
-    baseline: bool
+    baseline: Annotated[tuple[str, ...], BeforeValidator(_players)]
     against: tuple[str, ...] | None = None
     ratings: bool = False
 

@@ -24,7 +24,7 @@ from megastep.agents.errors import (
     memory_problem,
     user_errors,
 )
-from megastep.agents.evaluation import evaluate, record
+from megastep.agents.evaluation import evaluate_run, record
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, dry_run, launcher, rank, rank_checks, signals
@@ -175,7 +175,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if cfg.finish.evaluate:
             with process_group.unhurried():
                 episodes = cfg.finish.episodes
-                evaluate.run(settings.Evaluate(episodes=episodes, baseline=True, **common))
+                evaluate_run.run(
+                    settings.Evaluate(episodes=episodes, baseline=("random",), **common)
+                )
         if cfg.finish.record and is_first:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
