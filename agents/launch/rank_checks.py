@@ -77,7 +77,7 @@ def check_shared(folder: Path) -> str:
     """Checks that all ranks see the run folder of rank 0.
 
     Returns:
-        A random name, the same on all ranks of this start.
+        A random name of this launch, the same on all ranks.
 
     Raises:
         UserError: on all ranks, if one of them does not see the folder.
