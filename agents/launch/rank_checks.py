@@ -110,7 +110,7 @@ def check_shared(folder: Path) -> str:
 
 def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:
     """Returns the settings for this attempt. After a restart by torchrun, they resume the run from
-    its last checkpoint, or start it anew if there is none.
+    its last checkpoint, or start again if there is none.
     """
     folder = from_rank_0(lambda: team and team.earlier_folder())
     if folder is None:

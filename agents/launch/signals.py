@@ -43,8 +43,8 @@ def interrupt(number: int) -> NoReturn:
 
 
 def exit_on_signals(script: str) -> None:
-    """From this call on, a signal ends the process at once with one line. For imports and
-    interpreter shutdown, when there is nothing to save.
+    """Makes signals end the process at once, with one line. For imports and interpreter shutdown,
+    when there is nothing to save.
     """
 
     def exit_at_once(number, frame) -> NoReturn:

@@ -83,7 +83,7 @@ def write(
 
 
 def sealed(content: bytes) -> bytes:
-    """Returns a file's bytes with the SHA-256 in its header computed anew."""
+    """Returns a file's bytes with the SHA-256 in its header recomputed."""
     match = _SEAL.search(content)
     assert match is not None
     start, end = match.span(1)

@@ -41,13 +41,13 @@ class Saver:
         keep_checkpoints: number of checkpoints to keep, besides the one with the best score.
         made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
         replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is saved once per
-            this many checkpoints, and with the last one if that takes up to `REPLAY_SECONDS`.
+            this many checkpoints, and with the last one if that takes `REPLAY_SECONDS` or less.
         rank_files: passes the states of the other ranks to rank 0. Each rank has a saver, and rank
             0's writes the checkpoints.
 
     Attributes:
-        error: why the last checkpoint could not be written, as a sentence; None if it was. Valid
-            after `wait`.
+        error: why the last checkpoint could not be written, as a sentence; None if it was
+            written. Valid after `wait`.
         lacks_replay: True if the last call left out the replay buffer.
         seconds: time that writing the last checkpoint took.
     """
