@@ -109,7 +109,7 @@ class PPO(GradientLearner):
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""
-        # A minibatch has its share of the rollout and of the activations. Values are computed from
+        # A minibatch holds its part of the rollout and of the activations. Values are computed from
         # the features of the whole rollout, 4 bytes per unit.
         rollout = bytes_per_step(env, self.policy)
         minibatch = (rollout + self.policy.activation_bytes) / self.n_minibatches

@@ -1,4 +1,4 @@
-"""The process group: its ranks, and their communication on the host.
+"""Joins the process group, and exchanges values between its ranks on the host.
 
 torchrun, or `ranks=` on the command line, starts the ranks and sets their environment variables.
 
@@ -40,7 +40,7 @@ class Counts:
     Attributes:
         n_operations: collective operations started.
         n_updates: updates that the ranks have agreed to start.
-        is_exempt: the others wait for this rank however long it takes.
+        is_exempt: True while the others wait for this rank without limit.
     """
 
     n_operations = n_updates = 0
@@ -52,9 +52,9 @@ counts = Counts()
 
 @contextlib.contextmanager
 def unhurried() -> Iterator[None]:
-    """Lets the other ranks wait for this one without limit, as for an evaluation or for files.
+    """Lets the other ranks wait for this one without limit, for example while it evaluates.
 
-    Otherwise a rank counts as hung when others have waited `watch.LOST_SECONDS` for it.
+    Otherwise a rank counts as hung once the others have waited `watch.LOST_SECONDS` for it.
     """
     counts.is_exempt, before = True, counts.is_exempt
     try:
@@ -65,7 +65,7 @@ def unhurried() -> Iterator[None]:
 
 def start(seconds: float = START_SECONDS) -> None:
     """Joins the ranks that torchrun started; returns when all have joined. A no-op in a single
-    process, or if it has joined.
+    process, or if this one has joined already.
 
     Args:
         seconds: time limit.
@@ -138,7 +138,7 @@ def n_ranks() -> int:
 
 
 def local_rank() -> int | None:
-    """Returns this rank's number on its machine, that of its GPU; None without torchrun."""
+    """Returns this rank's index on its machine, which is its GPU's too; None without torchrun."""
     info = rank_info()
     return info and info.local_rank
 
@@ -162,7 +162,7 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     """Returns the numbers of every rank, by rank. Waits for the other ranks; does not use the GPU.
 
     Args:
-        numbers: equally many on every rank.
+        numbers: the same count on every rank.
     """
     row = torch.tensor(numbers, dtype=torch.float64)
     if n_ranks() == 1:

@@ -1,4 +1,4 @@
-"""Numbers of all ranks for a report, on the host. Each function waits for the other ranks.
+"""Combines the ranks' numbers for a report, on the host. Each function waits for the other ranks.
 
 Tensors are exchanged on their device: between GPUs this is ten times as fast as on the host, and
 training waits for reports.

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 def run(cfg: settings.Evaluate) -> Path:
     """Evaluates a run, each environment in one home throughout. Returns the path of the table.
 
-    Of several ranks, each plays its share. Rank 0 writes; the others return the run's folder.
+    With several ranks, each plays some of the environments. Rank 0 writes; the others return the
+    run's folder.
 
     Writes .json, .md and .csv, which has a row per episode, into the run's folder `evaluations`,
     one of each per source of geometries (per environment where it has none), split and checkpoint.

@@ -1,5 +1,5 @@
-"""One rank of a training run, started by `launcher` or torchrun: it joins the other ranks, and ends
-with them. Each error is reported by one rank.
+"""One rank of a training run, started by `launcher` or torchrun: it joins the other ranks and ends
+with them. Only one rank reports an error.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.launch import endings, launcher, signals, started
 
-#: Seconds that a rank waits for rank 0 to end after an error, and after a signal (it saves).
+#: Seconds that a rank waits for rank 0 to end: after an error; and after a signal, as rank 0 saves.
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
 #: The team that this process has joined.
 _team = None
@@ -83,7 +83,7 @@ class Team:
         assert info is not None
         if info.attempt == 0:
             return None
-        if launcher.JOB in os.environ:  # a folder that is this user's alone
+        if launcher.JOB in os.environ:  # the job folder, to which only this user can write
             path = Path(os.environ[launcher.JOB], launcher.RUN)
             return Path(path.read_text()) if path.exists() else None
         return started.proven_folder(self.store)
@@ -92,7 +92,7 @@ class Team:
         """Exits at once, because a rank was lost.
 
         Args:
-            problem: to report; None if another rank reports it.
+            problem: what to report; None if another rank reports it.
         """
         if problem:
             report_ending(endings.Ending(launcher.LOST, f"{problem}. {launcher.hint(self.folder)}"))
@@ -109,7 +109,7 @@ class Team:
         self.watch.leave(seconds)
 
     def finish(self) -> None:
-        """Forgets the run, which is done."""
+        """Removes the proof by which restarted ranks would find the run, which is done."""
         if environment.rank() == 0 and self.folder is not None:
             started.remove_proof(self.folder)
 

@@ -1,4 +1,4 @@
-"""Training, in this process or with several ranks in processes of their own."""
+"""Trains, in this process or with several ranks in processes of their own."""
 
 import contextlib
 import functools
@@ -65,8 +65,8 @@ def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path,
 def run(cfg: settings.Train) -> Path | None:
     """Trains. Returns the run folder, None for a dry run.
 
-    If torchrun started this process, it trains as one of the ranks, of which rank 0 writes the run
-    folder. With `cfg.ranks` or `cfg.restarts`, this process starts the ranks.
+    If torchrun started this process, it trains as one of the ranks; rank 0 writes the run folder.
+    With `cfg.ranks` or `cfg.restarts`, this process starts the ranks and waits for them.
 
     Raises:
         Interrupted: a signal came; the run was saved.
@@ -92,7 +92,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     if cfg.resume == again.AUTO:
         start = together(lambda: again.automatic(cfg))
         if start.is_done:
-            console.say(f"The run in {start.folder} has had its budget.")
+            console.say(f"The run in {start.folder} has already used up its budget.")
             return start.folder
         cfg = start.cfg
     is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(str(cfg.folder)))
@@ -157,7 +157,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                     curves.plot_curves(folder)
         if trainer.profiler and trainer.profiler.path:
             console.say(f"Profile: {trainer.profiler.path}, and a trace beside it")
-        # a signal on one rank stops all, and so does a checkpoint that one cannot save
+        # all ranks stop if one got a signal or could not save a checkpoint
         ends = process_group.gather_objects((numbers[:1], trainer.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
@@ -190,7 +190,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
 
 
 def saved_by(trainer: Trainer, folder: Path) -> str:
-    """Returns what is saved of a training run that an error ended, and how to resume it."""
+    """Returns how much of a run that ended with an error is saved, and how to resume it."""
     text = trainer.saver.error or "The latest updates could not be saved"
     text = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else text
     return f"{text}. {folders.to_continue(folder)}"

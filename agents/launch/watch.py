@@ -25,17 +25,18 @@ from megastep.agents.distributed import environment, process_group
 
 #: Seconds between heartbeats.
 PERIOD = 2.0
-#: Seconds without a heartbeat, or behind the neighbour, after which a rank is lost; and seconds
-#: without a heartbeat if a connection has broken.
-LOST_SECONDS, BROKEN_SECONDS = 20.0, 5.0
-#: Seconds that a rank may be behind in the first two updates, which compile kernels and graphs.
+#: A rank is lost after this many seconds without a heartbeat, or while its neighbour waits for it.
+LOST_SECONDS = 20.0
+#: The same for heartbeats, once a connection has broken.
+BROKEN_SECONDS = 5.0
+#: Seconds to wait for a rank in the first two updates, which compile kernels and graphs.
 FIRST_SECONDS = 300.0
-#: A rank may be behind for this many times the longest wait so far that ended well.
+#: A wait may last this many times the longest earlier wait, if that is more.
 PATIENCE = 5
 #: Seconds that a rank may still take to save and end after the store is gone.
 LAST_SECONDS = 60.0
 
-#: Counts the watches of this process, in step on all ranks: each watch has its own keys.
+#: Numbers the watches of this process, equally on all ranks, so that each has its own keys.
 NUMBERS = itertools.count()
 
 
@@ -46,8 +47,8 @@ class Heartbeat(NamedTuple):
         number: counts heartbeats.
         n_operations: collective operations started.
         n_updates: updates started.
-        is_exempt: the others wait for it however long it takes, as for an evaluation.
-        has_left: it is done.
+        is_exempt: True while the others wait for it without limit, as during an evaluation.
+        has_left: True once it is done and no longer monitored.
         host: name of its machine.
     """
 
@@ -63,9 +64,9 @@ HEARTBEAT = TypeAdapter(Heartbeat)
 
 
 class LossDetector:
-    """Decides from the heartbeats of two ranks whether the other one is lost.
+    """Decides whether the neighbouring rank is lost, from its heartbeats and this rank's.
 
-    Time is counted in polls, so that a machine may sleep for an hour without losing a rank.
+    Time is counted in polls, so no rank is lost when a machine wakes up after an hour of sleep.
     """
 
     def __init__(self) -> None:
@@ -200,5 +201,5 @@ class Watch:
             return None
         try:
             return HEARTBEAT.validate_json(self.store.get(name))
-        except ValueError:  # which no rank has written
+        except ValueError:  # written by something other than a rank
             return None
