@@ -44,7 +44,8 @@ TRAIN_HELP = """Trains a policy in an environment.
 The most common words:
   experiment=quickstart        the recipe of `make train`: train, evaluate on unseen homes, film
   env=minimal geometry=box     another environment, other homes
-  seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
+  seconds=1h samples=10M       when to stop, whichever comes first, also seconds=60 samples=1e7;
+                               Ctrl-C stops too, and saves
   env.n_envs=256 device=cpu    another size, another device
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
@@ -85,6 +86,11 @@ REPEATABLE = (
     "logger",
     "finish",
 )
+#: The keys that may be written with units, and their kind.
+QUANTITIES = {
+    **dict.fromkeys(("seconds", "more_seconds", "checkpoint_seconds"), "seconds"),
+    **dict.fromkeys(("samples", "more_samples"), "samples"),
+}
 #: The keys that take a run, each with what is said of a key that cannot go with it.
 CURES = {
     "resume": "cannot change when a run is resumed; init=RUN starts a new one from its weights",
@@ -103,6 +109,9 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     """
     set_ranks(tree, typed)
     tree.setdefault("logger", {})  # as it is with logger=none
+    for key, kind in QUANTITIES.items():
+        if key in tree:
+            tree[key] = settings.quantity(tree[key], kind)
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if tree.get("resume") == AUTO and "rerun" not in given:
         given.remove("resume")  # what there is to resume is looked up when training begins

@@ -82,7 +82,7 @@ def write_table(
     text = json.dumps(result, indent=2)
     if columns := columns_of(episodes):
         text = f'{text[:-2]},\n  "episodes": {json.dumps(columns)}\n}}'
-    console.say(f"{title}\n{console.table(head, lines)}")
+    console.say(f"{title}\n{console.table(head, lines, width=console.terminal_width())}")
     with user_errors(f"{folder} cannot be written: "):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(

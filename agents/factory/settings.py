@@ -49,6 +49,27 @@ def _ranks(n: int | str) -> int | str:
     return n
 
 
+#: Units of seconds, and factors of counts.
+UNITS = {
+    "seconds": {"s": 1, "sec": 1, "m": 60, "min": 60, "h": 3600, "d": 86400},
+    "samples": {"k": 1_000, "m": 1_000_000, "g": 1_000_000_000, "b": 1_000_000_000},
+}
+
+
+def quantity(text: object, kind: str) -> object:
+    """Returns the number that people write as `100k` or `1h30min`; anything else as it is.
+
+    Args:
+        kind: a key of `UNITS`.
+    """
+    units = UNITS[kind]
+    part = rf"(\d+(?:\.\d+)?(?:e\+?\d+)?) *({'|'.join(sorted(units, key=len, reverse=True))})"
+    if not isinstance(text, str) or not re.fullmatch(rf"(?:{part} *)+", text.lower()):
+        return text
+    total = sum(float(n) * units[unit] for n, unit in re.findall(part, text.lower()))
+    return int(total) if total.is_integer() else total
+
+
 Above0 = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]

@@ -167,6 +167,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
         nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
+        result = result_of(trainer)
         del trainer, saved  # frees GPU memory for the evaluation
         common: dict = dict(
             run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device
@@ -186,7 +187,28 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
         if cfg.rerun and is_first:
             compare(folder, folders.folder_of(folders.find(cfg.rerun)))
+        if is_first:
+            console.say(f"{result}. The run is in {folder}\n{next_command(cfg, folder)}")
     return folder
+
+
+def result_of(trainer: Trainer) -> str:
+    """Returns what a run came to: samples, seconds, and the return of its last episodes."""
+    text = f"Trained {trainer.samples:,} samples in {console.duration(trainer.clock.seconds)}"
+    latest = trainer.latest_stats
+    if "episode/return" not in latest:
+        return f"{text}; no episode ended since the last report"
+    n_episodes = f"{latest['episode/window']:,.0f}"
+    return f"{text}; mean return {latest['episode/return']:.4g} of the last {n_episodes} episodes"
+
+
+def next_command(cfg: settings.Train, folder: Path) -> str:
+    """Returns what people do next with a run that has ended: evaluate it, film it, or continue."""
+    if not cfg.finish.evaluate:
+        return f"To evaluate it: {folders.command_of('evaluate', 'run', folder)}"
+    if not cfg.finish.record:
+        return f"To film it: {folders.command_of('record', 'run', folder)}"
+    return f"To train it further: {folders.resume_command(folder)} more_seconds=10min"
 
 
 def saved_by(trainer: Trainer, folder: Path) -> str:

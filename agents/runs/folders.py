@@ -245,10 +245,15 @@ def load_checkpoint(
 
 def resume_command(folder: Path, key: str = "resume") -> str:
     """Returns the command that resumes a run, or with the key `rerun` repeats it."""
+    return command_of("train", key, folder)
+
+
+def command_of(script: str, key: str, folder: Path) -> str:
+    """Returns the command that does something with a run, such as `python evaluate.py run=RUN`."""
     # quoted for the shell and for Hydra where needed
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
-    return f"{package.command('train', 'python ')} {shlex.quote(f'{key}={name}')}"
+    return f"{package.command(script, 'python ')} {shlex.quote(f'{key}={name}')}"
 
 
 def to_continue(folder: Path) -> str:
