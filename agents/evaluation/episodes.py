@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -128,15 +128,18 @@ def evaluate(
     if dataclasses.is_dataclass(env):
         homes = [*geometries]
         device = getattr(next(iter(_parameters(policy)), None), "device", "cpu")
-        stage = Stage(env, homes, episodes or max(1, len(homes)), seed, device)
-        numbers, sources, env = stage.numbers, factory.sources_of(stage.homes), stage.env
+        chosen = cast("settings.Env", env)
+        stage = Stage(chosen, homes, episodes or max(1, len(homes)), seed, device)
+        numbers, sources, made = stage.numbers, factory.sources_of(stage.homes), stage.env
     elif episodes is not None or geometries:
         raise ValueError(
             "an environment has as many episodes as lanes, in its own homes: give settings to "
             "choose episodes and geometries, or make it with another n_envs"
         )
-    played = playing.first_episodes(env, policy, seed, greedy, max_steps)
-    roles = optional(env, "roles")
+    else:
+        made = cast("Env", env)
+    played = playing.first_episodes(made, policy, seed, greedy, max_steps)
+    roles = optional(made, "roles")
     rows = rows_of(played, seed, numbers, sources, roles)
     return Evaluation(rows, statistics.summaries(played, roles, sources))
 

@@ -66,7 +66,7 @@ def quantity(text: object, kind: str) -> object:
     part = rf"(\d+(?:\.\d+)?(?:e\+?\d+)?) *({'|'.join(sorted(units, key=len, reverse=True))})"
     if not isinstance(text, str) or not re.fullmatch(rf"(?:{part} *)+", text.lower()):
         return text
-    total = sum(float(n) * units[unit] for n, unit in re.findall(part, text.lower()))
+    total = sum((float(n) * units[unit] for n, unit in re.findall(part, text.lower())), 0.0)
     return int(total) if total.is_integer() else total
 
 
