@@ -53,6 +53,7 @@ AGENTS = (
     ("selfplay",),
     ("factory",),
     ("evaluation", "pretrained"),
+    ("reports",),
     ("launch",),
     ("cli",),
 )
@@ -79,7 +80,7 @@ SHARED_WITH_BOTS = SHARED | {
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
 # environments, writes videos and starts processes.
-UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained")
+UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",

@@ -310,6 +310,7 @@ class Finish:
     episodes: Count
     record: bool
     steps: Steps
+    report: bool = False
 
 
 @frozen

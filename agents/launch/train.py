@@ -182,6 +182,11 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if cfg.finish.record and is_first:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
+        if cfg.finish.report and is_first:
+            from megastep.agents.reports import report
+
+            with console.warned():
+                console.say(f"Report: {report.write([folder], folder / 'report.html')}")
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All other rollouts were used; the run is in {folder}"
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
