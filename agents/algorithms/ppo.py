@@ -7,6 +7,7 @@ synchronises: conditions are bool tensors on the device.
 
 from typing import Annotated, Literal
 
+import torch
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
@@ -91,6 +92,7 @@ class PPO(GradientLearner):
 
     def collector(self, env: Env) -> Collector:
         """Returns a collector of rollouts of `n_steps` steps."""
+        self.policy.clear_stats()
         return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps))
 
     def bytes_per_env(self, env: Env) -> float:
@@ -109,7 +111,7 @@ class PPO(GradientLearner):
         advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
         moments = masked_moments(valid, targets, advantages)
         (_, _, variance), (_, _, error) = moments  # an advantage is the error of the value
-        explained = 1 - error / variance.clamp(min=1e-8)
+        explained = 1 - error / torch.maximum(variance, 1e-8 * error).clamp(min=1e-30)
         # One row of observations is enough: every rollout brings another B.
         last = rollout.world(-1)
         own_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])

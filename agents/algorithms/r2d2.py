@@ -129,6 +129,7 @@ class R2D2(GradientLearner):
         Raises:
             ValueError: if the replay buffer is too small, or a gradient step has no sequence.
         """
+        self.policy.clear_stats()
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
         ratio, n_lanes = self.replay_settings.ratio, rollout.n_lanes
         if ratio * n_lanes < self.gradient_steps:

@@ -133,6 +133,7 @@ class VTrace(GradientLearner):
             ValueError: if the replay buffer is too small, or the environment has opponents and
                 `lag` > 0.
         """
+        self.policy.clear_stats()
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
         if self.replay_settings:
             env_spaces = env.obs_space, env.action_space
@@ -165,6 +166,8 @@ class VTrace(GradientLearner):
         is_finite, _ = self.steps.begin(rollout.floats())
         if self.replay_buffer is not None:
             self.replay_buffer.add(rollout, is_finite)
+        # The first rollout tells only the size of returns. It counts as skipped if not finite.
+        is_enabled = ~(self.policy.critic.output.is_clear & is_finite)
         all_estimates = []
         for _ in range(self.n_epochs):
             generator = self.generator.on(self.device)
@@ -172,7 +175,7 @@ class VTrace(GradientLearner):
             for lanes in order.tensor_split(self.n_minibatches):
                 loss, metrics, estimates = self._losses(self._batch(rollout, lanes), len(lanes))
                 self.steps.backward(loss, metrics, estimates.valid.sum())
-                self.steps.take()
+                self.steps.take(is_enabled)
                 all_estimates.append(estimates)
         # Statistics change only now, so the whole update saw the normalisation that acted. One row
         # of observations is enough: every rollout brings another B.

@@ -75,7 +75,6 @@ def add_moments(norms: list, all_moments: list, is_counted: torch.Tensor | None 
                 new_variance=variance,
                 n_counted=n_counted,
                 n=mean.numel(),
-                min_scale=norm.min_scale,
             )
         )
     blocks = Blocks(len(packed), threads=_MOMENTS_THREADS)
