@@ -49,7 +49,7 @@ class ValueOutput(nn.Module):
     @property
     def is_clear(self) -> torch.Tensor:
         """Whether there have been no statistics since `clear`: () bool."""
-        return (self.count == 0) & ~self.linear.weight.any()
+        return (self.count == 0) & ~self.linear.weight.any() & ~self.linear.bias.any()
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         normalised = linear(x, self.linear).float().squeeze(-1)

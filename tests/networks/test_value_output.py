@@ -37,7 +37,7 @@ def test_constant_returns_do_not_divide_by_zero():
     value = ValueOutput(WIDTH)
     for _ in range(5):
         value.update_stats(torch.zeros(64), VALID)
-    assert value.scale.item() == pytest.approx(1e-3)
+    assert 0 < value.scale.item() < 1e-12
     assert value(torch.randn(8, WIDTH)).isfinite().all()
 
 
