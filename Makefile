@@ -15,7 +15,7 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-slow test-nightly lint setup lock clean
+.PHONY: train test test-slow test-nightly test-gpu lint wheel setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
@@ -26,15 +26,29 @@ test: $(SETUP)             ## run the fast tests: 4 minutes on two cores
 test-slow: $(SETUP)        ## run the thorough tests: 10 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 
-test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour, by hand; SEED=2 makes others
+test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour; SEED=2 makes others
 	$(PYTEST) -m nightly
 	EXAMPLES=2000 $(PYTEST) tests/test_laws.py
 	$(PYTHON) scripts/mutate.py --n 30 --seed $(SEED) --jobs $(CORES)
+
+test-gpu: $(SETUP)         ## run the tests that need a GPU
+	$(PYTHON) -m pytest -q -m cuda
 
 lint: $(SETUP)             ## check style and formatting of Python and kernels
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
+
+wheel:                     ## build sdist and wheel into dist/, check them, train with the wheel alone
+	rm -rf dist build
+	$(BASE) -m venv build/tools
+	build/tools/bin/python -m pip install -q build==1.6.1 twine==7.0.0
+	build/tools/bin/python -m build
+	build/tools/bin/python -m twine check --strict dist/*
+	$(BASE) -m venv build/empty
+	build/empty/bin/python -m pip install -q -c constraints.txt torch==2.13.0 dist/*.whl
+	mkdir build/folder
+	cd build/folder && env -u PYTHONPATH ../empty/bin/megastep train env=minimal geometry=box samples=1e5
 
 setup: $(SETUP)            ## create .venv
 

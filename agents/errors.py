@@ -26,6 +26,12 @@ class Differs(UserError):
     code = 1
 
 
+class EnvFailed(UserError):
+    """An environment of somebody else raised an error."""
+
+    code = 4
+
+
 class ConfigErrors(UserError):
     """All errors of one configuration: `errors`, (dotted key, sentence) each."""
 

@@ -65,18 +65,27 @@ class Core:
         return torch.full((self.n_envs,), value, device=self.device)
 
     def state(self, e: int = 0) -> arrdict:
-        """Returns environment ``e`` for :meth:`plot_state`: lines, lit texels, lights, agents'
-        poses.
+        """Returns environment ``e`` for :meth:`plot_state`: lines of agents, objects and walls, lit
+        texels, lights, agents' poses.
         """
         engine.update_agent_geometry(self.scenery, self.agents)
+        engine.update_objects(self.scenery, self.agents)
         lines, colours, lights = self.scenery.env(e)
-        agents = self.agents
+        agents, n_moving = self.agents, self.scenery.agent_lines.shape[1]
+        if self.scenery.objects is not None:  # without those that are not there
+            n_agent_lines, n_moving = n_moving, n_moving + self.scenery.objects.lines.shape[1]
+            kept = (lines[:, 0] != lines[:, 1]).any(-1).tolist()
+            kept = [
+                k for k, is_long in enumerate(kept) if is_long or not n_agent_lines <= k < n_moving
+            ]
+            n_moving -= len(lines) - len(kept)
+            lines, colours = lines[kept], [colours[k] for k in kept]
         return arrdict(
             lines=lines,
             texels=torch.cat(colours),
             widths=torch.tensor([len(texels) for texels in colours]),
             lights=lights,
-            n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]),
+            n_moving_lines=torch.tensor(n_moving),
             positions=agents.positions[e].clone(),
             angles=agents.angles[e].clone(),
             yaws=agents.yaws.clone(),
@@ -101,8 +110,8 @@ class Core:
         ends = state.widths.cumsum()
         colours = np.split(state.texels, ends[:-1])
         if seen is not None:
-            agents = int(state.widths[: int(state.n_agent_lines)].sum())
-            seen = np.split(np.concatenate([np.ones(agents, bool), seen]), ends[:-1])
+            n_moving = int(state.widths[: int(state.n_moving_lines)].sum())
+            seen = np.split(np.concatenate([np.ones(n_moving, bool), seen]), ends[:-1])
         ax = plotting.plot_scenery(state.lines, colours, state.lights, seen=seen, ax=ax)
         marks = plotting.camera_colours(len(state.yaws))
         for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):

@@ -83,8 +83,7 @@ class EnvState:
                 generators[path] = _generator_state(leaf)
             elif isinstance(leaf, np.ndarray):
                 if _is_savable(leaf):
-                    arrays[path] = torch.from_numpy(np.array(leaf, order="C"))
-                    kinds[path] = "numpy"
+                    arrays[path], kinds[path] = _copied(leaf)
             elif not isinstance(leaf, ReadOnlyTensor):
                 arrays[path], kinds[path] = leaf.detach(), leaf.device.type
         values = {path: _encoded(node) for path, node in self._plain_values()}
@@ -102,7 +101,7 @@ class EnvState:
 
     def host_state(self) -> dict[str, dict[str, Any]]:
         """Returns the part of the state that is not in tensors, for `restore_host`."""
-        arrays, generators, frozen = {}, {}, {}
+        arrays, kinds, generators, frozen = {}, {}, {}, {}
         is_on_gpu = torch.device(self.env.device).type == "cuda"
         for path, (_, _, leaf) in walk(self.root, _STATEFUL).items():
             is_frozen = is_on_gpu and getattr(leaf, "device", None) == torch.device("cpu")
@@ -112,10 +111,10 @@ class EnvState:
                     frozen |= {path: _bytes(state)} if is_frozen else {}
                 elif isinstance(leaf, np.ndarray):
                     if _is_savable(leaf):
-                        arrays[path] = torch.from_numpy(np.array(leaf, order="C"))
+                        arrays[path], kinds[path] = _copied(leaf)
                 elif is_frozen and leaf.nbytes < _LARGE and not isinstance(leaf, ReadOnlyTensor):
                     frozen[path] = _bytes(leaf)
-        state = dict(kinds=dict.fromkeys(arrays, "numpy"), arrays=arrays, generators=generators)
+        state = dict(kinds=kinds, arrays=arrays, generators=generators)
         state["values"] = {path: _encoded(node) for path, node in self._plain_values()}
         state |= dict(n_items=self._members()["lengths"], frozen=frozen)
         none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
@@ -158,7 +157,7 @@ class EnvState:
         """Returns {path: an earlier path} of tensors that are the same."""
         first, aliases = {}, {}
         for path, leaf in arrays.items():
-            key = _place(leaf)
+            key = _identity(leaf)
             if leaf.numel() and first.setdefault(key, path) != path:
                 aliases[path] = first[key]
         return aliases
@@ -219,14 +218,14 @@ class EnvState:
                 raise ValueError(f"{_name(path)} is no longer the kind of generator that was saved")
         fits = {path for path, value in state["arrays"].items() if _fits(leaves.get(path), value)}
         for path in fits:
-            torch.as_tensor(leaves[path]).copy_(state["arrays"][path])
+            _as_tensor(leaves[path]).copy_(state["arrays"][path])
         for path, value in state["arrays"].items():
             # what has no such tensor yet, or began as one tensor with another
             if path not in fits or not _equal(leaves[path], value):
                 self._replace(path, _as_kind(value, state["kinds"][path]))
         for path, first in state["aliases"].items():
             same, now = node_at(self.root, first), node_at(self.root, path)
-            if _place(same) != _place(now):
+            if _identity(same) != _identity(now):
                 self._replace(path, same)
 
     def _set_value(self, path, value):
@@ -329,7 +328,29 @@ def _is_plain(node):
 
 
 def _is_savable(array):
-    return array.dtype.kind in "biufc" and array.dtype.itemsize <= 16
+    return _is_of_numbers(array.dtype) or (array.dtype.kind in "SUmM" and array.dtype.itemsize > 0)
+
+
+def _is_of_numbers(dtype):
+    """Returns whether PyTorch has this type of NumPy's."""
+    is_long = dtype.itemsize > 16 or dtype == np.longdouble
+    return dtype.kind in "biufc" and not is_long and dtype.isnative
+
+
+def _as_tensor(leaf):
+    """Returns a tensor, or an array as a tensor that shares its memory: of characters or times, as
+    bytes on a last axis.
+    """
+    if isinstance(leaf, torch.Tensor):
+        return leaf
+    is_of_numbers = _is_of_numbers(leaf.dtype)
+    return torch.from_numpy(leaf if is_of_numbers else leaf[..., None].view(np.uint8))
+
+
+def _copied(array):
+    """Returns a copy of an array as a tensor, and the kind from which `_as_kind` makes it again."""
+    kind = "numpy" if _is_of_numbers(array.dtype) else f"numpy {array.dtype.str}"
+    return _as_tensor(np.array(array, order="C")), kind
 
 
 def _parent(path):
@@ -341,7 +362,7 @@ def _name(path):
     return path.removeprefix(".env").lstrip(".")
 
 
-def _place(leaf):
+def _identity(leaf):
     """Returns what is equal for tensors that are the same."""
     if not isinstance(leaf, torch.Tensor):
         return id(leaf)
@@ -352,11 +373,11 @@ def _digest(tensor):
     """Returns a number that differs if a tensor has other bytes or these in another order."""
     data = tensor.detach().contiguous().view(-1).view(torch.uint8)
     data = data.view(torch.int32) if len(data) % 4 == 0 else data
-    places = torch.arange(1, _CHUNK + 1, device=data.device) * _FACTOR
-    places = places.to(torch.int32) | 1  # odd, so each bit counts
+    factors = torch.arange(1, _CHUNK + 1, device=data.device) * _FACTOR
+    factors = factors.to(torch.int32) | 1  # odd, so each bit counts
     total = torch.zeros((), dtype=torch.int64, device=data.device)
     for chunk in data.split(_CHUNK):  # all modulo a power of 2
-        total = total * _FACTOR + (chunk * places[: len(chunk)]).sum(dtype=torch.int64)
+        total = total * _FACTOR + (chunk * factors[: len(chunk)]).sum(dtype=torch.int64)
     return int(total)
 
 
@@ -364,7 +385,7 @@ def _fits(leaf, value):
     """Returns whether a tensor or array can take a saved value in place."""
     if isinstance(leaf, np.ndarray):
         is_usable = _is_savable(leaf) and leaf.flags.writeable and min(leaf.strides, default=0) >= 0
-        return is_usable and _fits(torch.from_numpy(leaf), value)
+        return is_usable and _fits(_as_tensor(leaf), value)
     if not isinstance(leaf, torch.Tensor):
         return False
     return leaf.shape == value.shape and leaf.dtype == value.dtype and not is_expanded(leaf)
@@ -372,14 +393,15 @@ def _fits(leaf, value):
 
 def _equal(leaf, value):
     # as bytes, since NaN is not equal to itself
-    pair = (torch.as_tensor(one).cpu().contiguous().view(-1) for one in (leaf, value))
+    pair = (_as_tensor(one).cpu().contiguous().view(-1) for one in (leaf, value))
     return torch.equal(*(one.view(torch.uint8) for one in pair))
 
 
 def _as_kind(value, kind):
     """Returns a saved tensor as what it was: an array, or a tensor on a kind of device."""
-    if kind == "numpy":
-        return value.cpu().numpy().copy()
+    if kind.startswith("numpy"):
+        array, dtype = value.cpu().numpy().copy(), kind.removeprefix("numpy ")
+        return array if dtype == kind else array.view(dtype)[..., 0]
     has_device = kind != "cuda" or torch.cuda.is_available()
     return value.to(kind if has_device else "cpu", copy=True)
 

@@ -8,6 +8,7 @@
 | `masks` | (H, W) int16 over square cells: -1 where a wall touches the cell, else the number of its
 room (1, 2, ...), else 0 |
 | `res` | the side of a cell in metres |
+| `doors` | if it has any: (K, 2, 2) float32, the segments that would close its K doorways |
 
 The lower-left corner of the masks is at (0, 0); row 0 is at the top. Further keys are allowed. In
 this file `shape` is the (H, W) of the masks, and an index is an (i, j) pair of row and column.
@@ -222,28 +223,33 @@ def validate_geometry(g: dict) -> dict:
     if not 0.01 <= res <= 10:
         raise ValueError(f"'res' must be from 0.01 to 10 m per cell, but is {res:g}")
     number = int(_array(g, "id", "iu", ()))
-    return type(g)(g, id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
+    parts = dict(id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
+    if "doors" in g:
+        parts["doors"] = _coordinates(g, "doors", (None, 2, 2), MAX_WALLS)
+    return type(g)(g, **parts)
 
 
 def mirror_image(g: dotdict) -> dotdict:
-    """Returns a geometry with left and right swapped, and without its further keys.
+    """Returns a geometry with left and right swapped, and with the keys alone that the head of this
+    file lists.
 
     Raises:
         ValueError: if `validate_geometry` refuses it, or a wall or light lies beyond its masks.
     """
     g = validate_geometry(dotdict(g))
     width = g.masks.shape[1] * g.res
-    furthest = max(points[..., 0].max(initial=0) for points in (g.walls, g.lights))
+    segments = {key: g[key] for key in ("walls", "lights", "doors") if key in g}
+    furthest = max(points[..., 0].max(initial=0) for points in segments.values())
     if furthest >= width:
         raise ValueError(
             f"geometry {g.id} has no mirror image: a wall or light is at x = {furthest:g} m, but "
             f"its masks end at {width:g} m"
         )
-    walls, lights = g.walls.copy(), g.lights.copy()
-    walls[..., 0] = width - walls[..., 0]
-    lights[..., 0] = width - lights[..., 0]
+    mirrored = {key: points.copy() for key, points in segments.items()}
+    for points in mirrored.values():
+        points[..., 0] = width - points[..., 0]
     cells = np.ascontiguousarray(g.masks[:, ::-1])
-    return validate_geometry(dotdict(id=g.id, walls=walls, lights=lights, masks=cells, res=g.res))
+    return validate_geometry(dotdict(id=g.id, masks=cells, res=g.res, **mirrored))
 
 
 def content_hash(geometries: Sequence[dotdict]) -> "hashlib._Hash":

@@ -22,7 +22,7 @@ def import_object(name: str) -> Callable:
     """
     module, _, attribute = name.partition(":")
     if not all(part.isidentifier() for part in [*module.split("."), *attribute.split(".")]):
-        raise ValueError(f"{name!r} is no import path, such as my_package.rover:Rover")
+        raise ValueError(f"{name!r} is not an import path, such as my_package.rover:Rover")
     if module.partition(".")[0] != "megastep":
         search_current_folder()
     try:

@@ -49,7 +49,9 @@ class ReadOnlyTensor(torch.Tensor):
             out.setflags(write=False)
         if isinstance(out, (torch.UntypedStorage, torch.TypedStorage)):
             return out.clone()
-        return out if isinstance(out, torch.Size) else tree_map_only(torch.Tensor, guarded, out)
+        if isinstance(out, torch.Size) or name == "tolist":  # which hold no tensors
+            return out
+        return tree_map_only(torch.Tensor, guarded, out)
 
     def set_(self, *args, **kwargs):  # the one method that skips __torch_function__
         raise ValueError(self.refusal)

@@ -64,6 +64,9 @@ class Env(Protocol):
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``. Default: None, there is none.
         close(): ends what it started, such as processes. Called after training. Default: none.
+        pop_restarts(): returns how many environments were made anew after an error since the last
+            call, which reports have as ``episode/restarts``. Default: None, none ever is.
+        max_episode_steps: steps at which an evaluation cuts an episode off. Default: 100,000.
         desync(): gives every lane a random age, as if its episode had been going on for some steps.
             Training calls it after ``reset``, so that lanes do not end their episodes in the same
             steps. Default: none.
@@ -89,6 +92,8 @@ DEFAULTS: dict[str, Any] = {
     "capturable": True,
     "resumable": True,
     "close": lambda: None,
+    "pop_restarts": lambda: None,
+    "max_episode_steps": 100_000,
     "check": lambda: None,
     "layout": None,
     "weigh_layouts": None,

@@ -6,8 +6,9 @@ Workers import Gymnasium and what the environments need, but not PyTorch.
 import contextlib
 import multiprocessing
 import os
+import signal
 import sys
-import traceback
+import time
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from megastep import workers
+from megastep.sync_envs import EnvError, SyncEnvs, names_of_numbers
 
 __all__ = ["VectorProcesses", "start_rendering"]
 
@@ -30,23 +32,26 @@ class VectorProcesses:
     killed.
 
     Args:
-        make: ``make(num_envs=n)`` returns a ``SyncVectorEnv``. It is sent to the workers.
+        make: ``make(n_envs=n, first=i)`` returns :class:`~megastep.sync_envs.SyncEnvs`. It is sent
+            to the workers.
         n_envs: number of environments, N.
         n_processes: number of processes. Default: one per core, shared among the ranks of a host.
     """
 
-    def __init__(self, make: Callable, n_envs: int, n_processes: int | None = None):
+    def __init__(self, make: Callable[..., SyncEnvs], n_envs: int, n_processes: int | None = None):
         import loky
         from gymnasium.vector.utils import create_empty_array
         from loky.backend import get_context
 
         if n_processes is None:
             n_processes = loky.cpu_count() // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
-        example = make(num_envs=1)
+        example = make(n_envs=1)
         self.metadata, self.render_mode = example.metadata, example.render_mode
         self.single_observation_space = example.single_observation_space
         self.single_action_space = example.single_action_space
-        example.close()
+        self.restart_failed = example.restart_failed
+        with contextlib.suppress(Exception):
+            example.close()
         edges = np.linspace(0, n_envs, min(max(n_processes, 1), n_envs) + 1).astype(int).tolist()
         self.rows = [slice(*pair) for pair in zip(edges, edges[1:])]
         self.observations = create_empty_array(self.single_observation_space, n_envs)
@@ -59,7 +64,7 @@ class VectorProcesses:
                 pipe, far_end = multiprocessing.Pipe()
                 process = context.Process(
                     target=_serve,
-                    args=(far_end, make, rows.stop - rows.start),
+                    args=(far_end, make, rows),
                     daemon=True,
                     env=workers.WORKER_ENV,
                 )
@@ -67,47 +72,97 @@ class VectorProcesses:
                 far_end.close()
                 self.pipes.append(pipe)
                 self.processes.append(process)
+        self.pipes[0].send(("try", None))
+        names = self._receive(0)
+        self.names = () if isinstance(names, Exception) else names
+        self._ask("name", [self.names for _ in self.pipes])
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Any, dict]:
-        """Resets every environment. Returns (observations, no infos)."""
-        seeds = [None if seed is None else list(seed[rows]) for rows in self.rows]
-        for rows, obs in zip(self.rows, self._ask("reset", seeds)):
+        """Resets every environment. Returns (observations, news), see `step`."""
+        answers = self._ask("reset", [seed and list(seed[rows]) for rows in self.rows])
+        for rows, (obs, _) in zip(self.rows, answers):
             _write(self.observations, rows, obs)
-        return self.observations, {}
+        return self.observations, self._news([news for _, news in answers])
 
     def step(self, actions: Any) -> tuple[Any, ...]:
-        """Takes one step. Returns (observations, rewards, terminated, truncated, no infos), which
-        are valid until the next call.
+        """Takes one step. Returns (observations, rewards, terminated, truncated, news), which are
+        valid until the next call. News are those of :class:`~megastep.sync_envs.SyncEnvs`.
         """
         answers = self._ask("step", [_read(actions, rows) for rows in self.rows])
-        for rows, (obs, *results) in zip(self.rows, answers):
+        for rows, (obs, *results, _) in zip(self.rows, answers):
             _write(self.observations, rows, obs)
             _write(self.results, rows, results)
-        return self.observations, *self.results, {}
+        return self.observations, *self.results, self._news([news for *_, news in answers])
 
     def render(self) -> list[Any]:
         """Returns a frame of every environment."""
         return [frame for frames in self._ask("render", self.rows) for frame in frames]
 
     def close(self) -> None:
-        """Ends the processes."""
+        """Closes the environments and ends their processes, by force after `PATIENCE` seconds.
+
+        Raises:
+            EnvError: the first error of an environment that could not be closed.
+        """
+        answers, pipes = [], [*self.pipes]
+        for pipe in pipes:
+            with contextlib.suppress(EOFError, OSError):  # it has ended
+                pipe.send(("close", None))
+        end = time.monotonic() + PATIENCE
+        for pipe in pipes:
+            with contextlib.suppress(EOFError, OSError):
+                if pipe.poll(max(0.0, end - time.monotonic())):
+                    answers.append(pipe.recv())
+                else:
+                    answers.append(EnvError(f"close() did not return in {PATIENCE} s"))
         self._finalizer()
+        for answer in answers:
+            if isinstance(answer, Exception):
+                raise answer
 
     def _ask(self, command, arguments):
         """Returns the answer of each process to a command."""
-        answers = []
-        try:
-            for pipe, argument in zip(self.pipes, arguments, strict=True):
+        for pipe, argument in zip(self.pipes, arguments, strict=True):
+            with contextlib.suppress(OSError):  # of a process that has ended, as its answer tells
                 pipe.send((command, argument))
-            answers = [pipe.recv() for pipe in self.pipes]
-        except (EOFError, OSError):
-            raise MemoryError(
-                "a process that steps environments was killed, perhaps for want of memory"
-            ) from None
+        answers = [self._receive(number) for number in range(len(self.pipes))]
         for error in answers:
-            if isinstance(error, str):
-                raise RuntimeError(f"an environment failed in its process:\n{error}")
+            if isinstance(error, Exception):
+                raise error
         return answers
+
+    def _receive(self, number):
+        """Returns the answer of a process, which may be an error of an environment.
+
+        Raises:
+            MemoryError: it was killed.
+            EnvError: it has ended otherwise.
+        """
+        try:
+            return self.pipes[number].recv()
+        except (EOFError, OSError):
+            process, rows = self.processes[number], self.rows[number]
+        process.join(PATIENCE)
+        code = process.exitcode
+        if code in (None, -signal.SIGKILL):
+            raise MemoryError(
+                "a process that steps environments was killed, perhaps because memory ran out"
+            )
+        how = f"with exit code {code}" if code >= 0 else f"by {signal.Signals(-code).name}"
+        raise EnvError(
+            f"the process that steps environments {rows.start} to {rows.stop - 1} was ended {how}"
+        )
+
+    def _news(self, of_processes):
+        """Returns the news of all environments."""
+        news = {"failures": [one for part in of_processes for one in part.get("failures", ())]}
+        if any("numbers" in part for part in of_processes):
+            n_envs = self.rows[-1].stop
+            news["numbers"] = {name: np.full(n_envs, np.nan) for name in self.names}
+            for rows, part in zip(self.rows, of_processes):
+                for name, values in part.get("numbers", {}).items():
+                    news["numbers"][name][rows] = values
+        return {key: value for key, value in news.items() if value}
 
 
 def start_rendering(vector: Any) -> None:
@@ -124,25 +179,46 @@ def start_rendering(vector: Any) -> None:
         vector.render_mode = "rgb_array"
 
 
-def _serve(pipe, make, n_envs):
+def _serve(pipe, make, rows):
     """Answers commands until the pipe is closed, which it is when the other process ends."""
+    envs = _attempt(make, n_envs=rows.stop - rows.start, first=rows.start)
     with contextlib.suppress(EOFError, OSError):
-        try:
-            envs = make(num_envs=n_envs)
-            while True:
-                command, argument = pipe.recv()
-                if command == "reset":
-                    pipe.send(envs.reset(seed=argument)[0])
-                elif command == "step":
-                    pipe.send(envs.step(argument)[:4])
-                else:
-                    start_rendering(envs)
-                    pipe.send(envs.render())
-        except (EOFError, OSError):
-            envs.close()
-            raise
-        except Exception:
-            pipe.send(traceback.format_exc())
+        while True:
+            command, argument = pipe.recv()
+            if isinstance(envs, Exception):
+                pipe.send(envs)
+            else:
+                pipe.send(_attempt(_answer, envs, command, argument))
+            if command == "close":
+                return
+    with contextlib.suppress(Exception):
+        envs.close()
+
+
+def _answer(envs, command, argument):
+    if command == "reset":
+        return envs.reset(seed=argument)
+    if command == "step":
+        return envs.step(argument)
+    if command == "try":
+        return names_of_numbers(envs.make())
+    if command == "name":
+        envs.names = argument
+        return None
+    if command == "close":
+        return envs.close()
+    start_rendering(envs)
+    return envs.render()
+
+
+def _attempt(function, *arguments, **more):
+    """Returns what a function returns, or its error, in a form that can be sent."""
+    try:
+        return function(*arguments, **more)
+    except (EnvError, MemoryError) as error:
+        return error if isinstance(error, EnvError) else MemoryError(*map(str, error.args))
+    except Exception as error:
+        return EnvError.of(error, "an environment")
 
 
 def _end(pipes, processes):

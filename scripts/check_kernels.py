@@ -19,27 +19,27 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import megastep
 from megastep.kernels.build.compile import EngineError, build_cuda
-from megastep.kernels.build.program import Program
+from megastep.kernels.build.kernel_library import KernelLibrary
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def programs() -> list[Program]:
-    """Returns all programs of megastep that have kernels for GPUs, by folder."""
+def libraries() -> list[KernelLibrary]:
+    """Returns all libraries of megastep that have kernels for GPUs, by folder."""
     found = {}
     for module in pkgutil.walk_packages(megastep.__path__, "megastep."):
-        if not makes_program(module):
+        if not makes_library(module):
             continue
         for value in vars(importlib.import_module(module.name)).values():
-            if isinstance(value, Program) and value.cuda_operations:
+            if isinstance(value, KernelLibrary) and value.cuda_operations:
                 found[value.folder] = value
     return [found[folder] for folder in sorted(found)]
 
 
-def makes_program(module: pkgutil.ModuleInfo) -> bool:
-    """Returns whether a module's source makes a program. Others may need packages of an extra."""
+def makes_library(module: pkgutil.ModuleInfo) -> bool:
+    """Returns whether a module's source makes a library. Others may need packages of an extra."""
     spec = module.module_finder.find_spec(module.name)
-    return "Program(" in Path(spec.origin).read_text()
+    return "KernelLibrary(" in Path(spec.origin).read_text()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -49,14 +49,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("architecture", nargs="?", default="sm_90")
     architecture = parser.parse_args(argv).architecture
     failed = False
-    for program in programs():
+    for library in libraries():
         start = time.perf_counter()
         try:
-            build_cuda(program, architecture)
+            build_cuda(library, architecture)
             result = f"{time.perf_counter() - start:.1f} s"
         except EngineError as error:
             result, failed = f"failed: {error}", True
-        print(f"{program.folder.resolve().relative_to(ROOT)}: {result}")
+        print(f"{library.folder.resolve().relative_to(ROOT)}: {result}")
     return int(failed)
 
 

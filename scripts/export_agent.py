@@ -148,7 +148,7 @@ def export(
             acts otherwise once it is rounded. Nothing was written then.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise UserError(f"{name!r} is no name of an agent; use small letters, digits and _")
+        raise UserError(f"{name!r} is not a name for an agent; use small letters, digits and _")
     folder, path = folder or package.PRETRAINED, folders.find(run)
     loaded = folders.load_checkpoint(path, False, factory.make_device("cpu"))
     if not loaded.numbers:

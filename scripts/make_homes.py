@@ -55,7 +55,9 @@ def statistics(plans):
         "rooms": [len(g.rooms) for g in plans],
         "room area, m2": [area for g in plans for area in g.areas],
         "free area, m2": [sum(g.areas) for g in plans],
-        "door width, m": [width for g in plans for width in g.doors],
+        "door width, m": [
+            width for g in plans for width in np.abs(g.doors[:, 1] - g.doors[:, 0]).sum(-1)
+        ],
         "doors per room": [len(g.doors) / len(g.rooms) for g in plans],
         "openings": [len(g.openings) for g in plans],
     }

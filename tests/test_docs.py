@@ -11,7 +11,8 @@ from megastep import envs
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
-PAGES = [*ROOT.glob("*.md"), *DOCS.glob("*.md"), *DOCS.glob("lab/*.md")]
+FOLDERS = DOCS, DOCS / "lab", DOCS / "decisions"
+PAGES = [page for folder in (ROOT, *FOLDERS) for page in folder.glob("*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.
 NEEDS_FILES = (
     r"resume=|rerun=|init=|my_package|cores:|encoders:|my_a2c:|safe:|rover:|convoy:|my_rooms:|my_sqlite:"
@@ -63,6 +64,17 @@ def test_every_environment_has_a_section():
     assert set(envs.ENVS) <= {title.lower() for title in titles}
 
 
+def test_every_decision_is_a_short_page_of_the_index():
+    index, *pages = sorted((DOCS / "decisions").glob("*.md"))  # README.md is the first
+    rows = re.findall(r"^\| \[(.+)\]\((.+)\) \|", index.read_text(), re.M)
+    texts = {page.name: page.read_text() for page in pages}
+    assert sorted(rows) == sorted((text.splitlines()[0][2:], name) for name, text in texts.items())
+    for name, text in texts.items():
+        parts = re.findall(r"^\*\*(\w+)\.\*\*", text, re.M)
+        assert parts == ["Context", "Decision", "Consequence"], name
+        assert text.count("\n") <= 25, name
+
+
 @functools.cache
 def tiers(path):
     """Returns {test: (its marks among slow, nightly and cuda, decorators)} of a file of tests."""
@@ -90,4 +102,4 @@ def test_tests_of_all_faults_exist():
             # every case of a test may have a mark of its own
             is_of_tier = marks == {tier} - {""} or not marks and f"mark.{tier}" in decorators
             assert is_of_tier, (fault, path, name)
-    assert len(rows) == 56
+    assert len(rows) == 62

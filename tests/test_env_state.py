@@ -38,6 +38,8 @@ class Env:
         self.place_of_two, self.nested, self.total = (3, 4), [[1]], 0.0
         self.colour, self.key, self.by_name = Colour.RED, b"a", {"a": torch.zeros(1), 2: Inner()}
         self.one, self.other = torch.zeros(2), torch.zeros(2)
+        self.letters, self.lines = np.array([b"a", b"b"]), np.array([["a", "bc"]])
+        self.times = np.array(["2020-01-01"], "M8[D]")
 
     def draw(self):
         return (
@@ -53,6 +55,7 @@ class Env:
     def step(self):
         self.place += torch.tensor([1, torch.nan, torch.inf])
         self.wind[0] += 1
+        self.letters[0], self.lines[0, 0], self.times = b"c", "d", self.times + self.n
         self.n, self.name = self.n + 1, "wild"
         self.seen.add(self.n + 5)
         self.pages = {"b": None}
@@ -84,6 +87,7 @@ def facts(env):
         env.key,
         sorted(map(str, env.by_name)),
     )
+    more = *more, env.letters.tolist(), env.lines.tolist(), env.times.tolist()
     rest = env.later_array, env.later_list, env.by_name[2].n, env.one, env.other
     return [*(torch.as_tensor(one).tolist() for one in arrays), *plain, *more, *rest, kinds]
 
@@ -119,7 +123,7 @@ def test_what_cannot_be_saved_is_named():
     env = Env()
     assert EnvState(env).unreachable() == []
     env.counter, env.nodes, env.objects = iter([1]), {object()}, np.array([env])
-    env.words, env.span = np.array(["a"]), range(2)
+    env.words, env.span = np.zeros(1, "i4,f4"), range(2)
     env.fixed = (1, 2.0, b"bytes", range(3), slice(1), torch.float16, np.float32(1), len)
     state = EnvState(env)
     names = ["counter (list_iterator)", "nodes (set)", "objects (ndarray)", "words (ndarray)"]

@@ -16,7 +16,17 @@ SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
-    ("cache", "colour", "dotdict", "read_only", "settings", "types", "video", "workers"),
+    (
+        "cache",
+        "colour",
+        "dotdict",
+        "read_only",
+        "settings",
+        "sync_envs",
+        "types",
+        "video",
+        "workers",
+    ),
     ("arrdict", "geometry", "imports", "kernels", "plotting", "ragged", "vector_processes"),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "env_state", "geometries", "scene"),
@@ -26,9 +36,10 @@ SIMULATOR = (
 )
 ENGINE = (
     ("checks", "outputs", "state_tree", "views"),
+    ("objects",),
     ("agents", "devices", "scenery"),
     ("launch_params",),
-    ("lighting", "movement", "spawning", "texels"),
+    ("lighting", "movement", "object_updates", "spawning", "texels"),
     ("rendering",),
 )
 AGENTS = (
@@ -75,6 +86,7 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.engine",
     "megastep.recording",
     "megastep.scene",
+    "megastep.sync_envs",
     "megastep.workers",
 }
 # Rooms whose subject ranks are, and how many files elsewhere may know of them.
@@ -109,6 +121,7 @@ OUTSIDE_USERS = {
         "megastep/envs/gymnasium/*.py",
         "megastep/envs/on_host/*.py",
         "megastep/envs/pettingzoo.py",
+        "megastep/sync_envs.py",
         "megastep/vector_processes.py",
     ),
     "hydra": ("agents/cli/*.py",),

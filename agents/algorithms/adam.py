@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.kernels.build.launch import Blocks, launch
 
-_MAX_ROWS = PROGRAM.constants["ADAM_ROWS"]
-_THREADS = PROGRAM.constants["ADAM_THREADS"]
+_MAX_ROWS = LIBRARY.constants["ADAM_ROWS"]
+_THREADS = LIBRARY.constants["ADAM_THREADS"]
 _NONE = MappingProxyType({})
 
 
@@ -78,7 +78,7 @@ class Adam:
         sums = self.n_steps.new_empty(n_sums)
         for rows, n_blocks in launches:
             launch(
-                *(PROGRAM, "squared_norm", sums.device, Blocks(n_blocks, threads=_THREADS)),
+                *(LIBRARY, "squared_norm", sums.device, Blocks(n_blocks, threads=_THREADS)),
                 rows=b"".join(rows),
                 sums=sums,
                 n_rows=len(rows),
@@ -129,7 +129,7 @@ class Adam:
         """Takes a `step` that `n_steps` counts already, if it `is_fused`."""
         for rows, n_blocks in self._launches():
             launch(
-                *(PROGRAM, "adam", self.lr.device, Blocks(n_blocks, threads=_THREADS)),
+                *(LIBRARY, "adam", self.lr.device, Blocks(n_blocks, threads=_THREADS)),
                 rows=b"".join(rows),
                 lr=self.lr,
                 n_steps=self.n_steps,
@@ -155,7 +155,7 @@ class Adam:
                 addresses = [x.data_ptr() for x in (p, p.grad, mean, square)]
                 names = "parameter", "gradient", "mean", "square"
                 rows.append(
-                    PROGRAM.params.AdamRowParams(
+                    LIBRARY.params.AdamRowParams(
                         **dict(zip(names, addresses, strict=True)),
                         n=p.numel(),
                         first_block=n_blocks,

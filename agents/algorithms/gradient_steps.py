@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from megastep.agents.algorithms.adam import Adam
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
 from megastep.kernels.build.launch import Blocks, launch
@@ -103,7 +103,7 @@ class GradientSteps:
         Returns:
             () bool, whether the step was taken.
         """
-        max_metrics = PROGRAM.constants["JUDGED_METRICS"]
+        max_metrics = LIBRARY.constants["JUDGED_METRICS"]
         if self.optimizer.is_fused and len(self._metrics) <= max_metrics:
             grad_norm, is_taken = self._judge_on_gpu(is_enabled)
             self.optimizer.step_on_gpu(is_taken, grad_norm, self.max_grad_norm)
@@ -130,13 +130,13 @@ class GradientSteps:
         """Does `_judge` in two kernels, and counts the step."""
         sums, device = self.optimizer.squared_norms(), self._lr.device
         metrics = [value.float() for value in self._metrics.values()]
-        pack = PROGRAM.params.MetricParams
+        pack = LIBRARY.params.MetricParams
         is_first = self._totals is None
         if is_first:
             self._totals = sums.new_empty(len(metrics) + 3)
         grad_norm, is_taken = sums.new_empty(()), torch.empty_like(self._is_finite)
         launch(
-            *(PROGRAM, "judge", device, Blocks(1, threads=PROGRAM.constants["ADAM_THREADS"])),
+            *(LIBRARY, "judge", device, Blocks(1, threads=LIBRARY.constants["ADAM_THREADS"])),
             metrics=b"".join(pack(values=value) for value in metrics),
             sums=sums,
             is_finite=self._is_finite,

@@ -1,4 +1,4 @@
-"""Detection of NaN, infinity and overflow on the device, and their description on the host.
+"""Detects NaN, infinity and overflow on the device, and describes them on the host.
 
 T time, B lanes.
 """
@@ -11,13 +11,13 @@ from typing import Any
 import torch
 from torch.utils._pytree import tree_leaves_with_path
 
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.kernels.build.launch import Blocks, launch
 
-#: The largest magnitude allowed in a rollout. Squares of returns made of such rewards, summed over
-#: millions of steps, still fit into float32 (3e38). A float16 that overflowed is inf, so larger.
+#: Largest magnitude allowed in a rollout. With such rewards, squared returns summed over millions
+#: of steps still fit into float32 (3e38). float16 overflows to inf, which is above the limit, too.
 LIMIT = 1e12
-#: At most this many lanes with non-finite numbers are named.
+#: Number of lanes that a message names at most.
 MAX_NAMED = 8
 
 
@@ -26,7 +26,8 @@ class NonFiniteError(RuntimeError):
     the likely cure.
 
     Args:
-        is_from_env: True if the environment produced them, so that the policy is as good as before.
+        message: the error.
+        is_from_env: True if the environment produced them; the policy is intact then.
     """
 
     def __init__(self, message: str, is_from_env: bool = False):
@@ -36,17 +37,17 @@ class NonFiniteError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class NonFiniteValue:
-    """A number that is NaN, infinite or beyond `LIMIT`: the first of its lane.
+    """The first number of a lane that is NaN, infinite or beyond `LIMIT`.
 
     Attributes:
         name: name of the tensor, such as `obs.rgb` or `reward`.
         lane: lane of the rollout.
-        step: step of that lane, since the environment was reset, that returned the number or that
-            an action was chosen for, from 1; 0 for the world that `reset` returned.
+        step: step since the environment's `reset` that returned the number, or that an action was
+            chosen for, from 1; 0 for the world that `reset` returned.
         size: magnitude of the number.
         rollout: number of the rollout, from 1.
-        others: the first numbers of up to `MAX_NAMED - 1` other lanes of the same rollout.
-        n_lanes: number of lanes of that rollout with such numbers.
+        others: the same for up to `MAX_NAMED - 1` other lanes of the rollout.
+        n_lanes: number of lanes of the rollout with such numbers.
         n_agents: lanes per environment.
     """
 
@@ -66,14 +67,14 @@ class NonFiniteValue:
 
     @property
     def is_from_env(self) -> bool:
-        """True if the environment produced the number, false if the policy did."""
+        """True if the environment produced the number, False if the policy did."""
         return self.name.split(".")[0] in ("obs", "privileged", "reward")
 
     def in_env(self, lanes: Sequence[int], n_agents: int) -> "NonFiniteValue":
-        """Returns the same with lanes of an environment.
+        """Returns a copy whose lanes are those of the environment instead of the rollout.
 
         Args:
-            lanes: the environment's lane of each lane of the rollout.
+            lanes: environment lane of each lane of the rollout.
             n_agents: lanes per environment.
         """
         return dataclasses.replace(
@@ -95,35 +96,34 @@ class NonFiniteValue:
 
 
 class NonFiniteCheck:
-    """Checks one rollout after another for non-finite numbers, and counts skipped updates.
+    """Checks rollouts for non-finite numbers and counts skipped updates.
 
-    Only `read` synchronises. Everything is in place and of a fixed shape, so checks can be part of
-    a CUDA graph.
+    Only `read` synchronises. All else works in place on fixed shapes, so CUDA graphs can record it.
 
     Args:
         device: device of the rollouts.
     """
 
     def __init__(self, device: torch.device):
-        # [rollouts checked, updates skipped in a row, then of the first rollout with non-finite
-        #  numbers: its number (from 1; 0: none), its bad lanes, and of the first `MAX_NAMED` of
-        #  those the index in `_sizes` and the magnitude of the lane's first number; NaN as -1 and
-        #  infinity as 1.8e308, since checkpoints hold this]
+        # [rollouts checked, updates skipped in a row; of the first rollout with non-finite numbers:
+        #  its number (from 1; 0: none), the number of lanes with some, and of the first `MAX_NAMED`
+        #  such lanes the index in `_sizes` of the lane's first number, then their magnitudes, with
+        #  NaN as -1 and infinity as 1.8e308]
         self.record = torch.zeros(4 + 2 * MAX_NAMED, dtype=torch.float64, device=device)
 
     @property
     def found(self) -> torch.Tensor:
-        """() bool on the device, whether there was a non-finite number since the last `read`."""
+        """() bool on the device, true if a non-finite number was detected since the last `read`."""
         return self.record[2] > 0
 
     def __call__(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Checks a rollout and keeps the first non-finite number of each lane until `read`.
+        """Checks a rollout. Keeps the first non-finite number of each lane until `read`.
 
         Args:
             floats: tensors by name, each (T, B, ...) or (T+1, B, ...), at least one of T.
 
         Returns:
-            () bool on the device, whether all numbers are finite and within `LIMIT`.
+            () bool on the device, true if all numbers are finite and within `LIMIT`.
         """
         if _is_fused(floats):
             return self._check_on_gpu(floats)
@@ -144,17 +144,17 @@ class NonFiniteCheck:
         return n_bad == 0
 
     def _check_on_gpu(self, floats):
-        """Does the same as `__call__` in two kernels."""
+        """Implements `__call__` with two kernels."""
         tensors = list(floats.values())
         n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
-        device, constants = tensors[0].device, PROGRAM.constants
+        device, constants = tensors[0].device, LIBRARY.constants
         first_rows = torch.full((n_lanes,), 2**31 - 1, dtype=torch.int32, device=device)
         is_finite = torch.empty((), dtype=torch.bool, device=device)
         block_bytes = 16 * constants["CHECKED_THREADS"] * constants["CHECKED_WORDS"]
         packed, n_blocks = [], 0
         for tensor in tensors:
             packed.append(
-                PROGRAM.params.CheckedTensorParams(
+                LIBRARY.params.CheckedTensorParams(
                     values=tensor,
                     first_block=n_blocks,
                     n_steps=len(tensor),
@@ -162,7 +162,7 @@ class NonFiniteCheck:
                     is_half=int(tensor.dtype == torch.float16),
                 )
             )
-            # at least one byte more, so that a block sees the numbers after the last whole word
+            # one more block than full ones, for the numbers after the last whole word
             n_blocks += tensor.numel() * tensor.element_size() // block_bytes + 1
         shared = dict(
             tensors=b"".join(packed),
@@ -172,9 +172,9 @@ class NonFiniteCheck:
             n_lanes=n_lanes,
         )
         blocks = Blocks(n_blocks, threads=constants["CHECKED_THREADS"])
-        launch(PROGRAM, "find_bad", device, blocks, **shared, limit=LIMIT)
+        launch(LIBRARY, "find_bad", device, blocks, **shared, limit=LIMIT)
         launch(
-            *(PROGRAM, "record", device, Blocks(1, threads=constants["RECORD_THREADS"])),
+            *(LIBRARY, "record", device, Blocks(1, threads=constants["RECORD_THREADS"])),
             **shared,
             record=self.record,
             is_finite=is_finite,
@@ -183,26 +183,29 @@ class NonFiniteCheck:
         return is_finite
 
     def state_dict(self) -> torch.Tensor:
-        """Returns the rollouts checked and the updates skipped in a row.
+        """Returns (2,) float64: rollouts checked, and updates skipped in a row.
 
-        What was found and is not read yet is left out, since reading it follows the clock.
+        Omits unread detections, because when they are read depends on wall-clock time.
         """
         return self.record[:2].clone()
 
     def load_state_dict(self, counts: torch.Tensor) -> None:
-        """Continues from a `state_dict`."""
+        """Restores a `state_dict`."""
         self.record.zero_()[:2] = counts.to(self.record)
 
     def count(self, is_skipped: torch.Tensor) -> None:
-        """Counts one update, () bool whether it was skipped."""
+        """Counts an update. `is_skipped` is () bool; an applied update resets the count to 0."""
         self.record[1].add_(1).mul_(is_skipped)
 
     def read(self, floats: dict[str, torch.Tensor]) -> tuple[NonFiniteValue | None, int]:
-        """Returns the first non-finite number since the last call, with those of other lanes, and
-        the number of updates skipped in a row. Synchronises.
+        """Reads and clears the detections since the last call. Synchronises.
 
         Args:
             floats: tensors of any rollout; only names and shapes are used.
+
+        Returns:
+            The first non-finite number, with those of other lanes, or None; and the number of
+            updates skipped in a row.
         """
         _, n_skipped, rollout, n_bad, *numbers = self.record.tolist()
         self.record[2:].zero_()
@@ -218,9 +221,9 @@ class NonFiniteCheck:
 
 
 def _is_fused(floats):
-    """Returns whether kernels can check these tensors."""
+    """Returns True if the kernels can check these tensors."""
     tensors = list(floats.values())
-    return len(tensors) <= PROGRAM.constants["CHECKED_TENSORS"] and all(
+    return len(tensors) <= LIBRARY.constants["CHECKED_TENSORS"] and all(
         tensor.is_cuda
         and tensor.dtype in (torch.float16, torch.float32)
         and tensor.is_contiguous()
@@ -233,7 +236,7 @@ def _is_fused(floats):
 def _sizes(floats):
     """Returns the largest magnitudes, ((T+1) F, B) for F tensors, NaN where there is a NaN.
 
-    Rows are ordered by time, then by tensor. Row t of a tensor of T rows came with world t+1.
+    Rows are ordered by time, then by tensor. Row t of a tensor with T rows belongs to world t+1.
     """
     tensors = list(floats.values())
     n_steps, n_lanes = min(map(len, tensors)), tensors[0].shape[1]
@@ -248,8 +251,8 @@ def _largest(values):
     if values.dim() > 2:
         values = values.flatten(2)
         if torch.finfo(values.dtype).max < LIMIT:
-            # any number beyond LIMIT is inf in this dtype, and stays inf or becomes NaN in a sum,
-            # which is five times faster than a maximum
+            # float16 cannot hold numbers beyond LIMIT but inf, which a sum turns into inf or NaN;
+            # sums are five times as fast as maxima
             values = values.sum(-1, dtype=torch.float32)
         else:
             values = torch.maximum(values.amax(-1), -values.amin(-1))
@@ -266,14 +269,14 @@ def _value_at(floats, rollout, index, size):
 
 
 def lane_name(lane: int, n_agents: int) -> str:
-    """Returns a lane's name for messages, with its environment if that has several lanes."""
+    """Returns a lane's name for messages, with its environment if it has several lanes."""
     return f"lane {lane}" + (f" (environment {lane // n_agents})" if n_agents > 1 else "")
 
 
 def nonfinite_leaf(tree: Any) -> str | None:
     """Returns the dotted path of the first non-finite tensor in nested dicts and lists, or None.
 
-    Numbers pass, since some are infinite for good reasons, such as the best loss so far.
+    Ignores plain numbers, which may well be infinite, such as an initial best loss.
     """
     for path, leaf in tree_leaves_with_path(tree):
         if isinstance(leaf, torch.Tensor) and not leaf.isfinite().all():

@@ -2,7 +2,7 @@
 
 import torch
 
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.kernels.build.launch import WARP, launch
 
 _MAX_COUNTED = 16_384  # keys; counting takes the square of their number
@@ -28,5 +28,5 @@ def order(keys: torch.Tensor) -> torch.Tensor:
 def _order_on_gpu(keys):
     """Does `order` in one kernel."""
     n, result = len(keys), torch.empty_like(keys, dtype=torch.int64)
-    launch(PROGRAM, "order", keys.device, n * WARP, keys=keys, order=result, n=n)
+    launch(LIBRARY, "order", keys.device, n * WARP, keys=keys, order=result, n=n)
     return result

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.arrdict import arrdict
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
@@ -101,10 +101,10 @@ class _FusedLoss(torch.autograd.Function):
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
         n_rows = logprobs.numel()
         blocks = Blocks(-(-n_rows // BLOCK))
-        sums = logprobs.new_empty(blocks.x, PROGRAM.constants["N_SUMS"])
+        sums = logprobs.new_empty(blocks.x, LIBRARY.constants["N_SUMS"])
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         launch(
-            *(PROGRAM, "ppo_loss", logprobs.device, blocks),
+            *(LIBRARY, "ppo_loss", logprobs.device, blocks),
             logprobs=logprobs.contiguous(),
             **dict(zip(("entropies", "values", "errors"), inputs, strict=True)),
             old_logprobs=batch.logprobs.contiguous(),

@@ -147,9 +147,9 @@ class R2D2(GradientLearner):
         """Returns about how many bytes a rollout and a minibatch take per environment."""
         # A minibatch has its share of what is replayed per rollout; two networks have activations.
         per_step = bytes_per_step(env, self.policy)
-        share = self.replay_settings.ratio / self.gradient_steps
+        fraction = self.replay_settings.ratio / self.gradient_steps
         rollout = (self.n_steps + 1) * per_step
-        minibatch = share * (self.length + 1) * (per_step + 2 * self.policy.activation_bytes)
+        minibatch = fraction * (self.length + 1) * (per_step + 2 * self.policy.activation_bytes)
         return optional(env, "n_agents") * (rollout + minibatch)
 
     def replay_size(self, env: Env) -> tuple[int, float]:

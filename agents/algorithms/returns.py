@@ -12,7 +12,7 @@ the value is 0; after a truncated step returns bootstrap from V. No sum crosses 
 import torch
 
 from megastep import arrdict
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.networks.scan import linear_scan
 from megastep.kernels.build.launch import launch
 
@@ -72,7 +72,7 @@ def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_):
     advantages, targets = reward.new_empty(2, n_steps, n_lanes)
     valid = torch.empty_like(advantages, dtype=torch.bool)
     launch(
-        *(PROGRAM, "gae", value.device, n_lanes),
+        *(LIBRARY, "gae", value.device, n_lanes),
         reward=reward.contiguous(),
         values=value.contiguous(),
         last_value=last_value.contiguous(),
@@ -148,7 +148,7 @@ def _vtrace_on_gpu(steps, value, last_value, settings):
     n_steps, n_lanes = value.shape
     advantages, targets = value.new_empty(2, n_steps, n_lanes)
     launch(
-        *(PROGRAM, "vtrace", value.device, n_lanes),
+        *(LIBRARY, "vtrace", value.device, n_lanes),
         **{name: leaf.contiguous() for name, leaf in steps.items()},
         values=torch.cat([value, last_value[None]]),
         advantages=advantages,

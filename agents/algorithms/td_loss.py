@@ -10,7 +10,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.kernels import PROGRAM
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
 from megastep.agents.networks.outputs import Output
 from megastep.agents.storage.rollout import without_last
@@ -21,9 +21,9 @@ from megastep.types import Tree
 METRICS = "td", "td_error", "q", "staleness", "effective_samples"
 _ENDS = "reward", "terminal", "truncated"
 _EPS = 1e-3  # of `returns.rescale`
-_THREADS = PROGRAM.constants["TD_THREADS"]
-_SEQUENCES = PROGRAM.constants["TD_SEQUENCES"]
-_N_SUMS, _N_METRICS = (PROGRAM.constants[f"N_TD_{name}"] for name in ("SUMS", "METRICS"))
+_THREADS = LIBRARY.constants["TD_THREADS"]
+_SEQUENCES = LIBRARY.constants["TD_SEQUENCES"]
+_N_SUMS, _N_METRICS = (LIBRARY.constants[f"N_TD_{name}"] for name in ("SUMS", "METRICS"))
 
 
 class Settings(NamedTuple):
@@ -117,7 +117,7 @@ class _FusedLoss(torch.autograd.Function):
         names = *_ENDS, "actions", "starts", "learns", "weight", "age"
         tensors = {name: batch[name].contiguous() for name in names}
         launch(
-            *(PROGRAM, "td_loss", q.device, Blocks(n_blocks, threads=_THREADS)),
+            *(LIBRARY, "td_loss", q.device, Blocks(n_blocks, threads=_THREADS)),
             q=q.contiguous(),
             target_q=target_q.contiguous(),
             **tensors,
@@ -135,7 +135,7 @@ class _FusedLoss(torch.autograd.Function):
             eps=_EPS,
         )
         launch(
-            *(PROGRAM, "td_metrics", q.device, Blocks(1, threads=_THREADS)),
+            *(LIBRARY, "td_metrics", q.device, Blocks(1, threads=_THREADS)),
             sums=sums,
             metrics=metrics,
             n_blocks=n_blocks,

@@ -146,11 +146,11 @@ class VTrace(GradientLearner):
         """Returns about how many bytes the rollouts and a minibatch take per environment."""
         # One rollout, one more per update of lag, and a minibatch: its share of fresh and replayed
         # steps, with their activations.
-        share = 1 / self.n_minibatches
+        fraction = 1 / self.n_minibatches
         if self.replay_settings:
-            share *= 1 + self.replay_settings.ratio
-        per_step = bytes_per_step(env, self.policy) * (1 + self.lag + share)
-        per_step += self.policy.activation_bytes * share
+            fraction *= 1 + self.replay_settings.ratio
+        per_step = bytes_per_step(env, self.policy) * (1 + self.lag + fraction)
+        per_step += self.policy.activation_bytes * fraction
         return optional(env, "n_agents") * (self.n_steps + 1) * per_step
 
     def replay_size(self, env: Env) -> tuple[int, float]:

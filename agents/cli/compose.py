@@ -1,8 +1,9 @@
 """The words of a command line -> Hydra -> checked settings, before anything is written.
 
-Only Hydra's public API is used: its grammar reads the words, `hydra.compose` composes the groups
-from files with their `blocks`, and keys are set in what comes out, so that every error has its own
-word. Jobs of sweeps compose in the same way, in whichever process they run.
+Hydra's grammar reads the words, `hydra.compose` composes the groups from files with their `blocks`,
+and keys are set in what comes out, so that every error has its own word. Two methods of Hydra are
+replaced: `ConfigStore.__deepcopy__` here, and `load_config` of its sources of files in `blocks`.
+Jobs of sweeps compose in the same way, in whichever process they run.
 """
 
 import copy
@@ -36,7 +37,7 @@ from megastep.settings import closest
 LONGEST, MOST_BRACKETS = 200, 40
 #: Bytes that the locale's encoding does not have.
 UNDECODED = re.compile(r"[\ud800-\udfff]")
-NO_TEXT = "is no text in this locale; PYTHONUTF8=1 reads UTF-8"
+NO_TEXT = "is not valid text in this locale; PYTHONUTF8=1 reads UTF-8"
 #: An element of a value with = in it, as folders of sweeps have, and what quotes it.
 WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
 #: Members of Hydra's own groups that come with the optional dependencies.
@@ -46,6 +47,8 @@ OPEN = {
     key: OmegaConf.create({}, flags={"struct": False})
     for key in (*settings.IMPORTED, "agent", "opponents")
 }
+#: The learner whose blocks are tried first where none is typed.
+GUESS = "ppo"
 #: What Hydra raises for words that it cannot use.
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
 STORE = config_store.ConfigStore.instance()
@@ -186,8 +189,8 @@ class Composer:
         keys += ["resume"] * (word == "latest" or "/" in word)
         keys = groups + [key for key in keys if key in names]
         if not word or not keys:
-            return "is no key=value; --cfg job prints all keys"
-        return f"is no key=value; did you mean {keys[0]}={word}?"
+            return "is not key=value; --cfg job prints all keys"
+        return f"is not key=value; did you mean {keys[0]}={word}?"
 
     def config(self, overrides: list[types.Override]) -> tuple[DictConfig, list[tuple[str, str]]]:
         """Returns (the configuration, the errors of words that are not in it)."""
@@ -253,7 +256,7 @@ class Composer:
     ) -> DictConfig:
         # with the blocks of what is typed, and once more if files choose another device or learner
         typed = dict(word.lstrip("+").split("=", 1) for word in groups if "=" in word)
-        blocks.apply(device or "auto", learner or typed.get("learner"))
+        blocks.apply(device or "auto", learner or typed.get("learner", GUESS))
         composed = functools.partial(hydra.compose, self.name, [*groups], return_hydra_config=True)
         config, before = composed(), dict(blocks.applied)
         device, name = device or config.get("device") or "auto", "learner.name"

@@ -179,8 +179,8 @@ def compare(row: Row, folder: Path, values: Sequence[float]) -> int:
     are_inside = [*map(Result.contains, row.results, values)]
     is_reproduced = all(are_inside) and is_exact is not False
     for result, value, is_inside in zip(row.results, values, are_inside, strict=True):
-        place = "inside" if is_inside else "OUTSIDE"
-        console.say(f"{place}: {value:.4g}, stated {result}, docs/lab/{result.page}")
+        verdict = "inside" if is_inside else "OUTSIDE"
+        console.say(f"{verdict}: {value:.4g}, stated {result}, docs/lab/{result.page}")
     console.say(sentence)
     if not all(are_inside) and "samples=" not in row.train:
         console.say(

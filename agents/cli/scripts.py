@@ -50,13 +50,12 @@ The most common words:
   finish.evaluate=true finish.record=true
                                a table and a video at the end
   opponents.past=0.4 opponents.bot=0.1
-                               in environments with several agents: shares of environments against
-                               past selves and a scripted policy; snapshots=8 keeps what ratings
-                               compare
+                               with several agents: fractions of environments against past selves
+                               and a scripted policy; snapshots=8 saves weights for ratings
   curriculum=sfl               draw homes that are won half of the time more often; plr: where
                                values err most
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
-                               more_seconds=60 more_samples=1e6 add to what it has had
+                               more_seconds=60 more_samples=1e6 extend its budget
   ranks=2                      two processes that train together, on a GPU each; all: every GPU;
                                restarts=2 starts them again if one is killed; dry_run=true only
                                prints what would run
@@ -89,6 +88,7 @@ RESUMABLE = (
     "dry_run",
     "logger",
     "finish",
+    "env.restart_failed",
 )
 
 
@@ -165,7 +165,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     if how == "resume" and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
         raise ConfigErrors(errors)
     saved |= {"trust": tree.get("trust", False)}
-    if environment.launched() is not None:
+    if environment.rank_info() is not None:
         saved["ranks"] = tree["ranks"]
     return saved
 
@@ -175,10 +175,10 @@ def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterat
     for name in ("samples", "seconds"):
         total, more = tree[name], tree.get(f"more_{name}")
         if more is not None and name in typed:
-            yield f"more_{name}", f"comes on top of what the run has had, {name}= is the total"
+            yield f"more_{name}", f"extends the budget, {name}= is the total; give one of them"
         elif more is None and isinstance(total, (int, float)) and had[name] >= total:
-            spent = f"the run has had {round(had[name], 1):,} of {name}={round(total, 1):,}"
-            yield name, f"{spent}; to continue, give more_{name}= or a larger {name}="
+            spent = f"already trained for {round(had[name], 1):,} of {round(total, 1):,} {name}"
+            yield name, f"the run has {spent}; to continue, give more_{name}= or a larger {name}="
 
 
 def set_ranks(tree: Tree, typed: list[str]) -> None:
@@ -188,14 +188,14 @@ def set_ranks(tree: Tree, typed: list[str]) -> None:
         ConfigErrors: another number was typed.
     """
     with user_errors():
-        place = environment.launched()
-    if place is None:
+        info = environment.rank_info()
+    if info is None:
         return
-    if "ranks" in typed and tree["ranks"] != place.n_ranks:
+    if "ranks" in typed and tree["ranks"] != info.n_ranks:
         text = f"{tree['ranks']!r} is not the number of ranks that torchrun has started, "
-        cure = f"{place.n_ranks}; leave it out, or start train.py without torchrun"
+        cure = f"{info.n_ranks}; leave it out, or start train.py without torchrun"
         raise ConfigErrors([("ranks", text + cure)])
-    tree["ranks"] = place.n_ranks
+    tree["ranks"] = info.n_ranks
 
 
 def check_training(cfg: settings.Train) -> None:

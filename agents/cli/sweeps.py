@@ -36,7 +36,7 @@ from megastep.agents.cli import scripts
 from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import settings
-from megastep.agents.launch import places, rank, signals
+from megastep.agents.launch import gpu_slots, rank, signals
 from megastep.agents.runs import folders, scores
 from megastep.agents.runs.atomic_files import write_atomically
 
@@ -107,7 +107,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
     _, jobs, config = jobs_of(composer, words)
-    idle = places.check(jobs, config)
+    idle = gpu_slots.check(jobs, config)
     folder = Path(config.sweep.dir)
     if UNDECODED.search(str(folder.absolute())):  # which the settings of jobs hold as text
         raise UserError(f"{str(folder.absolute())!r} {NO_TEXT}")
@@ -268,7 +268,7 @@ class Job:
                         if getattr(one, "group", "") is None
                     }
                     cfg = settings.changed(cfg, logger=getattr(cfg, "logger", {}) | grouped)
-                    with places.taken(cfg) as cfg:
+                    with gpu_slots.taken(cfg) as cfg:
                         result = scripts.SCRIPTS[self.source[0]].run(cfg)
                     row |= {"state": DONE, **(scores.outcome(result) if result else {})}
             except signals.Interrupted as stop:

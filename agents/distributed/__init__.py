@@ -1,7 +1,7 @@
-"""Several processes that train one policy, each with environments of its own: on the GPUs of one
-machine, on those of several, or on CPUs. A *rank* is one of them, as in PyTorch and NCCL.
+"""Data-parallel training of one policy, on GPUs of one or several machines, or on CPUs. A *rank*
+is one of the processes, as in PyTorch and NCCL. Each rank has its own environments.
 
-Every rank holds the same weights. Gradients, and every statistic that a weight depends on, are
-pooled over the ranks; what depends on a clock is decided by rank 0. In one process all of this does
-nothing, and costs nothing.
+All ranks hold the same weights. Gradients, and all statistics that weights depend on, are pooled
+over the ranks; rank 0 decides what depends on the clock. In a single process the functions of this
+package are no-ops.
 """

@@ -1,6 +1,6 @@
-"""Steps that all ranks take or none: an error of one is the error of all.
+"""Calls that succeed or fail on all ranks: an error on one rank is raised on every rank.
 
-Each function waits for the other ranks. In a process of its own it only calls what it is given.
+Each function waits for the other ranks. In a single process it just calls its argument.
 """
 
 import pickle
@@ -11,8 +11,8 @@ from megastep.agents.distributed.process_group import (
     exchange,
     gather_objects,
     n_ranks,
-    place,
     rank,
+    rank_label,
 )
 
 T = TypeVar("T")
@@ -24,13 +24,14 @@ def any_rank(condition: bool) -> bool:
 
 
 def together(function: Callable[[], T]) -> T:
-    """Calls a function on every rank. Returns what it returns here.
+    """Calls a function on every rank. Returns this rank's result.
 
-    The function does not wait for other ranks.
+    Args:
+        function: must not wait for other ranks.
 
     Raises:
-        Exception: if it raises one on any rank: on all ranks that of the first, with the rank's
-            place in its message if that is not rank 0.
+        Exception: on all ranks, the error of the first rank that failed. Unless that is rank 0, its
+            label is in the message.
     """
     if n_ranks() == 1:
         return function()
@@ -47,7 +48,7 @@ def together(function: Callable[[], T]) -> T:
 
 
 def from_rank_0(function: Callable[[], T]) -> T:
-    """Calls a function on rank 0. Returns what it returns, or raises its error, on every rank.
+    """Calls a function on rank 0. Returns its result, or raises its error, on every rank.
 
     Args:
         function: returns a small value that can be pickled.
@@ -56,15 +57,13 @@ def from_rank_0(function: Callable[[], T]) -> T:
 
 
 def _portable(error):
-    """Returns an error that can be pickled, None for None; that of another rank than 0 begins with
-    the rank's place.
-    """
+    """Returns an error that can be pickled, None for None. Adds the label of ranks other than 0."""
     if error is None:
         return None
     if rank() > 0 and len(error.args) == 1 and isinstance(error.args[0], str):
-        error.args = (f"{place()}: {error.args[0]}",)
+        error.args = (f"{rank_label()}: {error.args[0]}",)
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:
-        return RuntimeError(f"{place()}: {type(error).__name__}: {error}")
+        return RuntimeError(f"{rank_label()}: {type(error).__name__}: {error}")
     return error

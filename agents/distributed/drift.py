@@ -1,4 +1,4 @@
-"""Differences between the ranks: in what they were started with, and in what they learn."""
+"""Detects ranks that differ in weights, code or configuration."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from megastep.agents.distributed.pooling import all_gather
 from megastep.agents.distributed.process_group import gather_objects, n_ranks
 
-#: Integer types of as many bytes, through which the bits of a number are read.
+#: Integer dtype of each item size, to view the bits of floats.
 INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
@@ -18,8 +18,11 @@ class DriftError(RuntimeError):
 
 
 def first_difference(policy: torch.nn.Module) -> str | None:
-    """Returns the first parameter or buffer in which ranks differ, None if all bits are equal:
-    `policy.core.bias differs on rank 1`. Synchronises, and waits for the other ranks.
+    """Compares the weights of all ranks. Synchronises, and waits for the other ranks.
+
+    Returns:
+        The first parameter or buffer with different bits, such as `policy.core.bias differs on rank
+        1`; None if all are equal.
     """
     if n_ranks() == 1:
         return None
@@ -45,9 +48,7 @@ def check_drift(policy: torch.nn.Module) -> None:
 
 
 def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
-    """Returns the sum of the bits of each tensor as integers, modulo 2^64: an int64 vector on their
-    device.
-    """
+    """Returns the sum of the bits of each of n tensors as integers, mod 2^64: (n,) int64."""
     with torch.no_grad():
         parts = [_bits(tensor.detach()).sum(dtype=torch.int64) for tensor in tensors]
         return torch.stack(parts) if parts else torch.zeros(0, dtype=torch.int64)
@@ -60,11 +61,14 @@ def _bits(tensor):
 
 
 def first_differing_fact(facts: dict[str, object]) -> str | None:
-    """Returns what the ranks were started with differently, such as `learner.lr is 0.001 on rank 0,
-    and 0.01 on ranks 1 and 3`; None if nothing is different. Waits for the other ranks.
+    """Compares facts, such as versions and settings, of all ranks. Waits for the other ranks.
 
     Args:
-        facts: of this rank, by name, in the order of their importance.
+        facts: this rank's facts by name, the most important first.
+
+    Returns:
+        The first that differs, such as `learner.lr is 0.001 on rank 0, and 0.01 on ranks 1 and 3`;
+        None if all are equal.
     """
     everyones = gather_objects({name: str(value) for name, value in facts.items()})
     for name in dict.fromkeys(name for facts in everyones for name in facts):

@@ -1,5 +1,5 @@
-"""This process's place among the ranks, as torchrun's environment variables say. Knows no PyTorch,
-which takes seconds to import.
+"""Rank and number of ranks from torchrun's environment variables. Does not import PyTorch, which
+takes seconds.
 """
 
 import contextlib
@@ -11,17 +11,24 @@ from typing import NamedTuple
 NAMES = "RANK", "WORLD_SIZE", "LOCAL_RANK"
 
 
-class Launched(NamedTuple):
-    """This process's place among the ranks, as torchrun says."""
+class RankInfo(NamedTuple):
+    """This process among the ranks that torchrun started.
+
+    Attributes:
+        rank: 0 to `n_ranks` - 1.
+        n_ranks: number of ranks on all machines.
+        local_rank: number among the ranks of this machine.
+        attempt: how often torchrun has restarted the ranks.
+    """
 
     rank: int
     n_ranks: int
-    local_rank: int  # among the ranks of this machine
-    attempt: int = 0  # how often torchrun has started the ranks again
+    local_rank: int
+    attempt: int = 0
 
 
-def launched() -> Launched | None:
-    """Returns this process's place if torchrun started it, None for a process of its own.
+def rank_info() -> RankInfo | None:
+    """Returns this process's rank if torchrun started it, None for a single process.
 
     Raises:
         ValueError: torchrun's variables contradict each other.
@@ -33,16 +40,16 @@ def launched() -> Launched | None:
     if not all(text.isdecimal() for text in texts) or int(texts[0]) >= int(texts[1]):
         variables = " ".join(f"{name}={text}" for name, text in zip(NAMES, texts))
         raise ValueError(
-            f"{variables} is no rank of torchrun; to train in one process, unset these "
-            "environment variables"
+            f"{variables} is not a valid rank; to train in one process, unset these environment "
+            "variables"
         )
-    return Launched(*map(int, texts))
+    return RankInfo(*map(int, texts))
 
 
 def rank() -> int:
-    """Returns the number of the rank that this process is, 0 for a process of its own."""
-    place = launched()
-    return place.rank if place else 0
+    """Returns the rank of this process, 0 for a single process."""
+    info = rank_info()
+    return info.rank if info else 0
 
 
 def hostname() -> str:
@@ -51,9 +58,7 @@ def hostname() -> str:
 
 @contextlib.contextmanager
 def variables(changes: Mapping[str, str]) -> Iterator[None]:
-    """Sets environment variables, also of processes that are started, for the time of this
-    context.
-    """
+    """Sets environment variables for the duration of the context. Child processes inherit them."""
     before = {name: os.environ.get(name) for name in changes}
     os.environ.update(changes)
     try:

@@ -1,4 +1,4 @@
-"""What every rank does next, agreed upon once per update, so that all do the same updates."""
+"""Agrees once per update on what all ranks do next, so that all do the same updates."""
 
 from typing import NamedTuple
 
@@ -6,12 +6,12 @@ from megastep.agents.distributed.process_group import counts, exchange
 
 
 class Plan(NamedTuple):
-    """The next turn of the training loop.
+    """The next iteration of the training loop.
 
     Attributes:
         goes_on: there is another update.
-        saves: a checkpoint is saved before it.
-        lr_fraction: the factor of its learning rate.
+        saves: save a checkpoint before it.
+        lr_fraction: factor of its learning rate.
     """
 
     goes_on: bool
@@ -20,13 +20,14 @@ class Plan(NamedTuple):
 
 
 def agree(plan: Plan, is_stopped: bool, is_behind: bool) -> Plan:
-    """Returns the plan of rank 0, whose clock decides, unless another rank has a reason against it.
+    """Returns the plan of rank 0, whose clock decides, unless a rank is stopped or behind.
+
     Waits for the other ranks.
 
     Args:
-        plan: this rank's.
-        is_stopped: a signal stops this rank, and so all.
-        is_behind: this rank still writes its part of the last checkpoint, so none is saved.
+        plan: this rank's plan.
+        is_stopped: this rank got a signal; all ranks stop.
+        is_behind: this rank is still writing its part of the last checkpoint; none is saved.
     """
     counts.n_updates += 1
     rows = exchange([*plan, is_stopped, is_behind])

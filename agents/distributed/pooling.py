@@ -1,4 +1,4 @@
-"""Sums, moments and gradients over all ranks, as parts of an update. Nothing synchronises.
+"""Sums, moments and gradients pooled over all ranks. Never synchronises, so updates can use it.
 
 R ranks.
 """
@@ -31,20 +31,26 @@ def all_gather(tensor: torch.Tensor) -> torch.Tensor:
         return tensor[None]
     gathered = tensor.new_zeros(n_ranks(), *tensor.shape)
     gathered[rank()] = tensor
-    return all_reduce(gathered)  # each number is added to zeros, so it keeps its bits
+    return all_reduce(gathered)  # adding zeros keeps every bit
 
 
 def on_all_ranks(condition: torch.Tensor) -> torch.Tensor:
-    """Returns () bool, whether a () bool is true on every rank."""
+    """Returns () bool, true if the condition, () bool, is true on every rank."""
     if n_ranks() == 1:
         return condition
     return all_reduce((~condition).int()) == 0
 
 
 def pool_moments(*moments: Moments) -> list[Moments]:
-    """Returns the moments of the entries of all ranks together (Chan et al. 1979).
+    """Pools the moments (count, mean, variance) of all ranks (Chan et al. 1979).
 
-    One operation for all that are given, and as many kernels as for one.
+    Takes one collective operation, however many moments there are.
+
+    Args:
+        moments: this rank's, each of any shape, the same on all ranks.
+
+    Returns:
+        The moments over the entries of all ranks.
     """
     if n_ranks() == 1 or not moments:
         return list(moments)
@@ -54,7 +60,7 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     rows = all_gather(torch.cat([torch.stack(own_counts).double(), statistics.double()]))
     counts, means, variances = rows.split([len(sizes), sum(sizes), sum(sizes)], 1)
     n = _in_common_dtype(counts.sum(0), own_counts)
-    # repeat each count for every number of its moments
+    # one count per entry of a mean
     columns = counts.split(1, 1)
     counts = torch.cat([column.expand(-1, size) for column, size in zip(columns, sizes)], 1)
     divisor = counts.sum(0).clamp(min=1)
@@ -69,7 +75,7 @@ def pool_moments(*moments: Moments) -> list[Moments]:
 
 
 def _in_common_dtype(x, others):
-    """Returns x in the dtype of the others if all have one: a kernel instead of one for each."""
+    """Returns x in the dtype of the others if they agree: one kernel instead of one for each."""
     dtypes = {other.dtype for other in others}
     return x.to(*dtypes) if len(dtypes) == 1 else x
 
@@ -77,7 +83,7 @@ def _in_common_dtype(x, others):
 def pool_with_condition(
     condition: torch.Tensor, *moments: Moments
 ) -> tuple[torch.Tensor, list[Moments]]:
-    """Returns `on_all_ranks(condition)` and `pool_moments(*moments)`, by one operation."""
+    """Returns `on_all_ranks(condition)` and `pool_moments(*moments)`, in one collective."""
     if n_ranks() == 1:
         return condition, list(moments)
     one = torch.ones_like(condition, dtype=torch.int64)
@@ -91,18 +97,18 @@ def average_gradients(
     n_valid: torch.Tensor,
     means: Sequence[torch.Tensor] = (),
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Averages gradients over the ranks, in place, each weighted by the number of entries that its
-    loss is the mean over. A learner calls this after `backward()`, before it clips gradients.
+    """Averages gradients over the ranks, in place, weighted by the number of valid entries of each
+    rank's loss. A learner calls this after `backward()` and before it clips gradients.
 
-    All ranks must call it equally often, with the same parameters. In one process nothing changes.
+    All ranks must call it equally often, with the same parameters. A no-op in a single process.
 
     Args:
-        parameters: those without a gradient are left out. Gradients are float32.
-        n_valid: (), the number of entries.
-        means: tensors () to average in the same way, such as metrics.
+        parameters: parameters with float32 gradients; those without a gradient are skipped.
+        n_valid: (), number of entries that this rank's loss averages over.
+        means: tensors () to average with the same weights, such as metrics.
 
     Returns:
-        The number of entries of all ranks, and the means over them.
+        n_valid of all ranks together, and the averaged means.
     """
     means = [value.detach() for value in means]
     if n_ranks() == 1:
@@ -111,7 +117,7 @@ def average_gradients(
         held = [p for p in parameters if p.grad is not None]
         gradients = [p.grad.flatten() for p in held]
         numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
-        # one buffer, in which each gradient begins at a multiple of 16 bytes, as Adam likes it
+        # one buffer; each gradient starts at a multiple of 16 bytes, for Adam's vector loads
         sizes = [n + -n % 4 for n in map(len, gradients)]
         n_numbers = sum(sizes) + len(numbers)
         bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)

@@ -1,6 +1,6 @@
-"""The processes that train together: who they are, and what they tell each other on the host.
+"""The process group: its ranks, and their communication on the host.
 
-torchrun, or `ranks=` on the command line, starts them and sets their environment variables.
+torchrun, or `ranks=` on the command line, starts the ranks and sets their environment variables.
 
 R ranks.
 """
@@ -19,23 +19,23 @@ from typing import Any
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.environment import hostname, launched
+from megastep.agents.distributed.environment import hostname, rank_info
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
 
 
 class RankLost(RuntimeError):
-    """Another rank has ended, or does not answer."""
+    """Another rank has ended or does not answer."""
 
 
 class Counts:
-    """What this rank has done, for `watch` to compare.
+    """Progress of this rank, which `watch` compares.
 
     Attributes:
-        n_operations: number of operations of all ranks that it has begun.
-        n_updates: number of updates that the ranks have agreed to begin.
-        is_exempt: it does something for which the others wait, however long it takes.
+        n_operations: collective operations started.
+        n_updates: updates that the ranks have agreed to start.
+        is_exempt: the others wait for this rank however long it takes.
     """
 
     n_operations = n_updates = 0
@@ -47,9 +47,9 @@ counts = Counts()
 
 @contextlib.contextmanager
 def unhurried() -> Iterator[None]:
-    """In this context the other ranks wait for this one as long as it takes: an evaluation, files.
+    """Lets the other ranks wait for this one without limit, as for an evaluation or for files.
 
-    Otherwise a rank that the others have waited for, for `watch.LOST_SECONDS`, counts as hung.
+    Otherwise a rank counts as hung when others have waited `watch.LOST_SECONDS` for it.
     """
     counts.is_exempt, before = True, counts.is_exempt
     try:
@@ -59,20 +59,26 @@ def unhurried() -> Iterator[None]:
 
 
 def start(seconds: float = START_SECONDS) -> None:
-    """Joins the ranks that torchrun started. Returns when all have. Does nothing in a process of
-    its own.
+    """Joins the ranks that torchrun started; returns when all have joined. A no-op in a single
+    process, or if it has joined.
+
+    Args:
+        seconds: time limit.
+
+    Raises:
+        RuntimeError, ValueError: the ranks cannot connect.
     """
-    place = launched()
-    if place is None or distributed.is_initialized():
+    info = rank_info()
+    if info is None or distributed.is_initialized():
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
-    # torchrun may keep the store when it starts the ranks again, with addresses of the dead in it
-    keys = distributed.PrefixStore(f"ranks {place.attempt} {next(_STARTS)}", _store())
+    # a new prefix: after a restart the store may still hold addresses of the ended ranks
+    keys = distributed.PrefixStore(f"ranks {info.attempt} {next(_STARTS)}", _store())
     distributed.init_process_group(
-        backend, store=keys, rank=place.rank, world_size=place.n_ranks, timeout=wait
+        backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
     )
-    atexit.register(stop)  # threads of gloo that still run would abort the interpreter's end
+    atexit.register(stop)  # gloo threads must not outlive the interpreter
 
 
 _STARTS = itertools.count()
@@ -80,9 +86,9 @@ _STARTS = itertools.count()
 
 @functools.cache
 def _store() -> distributed.Store:
-    """Returns the key-value store of the ranks, which torchrun's agent has, or else rank 0."""
-    place, has_agent = launched(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    return _connection(is_master=place.rank == 0 and not has_agent)
+    """Returns the ranks' key-value store, which torchrun's agent hosts, or else rank 0."""
+    info, has_agent = rank_info(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    return _connection(is_master=info.rank == 0 and not has_agent)
 
 
 def _connection(is_master=False):
@@ -96,44 +102,44 @@ def _connection(is_master=False):
 
 
 def store(name: str) -> distributed.Store:
-    """Returns a connection of its own to the ranks' key-value store: no other thread waits on it.
+    """Opens another connection to the ranks' key-value store, for use by another thread.
 
     Args:
-        name: of a set of keys.
+        name: prefix of its keys.
     """
     return distributed.PrefixStore(f"megastep {name}", _connection())
 
 
 def stop() -> None:
-    """Leaves the other ranks."""
+    """Leaves the process group."""
     if distributed.is_initialized():
         distributed.destroy_process_group()
 
 
 def rank() -> int:
-    """Returns this process's number, 0 to R - 1; 0 without other ranks."""
+    """Returns this process's rank, 0 to R - 1; 0 in a single process."""
     return distributed.get_rank() if distributed.is_initialized() else 0
 
 
 def n_ranks() -> int:
-    """Returns R; 1 without other ranks."""
+    """Returns R; 1 in a single process."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
 def local_rank() -> int | None:
-    """Returns this rank's number on its machine, which is that of its GPU; None without ranks."""
-    place = launched()
-    return place and place.local_rank
+    """Returns this rank's number on its machine, that of its GPU; None without torchrun."""
+    info = rank_info()
+    return info and info.local_rank
 
 
-def place() -> str:
-    """Returns this rank's place for messages, such as `rank 1 on node-7`."""
+def rank_label() -> str:
+    """Returns this rank's label for messages, such as `rank 1 on node-7`."""
     return f"rank {rank()} on {hostname()}"
 
 
 @contextlib.contextmanager
 def communicating() -> Iterator[None]:
-    """An operation of all ranks, which is counted. An error of PyTorch's becomes `RankLost`."""
+    """Wraps a collective operation: counts it, and turns PyTorch's errors into `RankLost`."""
     counts.n_operations += 1
     try:
         yield
@@ -142,11 +148,10 @@ def communicating() -> Iterator[None]:
 
 
 def exchange(numbers: Sequence[float]) -> list[list[float]]:
-    """Returns the numbers of every rank, in the order of ranks. Waits for the others; touches no
-    GPU.
+    """Returns the numbers of every rank, by rank. Waits for the other ranks; does not use the GPU.
 
     Args:
-        numbers: as many from every rank.
+        numbers: equally many on every rank.
     """
     row = torch.tensor(numbers, dtype=torch.float64)
     if n_ranks() == 1:
@@ -158,7 +163,7 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
 
 
 def gather_objects(value: Any) -> list[Any]:
-    """Returns a small value of every rank, in the order of ranks. Waits for the others."""
+    """Returns a small picklable value of every rank, by rank. Waits for the other ranks."""
     if n_ranks() == 1:
         return [value]
     values = [None] * n_ranks()

@@ -1,7 +1,7 @@
-"""Numbers of all ranks for a report, returned on the host. Each function waits for the others.
+"""Numbers of all ranks for a report, on the host. Each function waits for the other ranks.
 
-Tensors are exchanged on their device. Between GPUs that takes a tenth of the time of an exchange on
-the host, and training waits for a report.
+Tensors are exchanged on their device: between GPUs this is ten times as fast as on the host, and
+training waits for reports.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def sum_over_ranks(values: torch.Tensor) -> torch.Tensor:
 
 
 def mean_over_ranks(values: dict[str, float]) -> dict[str, float]:
-    """Returns the means over the ranks of numbers by name.
+    """Averages numbers over the ranks, by name.
 
-    NaN does not count; a number that is NaN on all ranks is left out.
+    NaN is ignored; a number that is NaN on all ranks is left out.
     """
     rows, means = gather_objects(values), {}
     for name in values:
@@ -36,12 +36,12 @@ def mean_over_ranks(values: dict[str, float]) -> dict[str, float]:
 
 
 def gather_if_any(value: T, is_needed: bool, device: torch.device) -> list[T]:
-    """Returns a small value of every rank if some rank needs them, otherwise this rank's alone.
+    """Returns the values of all ranks if any rank needs them, otherwise only this rank's.
 
     Args:
-        value: can be pickled.
-        is_needed: this rank needs them.
-        device: where the ranks exchange whether any needs them. Synchronises.
+        value: small and picklable.
+        is_needed: this rank needs the values.
+        device: device on which the ranks exchange `is_needed`. Synchronises.
     """
     if n_ranks() == 1 or on_all_ranks(torch.tensor(not is_needed, device=device)):
         return [value]

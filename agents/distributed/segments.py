@@ -1,7 +1,7 @@
-"""A function recorded as several CUDA graphs, with calls between them.
+"""A function recorded as several CUDA graphs, with collective operations between them.
 
-A CUDA graph that holds a collective operation of NCCL can wait forever: graphs of different
-processes may start in different orders on a GPU's queues. So collectives are called between graphs.
+NCCL collectives inside CUDA graphs can deadlock, since graphs of different processes may start in
+different orders on a GPU's queues. So they are called between graphs.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import torch
 
 from megastep.capture import end_failed_recording
 
-#: The graph that is being recorded.
+#: The graph being recorded, if any.
 _recording: SegmentedGraph | None = None
 
 
 def between_graphs(call: Callable[[], object]) -> None:
-    """Calls a function; while a `SegmentedGraph` records, has each replay call it in this place.
+    """Calls a function. While a `SegmentedGraph` records, each replay will call it at this point.
 
     Args:
-        call: changes tensors in place. Is not called while a graph is recorded.
+        call: changes tensors in place. Not called during the recording.
     """
     if _recording is None:
         call()
@@ -31,17 +31,17 @@ def between_graphs(call: Callable[[], object]) -> None:
 
 
 class SegmentedGraph:
-    """Records a function as CUDA graphs: as one, unless the function calls `between_graphs`.
+    """Records a function as CUDA graphs: one, and one more after each call of `between_graphs`.
 
-    All graphs share one pool of memory, so a tensor of one segment can be read in the next.
+    All graphs share a memory pool, so a tensor of one segment can be read in the next.
 
     Args:
-        function: never synchronises. Its tensors keep their place in memory.
-        stream: the stream to record on.
-        generators: the generators that the function draws from.
+        function: must not synchronise. Its tensors must keep their addresses.
+        stream: stream to record on.
+        generators: random generators that the function uses.
 
     Attributes:
-        output: what the function returned; each replay writes its tensors again.
+        output: the function's result; each replay overwrites its tensors.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class SegmentedGraph:
                 self._begin()
                 try:
                     self.output = function()
-                finally:  # ending a failed recording raises as well
+                finally:  # which raises, too, after a failure
                     self._end()
         except RuntimeError as error:
             end_failed_recording()
@@ -74,7 +74,7 @@ class SegmentedGraph:
         self.graph = torch.cuda.CUDAGraph()
         for generator in self.generators:
             self.graph.register_generator_state(generator)
-        # threads of NCCL may query events meanwhile
+        # thread_local, since NCCL's threads may query events meanwhile
         self.graph.capture_begin(self.pool, capture_error_mode="thread_local")
 
     def _end(self):

@@ -1,12 +1,13 @@
 """An environment in unseen homes, where the agent of a run meets others."""
 
+import functools
 import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.share import Share
+from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import duels, ratings, statistics, suite, tables
 from megastep.agents.factory import settings
@@ -74,7 +75,7 @@ class Arena:
     """An environment in unseen homes, where the agent of a run meets others.
 
     It has two agents, or as many as it has if their number is fixed. Each home is played in from
-    every agent's place, equally often, in up to `cfg.episodes` duels.
+    every agent's slot, equally often, in up to `cfg.episodes` duels.
     """
 
     def __init__(
@@ -92,29 +93,31 @@ class Arena:
         self.others = [find_player(name, run, env, sample, cfg.trust) for name in cfg.against or ()]
         self.agent = load_player(run, sample, run)
         n_agents = optional(sample, "n_agents")
-        n_duels = max(1, cfg.episodes // n_agents)  # from each place
+        n_duels = max(1, cfg.episodes // n_agents)  # from each slot
         homes = factory.spread(homes, n_duels)
         n_duels -= n_duels % max(1, len(homes))
-        self.share = Share.of_this_rank(n_duels * n_agents, len(homes))
+        self.shard = Shard.of_this_rank(n_duels * n_agents, len(homes))
         self.seed = rank_seed(cfg.seed, process_group.rank())
-        env = settings.changed(env, n_envs=len(self.share.envs))
-        where |= dict(geometries=[homes[home] for home in self.share.homes], seed=self.seed)
+        env = settings.changed(env, n_envs=len(self.shard.envs))
+        where |= dict(geometries=[homes[home] for home in self.shard.homes], seed=self.seed)
         self.env, self.sample = factory.construct(env, **where), sample
         self.others = [
             player._replace(policy=factory.in_env(player.policy, env, self.env))
             for player in self.others
         ]
-        slots = rotating_slots(self.share.n_envs, n_agents, self.env.device)
-        self.slots = slots[[*self.share.envs]]
-        self.place, self.env_settings = tables.place(env, geometry, homes, cfg.split), env
+        slots = rotating_slots(self.shard.n_envs, n_agents, self.env.device)
+        self.slots = slots[[*self.shard.envs]]
+        self.labels, self.env_settings = tables.labels(env, geometry, homes, cfg.split), env
         self.sources = factory.sources_of(homes)
         warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> Any:
         policies = player.policy, opponent.policy
         with factory.errors():
-            played = duels.play(self.env, *policies, self.seed, self.cfg.greedy, slots=self.slots)
-        return self.share.with_others(played)
+            limit = self.cfg.max_steps or duels.MAX_STEPS
+            play = functools.partial(duels.play, max_steps=limit, slots=self.slots)
+            played = play(self.env, *policies, self.seed, self.cfg.greedy)
+        return self.shard.with_others(played)
 
     def duel(self, source: str | None = None) -> list[dict]:
         """Plays the run's agent against each of `cfg.against`, in homes of a `source` or of
@@ -158,9 +161,9 @@ class Arena:
         rows = ratings.rows(
             [(player.name, player.step) for player in players], scores, self.cfg.seed
         )
-        layouts, what = played[0, 1].get("homes"), f"{self.share.n_envs:,} duels of each pair"
+        layouts, what = played[0, 1].get("homes"), f"{self.shard.n_envs:,} duels of each pair"
         n_homes = None if layouts is None else len(layouts.unique())
-        title = f"Ratings in {self.place.title(what, n_homes)}, seed {self.cfg.seed}"
+        title = f"Ratings in {self.labels.title(what, n_homes)}, seed {self.cfg.seed}"
         cells = [[form.format_map(row) for form in tables.RATINGS.values()] for row in rows]
         table = console.table([*tables.RATINGS], cells)
         console.say(f"{title}\n{table}")

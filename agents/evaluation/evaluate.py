@@ -6,9 +6,9 @@ from typing import Any
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.share import Share
+from megastep.agents.distributed.shard import Shard
 from megastep.agents.evaluation import arena, playing, statistics, suite, tables
-from megastep.agents.factory import settings
+from megastep.agents.factory import env_failures, settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
 from megastep.agents.selfplay.bots.random import RandomActions
@@ -31,6 +31,22 @@ def run(cfg: settings.Evaluate) -> Path:
     env_settings = cfg.env or trained.env
     geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
     homes = factory.homes(env_settings, geometry, cfg.split)
+    folder, rank = folders.folder_of(loaded.path), process_group.rank()
+    with env_failures.told(env_settings, folder, rank=rank):
+        path = measure(cfg, loaded, env_settings, geometry, homes, device)
+    console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
+    return path
+
+
+def measure(
+    cfg: settings.Evaluate,
+    loaded: checkpoint.Checkpoint,
+    env_settings: settings.Env,
+    geometry: settings.Geometry,
+    homes: list,
+    device: Any,
+) -> Path:
+    """Does what `run` does, with what its settings name."""
     if cfg.ratings:
         path = arena.Arena(cfg, loaded, env_settings, geometry, homes, device).rate()
     elif cfg.against is not None:
@@ -41,20 +57,19 @@ def run(cfg: settings.Evaluate) -> Path:
             rows += suite.of_source(source, play(cfg, loaded, env_settings, part, device, source))
         if process_group.rank() > 0:
             return folders.folder_of(loaded.path)
-        place = tables.place(env_settings, geometry, homes, cfg.split)
+        labels = tables.labels(env_settings, geometry, homes, cfg.split)
         what = f"{rows[0]['lanes']:,} episodes{suite.each_source(geometry)}"
         n_homes = suite.count_homes(rows)
         rows = suite.with_worst_source(rows, "agent") if suite.is_suite(geometry) else rows
         path = tables.write_table(
             cfg,
             loaded,
-            [place.source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
-            f"{place.title(what, n_homes)}, after {loaded.step:,} samples "
+            [labels.source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
+            f"{labels.title(what, n_homes)}, after {loaded.step:,} samples "
             f"({loaded.path.name}), seed {cfg.seed}",
             rows,
             [*map(tables.cells, rows)],
         )
-    console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
 
 
@@ -68,17 +83,25 @@ def play(
 ) -> list[dict]:
     """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the table rows."""
     homes = factory.spread(homes, cfg.episodes)
-    share = Share.of_this_rank(cfg.episodes, len(homes))
+    shard = Shard.of_this_rank(cfg.episodes, len(homes))
     seed, trained = rank_seed(cfg.seed, process_group.rank()), factory.config_of(loaded)
-    env_settings = settings.changed(env_settings, n_envs=len(share.envs), resample=False)
-    where = dict(geometries=[homes[home] for home in share.homes], seed=seed, device=device)
+    env_settings = settings.changed(env_settings, n_envs=len(shard.envs), resample=False)
+    where = dict(geometries=[homes[home] for home in shard.homes], seed=seed, device=device)
     env, rows = factory.construct(env_settings, **where), []
     policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
     players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
     players += [("random", RandomActions(env.action_space), False)] * cfg.baseline
     sources = None if source else factory.sources_of(homes)
     for name, player, greedy in players:
-        episodes = share.with_others(playing.first_episodes(env, player, seed, greedy))
+        played = playing.first_episodes(env, player, seed, greedy, cfg.max_steps)
+        episodes = shard.with_others(played)
+        n_cut = int((~episodes["done"]).sum())
+        if n_cut and process_group.rank() == 0:
+            limit = cfg.max_steps or optional(env, "max_episode_steps")
+            console.warn(
+                f"{name}: {n_cut:,} of {len(episodes['done']):,} episodes had not ended after "
+                f"{limit:,} steps and are counted as truncated there; max_steps= sets the limit"
+            )
         summaries = statistics.summaries(episodes, optional(env, "roles"), sources)
         if source == suite.DENSE and "homes" in episodes:
             summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(episodes)})
@@ -105,14 +128,14 @@ def duel(
         rows += suite.of_source(source, meeting.duel(source))
     if process_group.rank() > 0:
         return folders.folder_of(run.path)
-    place = tables.place(meeting.env_settings, geometry, homes, cfg.split)
+    labels = tables.labels(meeting.env_settings, geometry, homes, cfg.split)
     what = f"{rows[0]['duels']:,} duels{suite.each_source(geometry)}"
-    title = place.title(what, suite.count_homes(rows))
+    title = labels.title(what, suite.count_homes(rows))
     rows = suite.with_worst_source(rows, "against") if suite.is_suite(geometry) else rows
     return tables.write_table(
         cfg,
         run,
-        ["duels", place.source, cfg.split, str(run.step), "against", *cfg.against],
+        ["duels", labels.source, cfg.split, str(run.step), "against", *cfg.against],
         f"{meeting.agent.name}, in {title}, seed {cfg.seed}",
         rows,
         [*map(tables.duel_cells, rows)],

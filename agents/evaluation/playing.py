@@ -84,14 +84,19 @@ def _has_fixed_form(before, after):
 
 @torch.no_grad()
 def first_episodes(
-    env: Env, policy: PolicyLike, seed: int = 1, greedy: bool = False, max_steps: int = 100_000
+    env: Env,
+    policy: PolicyLike,
+    seed: int = 1,
+    greedy: bool = False,
+    max_steps: int | None = None,
 ) -> arrdict:
     """Plays the first episode of each lane.
 
     Args:
         seed: of the action sampling.
         greedy: takes the most likely actions instead of sampling.
-        max_steps: maximum number of steps; unfinished episodes have `done` False.
+        max_steps: maximum number of steps, by default the environment's `max_episode_steps`;
+            unfinished episodes have `done` False.
 
     Returns:
         An arrdict on the environment's device:
@@ -129,6 +134,7 @@ def first_episodes(
         return world, state
 
     changed = draws, returns, lengths, metrics
+    max_steps = optional(env, "max_episode_steps") if max_steps is None else max_steps
     step_until(done, step, world, state, env, (policy,), changed, max_steps)
     return arrdict(
         returns=returns,

@@ -10,7 +10,7 @@ from megastep import recording
 from megastep.agents import console, factory
 from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import arena, duels
-from megastep.agents.factory import settings
+from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import folders
 from megastep.agents.selfplay.bots.random import RandomActions
 
@@ -36,7 +36,7 @@ def run(cfg: settings.Record) -> Path:
     homes = factory.homes(env_settings, geometry, cfg.split)
     homes = [homes[cfg.home % len(homes)]] if homes else []
     env_settings = settings.changed(env_settings, n_envs=1)
-    env = factory.make_sample(env_settings, homes, seed=cfg.seed, device=device)
+    env = factory.make_sample(env_settings, homes, seed=cfg.seed, device=device, films=True)
     random = RandomActions(env.action_space)
     policy = arena.load_player(loaded, env, loaded).policy if cfg.run else random
     if cfg.against is not None:
@@ -49,7 +49,8 @@ def run(cfg: settings.Record) -> Path:
         if not cfg.file:
             undo.callback(path.unlink, missing_ok=True)
         # a video is the last thing that a run should fail for
-        with user_errors(f"The video {path} could not be made: ", (Exception,)):
+        problem = f"The video {path} could not be made: "
+        with env_failures.told(env_settings, folder), user_errors(problem, (Exception,)):
             recording.film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
         undo.pop_all()
     console.say(f"Filmed {cfg.steps} steps: {path}")

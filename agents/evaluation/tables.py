@@ -15,7 +15,7 @@ from megastep.agents.runs.folders import folder_of, for_file
 INTERVAL = "95 % interval"
 
 
-class Place(NamedTuple):
+class Labels(NamedTuple):
     """Where a run is evaluated.
 
     Attributes:
@@ -39,14 +39,14 @@ class Place(NamedTuple):
         return f"{self.env}: {what}{homes}{self.choice}"
 
 
-def place(env: Env, geometry: Geometry, homes: list, split: str) -> Place:
+def labels(env: Env, geometry: Geometry, homes: list, split: str) -> Labels:
     if not homes:
-        return Place(env_name(env), env_name(env), "")
+        return Labels(env_name(env), env_name(env), "")
     path = Path(getattr(geometry, "path", None) or "")
     is_ours = geometry.name.startswith("megastep.")
     name = label(geometry.name) if is_ours else geometry.name
     choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
-    return Place(env_name(env), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
+    return Labels(env_name(env), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
 
 
 def write_table(

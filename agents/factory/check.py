@@ -89,10 +89,10 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
     return f"did you mean {keys[near[0]]}?" if near else "--cfg job prints all keys"
 
 
-#: Keys of earlier versions, with what took their place.
+#: Keys of earlier versions, and what replaced them.
 GONE = {
     "preset": "values follow device=cpu or device=cuda, and what you type wins",
-    "nonfinite_replay": "a NaN is met again by resuming, with the command that is printed",
+    "nonfinite_replay": "resuming reproduces a NaN; the warning has the command",
 }
 
 

@@ -35,10 +35,12 @@ OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
 ENVS, SOURCES = "megastep.envs", "megastep.geometries.sources"
 LEARNERS, LOGGERS = "megastep.agents.algorithms", "megastep.agents.training.loggers"
 #: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
-#: are passed by the program, `missing` are defaults, and the others are settings beside them.
+#: are passed by megastep, `missing` are defaults, and the others are settings beside them.
 ARGUMENTS = {
     "env": dict(
-        reserved=("geometries", "seed", "device", "privileged"), missing={"n_envs": 128}, name=str
+        reserved=("geometries", "seed", "device", "privileged", "films"),
+        missing={"n_envs": 128},
+        name=str,
     ),
     "geometry": dict(reserved=("split",), missing={"n": 512, "seed": 1}, name=str),
     "learner": dict(

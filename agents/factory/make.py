@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -36,6 +37,8 @@ from megastep.types import n_lanes, optional
 
 #: Number of environments in which the memory of one is measured.
 PROBE = 65
+#: A network of fewer bytes, and for fewer numbers in a row, is not in the check of memory.
+LARGE, FEW = 2**28, 4096
 #: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
 #: What the library raises for bad arguments, files and devices, and for too little memory.
@@ -161,10 +164,52 @@ def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **argume
                 engine.fit(env.n_envs, n_bytes, sample.device)
 
 
-def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None) -> Policy:
-    """Returns a policy on the environment's device; without a `critic` it can only act."""
+def check_network(agent: Agent, env: Any, n_rows: int, is_learning: bool) -> None:
+    """Raises UserError with the size of the spaces if a network for them does not fit into memory.
+
+    Args:
+        n_rows: observations that it reads at once.
+    """
+    n_inputs, n_outputs = sizes_of(env)
+    n_features = n_inputs
+    if agent.encoder == "cnn":  # about as many as pixels, however many channels there are
+        images = [x for x in spaces.leaves(env.obs_space).values() if hasattr(x, "H")]
+        n_features -= sum((x.C - 1) * x.n_agents * x.H * x.W for x in images)
+    # weights and their initialisation, gradients and the two moments of Adam
+    n_bytes = 4 * agent.width * (n_features + n_outputs) * (5 if is_learning else 2)
+    # one-hot observations, probabilities and their gradients, beyond what `check_memory` counts
+    n_many = max(0, n_features + n_outputs - FEW)
+    n_bytes += 4 * n_rows * n_many * (4 if is_learning else 2)
+    if n_bytes > LARGE and n_bytes > 0.95 * (free := engine.free_memory(env.device)):
+        raise UserError(
+            f"{getattr(env, 'id', type(env).__name__)} has {n_inputs:,} numbers to observe and "
+            f"{n_outputs:,} actions, for which a network of agent.width={agent.width} needs "
+            f"{n_bytes / 1e9:.1f} GB, but {free / 1e9:.1f} GB are free on {env.device}; choose a "
+            "smaller width, fewer environments, or an environment with smaller spaces"
+        )
+
+
+def sizes_of(env: Any) -> tuple[int, int]:
+    """Returns the numbers that a network reads and gives: of integers, one for each value."""
+
+    def size(space):
+        return math.prod(space.shape) * getattr(space, "n_actions", 1)
+
+    sides = env.obs_space, env.action_space
+    return tuple(sum(map(size, spaces.leaves(side).values())) for side in sides)
+
+
+def make_policy(
+    agent: Agent, env: Any, seed: int = 1, critic: str | None = None, n_rows: int | None = None
+) -> Policy:
+    """Returns a policy on the environment's device; without a `critic` it can only act.
+
+    Args:
+        n_rows: observations that it will read at once. Default: one of each lane of `env`.
+    """
     if torch.device(env.device).type == "cpu":
         share_threads(agent.width)
+    check_network(agent, env, n_rows or n_lanes(env), critic is not None)
     with errors():
         spaces = env.obs_space, env.action_space, optional(env, "privileged_space")
         return Policy(*spaces, seed=seed, **vars(agent) | {"critic": critic}).to(env.device)
@@ -181,7 +226,7 @@ def share_threads(width: int) -> None:
 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
     learner = construct(settings, policy=policy, seed=seed, graph=True)
-    with errors(f"{settings.name} is no learner: "):
+    with errors(f"{settings.name} is not a learner: "):
         check_learner(learner)
         try:
             checkpoint_format.check_plain(learner.state_dict(), "state_dict")
@@ -234,7 +279,7 @@ def make_opponents(
     Raises:
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
     """
-    shares = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
+    options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot):
         return None
     bot = None
@@ -245,7 +290,7 @@ def make_opponents(
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
             engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")
-        return Opponents(env, policy, bot, seed=seed, **shares)
+        return Opponents(env, policy, bot, seed=seed, **options)
 
 
 def make_bot(name: str | None, settings: Env, env: Any) -> Any:

@@ -31,13 +31,13 @@ from megastep.settings import (
 
 def _device(name: str) -> str:
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
-        raise ValueError(f"{name!r} is no device; use auto, cpu, cuda or cuda:<number>")
+        raise ValueError(f"{name!r} is not a device; use auto, cpu, cuda or cuda:<number>")
     return name
 
 
 def _ranks(n: int | str) -> int | str:
     if n != "all" and (isinstance(n, str) or not 1 <= n <= 10_000):
-        raise ValueError(f"{n!r} is no number of ranks; use a number from 1 on, or all")
+        raise ValueError(f"{n!r} is not a number of ranks; use 1 or more, or all")
     return n
 
 
@@ -86,7 +86,7 @@ def kind_of(group: str, name: str) -> type:
     try:
         taken = parameters_of(constructor)
         if missing := [f"{k}, {text}" for k, text in IMPORTED[group].items() if k not in taken]:
-            raise ValueError(f"it takes no {missing[0]}")
+            raise ValueError(f"it has no argument {missing[0]}")
         methods = METHODS.get(group, ()) if inspect.isclass(constructor) else ()
         if absent := [method for method in methods if not hasattr(constructor, method)]:
             raise ValueError(f"it has no method {absent[0]}")
@@ -298,7 +298,7 @@ class Train(Common):
             **{
                 f"more_{name}": self.resume is None
                 and getattr(self, f"more_{name}") is not None
-                and f"comes on top of what a resumed run has had; give resume=RUN, or {name}="
+                and f"extends a resumed run; give resume=RUN, or {name}= for a new run"
                 for name in ("samples", "seconds")
             },
             "snapshots": self.snapshots
@@ -327,6 +327,7 @@ def _given(run):
 class Evaluate(Played):
     run: Annotated[str, BeforeValidator(_given)]
     episodes: Count
+    max_steps: Count | None = None  # None: the environment's own limit
     baseline: bool
     against: tuple[str, ...] | None = None
     ratings: bool = False

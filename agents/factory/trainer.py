@@ -32,6 +32,7 @@ from megastep.agents.training import budget, loggers
 from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
+from megastep.types import optional
 
 
 def make_trainer(
@@ -60,7 +61,10 @@ def make_trainer(
         "privileged": cfg.agent.critic == "asymmetric",
     }
     sample = factory.make_sample(cfg.env, **where)
-    policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
+    n_rows = cfg.env.n_envs * optional(sample, "n_agents")
+    options = with_defaults(cfg.learner, LearnerOptions)
+    n_rows *= max(1, (options.n_steps or 1) // (options.n_minibatches or 1))  # of a minibatch
+    policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic, n_rows)
     policy.generator = SeededGenerator(stream_seed(seed, "policy"))
     learner = factory.make_learner(cfg.learner, policy, seed)
     cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)
@@ -97,7 +101,7 @@ def make_trainer(
                 annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
                 profiler=Profiler(folder, cfg.profile, device) if cfg.profile else None,
             )
-        improves = Trainer(
+        trainer = Trainer(
             opponents or env,
             policy,
             learner,
@@ -115,9 +119,9 @@ def make_trainer(
             **writers,
         )
         if cfg.resume:
-            improves.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
-            improves.lost += differing(loaded.made_with, made_with)
-    return improves
+            trainer.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
+            trainer.lost += differing(loaded.made_with, made_with)
+    return trainer
 
 
 def differing(before: dict[str, Any], now: dict[str, Any]) -> list[str]:

@@ -1,1 +1,1 @@
-"""Processes: the ranks of a run, their GPUs, signals, and how they end."""
+"""The processes of a run: its ranks, their GPUs, signals and exit codes."""

@@ -1,4 +1,4 @@
-"""Prints what a training run would do: the sizes of a rank, and of all."""
+"""The dry run: prints the size of a training run, per rank and in total."""
 
 from megastep.agents import console, factory
 from megastep.agents.factory import settings
@@ -9,7 +9,7 @@ from megastep.types import n_lanes, optional
 
 
 def show(cfg: settings.Train) -> None:
-    """Prints the sizes of a run, per rank and in total. Trains nothing and writes no file."""
+    """Prints environments, lanes and batch sizes, per rank and in total. Writes no file."""
     n_ranks = launcher.n_ranks(cfg)
     device = factory.make_device(cfg.device)
     names = ["", "a rank", "in total"] if n_ranks > 1 else ["", "in total"]
@@ -22,7 +22,7 @@ def show(cfg: settings.Train) -> None:
 
 
 def sizes(cfg: settings.Train, device) -> dict[str, int]:
-    """Returns the numbers of one rank, as far as the learner has them."""
+    """Returns the sizes of one rank by name, without those that the learner does not have."""
     geometries = factory.homes(cfg.env, cfg.geometry, "training")
     options = dict(seed=cfg.seed, device=device, privileged=cfg.agent.critic == "asymmetric")
     sample = factory.make_sample(cfg.env, geometries, **options)
@@ -41,12 +41,13 @@ def sizes(cfg: settings.Train, device) -> dict[str, int]:
 
 
 def count_opponents(cfg: settings.Train, sample) -> int:
-    """Returns the number of lanes that opponents play. UserError if they do not fit."""
+    """Returns the number of lanes that opponents control. Raises UserError if they do not fit."""
     opponents = cfg.opponents
     if not (opponents.past or opponents.bot):
         return 0
-    shares = opponents.past, opponents.bot, opponents.snapshots
     with factory.errors():
-        n_per_snapshot, n_bot = count_environments(sample, cfg.env.n_envs, *shares)
+        n_per_snapshot, n_bot = count_environments(
+            sample, cfg.env.n_envs, opponents.past, opponents.bot, opponents.snapshots
+        )
     n_past = n_per_snapshot * opponents.snapshots if opponents.past else 0
     return (n_past + n_bot) * (optional(sample, "n_agents") - 1)

@@ -1,4 +1,4 @@
-"""How a script ends: an exit code, and one sentence for people."""
+"""How a script ends: an exit code and one sentence for the user."""
 
 import json
 from collections.abc import Callable
@@ -14,9 +14,9 @@ class Ending(NamedTuple):
     """How a script ended.
 
     Attributes:
-        code: the exit code of the process.
-        text: what went wrong, or which signal came; empty if nothing did, or all is said already.
-        folder: the run's folder, of a training that is done.
+        code: exit code of the process.
+        text: the error or the signal; empty after success, or if it was printed already.
+        folder: the run folder, after training finished.
     """
 
     code: int = 0
@@ -31,7 +31,7 @@ class Ending(NamedTuple):
         return cls(*json.loads(path.read_text()))
 
     def raise_error(self) -> None:
-        """Raises what ended the script, if anything did: UserError or Interrupted."""
+        """Raises the error or signal that ended the script, as UserError or Interrupted, if any."""
         if self.code > 128:
             raise signals.Interrupted(self.code - 128, self.text)
         if self.code:
@@ -41,14 +41,18 @@ class Ending(NamedTuple):
 
 
 def ending_of(work: Callable[[], int | None]) -> Ending:
-    """Calls a function that returns an exit code or None. Returns how it ended.
+    """Calls a function and returns how it ended.
 
-    Errors that no user can put right are raised.
+    Args:
+        work: returns an exit code, None for 0.
+
+    Raises:
+        Exception: errors that the user cannot fix, such as bugs.
     """
     try:
         with signals.interrupting():
             return Ending(work() or 0)
-    except SystemExit as end:  # of argparse, of Hydra's help, and of a rank that leaves silently
+    except SystemExit as end:  # from argparse, Hydra's help, or a rank that exits silently
         return Ending(end.code or 0)
     except UserError as error:
         return Ending(error.code, str(error))

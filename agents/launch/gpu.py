@@ -1,4 +1,4 @@
-"""The first look at GPUs, through NVIDIA's driver: PyTorch takes seconds to import."""
+"""Finds GPUs through NVIDIA's driver, since importing PyTorch takes seconds."""
 
 import contextlib
 import ctypes
@@ -12,7 +12,7 @@ from pathlib import Path
 
 @functools.cache
 def driver() -> ctypes.CDLL | None:
-    """Returns the initialised driver, or None if there is none or it finds no GPU."""
+    """Returns the initialised driver library; None without a driver or a GPU."""
     with contextlib.suppress(OSError):
         library = ctypes.CDLL("libcuda.so.1")
         if library.cuInit(0) == 0:
@@ -20,13 +20,13 @@ def driver() -> ctypes.CDLL | None:
 
 
 def start_driver() -> None:
-    """Initialises the driver in a thread, which takes a while."""
-    # the interpreter waits for this thread: a process must not end within the driver
+    """Initialises the driver in a thread, while this process imports modules."""
+    # not a daemon: the process must not exit inside the driver
     threading.Thread(target=driver).start()
 
 
 def is_available() -> bool:
-    """Returns what `torch.cuda.is_available` does, without importing PyTorch."""
+    """Returns the same as `torch.cuda.is_available`, without importing PyTorch."""
     if "torch" in sys.modules:
         return sys.modules["torch"].cuda.is_available()
     package = importlib.util.find_spec("torch")
@@ -51,10 +51,11 @@ def count() -> int:
 
 
 def wake(device: str) -> None:
-    """Creates the context of the GPU that is called `device`, if it is one, in a thread. PyTorch
-    finds it there later.
+    """Creates a GPU's CUDA context in a thread; PyTorch uses it later. Saves half a second, as the
+    driver works while Python imports modules.
 
-    It takes half a second in the driver, which passes beside Python's imports.
+    Args:
+        device: such as `cuda` or `cuda:1`; `cpu` does nothing.
     """
     if device != "cpu":
         index = int(device.partition(":")[2] or 0)

@@ -1,10 +1,11 @@
-"""Starts the ranks of `ranks=2` on this machine through torchrun's library, and waits for them.
+"""Starts the ranks of `ranks=2` on this machine with torchrun's library and waits for them.
 
-The settings are composed and checked once, here. Each rank is a process that reads them from a
-temporary folder, the *job's folder*, in which it also notes its process's number and how it ended.
-So this process alone prints errors, forwards signals, and has the exit code of one process.
+This process composes and checks the settings once and writes them to a temporary *job folder*.
+Each rank reads them there, and writes its process id and how it ended. Only this process prints
+errors and forwards signals; its exit code is that of a run in one process.
 
-torchrun's agent runs in a thread: it would send a signal on and then give ranks 30 s to save.
+torchrun's agent runs in a thread, where it handles no signals: it would kill ranks that take more
+than 30 s to save.
 """
 
 import contextlib
@@ -27,13 +28,13 @@ from megastep.agents.launch import gpu, signals
 from megastep.agents.launch.endings import Ending
 from megastep.agents.runs import folders
 
-#: The environment variable that has the job's folder, for ranks that this module started.
+#: Environment variable with the job folder, set for ranks that this module started.
 JOB = "MEGASTEP_JOB"
-#: Its files: the settings, the signal that stops all ranks, and the folder of the run.
+#: Files of the job folder: settings; a mark that the user stopped the job; the run folder's path.
 SETTINGS, STOPPED, RUN = "settings.json", "stopped", "run"
-#: The exit code if a rank was killed, or hangs.
+#: Exit code if a rank was killed or hangs.
 LOST = 3
-#: Runs a rank. The current folder is not searched for modules before those of Python are.
+#: Code that runs a rank. Modules in the current folder must not shadow Python's own.
 RANK = """import sys
 sys.path[:] = filter(None, sys.path)
 from megastep.agents.launch import rank_process
@@ -44,37 +45,39 @@ def n_ranks(cfg: settings.Train) -> int:
     """Returns the number of ranks of a training run.
 
     Raises:
-        ConfigErrors: they are to share a GPU.
+        ConfigErrors: there is not a GPU for every rank.
     """
     if cfg.ranks == 1:
         return 1
-    place, n_gpus = environment.launched(), gpu.count() if cfg.device != "cpu" else 0
+    info, n_gpus = environment.rank_info(), gpu.count() if cfg.device != "cpu" else 0
     if ":" in cfg.device:
-        text = f"{cfg.device!r} is one GPU, and ranks have one each; use device=cuda"
+        text = f"{cfg.device!r} names one GPU, but every rank needs its own; use device=cuda"
         raise ConfigErrors([("device", text)])
     if cfg.ranks == "all":
         if not n_gpus:
             where = "device=cpu" if cfg.device == "cpu" else "this machine has none"
-            text = f"'all' is every GPU, and {where}; give a number, such as ranks=2"
+            text = f"'all' uses every GPU, but {where}; give a number, such as ranks=2"
             raise ConfigErrors([("ranks", text)])
         return n_gpus
-    if n_gpus and cfg.ranks > n_gpus and place is None:
+    if n_gpus and cfg.ranks > n_gpus and info is None:
         n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
-        text = f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all is one for each"
+        text = (
+            f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all uses each GPU once"
+        )
         raise ConfigErrors([("ranks", text)])
     return cfg.ranks
 
 
 def is_needed(cfg: settings.Train) -> bool:
-    """Returns whether training is done by other processes, which this one starts."""
-    return environment.launched() is None and (cfg.ranks != 1 or cfg.restarts > 0)
+    """Returns True if this process has to start others that train."""
+    return environment.rank_info() is None and (cfg.ranks != 1 or cfg.restarts > 0)
 
 
 def run(cfg: settings.Train) -> Path:
-    """Trains with several ranks, and returns the run folder.
+    """Trains with several ranks. Returns the run folder.
 
     Raises:
-        UserError, Interrupted: as a training run in this process does.
+        UserError, Interrupted: as training in this process does.
     """
     cfg = settings.changed(cfg, ranks=n_ranks(cfg))
     with contextlib.ExitStack() as stack:
@@ -85,7 +88,7 @@ def run(cfg: settings.Train) -> Path:
             agent.start()
             while agent.is_alive():
                 agent.join(0.2)
-                job.look()
+                job.poll()
         ending = job.ending()
     if numbers:
         by_signal = ending.code == 128 + numbers[0]
@@ -99,14 +102,19 @@ class Job:
     """The ranks of one training run.
 
     Args:
-        folder: a temporary one.
-        cfg: the settings, with the number of ranks.
+        folder: the job folder, a temporary one.
+        cfg: settings; `ranks` is a number.
+
+    Attributes:
+        attempt: how often torchrun has restarted the ranks.
+        cleared: attempts whose ranks have all been killed.
+        error: the error of torchrun's agent, if any.
     """
 
     def __init__(self, folder: Path, cfg: settings.Train):
         self.folder, self.cfg = folder, cfg
         self.attempt, self.error = 0, None
-        self.cleared: set[int] = set()  # attempts of which nothing is left
+        self.cleared: set[int] = set()
         facts = dict(
             settings=check.as_tree(cfg),
             argv=sys.argv,
@@ -124,24 +132,24 @@ class Job:
             self.error = error
 
     def stop(self, number: int) -> None:
-        """Passes a signal on to the ranks; those that begin later end at once."""
+        """Forwards a signal to the ranks. Ranks that start later exit at once."""
         (self.folder / STOPPED).touch()
-        self.look()
+        self.poll()
         self.send(number)
 
     def quit(self, number: int) -> None:
-        """Ends all ranks at once."""
+        """Kills all ranks and deletes the job folder."""
         self.send(signal.SIGKILL)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def send(self, number: int) -> None:
         for path in self.folder.glob(f"pid-{self.attempt}-*"):
-            with contextlib.suppress(OSError, ValueError):  # it has ended, or just begins to write
+            with contextlib.suppress(OSError, ValueError):  # it has ended, or is writing its id
                 os.kill(int(path.read_text()), number)
 
-    def look(self) -> None:
-        """Ends what is left of ranks that lost one; torchrun gives them 30 s. Says so if the ranks
-        start again.
+    def poll(self) -> None:
+        """Kills the remaining ranks of an attempt that lost one (torchrun would give them 30 s).
+        Warns when torchrun restarts the ranks.
         """
         ending = self.ending_of(self.attempt)
         if ending and ending.code == LOST and self.attempt not in self.cleared:
@@ -150,7 +158,7 @@ class Job:
         if [*self.folder.glob(f"pid-{self.attempt + 1}-*")]:
             ending = self.ending_of(self.attempt) or self.unknown_ending()
             self.attempt += 1
-            again = f"Starting again, {self.attempt} of restarts={self.cfg.restarts}"
+            again = f"Restarting, {self.attempt} of restarts={self.cfg.restarts}"
             problem = ending.text.partition(" To continue: ")[0]
             console.warn(" ".join(filter(None, [problem, f"{again}."])))
 
@@ -159,7 +167,7 @@ class Job:
         ending, failures = self.ending_of(self.attempt), getattr(self.error, "failures", None)
         is_stopped = (self.folder / STOPPED).exists()
         if ending and ending.code > 128 and failures and not is_stopped:
-            ending = None  # torchrun's own signal, to what is left of the ranks
+            ending = None  # from torchrun's signal to the remaining ranks
         return ending or self.unknown_ending()
 
     def ending_of(self, attempt: int) -> Ending | None:
@@ -167,16 +175,16 @@ class Job:
         return Ending.read(path) if path.exists() else None
 
     def unknown_ending(self) -> Ending:
-        """Returns how ranks ended that could not say it."""
+        """Returns the ending of ranks that wrote none, from the exit codes that torchrun saw."""
         failures = getattr(self.error, "failures", {})
         for rank, failure in failures.items():
             if failure.exitcode < 0:
                 name = signal.Signals(-failure.exitcode).name
-                text = f"was ended by {name}" + ", or too little memory" * (name == "SIGKILL")
+                text = f"was killed by {name}" + ", perhaps out of memory" * (name == "SIGKILL")
             else:
                 text = f"ended with exit code {failure.exitcode}"
-            place = f"rank {rank} on {environment.hostname()}"
-            return Ending(LOST, f"{place} {text}. {hint(self.run_folder())}")
+            label = f"rank {rank} on {environment.hostname()}"
+            return Ending(LOST, f"{label} {text}. {hint(self.run_folder())}")
         reason = shortened(self.error or "they ended without a message", 400)
         return Ending(2, f"The ranks cannot be started: {reason}")
 
@@ -186,22 +194,26 @@ class Job:
 
 
 def hint(folder: Path | None) -> str:
-    """Returns what is left of a training run that ended in the middle of an update."""
+    """Returns how to continue a run whose ranks were lost in the middle of an update."""
     if folder is None or not any((folder / "checkpoints").glob("*")):
         return "Nothing was saved yet"
-    return f"Its last checkpoint is whole. To continue: {folders.resume_command(folder)}"
+    return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
 
 
 def launch_ranks(n_ranks: int, n_restarts: int) -> None:
-    """Runs torchrun's agent.
+    """Runs torchrun's agent until all ranks have ended.
+
+    Args:
+        n_ranks: processes to start.
+        n_restarts: how often all ranks are restarted after a failure.
 
     Raises:
-        ChildFailedError: of torch.distributed, if a rank failed.
+        torch.distributed.elastic.multiprocessing.errors.ChildFailedError: a rank failed.
     """
     from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-    # its warnings and errors are those of the ranks, which are told in one sentence
+    # its messages repeat the ranks' errors, which are reported in one sentence
     logger = logging.getLogger("torch.distributed")
     logger.handlers, logger.propagate = [logging.NullHandler()], False
     config = LaunchConfig(
@@ -220,18 +232,18 @@ def launch_ranks(n_ranks: int, n_restarts: int) -> None:
 
 
 def variables(job: Path, n_ranks: int) -> dict[str, str]:
-    """Returns the environment variables of ranks on one machine."""
+    """Returns the environment variables for ranks on this machine."""
     changes = {JOB: str(job)}
-    if (package.ROOT / "train.py").exists():  # in a checkout, which need not be installed
+    if (package.ROOT / "train.py").exists():  # a checkout, which may not be installed
         paths = filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
         changes["PYTHONPATH"] = os.pathsep.join(paths)
-    # a job of Slurm's may use some of a machine's cores only
+    # Slurm may allow a job only some of the cores
     is_linux = hasattr(os, "sched_getaffinity")
     n_cores = len(os.sched_getaffinity(0)) if is_linux else os.cpu_count() or 1
     defaults = {
         "OMP_NUM_THREADS": str(max(1, n_cores // n_ranks)),
         "TORCH_CPP_LOG_LEVEL": "ERROR",
     }
-    if os.path.exists("/sys/class/net/lo"):  # whether or not the machine's name has an address
+    if os.path.exists("/sys/class/net/lo"):  # works even if the host name does not resolve
         defaults["GLOO_SOCKET_IFNAME"] = "lo"
     return changes | {name: text for name, text in defaults.items() if name not in os.environ}

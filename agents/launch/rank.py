@@ -1,5 +1,5 @@
-"""A process of a training run with several ranks, which `launch` or torchrun started: it joins the
-others, speaks with one voice, and ends with them.
+"""One rank of a training run, started by `launcher` or torchrun: it joins the other ranks, and ends
+with them. Each error is reported by one rank.
 """
 
 import contextlib
@@ -14,15 +14,15 @@ from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.launch import endings, launcher, signals
 
-#: Seconds that a rank with an error gives rank 0 to tell of the same one, and to save.
+#: Seconds that a rank waits for rank 0 to end after an error, and after a signal (it saves).
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
-#: The ranks that this process has joined.
+#: The team that this process has joined.
 _team = None
 T = TypeVar("T")
 
 
 def announce(number: int) -> None:
-    """Rank 0 announces a signal, unless it is torchrun's, which ends what is left of the ranks."""
+    """Announces on rank 0 that training stops, unless torchrun sent the signal in tear-down."""
     job = os.environ.get(launcher.JOB)
     if environment.rank() == 0 and (
         job is None or os.path.exists(os.path.join(job, launcher.STOPPED))
@@ -31,19 +31,19 @@ def announce(number: int) -> None:
 
 
 def refuse(problem: str) -> None:
-    """Raises UserError if torchrun started this process. Rank 0 says it for all."""
-    if environment.launched():
+    """Raises UserError on rank 0 if torchrun started this process; other ranks exit silently."""
+    if environment.rank_info():
         raise UserError(problem) if environment.rank() == 0 else SystemExit(UserError.code)
 
 
-def tell(ending: endings.Ending) -> None:
-    """Says how the ranks end: on stderr, or to the process that launched them, which says it."""
-    place = environment.launched()
+def report_ending(ending: endings.Ending) -> None:
+    """Reports the ranks' ending to the process that launched them, or on stderr under torchrun."""
+    info = environment.rank_info()
     if launcher.JOB in os.environ:
-        if place.rank > 0 and ending.code != launcher.LOST:
-            name = f"rank {place.rank} on {environment.hostname()}: "
+        if info.rank > 0 and ending.code != launcher.LOST:
+            name = f"rank {info.rank} on {environment.hostname()}: "
             ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
-        path = Path(os.environ[launcher.JOB], f"ending-{place.attempt}")
+        path = Path(os.environ[launcher.JOB], f"ending-{info.attempt}")
         if not path.exists():
             ending.write(path)
     elif ending.text:
@@ -54,7 +54,8 @@ class Team:
     """The ranks of a training run, as one of them sees them.
 
     Attributes:
-        folder: the run's folder, once it is known.
+        folder: the run folder, once it is known.
+        watch: detects lost ranks.
     """
 
     def __init__(self):
@@ -67,7 +68,7 @@ class Team:
         self.watch.start()
 
     def set_folder(self, folder: Path) -> None:
-        """Tells where the run is, for those who end it or start it again."""
+        """Publishes the run folder to the launcher and to restarted ranks."""
         self.folder = folder
         if environment.rank() == 0:
             self.store.set("run", str(folder))
@@ -75,54 +76,55 @@ class Team:
                 Path(os.environ[launcher.JOB], launcher.RUN).write_text(str(folder))
 
     def earlier_folder(self) -> Path | None:
-        """Returns the run that was trained before torchrun started the ranks again."""
-        is_again = environment.launched().attempt > 0 and self.store.check(["run"])
+        """Returns the run folder of the previous attempt if torchrun restarted the ranks."""
+        is_again = environment.rank_info().attempt > 0 and self.store.check(["run"])
         return Path(self.store.get("run").decode()) if is_again else None
 
     def end(self, problem: str | None) -> NoReturn:
-        """Ends this process in the middle of training, since a rank is lost.
+        """Exits at once, because a rank was lost.
 
         Args:
-            problem: is told; None if another rank tells it.
+            problem: to report; None if another rank reports it.
         """
         if problem:
-            tell(endings.Ending(launcher.LOST, f"{problem}. {launcher.hint(self.folder)}"))
+            report_ending(endings.Ending(launcher.LOST, f"{problem}. {launcher.hint(self.folder)}"))
         console.restore()
         is_ours = launcher.JOB in os.environ
         os._exit(launcher.LOST if problem or not is_ours else 0)
 
     def leave(self, seconds: float = 0.0) -> None:
-        """Lets the others go on without this rank.
+        """Leaves the team; the other ranks no longer expect heartbeats from this one.
 
         Args:
-            seconds: how long to wait for rank 0 to leave as well.
+            seconds: how long to wait for rank 0 to leave, too.
         """
         self.watch.leave(seconds)
 
 
 @contextlib.contextmanager
 def joined() -> Iterator[Team | None]:
-    """Joins the ranks that torchrun started, and ends with them: one of them tells of an error.
+    """Joins the ranks that torchrun started. If one fails, all end and one of them reports it.
 
-    Does nothing in a process of its own, and inside itself.
+    Yields:
+        The team; None in a single process. Nested contexts yield the same team.
 
     Raises:
-        UserError, Interrupted: as in a process of its own, if this rank is the one to tell.
-        SystemExit: another rank tells.
+        UserError, Interrupted: as in a single process, if this rank reports the error.
+        SystemExit: another rank reports it.
     """
     global _team
     with user_errors():
-        place = environment.launched()
-    if place is None or place.n_ranks == 1 or _team is not None:
+        info = environment.rank_info()
+    if info is None or info.n_ranks == 1 or _team is not None:
         yield _team
         return
     from megastep.agents.distributed import process_group
 
-    if place.rank > 0:
+    if info.rank > 0:
         console.is_silent = True
-        console.prefix = f"{console.prefix}rank {place.rank} on {environment.hostname()}: "
+        console.prefix = f"{console.prefix}rank {info.rank} on {environment.hostname()}: "
     address = f"{os.environ.get('MASTER_ADDR')}:{os.environ.get('MASTER_PORT')}"
-    problem = f"The ranks cannot meet at {address}; is the port in use, or closed? "
+    problem = f"The ranks cannot connect to {address}; is the port in use, or closed? "
     with user_errors(problem, (RuntimeError, ValueError)):
         has_joined = process_group.n_ranks() == 1
         process_group.start()
@@ -131,13 +133,13 @@ def joined() -> Iterator[Team | None]:
         yield team
     except (Exception, signals.Interrupted) as error:
         if loss := _cause(error, process_group.RankLost):
-            with signals.handled(lambda number: None):  # torchrun sends SIGTERM
+            with signals.handled(lambda number: None):  # ignores torchrun's SIGTERM
                 team.watch.await_verdict()  # which ends this process
             team.end(f"A rank is lost: {loss}" if team.watch.claim() else None)
         is_signal = isinstance(error, signals.Interrupted)
-        tells = place.rank == 0 and team.watch.claim()
+        reports = info.rank == 0 and team.watch.claim()
         team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
-        if tells or team.watch.claim():
+        if reports or team.watch.claim():
             raise
         code = 128 + error.args[0] if is_signal else getattr(error, "code", 1)
         raise SystemExit(code) from None
@@ -149,14 +151,14 @@ def joined() -> Iterator[Team | None]:
 
 
 def _cause(error, kind):
-    """Returns the error of a kind that another was raised from or after, None if there is none."""
+    """Returns the error of a kind in the chain of an error's contexts; None if there is none."""
     while error is not None and not isinstance(error, kind):
         error = error.__context__
     return error
 
 
 def together(function: Callable[[], T]) -> T:
-    """Calls a function on every rank, as `agreement.together` does, once the ranks have joined."""
+    """Calls `agreement.together(function)` if ranks have joined, otherwise just the function."""
     if _team is None:
         return function()
     from megastep.agents.distributed import agreement

@@ -1,5 +1,5 @@
-"""What the ranks of a training run check together before they train. One process has nothing to
-check.
+"""Checks before training that all ranks run the same code, configuration and environments, and see
+the same run folder. A single process has nothing to check.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from megastep.agents.launch.rank import Team
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training.trainer import Trainer
 
-#: Seconds until what rank 0 writes must be seen on another machine.
+#: Seconds within which a file of rank 0 must be visible on the other machines.
 SHARED_SECONDS = 10.0
 
 
@@ -45,26 +45,26 @@ def check_start(cfg: settings.Train) -> None:
         _check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
 
 
-def check_world(cfg: settings.Train, running: Trainer) -> None:
-    """Raises UserError if the ranks differ in homes, spaces or initial weights."""
+def check_world(cfg: settings.Train, trainer: Trainer) -> None:
+    """Raises UserError if the ranks differ in geometries, spaces or initial weights."""
     if process_group.n_ranks() > 1:
         homes = factory.homes(cfg.env, cfg.geometry, "training")
         _check_equal(
-            {"the digest of the training homes": digest(homes), **running.saver.config["spaces"]}
+            {"the digest of the training homes": digest(homes), **trainer.saver.config["spaces"]}
         )
-        if difference := first_difference(running.policy):
-            raise UserError(f"The ranks begin with different weights: {difference}")
+        if difference := first_difference(trainer.policy):
+            raise UserError(f"The ranks start with different weights: {difference}")
 
 
 def _check_equal(facts):
     if difference := first_differing_fact(facts):
         raise UserError(
-            f"The ranks differ: {difference}; start all with the same code, packages and words"
+            f"The ranks differ: {difference}; start all with the same code, packages and options"
         )
 
 
 def digest(homes: Iterable[dict[str, Any]]) -> str:
-    """Returns a short text that geometries have in common only if they are equal."""
+    """Returns a hash of geometries, 16 hexadecimal digits."""
     total = hashlib.sha256()
     for home in homes:
         for name in sorted(home):
@@ -75,20 +75,20 @@ def digest(homes: Iterable[dict[str, Any]]) -> str:
 
 
 def check_shared(folder: Path) -> str:
-    """Checks that all ranks see the run folder that rank 0 has opened.
+    """Checks that all ranks see the run folder of rank 0.
 
     Returns:
-        A name that all ranks of this start have, and no other start.
+        A random name, the same on all ranks of this start.
 
     Raises:
-        UserError: on all ranks, if it is another folder for one of them.
+        UserError: on all ranks, if one of them does not see the folder.
     """
     name = from_rank_0(secrets.token_hex)
     if process_group.n_ranks() == 1:
         return name
     token = f".ranks-{name}"
 
-    def look():
+    def wait_for_token():
         deadline = time.monotonic() + SHARED_SECONDS
         while not (folder.is_dir() and token in os.listdir(folder)):
             if time.monotonic() > deadline:
@@ -101,7 +101,7 @@ def check_shared(folder: Path) -> str:
     with user_errors(folders.CANNOT.format(folder)):
         from_rank_0((folder / token).touch)
     try:
-        together(look)
+        together(wait_for_token)
     finally:
         if process_group.rank() == 0:
             with contextlib.suppress(OSError):
@@ -110,8 +110,8 @@ def check_shared(folder: Path) -> str:
 
 
 def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:
-    """Returns the settings with which a run goes on, if torchrun has started the ranks again: from
-    its last checkpoint, or from the beginning if there is none.
+    """Returns the settings for this attempt. After a restart by torchrun, they resume the run from
+    its last checkpoint, or start it anew if there is none.
     """
     folder = from_rank_0(lambda: team and team.earlier_folder())
     if folder is None:

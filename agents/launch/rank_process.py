@@ -1,4 +1,4 @@
-"""Runs a rank of a training run that `launch` has started, in a process of its own."""
+"""The process of one rank that `launcher` started."""
 
 import json
 import os
@@ -17,13 +17,15 @@ from megastep.agents.launch import endings, launcher, rank, signals
 
 
 def main() -> int:
-    """Trains as one of the ranks that `launch` has started. Returns the exit code: 0, or another if
-    torchrun is to start the ranks again.
+    """Trains as one rank.
+
+    Returns:
+        The exit code: 0 if this rank's ending is final, otherwise torchrun may restart the ranks.
     """
-    place, job = environment.launched(), Path(os.environ[launcher.JOB])
-    for number in signals.SIGNALS:  # while there is nothing to save
+    info, job = environment.rank_info(), Path(os.environ[launcher.JOB])
+    for number in signals.SIGNALS:  # nothing to save yet
         signal.signal(number, lambda number, frame: os._exit(128 + number))
-    (job / f"pid-{place.attempt}-{place.rank}").write_text(str(os.getpid()))
+    (job / f"pid-{info.attempt}-{info.rank}").write_text(str(os.getpid()))
     if (job / launcher.STOPPED).exists():
         return 0
     facts = json.loads((job / launcher.SETTINGS).read_text())
@@ -50,5 +52,5 @@ def main() -> int:
         text = f"{type(error).__name__}: {shortened(error, 400)}"
         ending, code = endings.Ending(1, text), 1
     if ending.text or ending.folder:
-        rank.tell(ending)
+        rank.report_ending(ending)
     return code

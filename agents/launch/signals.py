@@ -1,5 +1,5 @@
-"""Ctrl-C, SIGTERM and SIGHUP. The first signal stops the work in good order, the second ends the
-program at once. The exit code is 128 + the signal's number.
+"""Ctrl-C, SIGTERM and SIGHUP. The first signal stops a script gracefully, the second at once. The
+exit code is 128 plus the signal's number.
 """
 
 import contextlib
@@ -15,16 +15,17 @@ from megastep.agents import package
 from megastep.agents.distributed import environment
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-#: Seconds within which a repeated signal counts as the same one: `timeout` and closing terminals
+#: Seconds within which a second signal counts as the first one: `timeout` and a closing terminal
 #: send two.
 SAME = 0.3
 
 
 class Interrupted(BaseException):
-    """A signal stopped the work: Interrupted(number, message), where the message says what is saved
-    and how to continue.
+    """A signal stopped the script. A BaseException, so that `except Exception` does not catch it.
 
-    It is no Exception, so that nothing takes it for an error of what it interrupted.
+    Args:
+        number: the signal's number.
+        message: what was saved and how to continue.
     """
 
 
@@ -37,8 +38,8 @@ def interrupt(number: int) -> NoReturn:
 
 
 def exit_on_signals(script: str) -> None:
-    """From here on a signal ends the program at once, with one line: for imports and the
-    interpreter's end, which have nothing to save.
+    """From this call on, a signal ends the process at once with one line. For imports and
+    interpreter shutdown, when there is nothing to save.
     """
 
     def exit_at_once(number, frame):
@@ -55,11 +56,17 @@ def handled(
     on_first: Callable[[int], None] = announce,
     on_second: Callable[[int], None] = lambda number: None,
 ) -> Iterator[list[int]]:
-    """Calls `on_first(number)` at the first signal. Another Ctrl-C or SIGTERM ends the program,
-    after `on_second(number)`.
+    """Handles signals for the duration of the context.
 
-    Ending harms nothing: checkpoints are renamed into place when whole. Yields a list that gets the
-    number of the first signal.
+    A second Ctrl-C or SIGTERM ends the process at once. That is safe: checkpoints are written to a
+    temporary folder and renamed.
+
+    Args:
+        on_first: called with the number of the first signal.
+        on_second: called with the number of the second, before the process ends.
+
+    Yields:
+        A list, empty until the first signal's number is appended.
     """
     numbers, ends_after = [], time.monotonic()
 
@@ -83,10 +90,10 @@ def handled(
 
 @contextlib.contextmanager
 def interrupting(on_first: Callable[[int], None] = interrupt) -> Iterator[None]:
-    """As `handled`, for an `on_first` that raises Interrupted.
+    """Like `handled`, for an `on_first` that raises Interrupted.
 
-    After a signal the block ends with Interrupted, whatever it raises or returns: libraries swallow
-    the exception, and fail in their clean-up or on a module that was imported in part.
+    After a signal the block always ends with Interrupted, even if a library swallows it, or fails
+    while it cleans up or on a partly imported module.
     """
     with handled(on_first) as numbers:
         try:
@@ -100,9 +107,7 @@ def interrupting(on_first: Callable[[int], None] = interrupt) -> Iterator[None]:
 
 @contextlib.contextmanager
 def deferred() -> Iterator[None]:
-    """A signal that comes inside takes effect when the block ends: for what must not be done in
-    part, and is quick.
-    """
+    """Delays signals until the block ends. For short steps that must not be interrupted."""
     numbers = []
     try:
         with handled(lambda number: None) as numbers:
@@ -113,8 +118,9 @@ def deferred() -> Iterator[None]:
 
 
 def stop(process: int) -> None:
-    """Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
-    as well: a second SIGHUP never ends a program.
+    """Stops another process gracefully, even if a terminal's Ctrl-C has reached it, too.
+
+    Sends SIGHUP where possible, since as a second signal it does not end the process at once.
     """
     is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):
@@ -122,7 +128,7 @@ def stop(process: int) -> None:
 
 
 def _install(handler: Callable) -> dict[int, object]:
-    # in the main thread; nohup has SIGHUP ignored, which stays so; returns the handlers there were
+    # returns the previous handlers; does nothing outside the main thread; respects nohup
     if threading.current_thread() is not threading.main_thread():
         return {}
     is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
@@ -130,6 +136,6 @@ def _install(handler: Callable) -> dict[int, object]:
 
 
 def _write(stream: TextIO | None, line: str) -> None:
-    # from a signal handler: past the stream's buffer, which may be in use
+    # unbuffered: the signal may have interrupted a write to the stream
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.write(stream.fileno(), f"{line}\n".encode())

@@ -1,4 +1,4 @@
-"""Trains in this process, or has ranks train in processes of their own."""
+"""Training, in this process or with several ranks in processes of their own."""
 
 import contextlib
 import functools
@@ -15,19 +15,27 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
 from megastep.agents.distributed.drift import DriftError
-from megastep.agents.errors import Differs, NonFinite, UserError, memory_problem, user_errors
+from megastep.agents.errors import (
+    Differs,
+    EnvFailed,
+    NonFinite,
+    UserError,
+    memory_problem,
+    user_errors,
+)
 from megastep.agents.evaluation import evaluate, record
-from megastep.agents.factory import settings
+from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import dry_run, launcher, rank, rank_checks, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
+from megastep.agents.training.trainer import Trainer
 
 
 def with_more(cfg: settings.Train) -> settings.Train:
-    """Returns `cfg` with more_samples and more_seconds added to what the resumed run has had."""
+    """Returns `cfg` with more_samples and more_seconds turned into totals of the resumed run."""
     totals = {}
     for name in ("samples", "seconds"):
         if (more := getattr(cfg, f"more_{name}")) is not None:
@@ -37,24 +45,27 @@ def with_more(cfg: settings.Train) -> settings.Train:
 
 
 def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
-    """Returns the run folder, locked, and what to resume."""
+    """Returns the run folder, locked, and the path to resume from (None for a new run)."""
     folder = (
         folders.folder_of(folders.find(cfg.resume))
         if cfg.resume
         else folders.new(settings.run_name(cfg), cfg.folder)
     )
     locks.enter_context(folders.locked(folder))
-    if cfg.resume and process_group.n_ranks() > 1:  # all from the newest one that is intact
+    if cfg.resume and process_group.n_ranks() > 1:  # all ranks from the same intact checkpoint
         return folder, str(folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).path)
     return folder, cfg.resume
 
 
 def run(cfg: settings.Train) -> Path | None:
-    """Trains as `cfg` says, and returns the run folder, None for a dry run. A signal saves and
-    raises Interrupted.
+    """Trains. Returns the run folder, None for a dry run.
 
-    Where torchrun started this process as a rank, all ranks train together. Rank 0 writes. With
-    `cfg.ranks`, other processes are started that do so.
+    If torchrun started this process, it trains as one of the ranks, of which rank 0 writes the run
+    folder. With `cfg.ranks` or `cfg.restarts`, this process starts the ranks.
+
+    Raises:
+        Interrupted: a signal came; the run was saved.
+        UserError: training cannot start or continue.
     """
     if cfg.dry_run:
         return dry_run.show(cfg)
@@ -65,13 +76,13 @@ def run(cfg: settings.Train) -> Path | None:
 
 
 def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
-    """Trains in this process, as one of a team of ranks if it is one. Returns the run folder."""
+    """Trains in this process, alone or as one rank of a team. Returns the run folder."""
     is_first = process_group.rank() == 0
     device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
     progress = console.Progress()
 
-    def show(running):
-        progress.show(*progress_of(running))
+    def show(trainer):
+        progress.show(*progress_of(trainer))
 
     rank_checks.check_start(cfg)
     cfg = rank_checks.started_again(cfg, team)
@@ -85,60 +96,68 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             if team:
                 team.set_folder(folder)
             cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
-            running = together(lambda: make_trainer(cfg, folder, device, token, show))
-            rank_checks.check_world(cfg, running)
-            from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
+            try:
+                trainer = together(
+                    env_failures.told(cfg.env, folder, rank=process_group.rank())(
+                        lambda: make_trainer(cfg, folder, device, token, show)
+                    )
+                )
+            except EnvFailed:
+                undo.pop_all()  # the folder has the traceback
+                raise
+            rank_checks.check_world(cfg, trainer)
+            from_rank_0(functools.partial(write_config, folder, trainer.saver.config["train"]))
             hosts = process_group.gather_objects(process_group.hostname())
-            clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
+            clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(trainer.lost)))
             if is_first:
                 if clauses:
-                    console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
+                    console.say(f"Resuming, but not bit for bit: {'; '.join(clauses)}.")
                 folders.record_start(folder)
                 provenance.record(
-                    folder, running.samples, device, package.version(), package.ROOT, hosts
+                    folder, trainer.samples, device, package.version(), package.ROOT, hosts
                 )
                 ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
                 console.say(f"Training on {ranks} in {folder}")
             undo.pop_all()
         resume = f"To continue: {folders.resume_command(folder)}"
+        saved = functools.partial(saved_by, trainer, resume)
         try:
             with (
+                env_failures.told(cfg.env, folder, saved, process_group.rank()),
                 signals.handled(rank.announce) as numbers,
                 progress if is_first else contextlib.nullcontext(),
-                contextlib.closing(running),
+                contextlib.closing(trainer),
             ):
-                running.train(lambda: bool(numbers))
+                trainer.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            saved = f"What was saved before is in {folder}{running.nonfinite_guard.hint}"
+            saved = f"Earlier checkpoints are in {folder}{trainer.nonfinite_guard.hint}"
             raise NonFinite(f"{error}. {saved}") from error
         except DriftError as error:
-            raise UserError(f"{error}. What was saved before is in {folder}") from error
+            raise UserError(f"{error}. Earlier checkpoints are in {folder}") from error
         except (MemoryError, RuntimeError) as error:
             problem = memory_problem(error)
             if not (problem or isinstance(error, engine.EngineError)):
                 raise
-            saved = running.saver.error or "What was learnt last could not be saved"
-            saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
             reason = problem or str(error).partition("\n")[0].rstrip(".")
-            raise UserError(f"{reason}. {saved}. {resume}") from error
+            raise UserError(f"{reason}. {saved()}") from error
         finally:
             if is_first:
                 with process_group.unhurried():
                     curves.plot_curves(folder)
-        if running.profiler and running.profiler.path:
-            console.say(f"Profile: {running.profiler.path}, and a trace beside it")
-        # a signal that one rank got stops all, and so does a checkpoint that one could not save
-        ends = process_group.gather_objects((numbers[:1], running.saver.error))
+        if trainer.profiler and trainer.profiler.path:
+            console.say(f"Profile: {trainer.profiler.path}, and a trace beside it")
+        # a signal on one rank stops all, and so does a checkpoint that one cannot save
+        ends = process_group.gather_objects((numbers[:1], trainer.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
-                signal, f"Stopped after {running.samples:,} samples. {resume}"
+                signal, f"Stopped after {trainer.samples:,} samples. {resume}"
             )
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
-        nonfinite, hint = running.nonfinite_guard.value, running.nonfinite_guard.hint
-        del running  # its memory is the evaluation's now
+        nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
+        del trainer, saved  # frees GPU memory for the evaluation
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
-        common["trust"] = True  # what it names has just run
+        common["trust"] = True  # its modules have just been imported
         if cfg.finish.evaluate:
             with process_group.unhurried():
                 episodes = cfg.finish.episodes
@@ -147,11 +166,18 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         if nonfinite and nonfinite.is_from_env:
-            learnt = f"All else was learnt from, and is in {folder}"
+            learnt = f"All other rollouts were used; the run is in {folder}"
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
         if cfg.rerun and is_first:
             compare(folder, folders.folder_of(folders.find(cfg.rerun)))
     return folder
+
+
+def saved_by(trainer: Trainer, resume: str) -> str:
+    """Returns what is saved of a training run that an error ended, and how to resume it."""
+    text = trainer.saver.error or "The latest updates could not be saved"
+    text = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else text
+    return f"{text}. {resume}"
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:
@@ -162,7 +188,7 @@ def write_config(folder: Path, config: dict[str, Any]) -> None:
 
 
 def compare(folder: Path, original: Path) -> None:
-    """Says whether two runs have the same metrics, byte for byte. Raises Differs if not."""
+    """Checks that two runs have the same metrics, byte for byte. Raises Differs if not."""
     ours, theirs = ((run / "metrics.jsonl").read_bytes() for run in (folder, original))
     if ours == theirs:
         console.say(f"metrics.jsonl equals that of {original}, byte for byte.")

@@ -1,10 +1,10 @@
-"""Finds ranks that were killed or hang, from a thread of each rank, and ends the others.
+"""Detects ranks that were killed or hang, in a thread of each rank, and ends the others.
 
-Every rank writes a heartbeat into torchrun's key-value store, and reads that of the next rank. So
-does each know of one other, however many there are, and the first that misses one tells them all.
+Every rank writes a heartbeat to torchrun's key-value store. Each rank monitors one neighbour, the
+next rank; the first to detect a loss tells all others through the store.
 
-A rank is lost if its heartbeat stops: it was killed, or stopped. It is lost as well if it hangs,
-that is if another has for some time been ahead of it in the operations that all ranks take part in.
+A rank is lost if its heartbeat stops (it was killed or suspended), or if it hangs: its neighbour
+has waited too long for it in a collective operation.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from typing import NamedTuple
 
 from megastep.agents.distributed import environment, process_group
 
-#: Seconds between two heartbeats.
+#: Seconds between heartbeats.
 PERIOD = 2.0
-#: Seconds without a heartbeat, or behind another rank, after which a rank is lost; and without a
-#: heartbeat once a connection has broken.
+#: Seconds without a heartbeat, or behind the neighbour, after which a rank is lost; and seconds
+#: without a heartbeat if a connection has broken.
 LOST_SECONDS, BROKEN_SECONDS = 20.0, 5.0
-#: Seconds behind another rank in the first two updates: kernels are compiled, graphs recorded.
+#: Seconds that a rank may be behind in the first two updates, which compile kernels and graphs.
 FIRST_SECONDS = 300.0
-#: An operation that once took long and went well may take so many times as long.
+#: A rank may be behind for this many times the longest wait so far that ended well.
 PATIENCE = 5
-#: Seconds in which a rank may still save and end once the store is gone.
+#: Seconds that a rank may still take to save and end after the store is gone.
 LAST_SECONDS = 60.0
 
-#: Numbers of the watches in this process, equal on all ranks: each watch has keys of its own.
+#: Counts the watches of this process, in step on all ranks: each watch has its own keys.
 NUMBERS = itertools.count()
 
 
 class Heartbeat(NamedTuple):
-    """What a rank says of itself.
+    """The progress of a rank.
 
     Attributes:
         number: counts heartbeats.
-        n_operations: number of operations of all ranks that it has begun.
-        n_updates: number of updates that it has begun.
-        is_exempt: it does something that others wait for, such as an evaluation.
+        n_operations: collective operations started.
+        n_updates: updates started.
+        is_exempt: the others wait for it however long it takes, as for an evaluation.
         has_left: it is done.
-        host: its machine.
+        host: name of its machine.
     """
 
     number: int
@@ -57,28 +57,33 @@ class Heartbeat(NamedTuple):
     host: str
 
 
-class Patience:
-    """Tells when another rank is lost, from its heartbeats and our own.
+class LossDetector:
+    """Decides from the heartbeats of two ranks whether the other one is lost.
 
-    Time is counted in looks, not by a clock: a machine that sleeps for an hour loses no rank.
+    Time is counted in polls, so that a machine may sleep for an hour without losing a rank.
     """
 
     def __init__(self):
         self.last = None
         self.n_silent = self.n_ahead = self.longest = 0
 
-    def look(self, ours: Heartbeat, theirs: Heartbeat, is_broken: bool) -> str | None:
-        """Returns what has become of the other rank, None if nothing is wrong.
+    def poll(self, ours: Heartbeat, theirs: Heartbeat, is_broken: bool) -> str | None:
+        """Compares two heartbeats, once every `PERIOD` seconds.
 
         Args:
-            is_broken: a connection to some rank has broken.
+            ours: heartbeat of this rank.
+            theirs: heartbeat of the monitored rank.
+            is_broken: a connection to any rank has broken.
+
+        Returns:
+            What happened to the other rank, as the rest of a sentence; None if it is not lost.
         """
         before, self.last = self.last, theirs
         if theirs.has_left or before is None:
             return None
         self.n_silent = self.n_silent + 1 if theirs == before else 0
         if self.n_silent * PERIOD > (BROKEN_SECONDS if is_broken else LOST_SECONDS):
-            return "does not answer: it was killed, or stopped, or the system ran out of memory"
+            return "does not answer: it was killed or suspended, or the system ran out of memory"
         is_ahead = ours.n_operations > theirs.n_operations and not theirs.is_exempt
         if is_ahead and theirs.n_operations == before.n_operations:
             self.n_ahead += 1
@@ -96,11 +101,12 @@ class Patience:
 
 
 class Watch:
-    """Watches over the ranks of this process group, from `start` to `leave`.
+    """Monitors the ranks of this process group, from `start` to `leave`.
 
     Args:
-        on_lost: is called in a thread with `rank 1 on node-7 hangs: ...` if this rank is the first
-            to find it, with None otherwise, and ends this process.
+        on_lost: called in the watch's thread when a rank is lost; must end this process. Its
+            argument is `rank 1 on node-7 hangs: ...` on the rank that reports the loss, None on the
+            others.
     """
 
     def __init__(self, on_lost: Callable[[str | None], None]):
@@ -112,29 +118,29 @@ class Watch:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        attempt = environment.launched().attempt
+        attempt = environment.rank_info().attempt
         self.store = process_group.store(f"watch {attempt} {next(NUMBERS)}")
         self._beat()
         self._thread.start()
 
     def claim(self) -> bool:
-        """Returns whether this rank is the first to tell of an error. The others end then."""
-        with contextlib.suppress(RuntimeError):  # the store is gone, so nobody else can tell
+        """Returns True on the first rank that calls this: it reports the error, the others end."""
+        with contextlib.suppress(RuntimeError):  # the store is gone, so no other rank can report
             return self.store.compare_set("end", "", f"{self.rank}").decode() == f"{self.rank}"
         return True
 
     def await_verdict(self) -> None:
-        """Waits until the lost rank is found, which ends this process, after a connection broke."""
+        """Waits after a broken connection until the lost rank is found, which ends this process."""
         self.is_broken = True
         with contextlib.suppress(RuntimeError):
             self.store.set("broken", "1")
         self._thread.join(LOST_SECONDS + 2 * PERIOD)
 
     def leave(self, seconds: float = 0.0) -> None:
-        """Ends the watch: the others may go on without this rank.
+        """Stops the watch; this rank no longer counts as lost.
 
         Args:
-            seconds: how long to wait for rank 0 to leave as well.
+            seconds: how long to wait for rank 0 to leave, too.
         """
         self.has_left = True
         self._wakes.set()
@@ -149,7 +155,7 @@ class Watch:
                 time.sleep(0.1)
 
     def _run(self):
-        patience, other = Patience(), (self.rank + 1) % self.n_ranks
+        detector, other = LossDetector(), (self.rank + 1) % self.n_ranks
         while not self.has_left:
             self._wakes.wait(PERIOD)
             if self.has_left:
@@ -160,11 +166,11 @@ class Watch:
                     return self.on_lost(None)
                 self.is_broken |= self.store.check(["broken"])
                 theirs = self._heartbeat_of(other)
-                problem = theirs and patience.look(ours, theirs, self.is_broken)
+                problem = theirs and detector.poll(ours, theirs, self.is_broken)
                 if problem and not self.has_left:
-                    place = f"rank {other} on {theirs.host}"
-                    return self.on_lost(f"{place} {problem}" if self.claim() else None)
-            except RuntimeError:  # the store has ended, with torchrun or the machine of rank 0
+                    label = f"rank {other} on {theirs.host}"
+                    return self.on_lost(f"{label} {problem}" if self.claim() else None)
+            except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
                 os.kill(os.getpid(), signal.SIGTERM)
                 self._wakes.wait(LAST_SECONDS)
                 return None if self.has_left else self.on_lost(None)

@@ -61,7 +61,7 @@ class GRU(nn.Module):
 
 
 class Feedforward(nn.Module):
-    """A hidden layer in the place of a recurrent core: only the current observation counts.
+    """A hidden layer instead of a recurrent core: only the current observation counts.
 
     Args:
         width: W.

@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.kernels import duelling as kernels
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.outputs import Output, gather
 from megastep.agents.networks.precision import cast, compute_dtype, product
@@ -22,7 +22,7 @@ class DuellingOutput(Output):
     """Action values (..., A, n) of a duelling network (Wang et al. 2016): the lane's value plus
     advantages minus their mean, each behind a hidden layer, in whatever scale a learner fits.
 
-    The action values take the place of `logits`. `sample` is epsilon-greedy: a policy that is
+    Action values replace `logits`. `sample` is epsilon-greedy: a policy that is
     always greedy can stand before a wall forever. `action_value` (...,) belongs to the lane's joint
     action, the sum over its agents (VDN, Sunehag et al. 2018).
 

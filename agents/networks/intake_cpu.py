@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from megastep.agents.networks.encoders import Flat
-from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
+from megastep.agents.networks.kernels.library import LIBRARY, is_built_for_cpu
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.engine.devices import threads
 from megastep.kernels.build.launch import launch
@@ -49,7 +49,7 @@ def normalised(
         n_channels = norm.mean.numel()
         leaf = leaf.contiguous()
         launch(
-            *(CORES, "normalise_leaf", out.device, 0),
+            *(LIBRARY, "normalise_leaf", out.device, 0),
             obs=leaf,
             mean=norm.mean,
             scale=norm.scale,

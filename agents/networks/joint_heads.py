@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.kernels import heads as kernels
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.outputs import MultiDiscreteOutput
 from megastep.agents.networks.precision import cast, product
 

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks import linear_cpu
 from megastep.agents.networks.kernels import layers as kernels
-from megastep.agents.networks.kernels.program import aligned_rows
+from megastep.agents.networks.kernels.library import aligned_rows
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.running_norm import RunningNorm
 

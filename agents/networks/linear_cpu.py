@@ -5,7 +5,7 @@ engine's threads. `torch.nn.functional.linear` is the same in PyTorch.
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
+from megastep.agents.networks.kernels.library import LIBRARY, is_built_for_cpu
 from megastep.engine.devices import threads
 from megastep.kernels.build.launch import launch
 
@@ -42,7 +42,7 @@ def matmul(
     if out is None:
         out = torch.empty(len(a), b.shape[1])
     launch(
-        *(CORES, "matmul", a.device, 0),
+        *(LIBRARY, "matmul", a.device, 0),
         a=a,
         b=b,
         bias=None if bias is None else bias.contiguous(),

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import lstm as kernels
 from megastep.agents.networks.kernels import lstm_sequence
-from megastep.agents.networks.kernels.program import aligned, check_shapes
+from megastep.agents.networks.kernels.library import aligned, check_shapes
 from megastep.agents.networks.lstm_cpu import CpuSequence, fits
 from megastep.agents.networks.precision import cast, cast_joined, compute_dtype, product
 from megastep.arrdict import arrdict

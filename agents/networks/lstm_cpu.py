@@ -6,7 +6,7 @@ T time, B lanes, W width. `megastep.agents.networks.lstm` has the same as PyTorc
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks.kernels.program import CORES, is_built_for_cpu
+from megastep.agents.networks.kernels.library import LIBRARY, is_built_for_cpu
 from megastep.agents.networks.linear_cpu import matmul
 from megastep.engine.devices import threads
 from megastep.kernels.build.launch import launch
@@ -31,7 +31,7 @@ class CpuSequence(torch.autograd.Function):
         last_cell = torch.empty_like(cell)
         n_steps, n_lanes, width = x.shape
         launch(
-            *(CORES, "lstm_sequence_forward", x.device, 0),
+            *(LIBRARY, "lstm_sequence_forward", x.device, 0),
             x=x,
             input_weight=input_weight,
             bias=bias,
@@ -60,7 +60,7 @@ class CpuSequence(torch.autograd.Function):
         d_output, d_cell = torch.empty_like(d_last_cell), torch.empty_like(d_last_cell)
         n_steps, n_lanes, width = x.shape
         launch(
-            *(CORES, "lstm_sequence_backward", x.device, 0),
+            *(LIBRARY, "lstm_sequence_backward", x.device, 0),
             input_weight=input_weight,
             weight=weight,
             reset=reset,

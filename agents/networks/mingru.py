@@ -28,7 +28,7 @@ from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import mingru as kernels
 from megastep.agents.networks.kernels import mingru_step
-from megastep.agents.networks.kernels.program import aligned, check_shapes
+from megastep.agents.networks.kernels.library import aligned, check_shapes
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict

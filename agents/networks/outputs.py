@@ -11,7 +11,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.kernels import layers as kernels
-from megastep.agents.networks.kernels.program import DTYPES
+from megastep.agents.networks.kernels.library import DTYPES
 from megastep.agents.networks.layers import CategoricalTerms, linear
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.arrdict import arrdict

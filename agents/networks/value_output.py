@@ -9,7 +9,7 @@ from torch import nn
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.kernels import heads as kernels
 from megastep.agents.networks.kernels import moments as statistics
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.precision import compute_dtype

@@ -1,1 +1,1 @@
-"""What a run leaves on disk: its folder and lock, checkpoints, records, and agents in one file."""
+"""The files of a run: folder and lock, checkpoints, metrics, provenance, and exported agents."""

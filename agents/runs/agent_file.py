@@ -1,15 +1,15 @@
-"""An agent in one file: its acting weights, and what rebuilds its environment and policy.
+"""Agent files: a trained agent in one file, with its environment's and policy's configuration.
 
-The format is safetensors (https://github.com/huggingface/safetensors). The metadata of its header,
-texts by name, holds
+The format is safetensors (https://github.com/huggingface/safetensors). The metadata in its header
+maps names to strings:
 
-    format    of what follows, `FORMAT`
-    config    as config.json of a checkpoint, JSON
-    facts     what made the agent, such as samples, seconds, command and commit, JSON
-    tables    its evaluations: a list of {title, command, rows}, JSON
-    sha256    of the bytes after the header, which are those of all tensors
+    format    version of this metadata, `FORMAT`
+    config    config.json of a checkpoint
+    facts     how the agent was trained, such as samples, seconds, command and commit; JSON
+    tables    its evaluations: a list of {title, command, rows}; JSON
+    sha256    hash of all bytes after the header, those of the tensors
 
-Weights are float16, statistics float32. Reading without a device does not import PyTorch.
+Weights are float16, statistics float32. Without a device, reading does not import PyTorch.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 SUFFIX = ".safetensors"
 FORMAT = "1"
-#: Names of dtypes by safetensors' names.
+#: NumPy's name of each dtype by safetensors' name.
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I64": "int64"}
 _MAX_HEADER = 2**24  # bytes
 
 
 def is_agent_file(path: Path) -> bool:
-    """Returns True if a path names the file of an agent."""
+    """Returns True if a path has the suffix of agent files."""
     return path.suffix == SUFFIX
 
 
@@ -49,16 +49,17 @@ def write(
     facts: Mapping[str, Any],
     tables: Sequence[dict[str, Any]] = (),
 ) -> None:
-    """Writes the file of an agent, whole or not at all.
+    """Writes an agent file atomically.
 
     Args:
-        tensors: the policy's state, of the dtypes that the file shall have; on the CPU.
-        config: as a checkpoint's.
-        facts: plain values by name; `samples` is among them.
-        tables: its evaluations.
+        path: the file.
+        tensors: the policy's state, on the CPU, in the dtypes to store.
+        config: configuration as in a checkpoint.
+        facts: plain values by name, among them `samples`.
+        tables: evaluations.
 
     Raises:
-        ValueError: a tensor has another dtype than those of `DTYPES`.
+        ValueError: a dtype is not in `DTYPES`.
         OSError: the file cannot be written.
     """
     from safetensors.numpy import save
@@ -67,7 +68,7 @@ def write(
     for name, array in arrays.items():
         if array.dtype.name not in DTYPES.values():
             allowed = ", ".join(DTYPES.values())
-            raise ValueError(f"{name} is {array.dtype}, and files of agents hold {allowed}")
+            raise ValueError(f"{name} is {array.dtype}, but agent files hold {allowed}")
     _, data = _split(save(arrays))
     metadata = {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
     for name, value in (("config", config), ("facts", dict(facts)), ("tables", [*tables])):
@@ -76,19 +77,20 @@ def write(
 
 
 def _split(content):
-    """Returns the header of a file, and the bytes of its tensors."""
+    """Returns the header of a file and the bytes of its tensors."""
     end = 8 + int.from_bytes(content[:8], "little")
     return content[8:end], content[end:]
 
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
-    """Loads an agent as a checkpoint with the policy's state alone.
+    """Loads an agent file as a checkpoint that has only the policy's state.
 
     Args:
-        device: where the tensors go; None leaves out the state, and does not import PyTorch.
+        path: the file.
+        device: device of the tensors; None loads no state and does not import PyTorch.
 
     Raises:
-        DamagedCheckpoint: the file is damaged, or no agent's.
+        DamagedCheckpoint: the file is damaged or not an agent file.
         CheckpointError: a later version of megastep wrote it.
     """
     metadata, entries = _read(path)
@@ -104,16 +106,17 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
-    """Returns `config`, `facts` and `tables` of the file of an agent, and `untrusted`, the import
-    paths outside megastep in its configuration.
+    """Returns `config`, `facts` and `tables` of an agent file, and `untrusted`: the import paths
+    outside megastep in its configuration.
 
-    Raises: as `read`.
+    Raises:
+        CheckpointError: as `read`.
     """
     return _read(path)[0]
 
 
 def _read(path):
-    """Returns what `read_metadata` does, and dtype, shape and bytes of each tensor by name."""
+    """Returns the result of `read_metadata`, and dtype, shape and bytes of each tensor by name."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -132,21 +135,21 @@ def _read(path):
                 raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
             metadata = {name: json.loads(texts[name]) for name in ("config", "facts", "tables")}
             if type(metadata["facts"]["samples"]) is not int:
-                raise ValueError("its number of samples is none")
+                raise ValueError("invalid number of samples")
             if not {"train", "spaces"} <= metadata["config"].keys():
-                raise ValueError("its configuration is not whole")
+                raise ValueError("incomplete configuration")
             metadata["untrusted"] = tuple(trust.foreign_names(texts["config"].encode()))
             return metadata, entries
     except safetensors.SafetensorError as error:
         problem = shortened(error)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        problem = str(error) if type(error) is ValueError else "its header is not an agent's"
+        problem = str(error) if type(error) is ValueError else "unexpected header"
     else:
         raise CheckpointError(
             f"{path} has format {version!r}, and this version of megastep reads {FORMAT}. Update "
             "megastep"
         )
-    raise DamagedCheckpoint(f"{path} is damaged, or no agent of megastep: {problem}")
+    raise DamagedCheckpoint(f"{path} is damaged or not an agent file of megastep: {problem}")
 
 
 def _tensors(entries, device):

@@ -1,6 +1,6 @@
-"""The record of how the learning rate fell: its factor in each update, a float64 each.
+"""The annealing record: the learning rate's factor in each update, one float64 each.
 
-What the clock decided is in it, so a run can be repeated: `megastep rerun RUN`.
+With `seconds=` the factors depend on the clock; the record lets `megastep rerun` repeat such a run.
 """
 
 import contextlib
@@ -14,8 +14,8 @@ FILE = "annealing.f64"
 
 
 def read(folder: Path | str) -> array:
-    """Returns the factors of a run's updates, in order; none if there is no record. NaN stands for
-    those of an earlier version, which recorded none.
+    """Returns the factor of each update of a run; empty without a record. NaN marks updates by
+    versions that recorded none.
     """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
@@ -29,8 +29,8 @@ class AnnealingRecord:
 
     Args:
         folder: the run folder.
-        n_updates: updates that the run has had. Later factors are removed; missing ones, of a run
-            that an earlier version began, are NaN.
+        n_updates: updates of the run so far. Factors of later updates are removed; missing factors
+            become NaN.
 
     Raises:
         OSError: the file cannot be written.
@@ -43,18 +43,18 @@ class AnnealingRecord:
             self.append(math.nan)
 
     def append(self, factor: float) -> None:
-        """Adds the factor of an update. It is written with the next report."""
+        """Appends the factor of an update, in memory until the next `flush`."""
         self.file.unwritten += array("d", [factor]).tobytes()
 
     def flush(self) -> None:
-        """Writes what was added."""
+        """Writes the appended factors."""
         self.file.flush()
 
     def sync(self) -> None:
-        """Writes what was added and flushes it to disk."""
+        """Writes the appended factors and flushes them to disk."""
         self.file.sync()
 
     def close(self) -> None:
-        """Writes what was added, if the disk has room for it."""
+        """Writes the appended factors, if the disk has room, and closes the file."""
         with contextlib.suppress(OSError):
             self.file.close()

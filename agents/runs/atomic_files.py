@@ -1,4 +1,4 @@
-"""Writes that a crash cannot leave half done, in folders that several writers may share."""
+"""Atomic writes, safe against crashes and other writers in the same folder."""
 
 import contextlib
 import itertools
@@ -10,19 +10,19 @@ import socket
 import time
 from pathlib import Path
 
-#: Age in seconds at which another machine's temporary files are deleted: its processes cannot be
-#: seen from here.
+#: Age in seconds at which temporary files of other machines are deleted, whose processes cannot be
+#: checked from here.
 ABANDONED = 24 * 3600
 _NAME = re.compile(r".*\.tmp-(?P<machine>.+)-(?P<pid>\d+)-(?P<token>\w+)-\d+")
-#: The token tells this process from an earlier one with the same number.
+#: The token distinguishes this process from an earlier one with the same id.
 _TOKEN, _COUNT = secrets.token_hex(4), itertools.count()
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a file through a temporary one that is renamed into place.
+    """Writes a temporary file and renames it to `path`.
 
-    A reader sees either the old or the new content, even if the process is killed or others write
-    the same file: the last one wins. Deletes what killed writers left in the folder.
+    Readers see either the old or the new content, even if the process is killed. Of several
+    writers, the last wins. Deletes temporary files that killed writers left in the folder.
 
     Raises:
         OSError: the disk is full or not writable. The old file is unchanged.
@@ -53,12 +53,12 @@ def temporary_path(path: Path) -> Path:
 
 
 def delete_leftovers(folder: Path | str) -> None:
-    """Deletes temporary files and folders in `folder` whose process no longer runs. Those of
-    another machine go when they are a day old.
+    """Deletes temporary files and folders in `folder` whose process has ended, and those of other
+    machines after a day.
     """
     for path in Path(folder).glob("*.tmp-*"):
         name = _NAME.fullmatch(path.name)
-        with contextlib.suppress(OSError):  # another process deletes or renames it
+        with contextlib.suppress(OSError):  # another process may delete or rename it
             if not name or _is_in_use(path, name["machine"], int(name["pid"]), name["token"]):
                 continue
             if path.is_dir():
@@ -75,7 +75,7 @@ def _is_in_use(path, machine, pid, token):
 
 def _is_alive(pid):
     try:
-        os.kill(pid, 0)  # sends nothing; not all systems have /proc
+        os.kill(pid, 0)  # sends no signal; not all systems have /proc
     except PermissionError:  # it is another user's
         return True
     except (ProcessLookupError, OverflowError):
@@ -84,7 +84,7 @@ def _is_alive(pid):
 
 
 def _machine():
-    """The name of what process numbers belong to: a host, or a container on it."""
+    """Returns a name for the host or container, within which process ids are unique."""
     name = re.sub(r"[^\w.]", "_", socket.gethostname())[:32]
     with contextlib.suppress(OSError):  # not all systems have namespaces
         name += "-" + re.sub(r"\D", "", os.readlink("/proc/self/ns/pid"))
@@ -104,18 +104,18 @@ def sync_folder(folder: Path) -> None:
 
 
 class AppendedFile:
-    """A file that grows. What a full disk refuses is kept, and written by the next call from the
-    byte where it stopped, so the file never has a hole.
+    """A file to append to. Data that a full disk refuses is kept and written by the next call, from
+    the byte where it stopped, so the file has no gaps.
 
     Args:
-        path: the file, made if it does not exist.
-        n_bytes: length to cut it to first; None keeps all.
+        path: the file, created if missing.
+        n_bytes: length to truncate it to first; None keeps all.
 
     Raises:
         OSError: the file cannot be opened or cut.
 
     Attributes:
-        unwritten: bytes to write.
+        unwritten: bytes still to write.
     """
 
     def __init__(self, path: Path, n_bytes: int | None = None):
@@ -134,12 +134,12 @@ class AppendedFile:
         self.flush()
 
     def flush(self) -> None:
-        """Writes what is left, with errors as `write`."""
+        """Writes `unwritten`. Raises as `write`."""
         while self.unwritten:
             del self.unwritten[: self.file.write(self.unwritten)]
 
     def sync(self) -> None:
-        """Writes what is left and flushes the file to disk, with errors as `write`."""
+        """Writes `unwritten` and flushes the file to disk. Raises as `write`."""
         self.flush()
         os.fsync(self.file.fileno())
 

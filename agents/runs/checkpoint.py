@@ -1,9 +1,8 @@
-"""The checkpoints of a run: one folder `step_<N>` per checkpoint, N environment steps.
+"""The checkpoints of a run: a folder `step_<N>` for each, after N environment steps.
 
-A checkpoint is written to a temporary folder, flushed to disk, verified and renamed into place. A
-reader sees a whole checkpoint or none, and damage is reported (:mod:`checkpoint_format`). No
-checkpoint is overwritten: a second one of the same step is `step_<N>-2`, and the first is deleted
-after the second is verified.
+A checkpoint is written to a temporary folder, flushed to disk, verified and renamed, so a reader
+sees a complete checkpoint or none. Damage is detected (:mod:`checkpoint_format`). A second
+checkpoint of the same step is `step_<N>-2`; the first is deleted once the second is verified.
 """
 
 from __future__ import annotations
@@ -52,16 +51,17 @@ def save(
         folder: the run's `checkpoints` folder.
         step: environment steps so far, of all lanes.
         state: dicts and lists of tensors and numbers.
-        config: the run's configuration, as JSON.
-        keep_checkpoints: number of latest steps kept, besides the one with the highest score.
-        score: for example the mean return, higher is better; None if unknown.
-        made_with: what the numbers depend on besides the configuration, such as versions.
-        replay_seconds: a replay buffer that takes longer to write is left out.
+        config: the run's configuration, JSON.
+        keep_checkpoints: number of latest steps to keep, besides the one with the highest score.
+        score: such as the mean return, higher is better; None if unknown.
+        made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
+        replay_seconds: leaves out a replay buffer that takes longer to write; None for no limit.
         add_files: as for `checkpoint_format.write`.
 
     Raises:
-        OSError: the disk is full or not writable. Nothing has changed.
-        DamagedCheckpoint: the disk returns other bytes than were written. Nothing has changed.
+        OSError: the disk is full or not writable. Other checkpoints are unchanged.
+        DamagedCheckpoint: the disk does not return the bytes written. Other checkpoints are
+            unchanged.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -71,7 +71,7 @@ def save(
         checkpoint_format.write(
             temporary, step, state, config, score, made_with, replay_seconds, add_files
         )
-        # verified before any old one is deleted
+        # verify before deleting any old one
         checkpoint_format.verify(temporary, checkpoint_format.read_manifest(temporary))
         path = folder / _next_name(folder, step)
         os.replace(temporary, path)
@@ -92,13 +92,14 @@ def load_latest(
 ) -> Checkpoint:
     """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
 
-    Warns about each damaged checkpoint that is skipped.
+    Warns of each damaged checkpoint that it skips.
 
     Args:
-        device: where what was learnt goes; all else goes to the CPU. None leaves out the state, and
-            does not import PyTorch.
-        is_whole: loads environments and replay buffer, too.
-        rank: whose state is loaded, see `checkpoint_format.read`.
+        folder: a `checkpoints` folder or one checkpoint.
+        device: device of weights and optimizer; the rest is loaded to the CPU. None loads no state
+            and does not import PyTorch.
+        is_whole: also loads environments and replay buffer.
+        rank: the rank whose state is loaded, see `checkpoint_format.read`.
 
     Raises:
         CheckpointError: there is none, all are damaged, or another version of megastep wrote it.
@@ -122,11 +123,11 @@ def load_latest(
 
 
 def set_aside_after(folder: Path | str, step: int) -> None:
-    """Renames the checkpoints after `step` to `step_<N>.aside`, for a run that resumes from `step`.
+    """Renames checkpoints after `step` to `step_<N>.aside`, when a run resumes from `step`.
 
-    `save` deletes each one when the run reaches its step again.
+    `save` deletes them once the run reaches their step again.
     """
-    for path in list_checkpoints(folder):  # the newest last: it stays the latest until then
+    for path in list_checkpoints(folder):  # the newest last, so that it stays the latest meanwhile
         if step_of(path) > step:
             aside = path.with_name(f"{path.name}.aside")
             _delete(aside)
@@ -146,13 +147,13 @@ def step_of(path: Path) -> int:
 
 
 def _step_and_number(path: Path) -> tuple[int, int]:
-    """Returns a checkpoint's step, and its number among the checkpoints of that step, from 1."""
+    """Returns a checkpoint's step, and its number among those of that step, from 1."""
     step, number = re.match(r"step_(\d+)(?:-(\d+))?", path.name).groups()
     return int(step), int(number or 1)
 
 
 def _next_name(folder: Path, step: int) -> str:
-    """Returns `step_<N>`, or `step_<N>-2` and so on if that step has checkpoints."""
+    """Returns `step_<N>`, or `step_<N>-2` and so on if the step has checkpoints already."""
     pairs = map(_step_and_number, list_checkpoints(folder))
     last = max((number for other_step, number in pairs if other_step == step), default=0)
     return f"step_{step}-{last + 1}" if last else f"step_{step}"
@@ -161,8 +162,8 @@ def _next_name(folder: Path, step: int) -> str:
 def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
     """Deletes old checkpoints, and set-aside ones up to `step`.
 
-    Keeps the last `keep_checkpoints` steps, the step with the best score and the last one with a
-    replay buffer. Of each step only the last checkpoint is kept.
+    Keeps the last `keep_checkpoints` steps, the step with the best score and the last step with a
+    replay buffer; of each step, only the last checkpoint.
     """
     checkpoints = list_checkpoints(folder)
     last_of_each_step = list({step_of(path): path for path in checkpoints}.values())
@@ -184,7 +185,7 @@ def _score(path: Path) -> float | None:
 
 
 def _delete(path: Path) -> None:
-    """Deletes a checkpoint. If killed, leaves a temporary folder and no damaged checkpoint."""
+    """Deletes a checkpoint. If killed midway, leaves a temporary folder, not a damaged one."""
     leftover = temporary_path(path)
     try:
         os.replace(path, leftover)

@@ -1,17 +1,16 @@
-"""The format of one checkpoint: a folder of these files.
+"""The format of a checkpoint: a folder of these files.
 
-    manifest.json  size and SHA-256 of each other file and of itself, so any damaged byte is found;
-                   format, step, score, what it was made with, and the numbers at the top of the
-                   state, such as samples and seconds
+    manifest.json  size and SHA-256 of every file and of itself, to detect damage; format, step,
+                   score, versions and device, and the counters of the state, such as samples
     config.json    the run's configuration
-    state.pt       what was learnt, and all else that is small
-    world.pt       the environments, and what the policy remembers of their episodes
-    replay.pt      the replay buffer, if there is one and it was saved
-    rank1.pt       of a run with several ranks: all of the state of rank 1 but the policy's weights,
-                   which ranks share; and so on. The other files are rank 0's
+    state.pt       weights, optimizer, statistics and everything else that is small
+    world.pt       environments and the actor state (observations and hidden states)
+    replay.pt      the replay buffer, if it was saved
+    rank1.pt, ...  with several ranks: the state of each other rank without the policy's weights,
+                   which are equal on all ranks. The files above are rank 0's
 
-All but the first two hold plain dicts of tensors, numbers and strings. A run that is resumed reads
-all; to evaluate needs `state.pt` alone. JSON is read without PyTorch.
+The .pt files hold plain dicts of tensors, numbers and strings. Resuming reads all files; evaluation
+only `state.pt`. JSON is read without PyTorch.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ from megastep.agents.runs.atomic_files import sync_folder
 if TYPE_CHECKING:
     import torch
 
-#: The format number. Increase it whenever older readers would misread a new checkpoint, or newer
-#: readers an old one, and add the last commit of the old format to `READERS`.
+#: The format number. Increase it if older readers would misread a checkpoint, or this version an
+#: older one, and add the last commit of the replaced format to `READERS`.
 FORMAT = 7
-#: Commits of megastep that read the older formats. The last one is migrated, see `_migrated`.
+#: Commits that read the older formats. `MIGRATED` is read here, see `_migrated`.
 READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db", 5: "916221d"}
 MIGRATED = 6
-#: The keys of a state that are in files of their own.
+#: Files other than state.pt, and the keys of the state that they hold.
 PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
 _RANK_FILE = re.compile(r"rank[1-9]\d*\.pt")
 _LOGGERS = "megastep.agents.training.loggers"
@@ -48,7 +47,7 @@ _CHUNK = 2**24  # bytes
 
 
 class CheckpointError(RuntimeError):
-    """No checkpoint can be used. The message names each one tried, its problem, and the cure."""
+    """No checkpoint can be used. The message names each one tried, its problem and the cure."""
 
 
 class DamagedCheckpoint(CheckpointError):
@@ -62,12 +61,12 @@ class Checkpoint:
     Attributes:
         path: its folder.
         step: environment steps of all lanes before it was saved.
-        numbers: the numbers at the top of the state.
+        numbers: counters of the state, such as samples and seconds.
         config: the run's configuration, as saved.
-        made_with: what the numbers depend on besides the configuration: versions, device, threads.
+        made_with: versions, device and threads that the numbers depend on.
         state: dicts of tensors and numbers, as saved; None if it was not loaded.
-        untrusted: import paths outside megastep that it names, if this user did not make it.
-        n_ranks: ranks whose state it holds.
+        untrusted: import paths outside megastep in `config`; empty if this user wrote it.
+        n_ranks: number of ranks whose state it holds.
     """
 
     path: Path
@@ -81,7 +80,7 @@ class Checkpoint:
 
 
 def rank_file(rank: int) -> str:
-    """Returns the name of the file with a rank's state."""
+    """Returns the file name of a rank's state, for ranks other than 0."""
     return f"rank{rank}.pt"
 
 
@@ -101,9 +100,10 @@ def write(
     """Writes a checkpoint into a new folder and flushes it to disk.
 
     Args:
-        replay_seconds: `replay.pt` is left out if it takes longer; None for no limit.
-        add_files: puts the files of other ranks into the folder. Returns their entries in the
-            manifest, by name.
+        path, step, state, config, score, made_with: as for `checkpoint.save`.
+        replay_seconds: leaves out `replay.pt` if it takes longer to write; None for no limit.
+        add_files: puts the files of other ranks into the folder; returns their manifest entries by
+            name.
     """
     import torch
 
@@ -137,11 +137,10 @@ def write(
 def write_state(
     path: Path, state: dict[str, Any], replay_seconds: float | None = None
 ) -> dict[str, Any]:
-    """Writes a rank's whole state into one file and flushes it to disk. Returns its entry in the
-    manifest.
+    """Writes a rank's state into one file and flushes it to disk. Returns its manifest entry.
 
     Args:
-        replay_seconds: if it takes longer, the replay buffer is left out; None for no limit.
+        replay_seconds: leaves out the replay buffer if the file takes longer; None for no limit.
     """
     import torch
 
@@ -156,11 +155,15 @@ def write_state(
 
 
 def check_plain(tree: Any, name: str) -> None:
-    """Raises TypeError for what loading without code refuses. It allows tensors, numbers, strings
-    and None, and lists, tuples and dicts of these.
+    """Checks that a tree can be loaded without running code: it may hold tensors, numbers, strings,
+    None, and lists, tuples and dicts of these.
 
     Args:
-        name: of the tree, for the message.
+        tree: what to check.
+        name: the tree's name in messages.
+
+    Raises:
+        TypeError: naming the path of anything else.
     """
     if isinstance(tree, dict):
         for key, part in tree.items():
@@ -178,14 +181,14 @@ def check_plain(tree: Any, name: str) -> None:
 
 
 class _TooLate(Exception):
-    """A file took longer to write than it may."""
+    """A file took longer to write than its deadline."""
 
 
 class _HashedFile:
-    """A file that counts and hashes what is written to it.
+    """A file that counts and hashes the bytes written to it.
 
     Attributes:
-        error: the first error. `torch.save` would hide it behind others, so nothing is raised.
+        error: the first error. Not raised, since `torch.save` would replace it by another.
     """
 
     def __init__(self, file: BinaryIO, deadline: float | None):
@@ -213,7 +216,7 @@ class _HashedFile:
 def _write_file(
     path: Path, write: Callable[[Any], Any], deadline: float | None = None
 ) -> dict[str, Any]:
-    """Writes a file and flushes it to disk. Returns its entry in the manifest."""
+    """Writes a file and flushes it to disk. Returns its manifest entry."""
     with open(path, "wb") as file:
         hashed = _HashedFile(file, deadline)
         write(hashed)
@@ -225,7 +228,7 @@ def _write_file(
 
 
 def sealed(manifest: dict[str, Any]) -> bytes:
-    """Returns the text of a manifest, with its own SHA-256 added."""
+    """Returns a manifest as JSON, with its own SHA-256 added."""
     digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
     return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
 
@@ -239,12 +242,13 @@ def read(
     """Loads a checkpoint.
 
     Args:
-        device: where the tensors of `state.pt` go; None: verifies everything and loads no state.
-        is_whole: loads the other parts of this rank, too, onto the CPU; rank 0 verifies everything.
-        rank: whose state is loaded. One without a file gets that in rank 0's `state.pt`.
+        path: the checkpoint's folder.
+        device: device of the tensors in `state.pt`; None verifies all files and loads no state.
+        is_whole: also loads the rank's other files, to the CPU; rank 0 verifies all files.
+        rank: the rank whose state is loaded; without a file of its own, only rank 0's `state.pt`.
 
     Raises:
-        DamagedCheckpoint: a file is missing or damaged, or could run code when loaded.
+        DamagedCheckpoint: a file is missing, damaged, or could run code when loaded.
         CheckpointError: another version of megastep wrote it.
     """
     manifest = read_manifest(path)
@@ -261,7 +265,7 @@ def read(
     try:
         config = json.loads(text)
     except (ValueError, RecursionError):
-        raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is no JSON") from None
+        raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is not JSON") from None
     checkpoint = Checkpoint(
         path,
         manifest["step"],
@@ -280,7 +284,7 @@ def read(
 
 
 def _load(path, device):
-    """Returns the state in a file."""
+    """Returns the state in a file. Raises DamagedCheckpoint."""
     import torch
 
     try:
@@ -298,7 +302,7 @@ def _load(path, device):
 
 
 def _migrated(state, manifest):
-    """Returns a state of the last format as one of this format."""
+    """Returns a state of format `MIGRATED` or `FORMAT` in `FORMAT`."""
     import torch
     from torch.nn.functional import pad
 
@@ -306,7 +310,7 @@ def _migrated(state, manifest):
         return state
     if "learner" in state and "optimizer" in state["learner"]:
         state["learner"].setdefault("check", torch.zeros(2, dtype=torch.float64))
-    if stats := state.get("episode_stats"):  # no episode was left out of a metric
+    if stats := state.get("episode_stats"):  # which counted no episodes left out of a metric
         n_metrics = len(stats["sums"]) - 4
         stats["sums"] = pad(stats["sums"], (0, 0, 0, n_metrics))
         stats["windows"] = [
@@ -316,8 +320,8 @@ def _migrated(state, manifest):
 
 
 def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
-    """Returns a configuration with loggers by label. Before there were several, `train.logger` had
-    the keys of W&B, or of none, and TensorBoard was always written.
+    """Returns a configuration with loggers by label. In older ones, `train.logger` is W&B or none,
+    and TensorBoard is implied.
     """
     match config:
         case {"train": {"logger": {"name": "none" | "wandb" as name, **keys}} as train}:
@@ -331,7 +335,8 @@ def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
 def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = None) -> None:
     """Compares files of a checkpoint, by default all, with the SHA-256 in its manifest.
 
-    Raises: as `read`.
+    Raises:
+        DamagedCheckpoint: a file is missing or differs.
     """
     for name in manifest["files"] if names is None else names:
         try:
@@ -355,9 +360,11 @@ def _digest(path):
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
-    """Returns a checkpoint's manifest, which must equal what `sealed` writes to the last byte.
+    """Returns a checkpoint's manifest.
 
-    Raises: as `read`.
+    Raises:
+        DamagedCheckpoint: it is not, byte for byte, what `sealed` writes.
+        CheckpointError: it has an unknown format.
     """
     try:
         data = (path / "manifest.json").read_bytes()
@@ -369,7 +376,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         version, is_intact = None, False
     if is_intact:
         others = {*manifest["files"]} - {"config.json", "state.pt", *PARTS}
-        is_intact = all(map(_RANK_FILE.fullmatch, others))  # a planted one may name any file
+        is_intact = all(map(_RANK_FILE.fullmatch, others))  # a forged manifest may name any path
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest):
         raise DamagedCheckpoint(

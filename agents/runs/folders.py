@@ -1,4 +1,4 @@
-"""Run folders: new ones, existing ones by name, and their locks."""
+"""Run folders: creating, finding and locking them."""
 
 import contextlib
 import dataclasses
@@ -18,11 +18,11 @@ from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
-#: One line for each start of a run: its folder.
+#: The folder of each start of a run, one per line.
 STARTED = RUNS / "started.txt"
-#: Settings of earlier runs that no longer exist, and changed nothing that a run learns.
+#: Settings in older runs that no longer exist and had no effect on learning.
 REMOVED = ("nonfinite_replay",)
-#: The beginning of an error's message.
+#: Prefix of error messages.
 CANNOT = "{} cannot be written; choose another with folder=: "
 
 
@@ -30,24 +30,30 @@ CANNOT = "{} cannot be written; choose another with folder=: "
 
 
 def for_file(name: str) -> str:
-    """Returns a name without what a file's cannot have."""
+    """Returns a name with characters that file names cannot have replaced by `-`."""
     return re.sub(r"[^\w.-]", "-", name)
 
 
 def make(path: Path) -> Path:
-    """Makes a new folder and returns it; a taken name gets -2, -3, ..."""
+    """Creates a folder and returns it; if it exists, `path`-2, -3, ..."""
     with user_errors(CANNOT.format(shortened(path))):
         path.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(1):
             folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-            with contextlib.suppress(FileExistsError):  # another program may have just taken it
+            with contextlib.suppress(FileExistsError):  # taken, perhaps by another process just now
                 folder.mkdir()
                 return folder
 
 
 def new(name: str, folder: str | None = None) -> Path:
-    """Returns the folder of a new run: `folder`, which must be new or empty, or by default one
-    called after the time and `name`.
+    """Returns the folder of a new run.
+
+    Args:
+        name: end of the default folder's name, which starts with the time.
+        folder: a folder that is empty or does not exist; None for the default in `RUNS`.
+
+    Raises:
+        UserError: the folder is not empty or cannot be written.
     """
     if folder is None:
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
@@ -56,7 +62,7 @@ def new(name: str, folder: str | None = None) -> Path:
 
 
 def check_free(name: str | None) -> None:
-    """Raises UserError if the folder of a new run is not empty, or cannot be read."""
+    """Raises UserError if the folder of a new run is not empty or cannot be read."""
     folder = Path(name or "")
     with user_errors(CANNOT.format(shortened(folder))):
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
@@ -70,24 +76,23 @@ def check_free(name: str | None) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keeps other processes from training in a run folder.
+    """Locks a run folder, so that no other process trains in it.
 
-    The system holds the lock for as long as this process lives, so none is ever stale: neither
-    after kill -9, nor when another process gets the number in the file.
+    The system releases the lock when this process ends, even by kill -9, so locks are never stale.
 
     Raises:
-        UserError: naming the process that trains there, or that the folder cannot be written.
+        UserError: another process, which is named, trains there; or the folder cannot be written.
     """
-    import filelock  # which takes a while
+    import filelock  # slow to import
 
-    # its last owner may just be deleting it
+    # the timeout is for a last owner that is just deleting it
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
         lock.acquire()
         path.write_text(str(os.getpid()))
     except filelock.Timeout:
         with user_errors(f"The run folder {folder} is in use, or was just now: "):
-            pid = path.read_text()  # its last owner may just be deleting it
+            pid = path.read_text()  # fails if the last owner has just deleted it
         raise UserError(
             f"The run folder {folder} is in use by process {pid}; wait for it, or stop it: "
             f"kill {pid}"
@@ -100,13 +105,13 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)  # while it is locked, so that it is not another's
+        path.unlink(missing_ok=True)  # still locked, so it cannot be another process's
         lock.release()
 
 
 def record_start(folder: Path) -> None:
-    """Notes that training starts in a folder now. `latest` follows these notes, since folders'
-    times change with whatever is written there, and clocks are moved.
+    """Records that training starts in a folder. `latest` is the last one recorded, since
+    modification times are unreliable.
     """
     with console.warned(f"{STARTED} cannot be written, so `latest` will not find {folder}: "):
         RUNS.mkdir(exist_ok=True)
@@ -118,8 +123,8 @@ def record_start(folder: Path) -> None:
 
 
 def known() -> list[Path]:
-    """Returns the runs here, and those elsewhere that were started here; the one started or resumed
-    last comes last.
+    """Returns the folders of all runs in or started from the current folder, ordered by when they
+    were last started or resumed.
     """
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
@@ -129,20 +134,19 @@ def known() -> list[Path]:
 
 
 def pretrained() -> dict[str, Path]:
-    """Returns the files of the agents that come with megastep, by name."""
+    """Returns the agent files that come with megastep, by name."""
     files = sorted(package.PRETRAINED.glob(f"*{agent_file.SUFFIX}"))
     return {path.stem: path for path in files}
 
 
 def find(name: str) -> Path:
-    """Returns an existing run's folder, one of its checkpoints, or the file of an agent.
+    """Returns the path of a run folder, a checkpoint or an agent file.
 
     Args:
-        name: a path, `latest`, or the name of a pretrained agent; what is at a path of that name
-            comes first.
+        name: a path, `latest`, or the name of a pretrained agent; an existing path has priority.
 
     Raises:
-        UserError: naming the nearest run and the nearest pretrained agent.
+        UserError: nothing is found. Names the most similar run and pretrained agent.
     """
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
@@ -152,7 +156,7 @@ def find(name: str) -> Path:
     if agent_file.is_agent_file(path) and os.path.isfile(path):
         return path
     if os.path.exists(path):
-        problem = "is no run, with a folder checkpoints"
+        problem = "is not a run: it has no folder checkpoints"
         if name in agents:
             raise UserError(f"{name} {problem}; rename it to use the pretrained agent {name}")
     elif name in agents:
@@ -171,23 +175,24 @@ def find(name: str) -> Path:
 def load_checkpoint(
     path: Path, trust: bool, device: Any = None, is_whole: bool = False, rank: int = 0
 ) -> checkpoint.Checkpoint:
-    """Returns the checkpoint of a run or an agent found with `find`, on a device; without one, all
-    but its state, and PyTorch is not imported. Warns of damaged ones it skips.
+    """Loads the latest intact checkpoint of a run, or an agent file. Warns of damaged checkpoints.
 
     Args:
-        trust: whether a run that another user made may name modules to import.
-        is_whole: loads environments and replay buffer, too, as for a run that is resumed.
-        rank: whose environments and replay buffer.
+        path: from `find`.
+        trust: whether to allow import paths outside megastep in a run that another user made.
+        device: device of the state; None loads no state and does not import PyTorch.
+        is_whole: also loads environments and replay buffer, to resume.
+        rank: the rank whose environments and replay buffer are loaded.
 
     Raises:
-        UserError: there is none; or, without `trust`, it names modules and another user made it.
+        UserError: there is no intact checkpoint, or `trust` is needed.
     """
     with user_errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
         if agent_file.is_agent_file(path):
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
-    with contextlib.suppress(AttributeError, KeyError, TypeError):  # a planted one holds anything
+    with contextlib.suppress(AttributeError, KeyError, TypeError):  # a forged one may hold anything
         for key in REMOVED:
             loaded.config["train"].pop(key, None)
     if loaded.untrusted and not trust:
@@ -200,7 +205,7 @@ def load_checkpoint(
 
 
 def resume_command(folder: Path, key: str = "resume") -> str:
-    """Returns the command that resumes a run or, with the key `rerun`, repeats it."""
+    """Returns the command that resumes a run, or with the key `rerun` repeats it."""
     # quoted for the shell and for Hydra where needed
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
@@ -208,13 +213,13 @@ def resume_command(folder: Path, key: str = "resume") -> str:
 
 
 def checkpoints_of(path: Path) -> Path:
-    """A checkpoint, or the folder of a run's checkpoints."""
+    """Returns the `checkpoints` folder of a run; a checkpoint is returned as it is."""
     return path if (path / "manifest.json").exists() else path / "checkpoints"
 
 
 def folder_of(path: Path) -> Path:
-    """The folder of the run that a path belongs to. The results of an agent's file, which may be
-    where nobody writes, go to a folder of their own, which need not exist.
+    """Returns the run folder of a path from `find`. For an agent file, which may be read-only,
+    returns a folder in `RUNS` for its results, which may not exist yet.
     """
     if agent_file.is_agent_file(path):
         return RUNS / f"pretrained-{path.stem}"
@@ -222,5 +227,5 @@ def folder_of(path: Path) -> Path:
 
 
 def name_of(path: Path) -> str:
-    """What tables call the agent at a path: the name of its run's folder, or of its file."""
+    """Returns the agent's name in tables: that of its run folder or agent file."""
     return path.stem if agent_file.is_agent_file(path) else folder_of(path).name

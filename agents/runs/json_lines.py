@@ -1,6 +1,6 @@
-"""Files of JSON lines: one object per line, with the environment steps so far as `samples`.
+"""JSON Lines files: one object per line, with the environment steps so far as `samples`.
 
-A killed run loses no line, and a damaged line does not affect others.
+A killed run loses no complete line, and a damaged line does not affect others.
 """
 
 import json
@@ -13,8 +13,8 @@ from megastep.agents.runs.atomic_files import AppendedFile, write_atomically
 
 
 class JsonLines:
-    """A file that lines are appended to. Each line is flushed when it is written; lines that a full
-    disk refuses are written with the next one.
+    """Appends lines to a file, unbuffered. Lines that a full disk refuses are written with the next
+    line.
     """
 
     def __init__(self, path: Path | str):
@@ -22,7 +22,7 @@ class JsonLines:
         self.file = AppendedFile(self.path)
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
-        """Appends a line of numbers and strings. Writes NaN and infinity as null."""
+        """Appends a line. NaN and infinity become null."""
         json_values = {
             key: value if isinstance(value, str) or math.isfinite(value) else None
             for key, value in values.items()
@@ -34,17 +34,16 @@ class JsonLines:
 
 
 def read(path: Path | str) -> list[dict[str, Any]]:
-    """Returns the objects of a file.
+    """Returns the objects in a file.
 
-    Skips damaged lines with a warning. Skips a last line that a crash cut short silently.
+    Skips damaged lines with a warning, and silently a last line that a crash cut short.
     """
     return [row for row, _ in _intact_lines(Path(path))]
 
 
 def truncate_after(path: Path | str, step: int) -> None:
-    """Removes the lines after `step` environment steps, which a resumed run writes again.
-
-    Removes damaged lines too. Does nothing if there is no such file.
+    """Removes the lines after `step` environment steps, which a resumed run writes again, and
+    damaged lines. Does nothing if the file does not exist.
 
     Raises:
         OSError: there is no space for a copy. The file is unchanged.
@@ -59,7 +58,7 @@ def truncate_after(path: Path | str, step: int) -> None:
 
 
 def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
-    """Returns the intact lines, each as an object and as its bytes."""
+    """Returns (object, bytes) of each intact line."""
     *lines, last = path.read_bytes().split(b"\n")
     rows = [(_parsed(line), line) for line in [*lines, last]]
     damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]

@@ -1,4 +1,4 @@
-"""What made a run: the code, the machine and the command, a line for each time that it started."""
+"""Provenance of a run: code version, machine and command, one line per start."""
 
 import contextlib
 import os
@@ -16,7 +16,7 @@ import torch
 from megastep.agents.runs.json_lines import JsonLines
 
 FILE = "provenance.jsonl"
-GIT_TIMEOUT = 5  # seconds, as for a repository on a slow disk
+GIT_TIMEOUT = 5  # seconds; a repository may be on a slow disk
 
 
 def record(
@@ -27,15 +27,15 @@ def record(
     source: Path,
     hosts: Sequence[str] = (),
 ) -> None:
-    """Appends a line to `provenance.jsonl` in a run folder. What cannot be found out is left out.
-
-    Never raises: what a run learns is worth more than this.
+    """Appends a line to a run's `provenance.jsonl`. Never raises; unknown facts are omitted.
 
     Args:
-        samples: environment steps so far, of a run that is resumed.
-        version: of megastep.
-        source: the folder that megastep is in, which may be a git checkout.
-        hosts: the machine of each rank, if there are several.
+        folder: the run folder.
+        samples: environment steps so far; 0 for a new run.
+        device: device that trains.
+        version: megastep's version.
+        source: folder of megastep's source, which may be a git checkout.
+        hosts: machine of each rank.
     """
     with contextlib.suppress(Exception), contextlib.closing(JsonLines(folder / FILE)) as lines:
         facts = {
@@ -54,11 +54,13 @@ def record(
 
 
 def made_with(device: torch.device, version: str, n_ranks: int = 1) -> dict[str, str | int]:
-    """Returns what a run's numbers depend on besides its configuration and its code: where these
-    are equal, equal seeds give equal bits.
+    """Returns versions, device, threads and ranks. If they, code and configuration are equal, equal
+    seeds give bit-identical runs.
 
     Args:
-        version: of megastep.
+        device: device that trains.
+        version: megastep's version.
+        n_ranks: number of ranks.
     """
     facts = {"torch": torch.__version__, "megastep": version}
     if n_ranks > 1:
@@ -71,20 +73,20 @@ def made_with(device: torch.device, version: str, n_ranks: int = 1) -> dict[str,
 
 
 def commit(folder: Path) -> str | None:
-    """Returns the commit of the git checkout at a folder, followed by `-dirty` if files under
-    version control have changed; None if there is no checkout or no git.
+    """Returns the commit of the git checkout at a folder, with `-dirty` if tracked files have
+    changed; None without a checkout or git.
     """
 
     def git(*words):
         command = ["git", "-C", str(folder), *words]
-        # not the repository of a git hook that starts this; no lock, as somebody may work there
+        # ignore the variables of a git hook that starts this; take no lock in the user's checkout
         env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
         env["GIT_OPTIONAL_LOCKS"] = "0"
         options = dict(capture_output=True, check=True, timeout=GIT_TIMEOUT, env=env, text=True)
         return subprocess.run(command, stdin=subprocess.DEVNULL, **options).stdout.strip()
 
     try:
-        # installed into an environment inside another project, megastep has not its commit
+        # megastep may be installed inside another project's checkout
         if Path(git("rev-parse", "--show-toplevel")).resolve() != folder.resolve():
             return None
         return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
@@ -93,7 +95,7 @@ def commit(folder: Path) -> str | None:
 
 
 def device_name(device: torch.device) -> str:
-    """Returns a GPU's name, or `cpu` and the processor's as far as the system tells it."""
+    """Returns the name of a GPU, or `cpu` and the processor's name."""
     if device.type == "cuda":
         return f"{device} {torch.cuda.get_device_name(device)}"
     model = None

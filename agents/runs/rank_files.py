@@ -1,5 +1,5 @@
-"""How the ranks bring their state into one checkpoint. Each rank but 0 writes a file beside the
-checkpoints; rank 0, which writes the checkpoint, moves the files into it. All share the run folder.
+"""Collects the states of all ranks in one checkpoint. Each rank but 0 writes a file beside the
+checkpoints; rank 0, which writes the checkpoint, moves the files into it.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from typing import Any
 from megastep.agents.runs import checkpoint_format
 from megastep.agents.runs.atomic_files import write_atomically
 
-#: Seconds that rank 0 waits for the files of the other ranks.
+#: Seconds that rank 0 waits for the other ranks' files.
 SECONDS = 60.0
 
 
 class RankFiles:
-    """The files of one launch of a run.
+    """The ranks' files of one launch of a run.
 
     Args:
-        folder: the run's `checkpoints` folder.
-        launch: a name that all ranks of this launch have, and no other launch. Rank 0 deletes the
-            files that earlier launches left.
-        rank, n_ranks: this rank's number, and how many there are.
+        folder: the run's `checkpoints` folder, which all ranks share.
+        launch: name of this launch, the same on all ranks. Rank 0 deletes files of other launches.
+        rank: this rank.
+        n_ranks: number of ranks.
     """
 
     def __init__(self, folder: Path, launch: str = "", rank: int = 0, n_ranks: int = 1):
@@ -41,17 +41,17 @@ class RankFiles:
                 path.unlink()
 
     def _paths(self, rank, number):
-        """Returns the paths of a rank's state and of its entry in the manifest, written last."""
+        """Returns the paths of a rank's state and of its manifest entry, which is written last."""
         name = f".rank{rank}-{self.launch}-{number}"
         return self.folder / f"{name}.pt", self.folder / f"{name}.json"
 
     def hand_in(
         self, number: int, state: dict[str, Any], replay_seconds: float | None = None
     ) -> None:
-        """Writes this rank's file: all of a state but the policy's weights, which ranks share.
+        """Writes this rank's file: its state without the policy's weights, which rank 0 saves.
 
         Args:
-            number: the same on all ranks, and another for each checkpoint.
+            number: number of the checkpoint, the same on all ranks.
             state, replay_seconds: as for `checkpoint.save`.
 
         Raises:
@@ -68,11 +68,12 @@ class RankFiles:
             raise
 
     def collect(self, number: int, folder: Path) -> dict[str, Any]:
-        """Moves the files of the other ranks into a new checkpoint, as `rank1.pt` and so on, when
-        they are there. Returns their entries in its manifest, by name.
+        """Waits for the other ranks' files and moves them into a checkpoint, as `rank1.pt` and so
+        on. Returns their manifest entries by name.
 
         Args:
-            folder: the checkpoint's.
+            number: number of the checkpoint.
+            folder: the checkpoint's folder.
 
         Raises:
             OSError: a rank did not write its file in time.
@@ -82,7 +83,7 @@ class RankFiles:
             path, entry_path = self._paths(rank, number)
             while not entry_path.exists():
                 if self._is_given_up.wait(0.02) or time.monotonic() > deadline:
-                    raise OSError(f"rank {rank} did not write its part within {SECONDS:.0f} s")
+                    raise OSError(f"rank {rank} did not write its state within {SECONDS:.0f} s")
             name = checkpoint_format.rank_file(rank)
             entries[name] = json.loads(entry_path.read_bytes())
             os.replace(path, folder / name)
@@ -91,9 +92,9 @@ class RankFiles:
 
     @property
     def is_given_up(self) -> bool:
-        """True if another rank has ended, so that its parts of checkpoints are missing."""
+        """True if another rank has ended, so its files no longer come."""
         return self._is_given_up.is_set()
 
     def give_up(self) -> None:
-        """Has `collect` wait no longer, as another rank has ended."""
+        """Makes `collect` stop waiting, because another rank has ended."""
         self._is_given_up.set()

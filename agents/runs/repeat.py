@@ -1,4 +1,4 @@
-"""How to meet a run's NaN or infinity again: from the last checkpoint before it, which is kept."""
+"""Reproduces a run's NaN or infinity: keeps the last checkpoint before it, to resume from."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ if TYPE_CHECKING:
     from megastep.agents.algorithms.nonfinite import NonFiniteValue
     from megastep.agents.training.trainer import Trainer
 
-#: The run folder, in that of the run, in which the checkpoint is kept.
+#: Folder inside the run folder that keeps the checkpoint, itself a run folder.
 FOLDER = "nonfinite"
-#: Settings that may have changed since a checkpoint and decide how a run goes on from it.
+#: Settings that a resumed run may have changed, and that affect how it continues.
 CHANGEABLE = "samples", "seconds", "device", "ranks"
 
 
 def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
-    """Returns how to meet the first NaN or infinity of a run again, as the rest of a sentence.
+    """Returns how to reproduce the first NaN or infinity of a run, as the rest of a sentence.
 
-    A run that is resumed meets it bit for bit. Its checkpoint is kept in a run folder of its own,
-    so the run goes on as it would have. Where checkpoints do not hold everything, or there is none
-    yet, the run has to be repeated from its first update.
+    Resuming from the last checkpoint reproduces it bit for bit, so that checkpoint is kept, in a
+    run folder of its own. If there is none yet, or checkpoints do not hold everything, the run must
+    be repeated from its first update.
 
     Args:
-        trainer: of rank 0, before it saves another checkpoint.
-        value: what was found.
-        is_resumed: this process resumed the run, so its first update was elsewhere.
+        trainer: rank 0's trainer, before it saves another checkpoint.
+        value: the first NaN or infinity.
+        is_resumed: this process resumed the run.
     """
     saver = trainer.saver
     saver.wait()
@@ -48,32 +48,32 @@ def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
             if "seconds" not in changed or trainer.budget.anneal != "seconds":
                 path = _keep(whole[-1], run, trainer)
                 words = [f"{key}={'null' if now is None else now}" for key, now in changed.items()]
-                return f". To see it again: {' '.join([folders.resume_command(path), *words])}"
-            reason = "the learning rate has followed another clock since the last one"
+                return f". To reproduce it: {' '.join([folders.resume_command(path), *words])}"
+            reason = "seconds= has changed since the last one, and with it the learning rate"
     except (OSError, UserError) as error:
         return f". The checkpoint before it could not be kept ({error})"
     why = f". Checkpoints cannot repeat it, as {reason}" if reason else ""
     # rerun needs a checkpoint at the end, and a policy that diverged is not saved
     if is_resumed or not value.is_from_env:
         return why
-    how = "To try from the start" if reason else "To see it again"
+    how = "To try from the start" if reason else "To reproduce it"
     return f"{why}. {how}, once this run has ended: {folders.resume_command(run, 'rerun')}"
 
 
 def _is_whole(path, trainer):
-    """Returns whether a checkpoint holds episodes, and the replay buffer if there is one."""
+    """Returns True if a checkpoint has environments, and the replay buffer if there is one."""
     has_replay = trainer.run_state.replay_buffer is None or (path / "replay.pt").exists()
     return has_replay and (path / "world.pt").exists()
 
 
 def _changed(path: Path, config: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings that a checkpoint has other values of."""
+    """Returns the settings in `CHANGEABLE` whose values differ from the checkpoint's."""
     before = json.loads((path / "config.json").read_bytes())["train"]
     return {key: config[key] for key in CHANGEABLE if config[key] != before.get(key)}
 
 
 def _keep(path, run, trainer):
-    """Makes a run folder with a checkpoint and the learning rates since. Returns the folder."""
+    """Creates a run folder with the checkpoint and the annealing record. Returns the folder."""
     kept = folders.make(run / FOLDER)
     try:
         shutil.copytree(path, kept / "checkpoints" / path.name, copy_function=_link)
@@ -87,7 +87,7 @@ def _keep(path, run, trainer):
 
 
 def _link(source, target):
-    """Gives a file a second name: checkpoints never change. Copies it where that is impossible."""
+    """Hard-links a file, since checkpoints never change; copies it where links fail."""
     with contextlib.suppress(OSError):
         os.link(source, target)
         return target

@@ -1,4 +1,4 @@
-"""The state of what trains: gathered for a checkpoint, and restored from it in a resumed run."""
+"""Gathers the state of a run for a checkpoint, and restores it when the run is resumed."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 
 class RunState:
-    """Gathers and restores the state of the parts of a run. Its counts are the trainer's.
+    """The state of a run, except for the trainer's counters.
 
     Args:
         env: the environment, after `reset()`.
-        policy: the policy that the learner improves.
-        learner: with its replay buffer, if it has one.
+        policy: the policy that trains.
+        learner: the learner; its replay buffer is included.
         collect: the learner's collector.
-        episode_stats: statistics of the episodes.
-        curriculum: what draws the homes of episodes, if anything does.
+        episode_stats: episode statistics.
+        curriculum: the curriculum, if any.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class RunState:
         return optional(self.env_state.env, "resumable")
 
     def incomplete(self) -> str | None:
-        """Returns why a checkpoint does not hold everything, as a clause; None if it does."""
+        """Returns why checkpoints do not hold everything, as a clause; None if they do."""
         if not self.is_resumable:
             return f"they do not hold {type(self.env_state.env).__name__}"
         if not hasattr(self.collect, "state_dict"):
@@ -62,12 +62,12 @@ class RunState:
         return f"they cannot hold {', '.join(names)} of the environment" if names else None
 
     def state_dict(self, has_episodes: bool = True) -> dict[str, Any]:
-        """Returns the state as dicts of tensors and plain values, most of which share their memory
-        with what trains. Nothing may step the environment meanwhile.
+        """Returns the state as dicts of tensors and plain values.
+
+        Most tensors are not copies, so copy them before the environment or the learner steps.
 
         Args:
-            has_episodes: includes the environment, if it is `resumable`, and what the policy
-                remembers of it.
+            has_episodes: includes the environment, if it is `resumable`, and the actor state.
         """
         parts = dict(
             policy=self.policy.state_dict(),
@@ -89,10 +89,12 @@ class RunState:
         """Restores a `state_dict`.
 
         Args:
-            is_new_rank: it is rank 0's without episodes, and this rank keeps generators of its own.
+            state: from `state_dict`.
+            is_new_rank: `state` is rank 0's, without episodes; this rank keeps its generators.
 
-        Returns what could not be restored and begins anew, a clause each; then the run does not
-        continue bit for bit.
+        Returns:
+            A clause for each part that could not be restored and starts anew; if there are any, the
+            run does not continue bit for bit.
         """
         if is_new_rank:
             state = self._of_new_rank(state)
@@ -110,12 +112,12 @@ class RunState:
             if "replay" in state:
                 self.replay_buffer.load_state_dict(state["replay"])
             else:
-                lost.append("the replay buffer was not saved and fills again")
-        return ["ranks that it did not have begin new episodes"] if is_new_rank else lost
+                lost.append("the replay buffer was not saved and starts empty")
+        return ["added ranks start new episodes"] if is_new_rank else lost
 
     def _of_new_rank(self, state):
-        """Returns a state of rank 0 with this rank's generators, and without what rank 0 counted
-        since the last report.
+        """Returns rank 0's state with this rank's generators, and with no episodes counted since
+        the last report.
         """
         stats, own = state["episode_stats"], self.state_dict(has_episodes=False)
         pairs = ((name, state[name]) for name in ("learner", "opponents") if name in state)
@@ -123,18 +125,18 @@ class RunState:
         return {**state, **parts, "episode_stats": stats | {"sums": 0 * stats["sums"]}}
 
     def _load_episodes(self, state):
-        """Restores the environment, what the policy remembers of it and the statistics."""
+        """Restores environment, actor state and episode statistics. Returns clauses."""
         lost = []
         if "env" not in state:
-            lost.append("its environments were not saved, so new episodes begin")
+            lost.append("environments were not saved, so new episodes start")
         elif not state["collector"]:
-            lost.append(f"{self.collector_name} has no state_dict, so new episodes begin")
+            lost.append(f"{self.collector_name} has no state_dict, so new episodes start")
         else:
             try:
                 self.env_state.load_state_dict(state["env"])
             except ValueError as error:
-                lost.append(f"{error}; new episodes begin")
-        if lost:  # only finished episodes can be counted on
+                lost.append(f"{error}; new episodes start")
+        if lost:  # unfinished episodes are lost
             state["episode_stats"] = {
                 name: state["episode_stats"][name] for name in ("sums", "windows")
             }
@@ -144,20 +146,20 @@ class RunState:
         return lost
 
     def warn_of_unreachable(self) -> None:
-        """Warns once of what the environment keeps where checkpoints cannot reach it."""
+        """Warns once of environment state that checkpoints cannot hold."""
         if self.has_named_unreachable or not self.is_resumable:
             return
         if names := self.env_state.unreachable():
             self.has_named_unreachable = True
             warnings.warn(
                 f"Checkpoints cannot hold {', '.join(names)} of the environment: if they change, a "
-                "resumed run differs from one left alone",
+                "resumed run differs from an uninterrupted one",
                 stacklevel=3,
             )
 
 
 def _with_generators(saved, own):
-    """Returns a saved state with the states of `SeededGenerator`s replaced by those of `own`."""
+    """Returns a saved state whose `SeededGenerator` states are replaced by those of `own`."""
     if not isinstance(saved, dict) or not isinstance(own, dict):
         return saved
     if "seed" in saved and saved.keys() <= {"seed", "device", "generator"}:

@@ -1,4 +1,4 @@
-"""Saving a run: checkpoints at intervals, and snapshots of the weights spaced over the budget."""
+"""Saves checkpoints of a run, and snapshots of the weights at even intervals of the budget."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from megastep.agents.runs.rank_files import RankFiles
 if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
 
-#: Bytes of a replay buffer that every checkpoint holds.
+#: Bytes up to which a replay buffer is in every checkpoint.
 SMALL_REPLAY = 2**28
-#: Seconds that a larger one may take to write when a run ends.
+#: Seconds that a larger replay buffer may take to write when a run ends.
 REPLAY_SECONDS = 5.0
 
 
 class Saver:
-    """Writes the checkpoints of one run, in a thread of its own.
+    """Writes the checkpoints of a run in a background thread.
 
-    A full, read-only or faulty disk causes one warning, at the next call or `wait`; each later call
-    tries again.
+    If the disk is full, read-only or faulty, the next call or `wait` warns once; later calls try
+    again.
 
     Args:
-        folder: where the checkpoints go.
+        folder: the run's `checkpoints` folder.
         config: the run's configuration, stored in each checkpoint.
-        keep_checkpoints: number of checkpoints kept, besides the one with the best score.
-        made_with: what a run's numbers depend on besides its configuration, such as versions.
-        replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is in every so many
+        keep_checkpoints: number of checkpoints to keep, besides the one with the best score.
+        made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
+        replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is in one of this many
             checkpoints, and in the last one if it can be written in `REPLAY_SECONDS`.
-        rank_files: where there are other ranks: each rank has a saver, and all save the same
-            checkpoints. That of rank 0 writes them, the others hand in their part.
+        rank_files: files of the other ranks. Each rank has a saver; rank 0's writes the
+            checkpoints, and the others hand in their states.
 
     Attributes:
-        error: why the last checkpoint could not be written, as a sentence; None if it was written.
-            Valid after `wait`.
-        lacks_replay: True if the last checkpoint was to leave out the replay buffer.
-        seconds: how long the thread took for the last checkpoint.
+        error: why the last checkpoint could not be written, as a sentence; None if it was. Valid
+            after `wait`.
+        lacks_replay: True if the replay buffer was not due in the last checkpoint.
+        seconds: time that the thread took for the last checkpoint.
     """
 
     def __init__(
@@ -70,23 +70,22 @@ class Saver:
     def __call__(
         self, step: int, state: dict[str, Any], score: float | None = None, is_last: bool = False
     ) -> None:
-        """Begins to write a checkpoint of `state` after `step` environment steps.
-
-        What `state` holds may change as soon as this returns.
+        """Copies `state` to the CPU and starts to write a checkpoint of it.
 
         Args:
-            state: dicts and lists of tensors and plain values.
-            score: for example the mean return, higher is better; None if unknown.
+            step: environment steps so far, of all lanes.
+            state: dicts and lists of tensors and plain values; may change once this returns.
+            score: such as the mean return, higher is better; None if unknown.
             is_last: no other checkpoint follows.
 
         Raises:
-            NonFiniteError: what was learnt has a NaN or infinity. Earlier checkpoints are kept.
+            NonFiniteError: policy or learner have a NaN or infinity. Earlier checkpoints are kept.
         """
         self.wait()
         self._number += 1
         state, seconds = self._with_replay(state, is_last)
         state = self._host_copy(state)
-        # an environment may keep an infinity; weights may not
+        # infinities are fine in environments, not in weights
         learnt = {name: state[name] for name in ("policy", "learner") if name in state}
         if path := nonfinite_leaf(learnt):
             raise NonFiniteError(
@@ -96,8 +95,8 @@ class Saver:
         self._thread.start()
 
     def _with_replay(self, state, is_last):
-        """Returns the state, without its replay buffer if it is not due, and the seconds that the
-        buffer may take.
+        """Returns the state, without the replay buffer if that is not due, and the time limit in
+        seconds for the buffer (None for no limit).
         """
         self.lacks_replay = False
         if "replay" not in state or _nbytes(state["replay"]) <= SMALL_REPLAY:
@@ -116,8 +115,8 @@ class Saver:
         if not self.has_warned_of_memory:
             self.has_warned_of_memory = True
             warnings.warn(
-                "There is too little memory for a copy of the replay buffer, so checkpoints do "
-                "not hold it",
+                "Checkpoints leave out the replay buffer, since there is too little memory to copy "
+                "it",
                 stacklevel=4,
             )
 
@@ -148,14 +147,14 @@ class Saver:
         self.seconds = time.monotonic() - began
 
     def give_up(self) -> None:
-        """Waits no longer for the parts of other ranks, as one has ended."""
+        """Stops waiting for the files of other ranks, because one has ended."""
         self.rank_files.give_up()
 
     def wait(self) -> None:
-        """Returns when nothing is being written. Warns if the last checkpoint failed.
+        """Waits until the last checkpoint is written. Warns if the disk failed.
 
         Raises:
-            Exception: what is not the disk's fault.
+            Exception: any other error of the thread.
         """
         if self._thread is None:
             return
@@ -167,7 +166,7 @@ class Saver:
             return
         if not isinstance(failure[-1], (OSError, checkpoint.DamagedCheckpoint)):
             raise failure[-1]
-        self._n_since_replay = self.replay_every  # the next one is to have it
+        self._n_since_replay = self.replay_every  # so that the next one has it
         has_warned = self.error is not None or self.rank_files.is_given_up
         self.error = self._message(*failure)
         if not has_warned:
@@ -189,13 +188,13 @@ class Saver:
 
 
 class _HostCopy:
-    """Copies a state to the CPU. Copies from a GPU go through pinned memory that is kept."""
+    """Copies a state to the CPU, from a GPU into pinned memory that is reused."""
 
     def __init__(self):
         self.pinned = {}
 
     def __call__(self, state: dict[str, Any]) -> dict[str, Any]:
-        """Returns the copy: plain dicts, lists and tuples. Synchronises."""
+        """Returns the copy as plain dicts, lists and tuples. Synchronises."""
         self.devices = set()
         copy = self._copied(state, ())
         for device in self.devices:
@@ -215,7 +214,7 @@ class _HostCopy:
     def _copied_tensor(self, tensor, path):
         if tensor.device.type != "cuda":
             return tensor.clone()
-        if path[0] == "replay" or "rollouts" in path:  # may be too large to pin
+        if path[0] == "replay" or "rollouts" in path:  # possibly too large to pin
             return tensor.cpu()
         kept = self.pinned.get(path)
         if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
@@ -226,7 +225,7 @@ class _HostCopy:
 
 
 def _free_memory():
-    """Returns bytes of memory that are free, infinity where the system does not tell."""
+    """Returns free memory in bytes, infinity if unknown."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (ValueError, OSError, AttributeError):
@@ -240,7 +239,7 @@ def _nbytes(state):
 class SnapshotSaver:
     """Saves the policy's weights at the end of each of `n` equal parts of the budget.
 
-    `evaluate.py ratings=true` compares these snapshots. :class:`Trainer` calls it with itself.
+    `evaluate.py ratings=true` compares these snapshots. :class:`Trainer` calls it once per update.
 
     Args:
         saver: writes the snapshots.

@@ -1,4 +1,4 @@
-"""What a run or an evaluation achieved, in one number."""
+"""Scores of runs and evaluations."""
 
 import contextlib
 import json
@@ -9,11 +9,15 @@ from megastep.agents.runs import json_lines
 
 
 def mean_return(rows: list[dict[str, Any]], n_reports: int = 10) -> float | None:
-    """Returns the score of a training run from its metrics, None if no episode finished.
+    """Returns the score of a training run: the mean return of the episodes that ended in its last
+    reports. None if no episode finished.
 
-    It is the mean return of the episodes that ended in the last reports, or of some more if they
-    are fewer than a report's means are over (`training.episode_stats`). Each counts once, so a
-    report of one lucky episode has the weight of one.
+    Each episode counts once. `episode/return` is a mean over a window of `episode/window` episodes,
+    which may include some from earlier reports (`training.episode_stats`).
+
+    Args:
+        rows: the objects of `metrics.jsonl`.
+        n_reports: number of last reports.
     """
     total, n_episodes, end = 0.0, 0, len(rows)
     while end > max(0, len(rows) - n_reports):
@@ -22,17 +26,21 @@ def mean_return(rows: list[dict[str, Any]], n_reports: int = 10) -> float | None
             total += n_in_mean * rows[end - 1]["episode/return"]
             n_episodes += n_in_mean
         end, n_before = end - 1, n_in_mean - rows[end - 1].get("episode/count", 0)
-        while end > 0 and n_before > 0:  # these reports are in that mean already
+        while end > 0 and n_before > 0:  # these reports are part of that window
             end, n_before = end - 1, n_before - rows[end - 1].get("episode/count", 0)
     return total / n_episodes if n_episodes else None
 
 
 def outcome(result: Path) -> dict[str, float | None]:
-    """Returns what a job achieved, from what it returned.
+    """Returns the scores of a job of a sweep.
 
-    score: for a sweeper: a training run's `mean_return`, an evaluation's return, the share of duels
-        won against the first opponent.
-    evaluated, lower, upper: the evaluated one of these with its interval; of a run its return.
+    Args:
+        result: the job's run folder, or the .json file of an evaluation.
+
+    Returns:
+        `score`: `mean_return` of a run; of an evaluation, the return or the fraction of duels won
+        against the first opponent. `evaluated`, `lower` and `upper`: the same of an evaluation, or
+        of a run's first evaluation, with its 95 % interval. None if unknown.
     """
     files, rows = [result], []
     if is_run := result.is_dir():

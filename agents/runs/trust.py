@@ -1,10 +1,9 @@
-"""Signatures of runs: which checkpoints may have modules imported.
+"""Signatures of checkpoints, which tell a user's own runs from downloaded ones.
 
 A checkpoint's configuration names classes by import path, and importing a module runs its code.
-Classes of megastep may always be imported. A configuration that names others is signed with an
-HMAC-SHA256 (RFC 2104) of `config.json`, so that each user's own runs are told from downloaded ones.
-The key is made once per user: `megastep/key` in `$XDG_CONFIG_HOME`, else in `~/.config`. Does not
-import PyTorch.
+megastep's own classes may always be imported. A `config.json` that names others is signed with
+HMAC-SHA256 (RFC 2104) and a key of the user: `megastep/key` in `$XDG_CONFIG_HOME`, by default
+`~/.config`. Does not import PyTorch.
 """
 
 import contextlib
@@ -19,7 +18,7 @@ import warnings
 from pathlib import Path
 
 KEY_BYTES = 32
-#: Groups of settings that may hold import paths.
+#: Settings groups that may contain import paths.
 GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum", "logger")
 #: Import paths of megastep's own components.
 OWN = re.compile(
@@ -30,7 +29,7 @@ OWN = re.compile(
 def sign(config: bytes) -> str | None:
     """Returns the signature of a `config.json`; None if it names no modules outside megastep.
 
-    Makes the user's key at the first use. If there can be none, warns and returns None.
+    Creates the user's key at the first use; if that fails, warns and returns None.
     """
     if not foreign_names(config):
         return None
@@ -59,7 +58,7 @@ def foreign_names(config: bytes) -> list[str]:
     tree, names = json.loads(config), []
     train = tree.get("train") if isinstance(tree, dict) else None
     stack = [train.get(group) for group in GROUPS] if isinstance(train, dict) else []
-    while stack:  # not recursive: a planted file may be nested deeply
+    while stack:  # not recursive: a forged file may be deeply nested
         value = stack.pop()
         if isinstance(value, (dict, list)):
             stack += [*value, *value.values()] if isinstance(value, dict) else value
@@ -78,17 +77,17 @@ def _path():
 
 
 def _read_key():
-    """Returns the key. Raises OSError if there is none, or others could have read or written it."""
+    """Returns the key. Raises OSError if it does not exist or is not private."""
     with open(_path(), "rb") as file:
         status, key = os.fstat(file.fileno()), file.read()
     is_private = status.st_uid == os.geteuid() and not stat.S_IMODE(status.st_mode) & 0o077
     if not is_private or len(key) != KEY_BYTES:
-        raise OSError(f"{_path()} is no private file of {KEY_BYTES} bytes; delete it")
+        raise OSError(f"{_path()} is not a private file of {KEY_BYTES} bytes; delete it")
     return key
 
 
 def _make_key():
-    """Returns the key, which is made if there is none. The first of several processes makes it."""
+    """Returns the key. Creates it if missing; among several processes, the first one does."""
     with contextlib.suppress(FileNotFoundError):
         return _read_key()
     path = _path()
@@ -100,7 +99,7 @@ def _make_key():
             file.flush()
             os.fsync(file.fileno())
         with contextlib.suppress(FileExistsError):
-            os.link(temporary, path)  # which, unlike a rename, replaces none
+            os.link(temporary, path)  # unlike a rename, does not replace an existing key
     finally:
         os.unlink(temporary)
     return _read_key()

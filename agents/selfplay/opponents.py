@@ -17,12 +17,12 @@ from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import launch
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 from megastep.settings import checked
 from megastep.types import Env, PolicyLike, World, optional
 
-PROGRAM = Program(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -167,7 +167,7 @@ class Opponents:
         )
         if reward.is_cuda and reward.dtype == torch.float32:
             launch(
-                *(PROGRAM, "count_pairs", reward.device, self.n_opposed),
+                *(LIBRARY, "count_pairs", reward.device, self.n_opposed),
                 **dict(reward=reward, terminal=terminal, truncated=truncated, slots=self.slots),
                 **dict(returns=self.returns, pairs=self.pairs),
                 **dict(n_envs=self.n_opposed, n_agents=self.env.n_agents),

@@ -1,3 +1,3 @@
-"""Storage of experience on the device: rollouts, the collectors that fill them, and the replay
-buffer with its sum tree of priorities.
+"""Storage of experience on the device: rollouts, collectors that fill them, and the prioritised
+replay buffer.
 """

@@ -1,10 +1,10 @@
-"""Collecting while the learner updates, with weights that are an exact number of updates old.
+"""Collects rollouts while the learner updates, with weights that are exactly `lag` updates old.
 
     call n:    waits for rollout n, returns it, and starts collecting rollout n + lag
-    rollout n: acted with the weights after update n - 1 - lag, or with the first weights
+    rollout n: collected with the weights after update n - 1 - lag, or the initial weights
 
-On a GPU a second stream collects while the learner updates on the current one. A CPU does the same
-work in the same order, one after the other, with the same numbers.
+On a GPU, a second stream collects while the learner updates on the current stream. A CPU collects
+in the same order, but not at the same time; the numbers are equal.
 """
 
 import copy
@@ -22,12 +22,12 @@ from megastep.types import Env
 
 
 class _Slot:
-    """One of the `lag` rollouts in progress, with the weights, the graph and the end event that
-    belong to it. The actor state is shared by all.
+    """One of the `lag` rollouts in progress, with its weights, CUDA graph and end event. All slots
+    share the actor state.
     """
 
     def __init__(self, env: Env, policy: Policy, rollout: Rollout, actor_state: arrdict):
-        # autocast caches the cast of a weight only if the weight requires a gradient
+        # autocast caches casts only of weights that require a gradient
         self.actor = policy.actor().requires_grad_(True)
         self.actor.generator = policy.generator  # shared by all actors and saved with the policy
         policy_weights = policy.state_dict()
@@ -42,15 +42,16 @@ class _Slot:
 
 
 class AsyncCollector:
-    """Collects `lag` rollouts in advance. Returns them one after the other, copied into `rollout`.
+    """Collects `lag` rollouts in advance. Each call copies the next one into `rollout`, returns it,
+    and starts another.
 
-    Rollouts store no values, since those of old weights are of no use.
+    Rollouts do not store values, since those of old weights are not used.
 
     Args:
         env: environment without opponents.
         policy: the policy that the learner updates.
-        rollout: what each call fills and returns.
-        lag: how many updates old the acting weights are.
+        rollout: filled and returned by each call.
+        lag: age of the acting weights, in updates.
 
     Raises:
         ValueError: if the environment has opponents, whose weights change with the updates.
@@ -69,11 +70,11 @@ class AsyncCollector:
         self.slots = [_Slot(env, policy, rollout, actor_state) for _ in range(lag)]
         self.actor_state = actor_state
         self.n_returned = 0  # rollouts; the next is of slot n_returned % lag
-        self.is_ahead = False  # whether every slot has been launched
+        self.is_ahead = False  # True once every slot is collecting
 
     @property
     def graph(self) -> Callable | None:
-        """The captured graph that collects, or None."""
+        """The CUDA graph that collects, or None."""
         return self.slots[0].collect.graph
 
     def __call__(self) -> Rollout:
@@ -90,7 +91,7 @@ class AsyncCollector:
         return self.rollout
 
     def allocate_layouts(self) -> None:
-        """Has rollouts hold the environment's layouts. Call before the first rollout."""
+        """Makes rollouts store the environments' layouts. Call before the first rollout."""
         for rollout in (self.rollout, *(slot.rollout for slot in self.slots)):
             rollout.allocate_layouts()
 
@@ -106,12 +107,12 @@ class AsyncCollector:
             slot.collect()
             slot.end = self.stream.record_event()
         if not isinstance(slot.collect.graph, Graph):
-            # An environment may replace tensors in its first steps, which frees memory of the
-            # current stream. Nothing may reuse that memory before these steps are done.
+            # An eager environment may free memory that belongs to the current stream, which must
+            # not reuse it before these steps are done.
             current.wait_event(slot.end)
 
     def wait(self) -> None:
-        """Blocks until nothing is being collected, so that others may use the environment."""
+        """Blocks until no rollout is being collected. Call it before using the environment."""
         if self.on_gpu:
             self.stream.synchronize()
 
@@ -121,7 +122,7 @@ class AsyncCollector:
         return dict(actor_state=self.actor_state, rollouts=rollouts, n_returned=self.n_returned)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a `state_dict` of a collector with the same lag."""
+        """Restores a `state_dict` of a collector with the same lag."""
         copy_tree(self.actor_state, state["actor_state"])
         self.n_returned, self.is_ahead = state["n_returned"], bool(state["rollouts"])
         for slot, rollout in zip(self.slots, state["rollouts"]):

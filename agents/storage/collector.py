@@ -1,4 +1,4 @@
-"""Collectors: a policy acts in an environment and fills rollouts.
+"""Collectors: step an environment with a policy and store the transitions in rollouts.
 
 T time, B lanes.
 """
@@ -22,8 +22,9 @@ _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` r
 def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
     """Resets an environment and allocates the rollout's metrics.
 
-    Returns the actor state for `collect`: arrdict(world, state), a copy of the parts of the current
-    world that rollouts store, and the hidden state.
+    Returns:
+        The actor state for `collect`: arrdict(world, state), with a copy of the parts of the
+        current world that rollouts store, and the policy's initial hidden state.
     """
     first = rollout.select_lanes(env.reset())
     rollout.allocate_metrics(first)
@@ -33,13 +34,16 @@ def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
 
 @torch.no_grad()
 def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> arrdict:
-    """Fills a rollout: T times act, step, store. Never synchronises, so it can be captured.
+    """Fills a rollout: act, step, store, T times. Never synchronises, so CUDA graphs can record it.
 
     Args:
-        actor_state: of `initial_actor_state` or of the previous `collect`; updated in place.
+        env: environment whose current world is in `actor_state`.
+        policy: acts; its values are stored if the rollout has `values`.
+        rollout: overwritten.
+        actor_state: from `initial_actor_state` or the previous `collect`; updated in place.
 
     Returns:
-        the actor state.
+        `actor_state`.
     """
     world, state = actor_state["world"], actor_state["state"]
     rollout.state[:] = state
@@ -62,7 +66,7 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
         if rollout.values is not None:
             features.append(policy(seen, state, sample=False)[0]["features"])
             rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
-    # Clear a non-finite hidden state, which would otherwise last until the lane's episode ends.
+    # A non-finite hidden state would otherwise last until the lane's episode ends.
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=_stored(world), state=state)
     for target, source in zip(leaves(actor_state), leaves(after), strict=True):
@@ -78,16 +82,18 @@ def capture_with(
     roots: tuple = (),
     warmup: int = 3,
 ) -> Callable:
-    """Records a function that acts in an environment as a CUDA graph, see
-    `megastep.capture.capture`. If it changes what an environment or a policy of another's class
-    keeps besides tensors, it is returned as it is, with the warning of `capture`. Such values stay
-    as they were, so nothing depends on when a graph is recorded.
+    """Records a function that steps an environment as a CUDA graph, by `capture`.
 
     Args:
         env: the environment.
-        policies: a policy, or several in a tuple.
-        function, args, warmup: as in `capture`.
-        roots: what else the function changes.
+        policies: a policy or a tuple of policies.
+        function, args, warmup: as for `capture`.
+        roots: other objects whose tensors the function changes.
+
+    Returns:
+        The graph; or `function` itself, with a warning, if it cannot be recorded, for example
+        because it changes attributes of a user's environment or policy that are not tensors. Such
+        attributes are restored, so results do not depend on when a graph is recorded.
     """
     state = EnvState(env, policies, host_only=True)
     before = state.host_state()
@@ -98,19 +104,19 @@ def capture_with(
 
 
 class Collector:
-    """Fills the same rollout again and again. Each call collects T steps and returns the rollout.
+    """Collects T steps per call into one rollout, which is overwritten and returned.
 
-    The first call is eager, so that libraries can initialise themselves. From the second call on, a
-    GPU replays a CUDA graph, unless the environment steps on the host.
+    The first call runs eagerly, since libraries initialise themselves then. Later calls on a GPU
+    replay a CUDA graph, unless the environment steps on the host.
 
     Args:
-        env: environment. It is reset here, once, unless there is an `actor_state`.
+        env: environment.
         policy: the acting policy.
         rollout: the rollout to fill.
         actor_state: actor state to continue from; None resets the environment.
 
     Attributes:
-        graph: the captured graph, or None.
+        graph: the CUDA graph; None before the second call and without graphs.
     """
 
     def __init__(
@@ -137,17 +143,15 @@ class Collector:
         return self.rollout
 
     def allocate_layouts(self) -> None:
-        """Has rollouts hold the environment's layouts. Call before the first rollout."""
+        """Makes rollouts store the environments' layouts. Call before the first rollout."""
         self.rollout.allocate_layouts()
 
     def state_dict(self) -> dict[str, Tree]:
-        """Returns the actor state: what the next rollout starts from, besides the environment."""
+        """Returns the actor state, from which the next rollout starts."""
         return {"actor_state": self.parts[-1]}
 
     def load_state_dict(self, state: dict[str, Tree]) -> None:
-        """Continues from a `state_dict`, which may come from another device. The next call is eager
-        again.
-        """
+        """Restores a `state_dict`, from any device. The next call runs eagerly again."""
         copy_tree(self.parts[-1], state["actor_state"])
         self.n_collected, self.graph = 0, None
 

@@ -1,4 +1,4 @@
-"""Copies and selections of many tensors at once."""
+"""Copies and index selections of many tensors in one kernel."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -7,15 +7,15 @@ from pathlib import Path
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
-from megastep.kernels.build.program import Program
 from megastep.types import Tree
 
-PROGRAM = Program(Path(__file__).parent / "kernels")
-_MAX_COPIES = PROGRAM.constants["MAX_COPIES"]
-_BLOCK_WORDS = BLOCK * PROGRAM.constants["COPY_WORDS"]
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
+_MAX_COPIES = LIBRARY.constants["MAX_COPIES"]
+_BLOCK_WORDS = BLOCK * LIBRARY.constants["COPY_WORDS"]
 _BLOCK_BYTES = 16 * _BLOCK_WORDS
-_MAX_SELECTED = PROGRAM.constants["MAX_SELECTED"]
+_MAX_SELECTED = LIBRARY.constants["MAX_SELECTED"]
 _MAX_BYTES = 2**31
 
 
@@ -24,15 +24,15 @@ def copy_all(
 ) -> None:
     """Copies the second tensor of each pair into the first, as `Tensor.copy_` does.
 
-    On a GPU contiguous tensors of equal dtype and shape are copied by one kernel: a copy of a few
-    kilobytes takes no time, but its launch takes a microsecond. They are copied in no order, so no
-    target may share memory with another tensor of the pairs.
+    On a GPU, contiguous tensors of equal dtype and shape are copied by one kernel, since launches
+    take longer than copies of a few kilobytes. Copies run in any order, so a target must not share
+    memory with another tensor of the pairs.
 
     Args:
-        pairs: targets and sources, all on one device but for sources on the host.
-        condition: () bool on the device. If false, no bit changes. None: copies always.
+        pairs: targets and sources, all on one device; sources may also be on the host.
+        condition: () bool on the device; if false, nothing is copied. None copies always.
     """
-    pairs = list(pairs)  # a source that nobody else holds lives until the launch
+    pairs = list(pairs)  # keeps sources alive until the launch
     fused = []
     for target, source in pairs:
         if target.is_cuda and _is_plain_copy(target, source):
@@ -47,7 +47,7 @@ def copy_all(
             n_bytes = target.numel() * target.element_size()
             is_aligned = not (target.data_ptr() | source.data_ptr()) % 16
             rows.append(
-                PROGRAM.params.CopyParams(
+                LIBRARY.params.CopyParams(
                     target=target,
                     source=source,
                     n_bytes=n_bytes,
@@ -57,7 +57,7 @@ def copy_all(
             )
             n_blocks += -(-n_bytes // _BLOCK_BYTES)
         launch(
-            *(PROGRAM, "copy_all", fused[0][0].device, Blocks(n_blocks)),
+            *(LIBRARY, "copy_all", fused[0][0].device, Blocks(n_blocks)),
             copies=b"".join(rows),
             condition=condition,
             n_copies=len(rows),
@@ -95,7 +95,7 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
             addresses = n_bytes | tensor.data_ptr() | results[i].data_ptr()
             word_size = next(size for size in (16, 8, 4, 1) if not addresses % size)
             rows.append(
-                PROGRAM.params.SelectParams(
+                LIBRARY.params.SelectParams(
                     target=results[i],
                     source=tensor,
                     n_steps=n_steps,
@@ -106,7 +106,7 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
             )
             n_blocks += -(-n_steps * len(lanes) * (n_bytes // word_size) // _BLOCK_WORDS)
         launch(
-            *(PROGRAM, "select_lanes", lanes.device, Blocks(n_blocks)),
+            *(LIBRARY, "select_lanes", lanes.device, Blocks(n_blocks)),
             tensors=b"".join(rows),
             lanes=lanes,
             n_lanes=tensors[chosen[0]].shape[1],

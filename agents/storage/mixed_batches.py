@@ -19,9 +19,7 @@ _IN_TIME = (
 
 
 def from_rollout(rollout: Rollout, lanes: torch.Tensor) -> arrdict:
-    """Returns whole sequences of some lanes (M,), as `Rollout.sequences`, and per sequence
-    `weight` 1 and `age` 0, both (M,).
-    """
+    """Returns `Rollout.sequences` of some lanes (M,), with `weight` 1 and `age` 0, both (M,)."""
     batch = rollout.sequences(lanes)
     return arrdict(batch, weight=torch.ones_like(batch.reward[0]), age=torch.zeros_like(lanes))
 
@@ -31,8 +29,8 @@ def add_replayed(
 ) -> arrdict:
     """Returns a fresh batch followed by n replayed sequences, (T, M + n, ...).
 
-    Burn-in steps are removed after warming up the hidden state. While the buffer is not ready, the
-    replayed sequences have `learns` false. `index` (n,) is for `ReplayBuffer.set_priorities`.
+    Burn-in steps warm up the hidden state and are then removed. Until the buffer is ready, replayed
+    sequences have `learns` false. `index` (n,) is for `ReplayBuffer.set_priorities`.
     """
     replayed = _burn_in(replay.sample(n, generator), policy, replay.settings.burn_in)
     replayed["learns"] = replayed.learns & replay.is_ready

@@ -9,46 +9,48 @@ from collections.abc import Sequence
 
 import torch
 
-from megastep.agents.storage.copies import PROGRAM
+from megastep.agents.storage.copies import LIBRARY
 from megastep.kernels.build.launch import WARP, Blocks, launch
 
-MAX_LEVELS = PROGRAM.constants["MAX_LEVELS"]
-MAX_SET = PROGRAM.constants["MAX_SET"]  # indices of `set_tree` and `set_priorities`
+MAX_LEVELS = LIBRARY.constants["MAX_LEVELS"]
+MAX_SET = LIBRARY.constants["MAX_SET"]  # indices of `set_tree` and `set_priorities`
 FAN_OUT = WARP  # children of a node
-_MAX_TENSORS = PROGRAM.constants["MAX_SELECTED"]
-_SET_THREADS, _READ_THREADS = (PROGRAM.constants[f"{name}_THREADS"] for name in ("SET", "READ"))
+_MAX_TENSORS = LIBRARY.constants["MAX_SELECTED"]
+_SET_THREADS, _READ_THREADS = (LIBRARY.constants[f"{name}_THREADS"] for name in ("SET", "READ"))
 _MAX_ENTRIES = 2**31  # kernels count lanes, rows and words in 32 bits
-_COPIES = {size: PROGRAM.constants[f"COPY_{size}"] for size in (16, 8, 4, 2, 1)}
+_COPIES = {size: LIBRARY.constants[f"COPY_{size}"] for size in (16, 8, 4, 2, 1)}
 #: How a stored dtype is read as another.
 _CONVERSIONS = {
-    (torch.uint8, torch.int64): PROGRAM.constants["BYTE_TO_LONG"],
-    (torch.int16, torch.int64): PROGRAM.constants["SHORT_TO_LONG"],
-    (torch.int32, torch.int64): PROGRAM.constants["INT_TO_LONG"],
-    (torch.uint8, torch.float16): PROGRAM.constants["BYTE_TO_HALF"],
-    (torch.uint8, torch.float32): PROGRAM.constants["BYTE_TO_FLOAT"],
-    (torch.float16, torch.float32): PROGRAM.constants["HALF_TO_FLOAT"],
+    (torch.uint8, torch.int64): LIBRARY.constants["BYTE_TO_LONG"],
+    (torch.int16, torch.int64): LIBRARY.constants["SHORT_TO_LONG"],
+    (torch.int32, torch.int64): LIBRARY.constants["INT_TO_LONG"],
+    (torch.uint8, torch.float16): LIBRARY.constants["BYTE_TO_HALF"],
+    (torch.uint8, torch.float32): LIBRARY.constants["BYTE_TO_FLOAT"],
+    (torch.float16, torch.float32): LIBRARY.constants["HALF_TO_FLOAT"],
 }
 
 
-def draw(levels: Sequence[torch.Tensor], shares: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def draw(
+    levels: Sequence[torch.Tensor], fractions: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Draws an index from each of M equal parts of a sum tree's total.
 
     Args:
         levels: of the tree, (blocks, FAN_OUT) float64 each.
-        shares: (M,) float64 from 0 to 1, where in its part.
+        fractions: (M,) float64 from 0 to 1, where in its part.
 
     Returns:
         indices (M,) int64 and their probabilities (M,) float64.
     """
-    index = torch.empty_like(shares, dtype=torch.int64)
-    probability = torch.empty_like(shares)
+    index = torch.empty_like(fractions, dtype=torch.int64)
+    probability = torch.empty_like(fractions)
     launch(
-        *(PROGRAM, "sample_tree", shares.device, WARP * len(shares)),
+        *(LIBRARY, "sample_tree", fractions.device, WARP * len(fractions)),
         tree=_packed(levels),
-        shares=shares,
+        fractions=fractions,
         index=index,
         probability=probability,
-        n_samples=len(shares),
+        n_samples=len(fractions),
     )
     return index, probability
 
@@ -62,7 +64,7 @@ def set_tree(levels: Sequence[torch.Tensor], index: torch.Tensor, values: torch.
         values: (n,) float64.
     """
     launch(
-        *(PROGRAM, "set_tree", index.device, Blocks(1, threads=_SET_THREADS)),
+        *(LIBRARY, "set_tree", index.device, Blocks(1, threads=_SET_THREADS)),
         tree=_packed(levels),
         index=index,
         values=values,
@@ -94,7 +96,7 @@ def set_priorities(
     """
     values = torch.empty_like(errors, dtype=torch.float64)
     launch(
-        *(PROGRAM, "set_priorities", index.device, Blocks(1, threads=_SET_THREADS)),
+        *(LIBRARY, "set_priorities", index.device, Blocks(1, threads=_SET_THREADS)),
         tree=_packed(levels),
         index=index,
         errors=errors,
@@ -164,7 +166,7 @@ def read_sequences(
             word_size = next(size for size in _COPIES if not addresses % size)
             n_words, kind = n_bytes // word_size, _COPIES[word_size]
         packed.append(
-            PROGRAM.params.ReadTensorParams(
+            LIBRARY.params.ReadTensorParams(
                 target=result,
                 source=rows,
                 n_rows=n_rows,
@@ -181,7 +183,7 @@ def read_sequences(
     weights, age = torch.empty_like(probability), torch.empty_like(index)
     weight = torch.empty_like(probability, dtype=torch.float32)
     launch(
-        *(PROGRAM, "read_sequences", device, Blocks(n_blocks, threads=_READ_THREADS)),
+        *(LIBRARY, "read_sequences", device, Blocks(n_blocks, threads=_READ_THREADS)),
         tensors=b"".join(packed),
         flags=flags,
         **dict(zip(("starts", "learns", "terminal", "truncated"), bools)),
@@ -204,5 +206,5 @@ def read_sequences(
 
 
 def _packed(levels):
-    rows = [PROGRAM.params.TreeLevelParams(sums=level) for level in levels]
-    return PROGRAM.params.SumTreeParams(levels=b"".join(rows), n_levels=len(levels))
+    rows = [LIBRARY.params.TreeLevelParams(sums=level) for level in levels]
+    return LIBRARY.params.SumTreeParams(levels=b"".join(rows), n_levels=len(levels))

@@ -1,8 +1,8 @@
 """Rollouts: T steps of B lanes on the device.
 
-T time, B lanes, M lanes of a minibatch. Row t of a rollout is the observation and the action of
-time t. `reward`, `reset`, `terminal` and `truncated` at row t come from the world that followed,
-t+1. So row t is a valid transition unless its `reset` is set.
+T time, B lanes, M lanes of a minibatch. Row t of a rollout has the observation and the action of
+time t. `reward`, `reset`, `terminal` and `truncated` in row t come from the next world, t+1. So row
+t is a valid transition unless its `reset` is set.
 """
 
 import math
@@ -31,12 +31,12 @@ class Rollout:
         n_lanes: B.
         obs_space: space of the observations.
         action_space: space of the actions.
-        state: the policy's hidden state of B lanes, such as `policy.initial(B)`; is copied.
+        state: the policy's hidden state of B lanes, such as `policy.initial(B)`; copied.
         device: device of all tensors.
-        privileged_space: space of what only the critic sees, or None.
+        privileged_space: space of privileged observations, which only the critic sees, or None.
         obs_dtype: dtype of observations, except integers and spaces that name a dtype.
-        learners: bool per lane of the environment, true for the B lanes that are stored. For
-            environments with opponents; None stores every lane.
+        learners: bool per lane of the environment, true for the B lanes to store, in environments
+            with opponents; None stores every lane.
         values: whether to store the critic's values.
 
     Attributes:
@@ -99,27 +99,27 @@ class Rollout:
     # ---- Writing ----
 
     def allocate_metrics(self, world: arrdict) -> None:
-        """Allocates the metrics of worlds like this one. Call once, before the first step."""
+        """Allocates the metrics that this world has. Call once, before the first step."""
         for name in world.get("metrics", {}):
             self.metrics[name] = torch.zeros_like(self.reward)
 
     def allocate_layouts(self) -> None:
-        """Has the layouts of the environment be stored. Call before the first step."""
+        """Makes the rollout store the environments' layouts. Call before the first step."""
         if self.layouts is None:
             self.layouts = torch.zeros_like(self.reward, dtype=torch.int32)
 
     def store_world(self, t: int, world: arrdict) -> arrdict:
-        """Stores the world at time t. Returns it as it was stored, for the policy to act on."""
+        """Stores the world at time t. Returns the stored copy, on which the policy acts."""
         copy_all(self._of_world(t, world))
         return self.world(t)
 
     def store_transition(self, t: int, world: arrdict) -> None:
-        """Stores reward, end of episode and metrics of the world that followed time t."""
+        """Stores reward, episode end and metrics of the world after the action of time t."""
         copy_all(self._of_transition(t, world))
 
     def store_decision(self, t: int, decision: arrdict) -> None:
-        """Stores the actions of time t, and their log-probabilities if the decision has any. Call
-        it before the environment steps, which may change the actions in place.
+        """Stores the actions of time t, and log-probabilities if the decision has them. Call it
+        before the environment steps, which may change actions in place.
         """
         pairs = _pairs(self.actions, t, decision["actions"])
         if "logprobs" in decision:
@@ -127,8 +127,8 @@ class Rollout:
         copy_all(pairs)
 
     def store_outcome(self, t: int, world: arrdict, layout: torch.Tensor | None = None) -> arrdict:
-        """Stores the world that followed time t: what happened, at t, and what it looks like, at
-        t + 1. Returns that as it was stored.
+        """Stores the world after the action of time t: reward, episode end, metrics in row t, the
+        observation in row t + 1. Returns `world(t + 1)`, the stored observation.
 
         Args:
             layout: (N,) integers, the environments' layouts in that world, if they are stored.
@@ -142,7 +142,7 @@ class Rollout:
         return self.world(t + 1)
 
     def _of_world(self, t, world):
-        """Returns pairs of what is stored of the world at time t."""
+        """Returns (target, source) pairs for the observation of time t."""
         pairs = [*_pairs(self.obs, t, world["obs"]), (self.starts[t], world["reset"])]
         if "learns" in world:
             pairs.append((self.learns[t], world["learns"]))
@@ -151,7 +151,7 @@ class Rollout:
         return pairs
 
     def _of_transition(self, t, world):
-        """Returns pairs of what is stored at time t of the world that followed."""
+        """Returns (target, source) pairs for row t, from the world after its action."""
         names = "reward", "terminal", "truncated"
         metrics = [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
         return [*((getattr(self, name)[t], world[name]) for name in names), *metrics]
@@ -193,11 +193,11 @@ class Rollout:
 
     @property
     def reset(self) -> torch.Tensor:
-        """(T, B) bool, whether row t's action was ignored because an episode started instead."""
+        """(T, B) bool, true where the action was ignored because a new episode started."""
         return self.starts[1:]
 
     def world(self, t: int) -> arrdict:
-        """Returns what a policy sees at time t: arrdict(obs, reset), and privileged if stored."""
+        """Returns the policy's input at time t: arrdict(obs, reset), and privileged if stored."""
         world = arrdict(obs=self.obs[t], reset=self.starts[t])
         if self.privileged is not None:
             world["privileged"] = self.privileged[t]
@@ -274,7 +274,7 @@ def make_rollout(env: Env, policy: Policy, n_steps: int, values: bool = True) ->
 
 
 def bytes_per_step(env: Env, policy: Policy) -> int:
-    """Returns about how many bytes a rollout takes per step and lane."""
+    """Returns the approximate size of a rollout in bytes per step and lane."""
     obs = _bytes(env.obs_space, default_itemsize=2)
     privileged = 0
     if policy.privileged_space:
@@ -297,7 +297,7 @@ def without_last(tree: Tree | None) -> Tree | None:
 
 
 def _pairs(rows, t, tree):
-    """Returns pairs of the leaves of row t and those of a tree."""
+    """Returns (target, source) pairs of the leaves of row t and of a tree."""
     targets, sources = spaces.leaves(rows), spaces.leaves(tree)
     return [(target[t], sources[path]) for path, target in targets.items()]
 

@@ -94,7 +94,7 @@ class SumTree:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `sample`'s indices and their `probability`, on a GPU in one kernel."""
         if self.is_fused:
-            return kernels.draw(self.levels, self._shares(n, generator))
+            return kernels.draw(self.levels, self._fractions(n, generator))
         index = self.sample(n, generator)
         return index, self.probability(index)
 
@@ -106,8 +106,8 @@ class SumTree:
         """
         if self.is_fused:
             return self.draw(n, generator)[0]
-        top, share = self.levels[-1], self._shares(n, generator)
-        rest = (share + torch.arange(n, device=top.device)) / n * self.total
+        top, fraction = self.levels[-1], self._fractions(n, generator)
+        rest = (fraction + torch.arange(n, device=top.device)) / n * self.total
         children = torch.arange(self.fan_out, device=top.device)
         index = torch.zeros(n, dtype=torch.int64, device=top.device)
         for level in reversed(self.levels):
@@ -128,7 +128,7 @@ class SumTree:
         tiny = torch.finfo(torch.float64).tiny
         return self.priorities.index_select(0, index) / self.total.clamp(min=tiny)
 
-    def _shares(self, n, generator):
+    def _fractions(self, n, generator):
         """Returns where in its part of the total each sample is, (n,) float64 from 0 to 1."""
         if n < 1:
             raise ValueError(f"n must be at least 1 index to draw, but {n} was given")

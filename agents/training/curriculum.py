@@ -212,7 +212,7 @@ class SFL(Curriculum):
 
     def probabilities(self) -> torch.Tensor:
         powers = self.scores ** (1 / self.temperature)
-        return self.uniform / len(powers) + (1 - self.uniform) * shares(powers)
+        return self.uniform / len(powers) + (1 - self.uniform) * proportions(powers)
 
     def _rescore(self, rollout, n, homes, ended):
         variance = (self.squares - self.means.square()).clamp(min=0.0)
@@ -265,7 +265,7 @@ class PLR(Curriculum):
         order = scores.argsort(descending=True, stable=True)
         ranks = torch.arange(1, len(order) + 1, dtype=torch.float32, device=order.device)
         powers = torch.empty_like(ranks).scatter_(0, order, ranks ** (-1 / self.temperature))
-        return (1 - self.mix) * shares(powers) + self.mix * shares(self.staleness.float())
+        return (1 - self.mix) * proportions(powers) + self.mix * proportions(self.staleness.float())
 
     def _rescore(self, rollout, n, homes, ended):
         advantages = returns.gae(**rollout.transitions(), **self.discounts).advantages
@@ -297,7 +297,7 @@ def fixed(values: torch.Tensor, largest: float) -> torch.Tensor:
     return (values.nan_to_num(0.0, largest).clamp(0.0, largest) * _ONE).round().long()
 
 
-def shares(weights: torch.Tensor) -> torch.Tensor:
-    """Returns weights (D,) divided by their sum; equal shares if it is 0."""
+def proportions(weights: torch.Tensor) -> torch.Tensor:
+    """Returns weights (D,) divided by their sum; all equal if it is 0."""
     total = weights.sum()
     return torch.where(total > 0, weights / total, 1 / len(weights))

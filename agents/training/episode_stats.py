@@ -12,11 +12,11 @@ from typing import Any
 import torch
 
 from megastep.agents.algorithms.nonfinite import LIMIT
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 from megastep.types import Env, optional
 
-PROGRAM = Program(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
 
 #: Means are over at least this many episodes, once so many have ended.
 MIN_EPISODES = 100
@@ -126,7 +126,7 @@ class EpisodeStats:
         return (
             reward.is_cuda
             and isinstance(learns, torch.Tensor)
-            and len(values) <= PROGRAM.constants["EPISODE_METRICS"]
+            and len(values) <= LIBRARY.constants["EPISODE_METRICS"]
             and all(value.dtype == torch.float32 for value in (reward, *values))
         )
 
@@ -134,14 +134,14 @@ class EpisodeStats:
         """Does the same as `add` in two kernels."""
         n_steps, n_lanes = reward.shape
         values = [metrics[name].contiguous() for name in self.metrics]
-        pack = PROGRAM.params.EpisodeMetricParams
+        pack = LIBRARY.params.EpisodeMetricParams
         of_lanes = self.sums.new_empty(len(self.sums), n_lanes)
         source_sums = None
         if self.sources:
             source_sums = self.sums.new_empty(len(self.sums), len(self.sources), n_lanes)
             layouts = layouts.contiguous()
         launch(
-            *(PROGRAM, "episodes", reward.device, n_lanes),
+            *(LIBRARY, "episodes", reward.device, n_lanes),
             metrics=b"".join(pack(values=value) for value in values),
             reward=reward.contiguous(),
             reset=reset.contiguous(),
@@ -163,9 +163,9 @@ class EpisodeStats:
             limit=LIMIT,
         )
         n_sums, n_columns = self.sums.shape
-        blocks = Blocks(n_columns, n_sums, PROGRAM.constants["COLUMNS_THREADS"])
+        blocks = Blocks(n_columns, n_sums, LIBRARY.constants["COLUMNS_THREADS"])
         launch(
-            *(PROGRAM, "episode_columns", reward.device, blocks),
+            *(LIBRARY, "episode_columns", reward.device, blocks),
             of_lanes=of_lanes,
             members=self.members,
             source_sums=source_sums,

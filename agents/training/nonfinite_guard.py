@@ -1,6 +1,6 @@
-"""What a run does about NaN and infinity: it names the first, and ends if they persist.
+"""Warns of the first NaN or infinity of a run, and ends the run if they persist.
 
-The learner skips the updates, see `nonfinite.NonFiniteCheck`.
+The learner skips such updates, see `nonfinite.NonFiniteCheck`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
 from megastep.agents.distributed.agreement import from_rank_0
-from megastep.agents.distributed.process_group import place, rank, unhurried
+from megastep.agents.distributed.process_group import rank, rank_label, unhurried
 from megastep.agents.distributed.reports import gather_if_any
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
@@ -25,20 +25,20 @@ MAX_SKIPPED = 20
 
 
 class NonFiniteGuard:
-    """Warns of the first NaN or infinity of a run, says how to meet it again, and ends a run whose
+    """Warns of the first NaN or infinity of a run, says how to reproduce it, and ends a run whose
     updates are all skipped.
 
-    With several ranks, all call it at the same updates, and know the same of each other's numbers.
+    All ranks must call it at the same updates; they exchange their detections.
 
     Args:
         env: the environment.
-        learner: its `check` is read. Without one, only metrics are guarded.
-        make_hint: returns how to meet the first NaN or infinity again, as the rest of a sentence,
+        learner: its `check` is read. Without one, only metrics are checked.
+        make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,
             such as `repeat.hint`. Called on rank 0.
 
     Attributes:
         value: the first NaN or infinity of the run, or None.
-        hint: how to meet it again, or "".
+        hint: how to reproduce it, or "".
     """
 
     def __init__(self, env: Env, learner: Learner, make_hint: Callable[[NonFiniteValue], str]):
@@ -50,11 +50,11 @@ class NonFiniteGuard:
     def check(self, rollout: RolloutLike) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.
 
-        Warns about the first NaN or infinity of the run. Call it before a checkpoint is saved: the
-        last one is then from before the number.
+        Warns of the first NaN or infinity of the run. Call it before a checkpoint is saved, so that
+        the last checkpoint precedes the NaN.
 
         Args:
-            rollout: the latest one.
+            rollout: the latest rollout.
 
         Raises:
             NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
@@ -65,10 +65,10 @@ class NonFiniteGuard:
         if value:
             value = value.in_env(_env_lanes(rollout), self.n_agents)
         is_bad = value is not None or n_skipped > 0
-        reports = gather_if_any((n_skipped, value, place()), is_bad, self.device)
+        reports = gather_if_any((n_skipped, value, rank_label()), is_bad, self.device)
         n_skipped = max(report[0] for report in reports)
-        _, value, place_of_value = next((one for one in reports if one[1]), reports[0])
-        text = f"{value}{f' ({place_of_value})' * (len(reports) > 1)}"
+        _, value, label = next((one for one in reports if one[1]), reports[0])
+        text = f"{value}{f' ({label})' * (len(reports) > 1)}"
         if value and self.value is None:
             with unhurried():
                 self.value, self.hint = value, from_rank_0(lambda: self.make_hint(value))
@@ -92,14 +92,14 @@ class NonFiniteGuard:
             name: lane_name(_env_lanes(rollout)[lane], self.n_agents)
             for name, lane in episode_stats.pop_bad_metrics().items()
         }
-        of_rank = {name: (lane, place()) for name, lane in bad.items()}
+        of_rank = {name: (lane, rank_label()) for name, lane in bad.items()}
         reports = gather_if_any(of_rank, bool(bad), self.device)
         of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
         episode_stats.named |= of_all.keys()
-        for name, (lane, place_of_lane) in of_all.items() if rank() == 0 else ():
-            of_place = f" ({place_of_lane})" * (len(reports) > 1)
+        for name, (lane, label) in of_all.items() if rank() == 0 else ():
+            where = f" ({label})" * (len(reports) > 1)
             warnings.warn(
-                f"metrics.{name} of {lane}{of_place} was not finite at the end of an episode; such "
+                f"metrics.{name} of {lane}{where} was not finite at the end of an episode; such "
                 f"episodes are left out of episode/{name}",
                 stacklevel=3,
             )

@@ -16,6 +16,7 @@ from megastep.agents.distributed.process_group import n_ranks, rank, unhurried
 from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.training.budget import Budget, Stopwatch
+from megastep.agents.training.closing import close_env
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import PHASES, PhaseTimer, device_memory
@@ -208,8 +209,10 @@ class Trainer:
         self.wait_for_files()
 
     def close(self) -> None:
-        """Closes the environment and the files of metrics, after training."""
-        optional(self.env, "close")()
+        """Closes the environment, which is no reason to lose what was learnt, and the files of
+        metrics, after training.
+        """
+        close_env(self.env)
         if self.annealing_record is not None:
             self.annealing_record.close()
         self.logger.close()
@@ -304,6 +307,9 @@ class Trainer:
         evaluation = {f"eval/{name}": value for name, value in evaluation.items()}
         means = mean_over_ranks({**of_curriculum, **loss_values, **evaluation})
         stats |= {name: means[name] for name in of_curriculum if name in means}
+        if (n_restarts := optional(self.env, "pop_restarts")()) is not None:
+            n_restarts = torch.tensor([n_restarts], device=self.env.device)
+            stats["episode/restarts"] = int(sum_over_ranks(n_restarts))
         self.latest_stats.update(stats)
         metrics = {
             **stats,

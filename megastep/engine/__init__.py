@@ -9,9 +9,11 @@ The step of a game is an operation too, in the environment's package, for exampl
 """
 
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_flag
-from megastep.engine.devices import device, fit, set_threads, threads
+from megastep.engine.devices import device, fit, free_memory, set_threads, threads
 from megastep.engine.lighting import bake
 from megastep.engine.movement import physics
+from megastep.engine.object_updates import place_objects, update_objects
+from megastep.engine.objects import Objects, check_objects
 from megastep.engine.outputs import Observation, Physics, Render
 from megastep.engine.rendering import observe, render, update_agent_geometry
 from megastep.engine.scenery import Layouts, Scenery
@@ -25,6 +27,7 @@ __all__ = [
     "Agents",
     "EngineError",
     "Layouts",
+    "Objects",
     "Observation",
     "Physics",
     "Render",
@@ -32,14 +35,18 @@ __all__ = [
     "bake",
     "check",
     "check_flag",
+    "check_objects",
     "device",
     "fit",
+    "free_memory",
     "observe",
     "physics",
+    "place_objects",
     "render",
     "set_threads",
     "spawn",
     "threads",
     "uniform",
     "update_agent_geometry",
+    "update_objects",
 ]

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from megastep.engine import checks
+from megastep.engine.objects import check_objects
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
@@ -102,10 +103,13 @@ def check(agents: Agents) -> None:
 
     Raises:
         EngineError: naming an environment with a non-finite position, angle or velocity, with an
-            action that is NaN, or with an action, layout or goal that does not exist.
+            action that is NaN, or with an action, layout or goal that does not exist; or naming
+            an object, see :func:`check_objects`.
     """
     flag = checks.instance("agents", agents, Agents).error_flag
     check_flag(checks.stored("agents.error_flag", flag))
+    if objects := _objects_of(agents):
+        check_objects(objects)
 
 
 def check_flag(error_flag: torch.Tensor) -> None:
@@ -124,6 +128,14 @@ def check_flag(error_flag: torch.Tensor) -> None:
 def check_on_cpu(agents: Agents) -> None:
     """Does what :func:`check` does if the agents are on the CPU, where nothing synchronises."""
     check_flag_on_cpu(agents.error_flag)
+    if agents.error_flag.is_cpu and (objects := _objects_of(agents)):
+        check_objects(objects)
+
+
+def _objects_of(agents):
+    """Returns the objects in the scenery that the agents were last in, or None."""
+    checked = vars(agents).get("_checked")
+    return checked and checked.scenery.objects
 
 
 def check_flag_on_cpu(error_flag: torch.Tensor) -> None:

@@ -11,6 +11,7 @@ from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
 from megastep.engine.devices import n_resident_threads
 from megastep.engine.launch_params import error_flag_address, lanes_of, scenery_params, state_params
+from megastep.engine.objects import object_params
 from megastep.engine.outputs import Physics
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import ENGINE, launch
@@ -33,7 +34,8 @@ def physics(
 ) -> Physics:
     """Moves the agents by their velocities for 1 / fps seconds, in place.
 
-    An agent stops just before the first wall or agent that it touches, and its velocities become 0.
+    An agent stops just before the first wall, agent or solid object that it touches, and its
+    velocities become 0.
 
     Args:
         actions: (N, A) int64, or (N, A, n_moves) float32. If given, velocities are first multiplied
@@ -59,9 +61,12 @@ def physics(
         moves_at = checks.address("moves", moves, (n_moves, 3), torch.float32, device)
         actions_at, controls_at = _addresses(actions, lanes, n_moves, device)
     progress = torch.empty(lanes, device=device)
+    kernel = _kernel(n, device)
+    if scenery.objects is not None:
+        kernel = kernel.replace("physics", "physics_objects")
     threads_per_env = _threads_per_env(n, device)
     launch(
-        *(ENGINE, _kernel(n, device), device, threads_per_env * n),
+        *(ENGINE, kernel, device, threads_per_env * n),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
         progress=progress,
@@ -73,6 +78,7 @@ def physics(
         retained=1 - damping,
         seconds=1 / agents.fps,
         threads_per_env=threads_per_env,
+        objects=object_params(scenery),
     )
     check_on_cpu(agents)
     return Physics(progress)

@@ -18,6 +18,8 @@ from megastep.engine.launch_params import (
     state_params,
     texel_bits,
 )
+from megastep.engine.object_updates import update_objects
+from megastep.engine.objects import object_params
 from megastep.engine.outputs import Observation, Render
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
@@ -26,6 +28,8 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
+#: Of an object's line, or its texel, in shared memory.
+LINE_BYTES = 16
 #: Agents are many if they need more threads than this many times those that a GPU runs at once, by
 #: what is faster on an H200.
 UNSPILLED_WAVES = 4
@@ -60,6 +64,7 @@ def render(scenery: Scenery, agents: Agents) -> Render:
     Also updates the agents' lines in ``scenery``. Training uses :func:`observe`, which is faster.
     """
     update_agent_geometry(scenery, agents)
+    update_objects(scenery, agents)
     device, shape = scenery.device, (*_per_camera(lanes_of(scenery, agents), agents), agents.res)
     out = Render(
         indices=torch.empty(shape, dtype=torch.int32, device=device),
@@ -88,7 +93,7 @@ def observe(
     """Renders what training needs, in one pass and without full-resolution tensors.
 
     Equals :func:`render` followed by the sensors of :mod:`~megastep.modules`. With one agent per
-    environment, ``scenery.lines`` is not updated.
+    environment, ``scenery.lines`` is not updated, nor are unlit objects' lines.
 
     Args:
         subsample: rays per pixel, a divisor of ``agents.res``; at most 32.
@@ -126,8 +131,11 @@ def observe(
         imu=torch.empty((n, a, 3), dtype=half, device=device) if imu else None,
         newly_seen=torch.empty(lanes, dtype=int32, device=device) if seen_fields else None,
     )
+    if scenery.objects is not None and scenery.objects.lit:
+        update_objects(scenery, agents)
     moving = state_params(scenery, agents, "velocity", "angvelocity") if imu else {}
-    _render(scenery, agents, subsample, max_depth, **moving, **seen_fields, **out._asdict())
+    optional = {**moving, **seen_fields, **out._asdict()}
+    _render(scenery, agents, subsample, max_depth, **optional)
     return out
 
 
@@ -153,6 +161,9 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     n = scenery.n_envs * scenery.n_agents
     kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
     n_per_block = 1 if kernel == "render_split" else BLOCK // WARP
+    if scenery.objects is not None:
+        shared += LINE_BYTES * (len(scenery.objects.line_object) + scenery.objects.n_objects)
+        kernel = kernel.replace("render", "render_objects")
     launch(
         *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared * n_per_block)),
         scenery=scenery_params(scenery, agents.radius),
@@ -174,6 +185,7 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
         n_pixels=res // subsample,
         inv_subsample=1 / subsample,
         inv_max_depth=1 / max_depth,
+        objects=object_params(scenery),
         **{**_OPTIONAL, **outputs},
     )
     check_on_cpu(agents)

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from megastep.engine import checks, views
+from megastep.engine.objects import Objects
 from megastep.engine.views import JoinedRagged
 from megastep.kernels.build.launch import ENGINE
 from megastep.ragged import Ragged
@@ -101,6 +102,18 @@ class Layouts(SetOnce):
         self._boxes[:, 2:].fill_(-torch.inf).scatter_reduce_(0, box, ends.amax(1), "amax")
 
     @cached_property
+    def extents(self) -> torch.Tensor:
+        """(D, 4): min x, min y, max x, max y of each layout's walls as they were at first."""
+        layout = torch.repeat_interleave(
+            torch.arange(self.n_layouts, device=self._boxes.device), self.box_starts.long().diff()
+        )[:, None].expand(-1, 2)
+        extents = self._boxes.new_full((self.n_layouts, 4), torch.inf)
+        extents[:, 2:] = -torch.inf
+        extents[:, :2].scatter_reduce_(0, layout, self._boxes[:, :2], "amin")
+        extents[:, 2:].scatter_reduce_(0, layout, self._boxes[:, 2:], "amax")
+        return extents
+
+    @cached_property
     def max_texels(self) -> int:
         """The largest number of static texels in any layout."""
         return int(self.texel_starts[self.wall_starts.long()].diff().max())
@@ -126,10 +139,13 @@ class Scenery(SetOnce):
         layout: (N,) int32, the layout that each environment shows. May be written in place.
         agent_lines: (N, A M, 2, 2), written by every render.
         agent_light: (N, K), written by every render.
+        objects: :class:`~megastep.engine.Objects`, or None; may be set once.
 
     Raises:
         TypeError, ValueError: naming the argument that does not fit.
     """
+
+    objects: Objects | None = None
 
     def __init__(
         self,
@@ -248,11 +264,12 @@ class Scenery(SetOnce):
         Takes the same time however many environments there are.
 
         Returns:
-            (lines (l, 2, 2), one lit texture (w, 3) per line, lights (l, 3)), agents' lines first.
+            (lines (l, 2, 2), one lit texture (w, 3) per line, lights (l, 3)): agents' lines, then
+            objects', then walls.
         """
         e = checks.integer("e", e, -self.n_envs, self.n_envs - 1)
         layouts, d = self._stored().layouts, int(self.layout[e])
-        lines = torch.cat([self.agent_lines[e], layouts.lines[d]])
+        lines = torch.cat([*self._moving_lines(e), layouts.lines[d]])
         first, last = layouts.wall_starts[d : d + 2].tolist()
         bounds = layouts.texel_starts[first : last + 1].tolist()
         model_bounds = self.model_texels.tolist()
@@ -261,9 +278,28 @@ class Scenery(SetOnce):
         walls = texels[:, :3] * texels[:, 3:]
         return (
             lines,
-            (*agents.split(_widths(model_bounds)), *walls.split(_widths(bounds))),
+            (
+                *agents.split(_widths(model_bounds)),
+                *self._of_objects(e),
+                *walls.split(_widths(bounds)),
+            ),
             layouts.lights[d].clone(),
         )
+
+    def _moving_lines(self, e):
+        # the lines of an environment's agents and objects
+        return (
+            [self.agent_lines[e]]
+            if self.objects is None
+            else [self.agent_lines[e], self.objects.lines[e]]
+        )
+
+    def _of_objects(self, e):
+        # the lit texel (1, 3) of each line of an environment's objects
+        if self.objects is None:
+            return ()
+        texels = self.objects.texels[e, self.objects.line_object.long()]
+        return (texels[:, :3] * texels[:, 3:]).split(1)
 
 
 def _same(name, what, expected, actual):

@@ -16,6 +16,7 @@ from megastep.engine.launch_params import (
     seed_params,
     state_params,
 )
+from megastep.engine.objects import object_params
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import ENGINE, WARP, launch
 
@@ -35,6 +36,9 @@ def spawn(
     cumulative: torch.Tensor | None = None,
 ) -> None:
     """Puts agents at random points of their environment's layout, at rest, with random headings.
+
+    They drop the objects that they carry, and avoid points on solid objects, unless these were of
+    another layout.
 
     Args:
         mask: (N, A) bool, agents to respawn.
@@ -68,6 +72,8 @@ def spawn(
         cumulative_at = checks.address("cumulative", cumulative, (n_layouts,), torch.int32, device)
     is_hidden, n_envs = checks.flag("hidden", hidden), scenery.n_envs
     kernel, n_threads = ("spawn_hidden", WARP * n_envs) if is_hidden else ("spawn", n_envs)
+    if scenery.objects is not None:
+        kernel += "_objects"
     launch(
         *(ENGINE, kernel, device, n_threads),
         scenery=scenery_params(scenery, agents.radius),
@@ -81,6 +87,7 @@ def spawn(
         **seed_params(seed),
         n_points=n_points,
         resample=int(checks.flag("resample", resample)),
+        objects=object_params(scenery),
     )
     check_on_cpu(agents)
 

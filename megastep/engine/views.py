@@ -1,4 +1,4 @@
-"""Scenery by environment: read-only views that join an environment's agents and its layout.
+"""Scenery by environment: read-only views that join its agents, its objects and its layout.
 
 N environments, A agents per environment, M lines of the agent model, K texels of one environment's
 agents, W walls of all layouts, L lines of all environments.
@@ -99,13 +99,15 @@ def _ranges(starts, widths):
 
 
 def lines(scenery) -> JoinedRagged:
-    """Returns the lines (l, 2, 2) of each environment: its agents' first, as last rendered."""
+    """Returns the lines (l, 2, 2) of each environment as last rendered: its agents', then its
+    objects', then walls.
+    """
     layout, walls = scenery.layout.long(), scenery.layouts.lines
-    n = scenery.agent_lines.shape[1]
-    agents = torch.arange(scenery.n_envs, device=scenery.device) * n
+    moving = [scenery.agent_lines, *([scenery.objects.lines] if scenery.objects else [])]
+    e = torch.arange(scenery.n_envs, device=scenery.device)
     return JoinedRagged(
         LINES,
-        (scenery.agent_lines.flatten(0, 1), agents, torch.full_like(agents, n)),
+        *((x.flatten(0, 1), e * x.shape[1], torch.full_like(e, x.shape[1])) for x in moving),
         (walls.vals, walls.starts[layout], walls.widths[layout]),
     )
 
@@ -120,35 +122,45 @@ def textures(scenery) -> JoinedRagged:
     """Returns the texels (w, 3) of each line of all environments."""
     agents = scenery.layouts.agent_textures
     starts = scenery.layout.long() * agents.shape[1]
-    return _by_line(scenery, TEXTURES, agents.flatten(0, 1), starts, scenery.layouts.textures.vals)
+    texels = scenery.layouts.textures.vals
+    return _by_line(scenery, TEXTURES, agents.flatten(0, 1), starts, texels, slice(3))
 
 
 def baked(scenery) -> JoinedRagged:
     """Returns the light (w,) on each line of all environments."""
     agents = scenery.agent_light
     starts = torch.arange(scenery.n_envs, device=scenery.device) * agents.shape[1]
-    return _by_line(scenery, BAKED, agents.flatten(), starts, scenery.layouts.baked.vals)
+    return _by_line(scenery, BAKED, agents.flatten(), starts, scenery.layouts.baked.vals, 3)
 
 
-def _by_line(scenery, refusal, agents, agent_starts, texels):
-    """Returns texels by line. In ``agents``, those of environment e start at ``agent_starts[e]``.
+def _by_line(scenery, refusal, agents, agent_starts, texels, channels):
+    """Returns texels by line. In ``agents``, those of environment e start at ``agent_starts[e]``;
+    an object's are ``channels`` of its texel.
 
-    A line is an agent's or a wall. Its piece of the other tensor is empty: both tables end in an
-    empty entry for this purpose.
+    A line is an agent's, an object's or a wall. Its piece of the other tensors is empty: tables end
+    in an empty entry for this purpose.
     """
     walls, wall_texels = scenery.layouts.lines, scenery.layouts.textures
     layout, bounds = scenery.layout.long(), scenery.model_texels.long()
     n_agents_lines, n_walls = len(bounds) - 1, len(walls.vals)
-    n_lines = n_agents_lines + walls.widths[layout]
+    objects = scenery.objects
+    n_moving = n_agents_lines + (len(objects.line_object) if objects else 0)
+    n_lines = n_moving + walls.widths[layout]
     e = torch.repeat_interleave(torch.arange(scenery.n_envs, device=scenery.device), n_lines)
     line = torch.arange(len(e), device=scenery.device) - (n_lines.cumsum(0) - n_lines)[e]
     agent_line = line.clamp(max=n_agents_lines)
-    wall = torch.where(
-        line < n_agents_lines, n_walls, walls.starts[layout[e]] + line - n_agents_lines
-    )
+    wall = torch.where(line < n_moving, n_walls, walls.starts[layout[e]] + line - n_moving)
+    parts = []
+    if objects:
+        of_object = (line >= n_agents_lines) & (line < n_moving)
+        at = (line - n_agents_lines).clamp(0, len(objects.line_object) - 1)
+        index = objects.line_object.long()[at]
+        vals = objects.texels[..., channels].flatten(0, 1)
+        parts = [(vals, e * objects.n_objects + index, of_object.long())]
     return JoinedRagged(
         refusal,
         (agents, agent_starts[e] + bounds[agent_line], _with_zero(bounds.diff())[agent_line]),
+        *parts,
         (texels, _with_zero(wall_texels.starts)[wall], _with_zero(wall_texels.widths)[wall]),
     )
 

@@ -154,12 +154,14 @@ def _part(name: str, part: Any) -> _Part:
     weight, mirror = options.pop("weight", 1), options.pop("mirror", False)
     known = [name for name in __all__ if name not in ("mixed", "suite")]
     if not isinstance(source, str) or source not in known and ":" not in source:
-        raise ValueError(f"{source!r} is no source; {closest(source, [*known, 'module:function'])}")
+        raise ValueError(
+            f"{source!r} is not a source; {closest(source, [*known, 'module:function'])}"
+        )
     function = import_object(source) if ":" in source else globals()[source]
     arguments = inspect.signature(function).parameters
     taken = [k for k in arguments if k != "split"]
     if missing := [k for k in ("n", "split", "seed") if k not in arguments]:
-        raise ValueError(f"{name}: {source} is no source, for it takes no {missing[0]}")
+        raise ValueError(f"{name}: {source} is not a source: it has no argument {missing[0]}")
     if unknown := [k for k in options if k not in taken]:
         raise ValueError(
             f"{name}: {source} has no option {unknown[0]}; {closest(unknown[0], taken)}"
@@ -169,9 +171,9 @@ def _part(name: str, part: Any) -> _Part:
         raise ValueError(f"{name}: {absent[0]} is missing")
     n = options.setdefault("n", arguments["n"].default)
     if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 0 <= n <= 1_000_000:
-        raise ValueError(f"{name}: {n!r} is no number of geometries, 0 to 1,000,000")
+        raise ValueError(f"{name}: {n!r} is not a number of geometries, 0 to 1,000,000")
     if isinstance(weight, bool) or not isinstance(weight, int) or not 1 <= weight <= 1000:
-        raise ValueError(f"{name}: weight={weight!r} is no integer from 1 to 1,000")
+        raise ValueError(f"{name}: weight={weight!r} is not an integer from 1 to 1,000")
     if not isinstance(mirror, bool):
         raise ValueError(f"{name}: mirror={mirror!r} is neither true nor false")
     return _Part(function, options, weight, mirror)

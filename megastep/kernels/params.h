@@ -5,6 +5,7 @@
 // N environments, D layouts, A agents per environment, C cameras per agent, R rays per camera, P
 // pixels per camera. W walls and T texels of all layouts together. B lanes.
 #pragma once
+#include "common/objects.h"
 #include "common/scenery.h"
 
 struct BakeParams {
@@ -29,6 +30,7 @@ struct PhysicsParams {
     float retained;       // fraction of the old velocities that is left if there are actions
     float seconds;        // length of the step
     int threads_per_env;  // on the GPU: a power of two up to 32
+    ObjectsParams objects;
 };
 
 struct UpdateAgentGeometryParams {
@@ -74,6 +76,7 @@ struct RenderParams {
     const unsigned char* clear_mask;  // (N, A) 1: clear seen first
     int* newly_seen;                  // (N, A) out: texels newly marked in seen
     int n_words;
+    ObjectsParams objects;
 };
 
 struct SpawnParams {
@@ -92,6 +95,28 @@ struct SpawnParams {
     unsigned int key1;
     int n_points;
     int resample;  // 1: an environment moves to a random layout if all its agents respawn
+    ObjectsParams objects;
+};
+
+struct UpdateObjectsParams {
+    SceneryParams scenery;
+    ObjectsParams objects;
+    const float* positions;  // (N, A, 2)
+    const float* angles;     // (N, A)
+};
+
+struct PlaceObjectsParams {
+    SceneryParams scenery;
+    ObjectsParams objects;
+    const float* agents;        // (N, A, 2) metres
+    const unsigned char* mask;  // (N, O) objects to place
+    const float* points;        // (D, n_points, 2) metres
+    int* counts;                // (N, O) in and out: numbers drawn so far
+    int* error_flag;            // (1) out: see common/errors.h
+    unsigned int key0;          // the seed
+    unsigned int key1;
+    int n_points;
+    float apart;  // metres, at least, between what is placed and agents and other objects
 };
 
 struct UniformParams {

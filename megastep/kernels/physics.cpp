@@ -36,6 +36,9 @@ static void sweep(const PhysicsParams& p, int first, int i, const float* walls, 
     for (int k = first; k < first + p.scenery.n_agents; k++)
         if (k != i)
             contact = minf(contact, sweep_agent(p, k, px, py, dx, dy, rho));
+    int env = first / p.scenery.n_agents, n_objects = p.objects.n_objects;
+    for (int k = env * n_objects; k < (env + 1) * n_objects; k++)
+        contact = minf(contact, sweep_object(p.objects, k, px, py, dx, dy, rho));
     p.progress[i] = progress_of(contact);
 }
 
@@ -69,3 +72,5 @@ KERNEL physics(const PhysicsParams& p) {
             step(p, env, meets);
     }
 }
+
+KERNEL physics_objects(const PhysicsParams& p) { physics(p); }

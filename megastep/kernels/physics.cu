@@ -4,5 +4,5 @@
 
 KERNEL BOUNDS(24) physics(PhysicsParams p) {
     wait_for_previous();
-    move_agents(p);
+    move_agents<0>(p);
 }

@@ -17,6 +17,25 @@ HD float sweep_agent(const PhysicsParams& p, int k, float px, float py, float dx
     return sweep_point(px - kx, py - ky, dx - other_dx, dy - other_dy, 2.f * rho);
 }
 
+// The fraction of the step d after which an agent at p touches object i, if that is an obstacle.
+HD float sweep_object(const ObjectsParams& o, int i, float px, float py, float dx, float dy,
+                      float rho) {
+    Object object = objects_of(o)[i];
+    float x = object.x, y = object.y, reach = rho + 1.5f * object.size;  // beyond crates' corners
+    if (!is_obstacle(object) || !boxes_meet(px, py, dx, dy, x, y, x, y, reach))
+        return NO_CONTACT;
+    int shape = o.shapes[i % o.n_objects];
+    if (shape == DISC)
+        return sweep_point(px - x, py - y, dx, dy, rho + object.size);
+    float contact = NO_CONTACT;
+    Pose pose = pose_at(x, y, object.angle);
+    for (int k = 0; k < n_lines_of(shape); k++) {
+        Float4 line = line_of(shape, k, object.size, pose);
+        contact = minf(contact, sweep_segment(px, py, dx, dy, line.x, line.y, line.z, line.w, rho));
+    }
+    return contact;
+}
+
 HD float progress_of(float contact) {
     return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
 }

@@ -44,6 +44,7 @@ DEVICE float sweep_walls(const SceneryParams& s, const ThreadGroup& group, const
 }
 
 // Writes the free fraction of agent a's step.
+template <int with_objects>
 DEVICE void sweep(const PhysicsParams& p, const ThreadGroup& group, int env, const Walls& walls,
                   float rho, int a) {
     int n_agents = p.scenery.n_agents;
@@ -55,12 +56,17 @@ DEVICE void sweep(const PhysicsParams& p, const ThreadGroup& group, int env, con
     for (int other = group.rank; other < n_agents; other += group.size)
         if (other != a)
             contact = minf(contact, sweep_agent(p, env * n_agents + other, px, py, dx, dy, rho));
+    if (with_objects)
+        for (int k = group.rank; k < p.objects.n_objects; k += group.size)
+            contact = minf(contact, sweep_object(p.objects, env * p.objects.n_objects + k, px, py,
+                                                 dx, dy, rho));
     for (int step = group.size / 2; step; step /= 2)
         contact = minf(contact, __shfl_xor_sync(group.mask, contact, step));
     if (group.rank == 0)
         p.progress[i] = progress_of(contact);
 }
 
+template <int with_objects>
 DEVICE void move_agents(const PhysicsParams& p) {
     int n_agents = p.scenery.n_agents;
     int env = (blockIdx.x * blockDim.x + threadIdx.x) / p.threads_per_env;
@@ -77,7 +83,7 @@ DEVICE void move_agents(const PhysicsParams& p) {
     Walls walls = walls_of(p.scenery, layout_of(p.scenery, env, p.error_flag));
     float rho = p.scenery.radius * INFLATION;
     for (int a = 0; a < n_agents; a++)
-        sweep(p, group, env, walls, rho, a);
+        sweep<with_objects>(p, group, env, walls, rho, a);
     __syncwarp(group.mask);
     for (int a = group.rank; a < n_agents; a += group.size)
         advance(p, env, a);

@@ -135,9 +135,10 @@ DEVICE void raster_group(View<is_split>& v, const Float4* ends, int line, int ac
 // Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
 // skipped. The others come nearest first, so that groups entirely behind earlier ones can be
 // skipped too.
-template <int is_split>
-DEVICE void raster_walls(View<is_split>& v, const SceneryParams& s, const EnvScenery& scenery,
+template <int drawn, int is_split>
+DEVICE void raster_walls(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
                          float half_width) {
+    const SceneryParams& s = p.scenery;
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
         unsigned int key = ~0u;
         ScreenBounds bounds = {-1.f, 0.f, 0, 0};
@@ -163,7 +164,8 @@ DEVICE void raster_walls(View<is_split>& v, const SceneryParams& s, const EnvSce
                 continue;  // the box is entirely behind earlier ones
             int l = BOX_WALLS * (start + k);
             raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
-                         scenery.n_agent_lines + l, l + v.warp_lane < scenery.n_walls);
+                         first_static_line<drawn>(p, scenery) + l,
+                         l + v.warp_lane < scenery.n_walls);
         }
     }
 }
@@ -176,5 +178,15 @@ DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvSc
         int l = first + v.warp_lane;
         int active = l < scenery.n_agent_lines && l / s.n_model != a;
         raster_group(v, (const Float4*)scenery.agent_lines + l, first, active);
+    }
+}
+
+// Rasterises the lines of all objects, as drawn by draw_line.
+template <int is_split>
+DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
+                           const Float4* objects) {
+    for (int first = 0; first < p.objects.n_lines; first += WARP) {
+        int l = first + v.warp_lane;
+        raster_group(v, objects + l, scenery.n_agent_lines + first, l < p.objects.n_lines);
     }
 }

@@ -61,6 +61,7 @@ struct Scratch {
     std::vector<float> sums;
     std::vector<unsigned short> halves;
     Rays rays;
+    std::vector<Float4> objects;
 };
 
 // Rasterises a near-clipped line, which is invisible where it is within the radius.
@@ -87,10 +88,11 @@ static void raster_span(PixelSpan span, int index, float* inverse, int* indices)
     }
 }
 
-// Rasterises n lines except [skip_first, skip_end), the agent's own. `offset` is the index of the
-// first line in the environment.
+// Rasterises n lines except those for which `is_skipped(line)`. `offset` is the index of the first
+// line in the environment.
+template <class IsSkipped>
 static void raster_lines(const Pose& camera, const Screen& screen, const RenderParams& p,
-                         const float* lines, int n, int offset, int skip_first, int skip_end,
+                         const float* lines, int n, int offset, IsSkipped is_skipped,
                          Scratch& scratch) {
     Projections& spans = scratch.projections;
     if ((int)scratch.visible.size() < n) {
@@ -118,7 +120,7 @@ static void raster_lines(const Pose& camera, const Screen& screen, const RenderP
     }
     for (int i = 0; i < n_visible; i++) {
         int l = scratch.visible[i];
-        if (l >= skip_first && l < skip_end)
+        if (is_skipped(l))
             continue;
         PixelSpan span = {firsts[l], ends[l], bases[l], gains[l]};
         if (nears[l])
@@ -138,12 +140,12 @@ static void find_runs(const std::vector<int>& index, int res, std::vector<Run>& 
     }
 }
 
-static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
-                          Rays& rays) {
+static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, const Float4* objects,
+                          const Pose& camera, Rays& rays) {
     for (auto [line, first, end] : rays.runs) {
         Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
         if (line >= 0)
-            surface = surface_of<1>(p.scenery, scenery, camera, line);
+            surface = surface_of<AGENTS | OBJECTS>(p, scenery, camera, line, objects);
         int n = end - first;
         std::fill_n(&rays.ax[first], n, surface.ax);
         std::fill_n(&rays.ay[first], n, surface.ay);
@@ -183,9 +185,9 @@ static void find_hits(const RenderParams& p, const Screen& screen, Rays& rays) {
     }
 }
 
-// As wall_colour, with a vector of all components.
-static void wall_samples(const SceneryParams& s, Rays& rays, int first, int end) {
-    const AnyFour* texels = (const AnyFour*)s.texels;
+// As colour_at, with a vector of all components.
+static void wall_samples(const void* of, Rays& rays, int first, int end) {
+    const AnyFour* texels = (const AnyFour*)of;
     const int *left = rays.left.data(), *right = rays.right.data();
     const float *weight = rays.weight.data(), *facing = rays.facing.data();
     const float* depth = rays.depth.data();
@@ -207,32 +209,37 @@ static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int 
     }
 }
 
-static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays) {
+static void find_samples(const RenderParams& p, const EnvScenery& scenery, const Float4* objects,
+                         Rays& rays) {
     for (auto [line, first, end] : rays.runs) {
         if (line < 0)
             std::fill_n(&rays.samples[first], end - first, Four{});
         else if (line < scenery.n_agent_lines)
             agent_samples(scenery, rays, first, end);
+        else if (line < first_static_line<OBJECTS>(p, scenery))
+            wall_samples(objects + p.objects.n_lines, rays, first, end);
         else
-            wall_samples(p.scenery, rays, first, end);
+            wall_samples(p.scenery.texels, rays, first, end);
     }
 }
 
 // Returns the number of newly seen texels. Nearly all were seen before, so blocks of rays are
 // tested for others first.
-static int mark_all_seen(const EnvScenery& scenery, Rays& rays, unsigned int* seen) {
-    int newly_seen = 0, n_agent_lines = scenery.n_agent_lines, first_texel = scenery.first_texel;
+static int mark_all_seen(const RenderParams& p, const EnvScenery& scenery, Rays& rays,
+                         unsigned int* seen) {
+    int newly_seen = 0, first_line = first_static_line<OBJECTS>(p, scenery);
+    int first_texel = scenery.first_texel;
     const int *index = rays.index.data(), *texel = rays.texel.data();
     for (int block = 0; block < (int)rays.index.size(); block += BLOCK_RAYS) {
         unsigned int unseen = 0;
 #pragma omp simd reduction(| : unseen)
         for (int i = 0; i < BLOCK_RAYS; i++) {
             int r = block + i, at = texel[r] - first_texel;
-            if (index[r] >= n_agent_lines)
+            if (index[r] >= first_line)
                 unseen |= ~seen[at >> 5] & 1u << (at & 31);
         }
         for (int r = block; unseen && r < block + BLOCK_RAYS; r++)
-            if (index[r] >= n_agent_lines)
+            if (index[r] >= first_line)
                 newly_seen += mark_seen(seen, texel[r] - first_texel);
     }
     return newly_seen;
@@ -311,24 +318,30 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
     std::fill(rays.inverse.begin(), rays.inverse.end(), 0.f);
     std::fill(rays.index.begin(), rays.index.end(), -1);
     if (s.n_agents > 1)
-        raster_lines(camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
-                     a * s.n_model, (a + 1) * s.n_model, scratch);
-    raster_lines(camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
-                 scenery.n_agent_lines, 0, 0, scratch);
+        raster_lines(
+            camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
+            [&](int l) { return l / s.n_model == a; }, scratch);
+    const Float4* objects = scratch.objects.data();
+    raster_lines(
+        camera, screen, p, (const float*)objects, p.objects.n_lines, scenery.n_agent_lines,
+        [](int) { return false; }, scratch);
+    raster_lines(
+        camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
+        first_static_line<OBJECTS>(p, scenery), [](int) { return false; }, scratch);
     if (p.centre_line)
         p.centre_line[view] = rays.index[p.res / 2];
     if (p.agent_ray)
         p.agent_ray[view] = agent_ray_of(rays.index, p.res, scenery.n_agent_lines);
     find_runs(rays.index, p.res, rays.runs);
-    find_surfaces(p, scenery, camera, rays);
+    find_surfaces(p, scenery, objects, camera, rays);
     find_hits(p, screen, rays);
     if (p.rgb || p.screen || p.depth)
-        find_samples(p, scenery, rays);
+        find_samples(p, scenery, objects, rays);
     if (p.indices || p.screen || p.locations || p.dots || p.distances)
         write_rays(p, screen, view, rays);
     if (p.rgb || p.depth)
         write_pixels(p, view, rays.samples, scratch);
-    return seen ? mark_all_seen(scenery, rays, seen) : 0;
+    return seen ? mark_all_seen(p, scenery, rays, seen) : 0;
 }
 
 static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
@@ -336,7 +349,11 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     int env = agent / s.n_agents, a = agent % s.n_agents;
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
-    EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
+    int layout = layout_of(s, env, p.error_flag);
+    EnvScenery scenery = env_scenery(s, env, layout);
+    scratch.objects.resize(p.objects.n_lines + p.objects.n_objects);
+    for (int l = 0; l < p.objects.n_lines; l++)
+        draw_line(p, env, layout, a, l, scratch.objects.data());
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);
     if (p.imu)
@@ -356,9 +373,11 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
 KERNEL render(const RenderParams& p) {
 #pragma omp parallel num_threads(p.scenery.n_threads)
     {
-        Scratch scratch = {{}, {}, {}, {}, Rays(p.res)};
+        Scratch scratch = {{}, {}, {}, {}, Rays(p.res), {}};
 #pragma omp for schedule(static)
         for (int agent = 0; agent < p.scenery.n_envs * p.scenery.n_agents; agent++)
             render_agent(p, agent, scratch);
     }
 }
+
+KERNEL render_objects(const RenderParams& p) { render(p); }

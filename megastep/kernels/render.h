@@ -29,6 +29,20 @@ HD float depth_reading(float distance, float radius, float inv_max_depth) {
     return 1.f - clamp((distance - radius) * inv_max_depth, 0.f, 1.f);
 }
 
+// Draws line l of an environment's objects as agent a sees it into `drawn`, and with an object's
+// first line its texel, after all lines. The first of the agents settles the objects.
+HD void draw_line(const RenderParams& p, int env, int layout, int a, int l, Float4* drawn) {
+    const ObjectsParams& o = p.objects;
+    int k = o.line_object[l], i = env * o.n_objects + k, first = o.line_starts[k];
+    Object object = placed(objects_of(o)[i], p.scenery, p.positions, p.angles, env);
+    drawn[l] = seen_line(object, o.shapes[k], l - first, a);
+    if (l != first)
+        return;
+    drawn[o.n_lines + k] = texel_of(o, object, o.lit ? o.texels[4 * i + 3] : 1.f);
+    if (a == 0)
+        settle(o, p.scenery, object, layout, i);
+}
+
 // What a ray contributes to its pixel.
 struct RaySample {
     float red, green, blue, depth;
@@ -54,26 +68,35 @@ HD void write_miss(const RenderParams& p, long long ray) {
     }
 }
 
+// The colour where a ray hits an agent or an object.
+template <int drawn>
+HD Colour moving_colour(const RenderParams& p, const EnvScenery& scenery, const Surface& surface,
+                        const Hit& hit, const Float4* objects) {
+    if (drawn & OBJECTS && surface.kind == OBJECTS)
+        return object_colour(objects[p.objects.n_lines + surface.first_texel], hit.facing);
+    return agent_colour(scenery, surface.first_texel, surface.width, hit);
+}
+
 // Shades ray r of camera `view`, which hits a surface at this inverse depth. Writes the
 // full-resolution outputs if `full_res`, and adds to newly_seen a texel that is seen for the first
 // time.
-template <int full_res>
+template <int full_res, int drawn>
 HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvScenery& scenery,
-                       const Surface& surface, int view, unsigned int* seen, int r,
-                       float inverse_depth, int& newly_seen) {
+                       const Surface& surface, const Float4* objects, int view, unsigned int* seen,
+                       int r, float inverse_depth, int& newly_seen) {
     float y = ray_slope(screen, r), length = p.ray_lengths[r];
     float distance = length * RECIPROCAL(inverse_depth);
     int first = surface.first_texel, width = surface.width;
     Hit hit = hit_of(surface, y, length);
     RaySample sample = {0.f, 0.f, 0.f, depth_reading(distance, screen.radius, p.inv_max_depth)};
     if (p.rgb || (full_res && p.screen)) {
-        Colour colour = surface.is_agent ? agent_colour(scenery, first, width, hit)
-                                         : wall_colour(p.scenery, first, width, hit);
+        Colour colour = surface.kind ? moving_colour<drawn>(p, scenery, surface, hit, objects)
+                                     : wall_colour(p.scenery, first, width, hit);
         sample.red = colour.red;
         sample.green = colour.green;
         sample.blue = colour.blue;
     }
-    if (seen && !surface.is_agent)
+    if (seen && !surface.kind)
         newly_seen += mark_seen(seen, first - scenery.first_texel + texel_at(hit.location, width));
     if (!full_res)
         return sample;

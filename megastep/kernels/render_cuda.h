@@ -30,8 +30,14 @@ DEVICE float quarter_of_sum(const RaySample& ray, int warp_lane) {
     return (second ? two : one) + __shfl_xor_sync(FULL_WARP, second ? one : two, 2);
 }
 
+// Where objects are drawn: after the nearest lines in shared memory.
+template <int drawn>
+DEVICE Float4* drawn_objects(const RenderParams& p, NearestLine* nearest) {
+    return drawn & OBJECTS ? (Float4*)(nearest + whole_tiles(p.res)) : 0;
+}
+
 // Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels.
-template <int full_res, int has_agents, int is_split>
+template <int full_res, int drawn, int is_split>
 DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScenery& scenery,
                   int view, unsigned int* seen, int& newly_seen) {
     int subsample = p.subsample, warp_lane = v.warp_lane;
@@ -52,10 +58,10 @@ DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScene
             if (full_res)
                 p.indices[ray] = nearest.line;
             if (nearest.line >= 0) {
-                Surface surface =
-                    surface_of<has_agents>(p.scenery, scenery, v.camera, nearest.line);
-                sample = shade_ray<full_res>(p, v.screen, scenery, surface, view, seen, r,
-                                             nearest.inverse, newly_seen);
+                const Float4* objects = drawn_objects<drawn>(p, v.nearest);
+                Surface surface = surface_of<drawn>(p, scenery, v.camera, nearest.line, objects);
+                sample = shade_ray<full_res, drawn>(p, v.screen, scenery, surface, objects, view,
+                                                    seen, r, nearest.inverse, newly_seen);
             } else if (full_res) {
                 write_miss(p, ray);
             }
@@ -84,17 +90,22 @@ DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, 
     return best == ~0u ? -1 : (int)(best & 0xffffu);
 }
 
-template <int full_res, int has_agents, int is_split>
+template <int full_res, int drawn, int is_split>
 DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelSpan* spans,
                          NearestLine* nearest, int* newly_seen_by_warp) {
     const SceneryParams& s = p.scenery;
     int warp = threadIdx.x / WARP;
     int rank = is_split ? threadIdx.x : warp_lane, n_threads = is_split ? BLOCK : WARP;
-    int env = has_agents ? agent / s.n_agents : agent, a = has_agents ? agent % s.n_agents : 0;
+    int env = drawn & AGENTS ? agent / s.n_agents : agent,
+        a = drawn & AGENTS ? agent % s.n_agents : 0;
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     Screen screen = screen_of(p);
-    EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
+    int layout = layout_of(s, env, p.error_flag);
+    EnvScenery scenery = env_scenery(s, env, layout);
+    if (drawn & OBJECTS && rank == warp_lane)
+        for (int l = warp_lane; l < p.objects.n_lines; l += WARP)
+            draw_line(p, env, layout, a, l, drawn_objects<drawn>(p, nearest));
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
     if (rank == 0)
         flag_nonfinite(p.error_flag, env, x, y, angle);
@@ -106,7 +117,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     Tiles tiles = {0, 0};
     if (is_split) {
         tiles = half_of_screen(p.res, warp);
-        __syncthreads();  // `seen` is clear
+        __syncthreads();  // `seen` is clear, and objects are drawn
     }
     int reads_both = is_split && (p.centre_line || p.agent_ray);  // halves of `nearest`
     for (int c = 0; c < p.n_cameras; c++) {
@@ -114,9 +125,11 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         Pose camera = pose_at(x, y, angle + p.yaws[c]);
         View<is_split> v = {camera, screen, p.ray_lengths, spans, nearest, warp_lane, tiles, 0.f};
         clear(v);
-        if (has_agents && s.n_agents > 1)
+        if (drawn & AGENTS && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
-        raster_walls(v, s, scenery, p.half_width);
+        if (drawn & OBJECTS)
+            raster_objects(v, p, scenery, drawn_objects<drawn>(p, nearest));
+        raster_walls<drawn>(v, p, scenery, p.half_width);
         __syncwarp();
         if (reads_both)
             __syncthreads();
@@ -124,14 +137,14 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
             p.centre_line[view] = nearest[p.res / 2].line;
         if (p.agent_ray && rank == warp_lane) {
             int ray = -1;
-            if (has_agents)
+            if (drawn & AGENTS)
                 ray = agent_ray_of(nearest, p.res, scenery.n_agent_lines, warp_lane);
             if (warp_lane == 0)
                 p.agent_ray[view] = ray;
         }
         if (reads_both)
             __syncthreads();
-        shade<full_res, has_agents>(p, v, scenery, view, seen, newly_seen);
+        shade<full_res, drawn>(p, v, scenery, view, seen, newly_seen);
     }
     if (!p.newly_seen)
         return;
@@ -147,8 +160,8 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
 }
 
 // One warp per agent. Three variants: all outputs, several agents, one agent. The last needs the
-// fewest registers.
-template <int may_write_all>
+// fewest registers. With objects there are the same three.
+template <int may_write_all, int with_objects = 0>
 DEVICE void render_by_warps(const RenderParams& p) {
     extern __shared__ NearestLine shared[];
     __shared__ PixelSpan spans[BLOCK];
@@ -158,7 +171,15 @@ DEVICE void render_by_warps(const RenderParams& p) {
         return;
     PixelSpan* warp_spans = spans + WARP * warp;
     NearestLine* nearest = shared + whole_tiles(p.res) * warp;
-    if (may_write_all && p.indices)
+    if (with_objects)  // whose lines and texels follow
+        nearest += 2 * (p.objects.n_lines + p.objects.n_objects) * warp;
+    if (with_objects && may_write_all && p.indices)
+        render_agent<1, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else if (with_objects && p.scenery.n_agents > 1)
+        render_agent<0, AGENTS | OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else if (with_objects)
+        render_agent<0, OBJECTS, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else if (may_write_all && p.indices)
         render_agent<1, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
     else if (p.scenery.n_agents > 1)
         render_agent<0, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);

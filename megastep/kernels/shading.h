@@ -1,6 +1,7 @@
 // Shading: where a ray hits a line, at which angle, and the colour there.
 #pragma once
 #include "common/math.h"
+#include "draw_objects.h"
 #include "params.h"
 #include "raster.h"
 
@@ -25,21 +26,40 @@ HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
             s.texel_starts[first]};
 }
 
-// A line hit by rays: its start and direction in the camera's frame, and its texels.
+// What is drawn beside walls, a bit each.
+constexpr int AGENTS = 1;
+constexpr int OBJECTS = 2;
+
+// The first wall's index among an environment's lines.
+template <int drawn>
+HD int first_static_line(const RenderParams& p, const EnvScenery& scenery) {
+    return drawn & OBJECTS ? scenery.n_agent_lines + p.objects.n_lines : scenery.n_agent_lines;
+}
+
+// A line hit by rays: its start and direction in the camera's frame, and its texels. `kind`: 0 of a
+// wall, AGENTS, OBJECTS.
 struct Surface {
     float ax, ay, vx, vy;
-    int first_texel, width, is_agent;
+    int first_texel, width, kind;
 };
 
-// Line l of an environment; agents' lines come first. If not `has_agents`, it is always a wall.
-template <int has_agents>
-HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const Pose& camera,
-                      int l) {
-    int is_agent = has_agents && l < scenery.n_agent_lines;
-    int i = is_agent ? l : l + (scenery.first_wall - scenery.n_agent_lines);
+// Line l of an environment: agents' come first, then objects', then walls. `objects`: as drawn by
+// draw_line.
+template <int drawn>
+HD Surface surface_of(const RenderParams& p, const EnvScenery& scenery, const Pose& camera, int l,
+                      const Float4* objects) {
+    const SceneryParams& s = p.scenery;
+    float ax, ay, bx, by;
+    if (drawn & OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(p, scenery)) {
+        int i = l - scenery.n_agent_lines;
+        to_camera(camera, objects[i].x, objects[i].y, ax, ay);
+        to_camera(camera, objects[i].z, objects[i].w, bx, by);
+        return {ax, ay, bx - ax, by - ay, p.objects.line_object[i], 1, OBJECTS};
+    }
+    int is_agent = drawn & AGENTS && l < scenery.n_agent_lines;
+    int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(p, scenery));
     Float4 line = LOAD((const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i);
     const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;
-    float ax, ay, bx, by;
     to_camera(camera, line.x, line.y, ax, ay);
     to_camera(camera, line.z, line.w, bx, by);
     return {ax, ay, bx - ax, by - ay, starts[0], starts[1] - starts[0], is_agent};
@@ -111,4 +131,10 @@ HD Colour agent_colour(const EnvScenery& scenery, int first, int width, const Hi
     Filter f = filter_at(hit.location, width);
     return blend(agent_texel(scenery, first + f.left), agent_texel(scenery, first + f.right),
                  f.weight, hit.facing);
+}
+
+// An object has one texel, which all its lines show.
+HD Colour object_colour(const Float4& texel, float facing) {
+    float light = texel.w * facing;
+    return {texel.x * light, texel.y * light, texel.z * light};
 }

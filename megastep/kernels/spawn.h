@@ -7,8 +7,8 @@
 
 // The first of agent a's points, counted from `first`, that no placed agent can see. Placed are
 // agents that do not respawn and those that already have. If every point is visible, the one that
-// is furthest from its nearest placed agent.
-template <class Group>
+// is furthest from its nearest placed agent. Points on obstacles are left out, unless all are.
+template <int with_objects, class Group>
 HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, int layout,
                     int first) {
     int n_agents = p.scenery.n_agents, n_per_agent = p.n_points / n_agents, furthest = first;
@@ -18,6 +18,8 @@ HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, in
     for (int k = 0; k < n_per_agent; k++) {
         int point = (first + k) % n_per_agent, seen = 0;
         float x = points[2 * point], y = points[2 * point + 1], nearest2 = INF_VALUE;
+        if (with_objects && !is_clear(p.objects, env, x, y, p.scenery.radius))
+            continue;
         for (int b = 0; b < n_agents; b++) {
             int other = env * n_agents + b;
             if (b == a || (b > a && p.mask[other]))
@@ -25,7 +27,8 @@ HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, in
             float from_x = p.positions[2 * other], from_y = p.positions[2 * other + 1];
             float dx = x - from_x, dy = y - from_y;
             nearest2 = minf(nearest2, dx * dx + dy * dy);
-            seen = seen || is_visible(p.scenery, group, walls, from_x, from_y, dx, dy);
+            seen = seen || is_visible<with_objects>(p.scenery, p.objects, group, walls, env, from_x,
+                                                    from_y, dx, dy);
         }
         if (!seen)
             return point;
@@ -65,10 +68,30 @@ HD void place(const SpawnParams& p, int i, const float* at, float angle) {
     p.angvelocity[i] = 0.f;
 }
 
+// The first of agent a's points, counted from `first`, that is on no obstacle; `first` if all are.
+HD int clear_point(const SpawnParams& p, int env, int a, int layout, int first) {
+    int n_per_agent = p.n_points / p.scenery.n_agents;
+    const float* points = p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent);
+    for (int k = 0; k < n_per_agent; k++) {
+        int point = (first + k) % n_per_agent;
+        if (is_clear(p.objects, env, points[2 * point], points[2 * point + 1], p.scenery.radius))
+            return point;
+    }
+    return first;
+}
+
+// Has agent a drop what it carries, where it is.
+HD void drop_all(const ObjectsParams& o, int env, int a) {
+    for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++)
+        if (objects_of(o)[i].carrier == a)
+            objects_of(o)[i].carrier = -1;
+}
+
 // Respawns the masked agents of an environment: at rest, with a random heading, at a random point
 // of the agent's own share of the layout's points; if `hidden`, at one that no other agent sees, if
-// there is one. An environment whose agents all respawn may move to another layout first.
-template <int hidden, class Group>
+// there is one. An environment whose agents all respawn may move to another layout first. They drop
+// what they carry, and respawn on no obstacle, unless it is of another layout.
+template <int hidden, int with_objects, class Group>
 HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
     const SceneryParams& s = p.scenery;
     int n_agents = s.n_agents, n_per_agent = p.n_points / n_agents, all = 1, any = 0, layout = 0;
@@ -89,10 +112,14 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
         if (a == 0 && moves)
             layout = drawn_layout(p, bits.c);
         int point = (int)(unit_float(bits.a) * (float)n_per_agent);
+        if (with_objects && !hidden && !moves)
+            point = clear_point(p, env, a, layout, point);
         if (hidden)
-            point = hidden_point(p, group, env, a, layout, point);
+            point = hidden_point<with_objects>(p, group, env, a, layout, point);
         sync(group);  // all threads have read what is written now
         if (group.rank == 0) {
+            if (with_objects)
+                drop_all(p.objects, env, a);
             if (p.point_index)
                 p.point_index[i] = a * n_per_agent + point;
             place(p, i, p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent + point),

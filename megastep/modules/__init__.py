@@ -20,25 +20,32 @@ from megastep.modules.movement import (
     to_global,
     to_local,
 )
+from megastep.modules.objects import COLOURS, Crate, Disc, Door, Objects, doorways
 from megastep.modules.sensors import IMU, RGB, Depth, downsample, render
 from megastep.modules.spawning import RandomSpawns, spawn_points
 from megastep.modules.visibility import TEXELS_PER_POINT, visible_texels
 
 __all__ = [
+    "COLOURS",
     "ENDLESS",
     "IMU",
     "MOVES",
     "RGB",
     "TEXELS_PER_POINT",
     "TURNS",
+    "Crate",
     "Depth",
+    "Disc",
+    "Door",
     "FreePoints",
     "Lifecycle",
     "MomentumMovement",
+    "Objects",
     "RandomLifespans",
     "RandomSpawns",
     "CounterGenerator",
     "SimpleMovement",
+    "doorways",
     "downsample",
     "random_ages",
     "render",

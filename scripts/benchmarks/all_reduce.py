@@ -21,8 +21,8 @@ N_LAPS, N_CALLS = 7, 100
 
 
 def main(kind: str) -> None:
-    place = process_group.launched()
-    device = torch.device(kind, place.local_rank) if kind == "cuda" else torch.device(kind)
+    info = process_group.rank_info()
+    device = torch.device(kind, info.local_rank) if kind == "cuda" else torch.device(kind)
     if kind == "cuda":
         torch.cuda.set_device(device)
     process_group.start()
@@ -37,7 +37,7 @@ def main(kind: str) -> None:
             if kind == "cuda":
                 torch.cuda.synchronize()
             laps.append(1e6 * (time.perf_counter() - start) / N_CALLS)
-        if place.rank == 0:
+        if info.rank == 0:
             print(size, *(f"{lap:.2f}" for lap in laps[1:]), flush=True)
     process_group.stop()
 

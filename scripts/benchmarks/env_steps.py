@@ -1,16 +1,18 @@
-"""Benchmarks of whole environments: `step`, `deathmatch`, `pong`, `memory`."""
+"""Benchmarks of whole environments: `step`, `objects`, `deathmatch`, `pong`, `memory`."""
 
 import itertools
 from collections.abc import Iterator
 
 import torch
-from random_walks import random_actions, walk, walk_in_homes, walk_in_rollouts
+from random_walks import N_HOMES, random_actions, walk, walk_in_homes, walk_in_rollouts
 from timing import graph_seconds_per_call, lap_seconds, measurement, rate, seconds_per_call
 
-from megastep import capture, engine, envs
+from megastep import capture, engine, envs, modules
+from megastep.geometries import sample
 
 N_ENVS = {"cuda": (1024, 2048, 4096, 8192, 16_384, 65_536, 262_144, 1_048_576), "cpu": (1024, 8192)}
 N_ENVS_IN_ROLLOUTS = {"cuda": (1024, 4096, 8192, 16_384), "cpu": (1024,)}
+N_ENVS_WITH_OBJECTS = {"cuda": (4096, 262_144), "cpu": (1024,)}
 N_ARENAS = {"cuda": (1024, 8192, 65_536), "cpu": (1024,)}  # homes of four agents each
 #: What a plain step leaves out because it is only read in training and evaluation, by environment.
 PLAIN = {"explorer": dict(metrics=False)}
@@ -34,6 +36,23 @@ def step(device: torch.device) -> Iterator[dict]:
             _, take_step = walk_in_rollouts("explorer", n_envs, device, **settings)
             what = f"explorer, `env.step`, {n_envs:,} environments{suffix}, in a rollout"
             yield rate(what, n_envs, graph_seconds_per_call(take_step, device))
+
+
+def objects(device: torch.device) -> Iterator[dict]:
+    """Frames per second of Explorer's `env.step`, without its metrics, in homes without objects and
+    with six: solid crates of four lines, and discs of six that nobody bumps into.
+    """
+    kinds = {"none": None, "six crates": modules.Crate(6, 0.2), "six discs": modules.Disc(6)}
+    for n_envs in N_ENVS_WITH_OBJECTS[device.type]:
+        homes = sample("bench", N_HOMES)
+        for name, kind in kinds.items():
+            env = envs.Explorer(n_envs, homes, device=device, metrics=False)
+            if kind is not None:
+                things = modules.Objects(homes, env.core, {"thing": kind})["thing"]
+                things.place(torch.ones(n_envs, dtype=torch.bool, device=device))
+            _, take_step = walk(env)
+            what = f"explorer, `env.step`, {n_envs:,} environments, objects: {name}"
+            yield rate(what, n_envs, seconds_per_call(take_step, device))
 
 
 def deathmatch(device: torch.device) -> Iterator[dict]:

@@ -166,11 +166,11 @@ def plot_learners(records: list[dict], path: Path) -> None:
         return
     grid = subplots(9, 2.9 * len(runs), len(runs), 2, squeeze=False, sharey="row")
     learners = list(LEARNERS)
-    places = sorted(runs, key=lambda place: (place[1] == "CPU", list(COMPARED).index(place[0])))
-    for (env, machine), (by_samples, by_seconds) in zip(places, grid):
-        place_runs = sorted(runs[env, machine], key=lambda run: learners.index(run[0]))
-        longest = max(record["curve"][-1][0] for _, record in place_runs)
-        for learner, record in place_runs:
+    panels = sorted(runs, key=lambda panel: (panel[1] == "CPU", list(COMPARED).index(panel[0])))
+    for (env, machine), (by_samples, by_seconds) in zip(panels, grid):
+        panel_runs = sorted(runs[env, machine], key=lambda run: learners.index(run[0]))
+        longest = max(record["curve"][-1][0] for _, record in panel_runs)
+        for learner, record in panel_runs:
             seconds, samples, values = zip(*record["curve"])
             if seconds[-1] < 0.75 * longest:
                 continue

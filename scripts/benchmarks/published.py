@@ -127,12 +127,11 @@ def published(
         ]
         limits = [] if seconds is None else [f"seconds={seconds}", "learner.anneal=seconds"]
         with ThreadPoolExecutor(jobs) as pool:
-            places = queue.SimpleQueue()  # core sets that no run has
+            idle = queue.SimpleQueue()  # core sets that no run has
             for cores in core_sets(jobs):
-                places.put(cores)
+                idle.put(cores)
             done = [
-                pool.submit(_train_and_measure, run, device, samples, limits, places)
-                for run in runs
+                pool.submit(_train_and_measure, run, device, samples, limits, idle) for run in runs
             ]
             by_run = dict(zip(runs, done))
             for title in tasks:
@@ -153,7 +152,7 @@ def core_sets(jobs: int) -> list[list[int]]:
     return [[cores[(i * share + k) % len(cores)] for k in range(share)] for i in range(jobs)]
 
 
-def _train_and_measure(run, device, samples, limits, places):
+def _train_and_measure(run, device, samples, limits, idle):
     """Trains a run unless its folder exists. Returns its row, None if no episode ended."""
     if not run.folder.exists():
         words = (
@@ -162,13 +161,13 @@ def _train_and_measure(run, device, samples, limits, places):
         )
         finish = "finish.evaluate=false", "finish.record=false"
         command = [sys.executable, "train.py", *words.split(), *limits, *finish]
-        cores = places.get()
+        cores = idle.get()
         environment = {"OMP_NUM_THREADS": str(len(cores))} | os.environ
         process = subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr, env=environment)
         if device.type == "cpu":  # a process with a GPU is helped by whatever core is idle
             os.sched_setaffinity(process.pid, cores)
         code = process.wait()
-        places.put(cores)
+        idle.put(cores)
         if code and not run.task.is_peak:
             raise subprocess.CalledProcessError(code, command)
     return measured(run, device)

@@ -34,7 +34,7 @@ def home(number: int, plan: dict) -> dotdict.dotdict:
     """
     corners = np.array(plan["verts"], float)
     if corners.ndim != 2 or corners.shape[1] != 2 or not np.isfinite(corners).all():
-        raise ValueError("its verts are no list of finite x and y")
+        raise ValueError("its verts are not a list of finite x and y")
     shift = MARGIN - corners.min(0)
     corners = corners + shift
     corners = corners[np.hypot(*(corners - np.roll(corners, 1, 0)).T) > 0]

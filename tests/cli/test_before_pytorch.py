@@ -1,4 +1,4 @@
-"""What is told before PyTorch is imported: help, errors, and what a stopped run has had."""
+"""Help, errors and spent budgets are reported before PyTorch is imported."""
 
 import inspect
 import json
@@ -180,10 +180,20 @@ def test_evaluation_needs_no_logger(stopped):
 @pytest.mark.parametrize(
     "budget, words, key, text",
     [
-        (["samples=64"], [], "samples", "has had 64 of samples=64; to continue, give more_samples"),
-        (["samples=64"], ["more_seconds=9"], "samples", "has had 64 of samples=64"),
-        (["samples=64"], ["samples=9"], "samples", "has had 64 of samples=9"),
-        (["seconds=2"], [], "seconds", "has had 2.5 of seconds=2.0; to continue, give more_sec"),
+        (
+            ["samples=64"],
+            [],
+            "samples",
+            "already trained for 64 of 64 samples; to continue, give more_samples",
+        ),
+        (["samples=64"], ["more_seconds=9"], "samples", "already trained for 64 of 64 samples"),
+        (["samples=64"], ["samples=9"], "samples", "already trained for 64 of 9 samples"),
+        (
+            ["seconds=2"],
+            [],
+            "seconds",
+            "trained for 2.5 of 2.0 seconds; to continue, give more_sec",
+        ),
         ([], ["more_seconds=9", "seconds=99"], "more_seconds", "seconds= is the total"),
         ([], ["more_samples=0"], "more_samples", "out of range"),
         ([], ["more_samples=x"], "more_samples", "expected an integer, got 'x'"),

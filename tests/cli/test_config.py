@@ -279,7 +279,7 @@ def test_parts_of_a_mix():
     words = "geometry=mixed", "geometry.parts={homes: 3, maze: {n: 2, braid: 1}, bench: 0}"
     assert compose(*words).geometry.parts == {"homes": 3, "maze": {"n": 2, "braid": 1}, "bench": 0}
     text = errors("geometry=mixed", "geometry.parts={hoems: 3}")["geometry.parts"]
-    assert text == "'hoems' is no source; did you mean homes?"
+    assert text == "'hoems' is not a source; did you mean homes?"
     text = errors("geometry=mixed", "geometry.parts={homes: 0}")["geometry.parts"]
     assert text.startswith("its counts sum to 0")
     words = "run=x", "geometry=suite", "geometry.parts={}"
@@ -345,14 +345,14 @@ def test_contradicting_settings():
         ("hydra.job.chdir=maybe", "hydra.job.chdir", "Value 'maybe' is not a valid bool"),
         ("hydra/launcher=basik", "hydra/launcher", "'basik' is unknown; did you mean basic?"),
         ("hydra/lancher=basic", "hydra/lancher", "did you mean hydra/launcher?"),
-        ("folder='r\udcff'", "folder='r\udcff'", "is no text in this locale"),
-        ("explorer", "explorer", "is no key=value; did you mean env=explorer?"),
-        ("quickstart", "quickstart", "is no key=value; did you mean experiment=quickstart?"),
+        ("folder='r\udcff'", "folder='r\udcff'", "is not valid text in this locale"),
+        ("explorer", "explorer", "is not key=value; did you mean env=explorer?"),
+        ("quickstart", "quickstart", "is not key=value; did you mean experiment=quickstart?"),
         ("learner.lr", "learner.lr", "has no value; write learner.lr=..."),
         ("+learner.lr", "+learner.lr", "has no value; write learner.lr=..."),
-        ("my-run", "my-run", "is no key=value; --cfg job prints all keys"),
-        ("runs/my-run", "runs/my-run", "is no key=value; did you mean resume=runs/my-run?"),
-        ("latest", "latest", "is no key=value; did you mean resume=latest?"),
+        ("my-run", "my-run", "is not key=value; --cfg job prints all keys"),
+        ("runs/my-run", "runs/my-run", "is not key=value; did you mean resume=runs/my-run?"),
+        ("latest", "latest", "is not key=value; did you mean resume=latest?"),
     ],
 )
 def test_bad_overrides(override, key, sentence):
@@ -364,12 +364,12 @@ def test_bad_overrides(override, key, sentence):
     "words, key, sentence",
     [
         ([], "run", "is missing; run=latest takes the newest run, run=FOLDER another one"),
-        (["runs/my-run"], "runs/my-run", "is no key=value; did you mean run=runs/my-run?"),
+        (["runs/my-run"], "runs/my-run", "is not key=value; did you mean run=runs/my-run?"),
         (["greedy"], "greedy", "has no value; write greedy=..."),
-        (["bot"], "bot", "is no key=value; did you mean against=bot?"),
-        (["my:Bot"], "my:Bot", "is no key=value; did you mean against=my:Bot?"),
-        (["run.v2/a"], "run.v2/a", "is no key=value; did you mean run=run.v2/a?"),
-        ([""], "''", "is no key=value; --cfg job prints all keys"),
+        (["bot"], "bot", "is not key=value; did you mean against=bot?"),
+        (["my:Bot"], "my:Bot", "is not key=value; did you mean against=my:Bot?"),
+        (["run.v2/a"], "run.v2/a", "is not key=value; did you mean run=run.v2/a?"),
+        ([""], "''", "is not key=value; --cfg job prints all keys"),
         (["~run"], "run", "is missing"),
         (["run=x", "split=tset"], "split", "'tset' is unknown; did you mean test?"),
     ],

@@ -1,4 +1,4 @@
-"""The first look at GPUs, before PyTorch is imported, at a stand-in for the driver."""
+"""GPUs are found before PyTorch is imported, at a stand-in for the driver."""
 
 import subprocess
 import sys

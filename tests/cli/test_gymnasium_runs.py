@@ -35,17 +35,28 @@ def test_settings():
     assert [composer.settings(job).env.id for job in jobs] == ["CartPole-v1", "ALE/Pong-v5"]
 
 
-def test_train_evaluate_and_begin_new_episodes(here, capsys):
-    """Frozen Lake cannot be saved, as it holds an array of characters."""
-    assert train.main([*WORDS, "env.id=FrozenLake-v1"]) == 0
-    (run,) = (here / "runs").glob("*FrozenLake-v1-1")
-    assert evaluate.main([f"run={run}", "episodes=8"]) == 0
-    (table,) = run.glob("evaluations/FrozenLake-v1-*.json")
-    assert [row["lanes"] for row in json.loads(table.read_text())["rows"]] == [8, 8]
+def test_train_evaluate_and_resume_exactly(here):
+    """Frozen Lake holds an array of characters, and has a number in its last info."""
+    words = [*WORDS, "env.id=FrozenLake-v1", "learner.anneal=never"]
+    assert train.main([*words, "folder=run"]) == 0
+    assert evaluate.main(["run=run", "episodes=8"]) == 0
+    (table,) = here.glob("run/evaluations/FrozenLake-v1-*.json")
+    rows = json.loads(table.read_text())["rows"]
+    assert [row["lanes"] for row in rows] == [8, 8] and "prob" in rows[0]["metrics"]
+    assert train.main(["resume=run", "more_samples=64"]) == 0
+    assert train.main([*words, "samples=128", "folder=alone"]) == 0
+    runs = [(here / name / "metrics.jsonl").read_bytes() for name in ("run", "alone")]
+    assert runs[0] == runs[1]
+
+
+def test_resumed_processes_begin_new_episodes(here, capsys):
+    words = [*WORDS, "env.id=CartPole-v1", "env.vectorization=async", "folder=run"]
+    assert train.main(words) == 0
     assert "Checkpoints cannot hold" not in capsys.readouterr().err
-    assert train.main([f"resume={run}", "more_samples=32"]) == 0
-    assert "its environments were not saved, so new episodes begin" in capsys.readouterr().out
-    assert [row["samples"] for row in json_lines.read(run / "metrics.jsonl")] == [32, 64, 96]
+    assert train.main(["resume=run", "more_samples=32"]) == 0
+    assert "environments were not saved, so new episodes start" in capsys.readouterr().out
+    samples = [row["samples"] for row in json_lines.read(here / "run/metrics.jsonl")]
+    assert samples == [32, 64, 96]
 
 
 def test_weights_of_another_environment_are_refused_by_its_name(capsys):

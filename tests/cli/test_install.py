@@ -2,6 +2,7 @@
 the dependencies of this one; and, nightly, in one that downloads them and the OpenAI Agents SDK.
 """
 
+import importlib.metadata
 import os
 import re
 import shutil
@@ -29,9 +30,18 @@ PACKAGE_DATA = {
 }
 
 
+def has_setuptools():
+    try:
+        return int(importlib.metadata.version("setuptools").partition(".")[0]) > 70
+    except importlib.metadata.PackageNotFoundError:
+        return False
+
+
 def build_wheel(source, folder):
     """Builds the wheel of a source folder with pip. Returns its path."""
     command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source]
+    if has_setuptools():  # no need to install another one
+        command.append("--no-build-isolation")
     subprocess.run(list(map(str, command)), check=True, env=ENVIRONMENT, cwd=folder)
     (wheel,) = folder.glob(f"{DISTRIBUTION}-*.whl")
     return wheel

@@ -114,7 +114,7 @@ def test_commands_are_without_places_of_the_machine(words, command):
 @pytest.mark.parametrize(
     "words, text",
     [
-        (["run", "Tiny"], "no name of an agent"),
+        (["run", "Tiny"], "not a name for an agent"),
         (["run/snapshots/step_512", NAME], "has weights only"),
         (["run", NAME, "--max-error", "1e-9"], "acts otherwise with weights in float16"),
         (["nowhere", NAME], "nowhere is neither a run folder nor a pretrained agent"),
@@ -282,14 +282,14 @@ DAMAGES = {
     "empty": (lambda content: b"", "header too small"),
     "cut off": (lambda content: content[:-7], "file not fully covered"),
     "a bit": (lambda content: content[:-3] + b"!" + content[-2:], "do not match their SHA-256"),
-    "header": (lambda content: content[:30] + b"!" + content[31:], "no agent of megastep"),
+    "header": (lambda content: content[:30] + b"!" + content[31:], "not an agent file of megastep"),
     "no text": (lambda content: content[:30] + b"\xff" + content[31:], "invalid UTF-8 in header"),
     "long header": (lambda content: b"\xff" * 8 + content, "header too large"),
     "spaces": (lambda content: (2**25).to_bytes(8, "little") + b" " * 2**25, "too long"),
-    "of others": (lambda content: b"\x02" + b"\0" * 7 + b"{}", "not an agent's"),
+    "of others": (lambda content: b"\x02" + b"\0" * 7 + b"{}", "unexpected header"),
     "no samples": (lambda content: changed(content, facts='{"samples": null}'), "samples"),
-    "no config": (lambda content: changed(content, config="{}"), "not whole"),
-    "deep": (lambda content: changed(content, tables="[" * 100_000), "not an agent's"),
+    "no config": (lambda content: changed(content, config="{}"), "incomplete configuration"),
+    "deep": (lambda content: changed(content, tables="[" * 100_000), "unexpected header"),
     "newer": (lambda content: changed(content, format="99"), "Update megastep"),
 }
 
@@ -320,7 +320,9 @@ def test_tensors_that_do_not_fill_the_file_are_refused(entry, tmp_path):
     path, config = tmp_path / "a.safetensors", {"train": {}, "spaces": {}}
     agent_file.write(path, {"w": torch.ones(2).half()}, config, {"samples": 1})
     path.write_bytes(changed(path.read_bytes(), {"w": entry}))
-    with pytest.raises(DamagedCheckpoint, match="a.safetensors is damaged, or no agent") as info:
+    with pytest.raises(
+        DamagedCheckpoint, match="a.safetensors is damaged or not an agent file"
+    ) as info:
         agent_file.read(path, "cpu")
     assert "\n" not in str(info.value)
 

@@ -1,4 +1,4 @@
-"""A run's NaN or infinity, met again by the command that its warning names."""
+"""A run's NaN or infinity is reproduced by the command that its warning names."""
 
 import os
 import shlex
@@ -72,7 +72,9 @@ def met(capsys, *words):
     *_, warning, sentence = capsys.readouterr().err.splitlines()
     number, hint = warning.removeprefix("warning: ").split("; its rollout was skipped")
     assert number.startswith("reward of lane") and f" at step {FAULT}" in number
-    assert sentence.startswith(f"train.py: {number}. All else") and sentence.endswith(hint)
+    assert sentence.startswith(f"train.py: {number}. All other rollouts") and sentence.endswith(
+        hint
+    )
     return number, hint
 
 
@@ -99,7 +101,7 @@ def test_a_resumed_run_meets_it_again(more, device, capsys):
     number, hint = met(capsys, *TINY, *more, EVERY_UPDATE, f"device={device}")
     before = files_of_run()
     assert updates_in("run/nonfinite") == [4] and min(updates_in("run")) > 5
-    assert hint == ". To see it again: python train.py resume=run/nonfinite"
+    assert hint == ". To reproduce it: python train.py resume=run/nonfinite"
     again, _ = met(capsys, *shlex.split(hint)[-1:])
     assert again == number and files_of_run() == before
 
@@ -108,7 +110,7 @@ def test_a_resumed_run_meets_it_again(more, device, capsys):
 @pytest.mark.parametrize("more", [PPO, OPPONENTS], ids=["ppo", "opponents"])
 def test_a_repeated_run_meets_it_again_where_nothing_was_saved_before(more, device, capsys):
     number, hint = met(capsys, *TINY, *more, f"device={device}")
-    assert hint == ". To see it again, once this run has ended: python train.py rerun=run"
+    assert hint == ". To reproduce it, once this run has ended: python train.py rerun=run"
     again, _ = met(capsys, "rerun=run", "folder=again")
     assert again == number and not Path("run/nonfinite").exists()
 
@@ -133,7 +135,7 @@ def test_the_learning_rate_of_another_clock_cannot_be_repeated(capsys):
     words = ["learner.anneal=seconds", "seconds=60"]
     assert train.main([*TINY, *PPO, f"samples={2 * UPDATE}", *words]) == 0
     _, hint = met(capsys, "resume=run", f"samples={12 * UPDATE}", "seconds=70")
-    clause = "the learning rate has followed another clock since the last one"
+    clause = "seconds= has changed since the last one, and with it the learning rate"
     assert hint == f". Checkpoints cannot repeat it, as {clause}"
 
 

@@ -6,8 +6,6 @@ import os
 import pathlib
 import random
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -21,7 +19,7 @@ from megastep.agents.runs import checkpoint, checkpoint_format, folders, provena
 from megastep.agents.storage.collector import Collector
 from megastep.agents.training import loggers
 from tests.helpers import tiny
-from tests.helpers.processes import HUNG, ROOT, start, wait_until
+from tests.helpers.processes import HUNG, Forked, forked, start, wait_until
 
 TINY = [*tiny.TINY, "log_every=1"]
 UPDATE = tiny.UPDATE
@@ -212,16 +210,12 @@ sys.exit(train.main(sys.argv[1:]))
 @pytest.mark.parametrize("number", ONE_SIGNAL[:2])
 def test_second_signal_quits(here, number):
     words = [*TINY, "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", STUCK, *words],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "STUCK_AFTER": str(2 * UPDATE)},
-        text=True,
-        stdout=subprocess.PIPE,
-    )
-    while process.stdout.readline() != "stuck\n":
-        assert process.poll() is None
+    (here / "stuck.py").write_text(STUCK)
+    environment = {**os.environ, "STUCK_AFTER": str(2 * UPDATE)}
+    process = Forked([here / "stuck.py", *words], here, environment)
+    wait_until(lambda: "stuck" in process.written(), process)
     process.send_signal(number)
-    assert "again" in process.stdout.readline() + process.stdout.readline()
+    wait_until(lambda: "again" in process.written(), process)
     time.sleep(0.5)
     process.send_signal(number)
     assert process.wait(timeout=HUNG) == 128 + number
@@ -257,7 +251,7 @@ def test_ctrl_c_while_compiling(here):
     compiler.write_text("\n".join(lines) + "\n")
     compiler.chmod(0o755)
     cache = str(here / "cache")
-    process = start(
+    process = forked(
         "train", *TINY, "samples=1e9", "folder=run", CXX=str(compiler), MEGASTEP_CACHE=cache
     )
     _, err = process.communicate(timeout=HUNG)
@@ -265,8 +259,13 @@ def test_ctrl_c_while_compiling(here):
     assert not (here / "run").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.nightly),
+    ],
+)
 def test_signal_of_the_terminal_while_filming(here, number):
     """The signal reaches this process, its workers and their resource tracker."""
     filming = ["finish.record=true", "finish.steps=5000"]
@@ -312,7 +311,7 @@ def at_any_moment(here, seed):
 @pytest.mark.parametrize(
     "seed",
     [
-        pytest.param(seed, marks=pytest.mark.slow if seed < 10 else pytest.mark.nightly)
+        pytest.param(seed, marks=pytest.mark.slow if seed < 5 else pytest.mark.nightly)
         for seed in range(50)
     ],
 )

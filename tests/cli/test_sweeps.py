@@ -24,7 +24,7 @@ from megastep.agents.cli import evaluate, scripts, sweeps, train
 from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory.settings import kind_of
-from megastep.agents.launch import places
+from megastep.agents.launch import gpu_slots
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import folders, scores
 from tests.helpers import tiny
@@ -32,6 +32,7 @@ from tests.helpers.processes import HUNG, ROOT, finished, is_running, start, wai
 
 PAYER = '''
 import os
+import time
 
 import torch
 
@@ -39,7 +40,9 @@ from megastep.envs import Minimal
 
 
 class Payer(Minimal):
-    """Episodes of four steps with reward `pay` each; the constructor fails for some moods."""
+    """Episodes of four steps with reward `pay` each. Fails in some moods, and takes its time in
+    another, so that jobs that last for seconds leave the processor to others.
+    """
 
     def __init__(self, *args, pay: float = 1.0, mood: str = "fine", **settings):
         if mood == "cross":
@@ -49,9 +52,10 @@ class Payer(Minimal):
         if mood == "lost" and os.environ.get("RANK") == "1":
             os.kill(os.getpid(), 9)
         super().__init__(*args, shortest=4, longest=4, **settings)
-        self.pay = pay
+        self.pay, self.pause = pay, 0.05 if mood == "slow" else 0.0  # seconds
 
     def step(self, decision):
+        time.sleep(self.pause)
         world = super().step(decision)
         world["reward"] = torch.full_like(world.reward, self.pay).masked_fill(world.reset, 0.0)
         return world
@@ -143,7 +147,7 @@ def test_folder_that_is_no_text(here, monkeypatch, capsys):
     monkeypatch.chdir(here / "r\udcff")
     assert train.main([*SHORT, "-m", "seed=1,2"]) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
-    assert "is no text in this locale" in sentence and not any((here / "r\udcff").iterdir())
+    assert "is not valid text in this locale" in sentence and not any((here / "r\udcff").iterdir())
 
 
 def test_table_stands_while_jobs_run(here, monkeypatch):
@@ -236,7 +240,8 @@ def test_joblib(here):
 @pytest.mark.slow
 def test_signal_saves_jobs_in_other_processes(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    process = start("train", *SMALL, "samples=1e12", "-m", "seed=1,2,3", *JOBLIB)
+    words = "samples=1e12", "env.mood=slow", "-m", "seed=1,2,3"
+    process = start("train", *SMALL, *words, *JOBLIB)
 
     wait_until(lambda: n_learning(here) == 2, process)
     process.send_signal(signal.SIGTERM)
@@ -297,9 +302,8 @@ def children(process):
 @pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
 def test_kill_9(here, victim):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    process = start(
-        "train", *SMALL, "seconds=8", "checkpoint_seconds=1", "-m", "seed=1,2,3", *JOBLIB
-    )
+    words = "seconds=8", "checkpoint_seconds=1", "env.mood=slow", "-m", "seed=1,2,3"
+    process = start("train", *SMALL, *words, *JOBLIB)
 
     def jobs():
         return [json.loads(path.read_text()) for path in here.glob("mine/.jobs/*/*.json")]
@@ -359,18 +363,18 @@ def gpus(here, monkeypatch):
 
 def test_jobs_share_gpus(gpus):
     cfg = gpus(3, "device=cuda")
-    jobs = [places.taken(cfg) for _ in range(6)]
+    jobs = [gpu_slots.taken(cfg) for _ in range(6)]
     devices = [job.__enter__().device for job in jobs[:5]]
     assert devices == ["cuda:0", "cuda:1", "cuda:2", "cuda:0", "cuda:1"]
     jobs[1].__exit__(None, None, None)  # one job of two on GPU 1 ends
     assert jobs[5].__enter__().device == "cuda:1" and gpus.current[-1] == 1
-    with places.taken(gpus(3, "device=auto")) as cfg:
+    with gpu_slots.taken(gpus(3, "device=auto")) as cfg:
         assert cfg.device == "auto" and gpus.current[-1] == 2
     for job in (jobs[0], *jobs[2:]):
         job.__exit__(None, None, None)
     gpus.current.clear()
     for n_gpus, word in ((1, "device=cuda"), (3, "device=cuda:2"), (3, "device=cpu")):
-        with places.taken(gpus(n_gpus, word)) as cfg:
+        with gpu_slots.taken(gpus(n_gpus, word)) as cfg:
             assert f"device={cfg.device}" == word and not gpus.current
 
 
@@ -382,9 +386,9 @@ def test_jobs_of_several_gpus(gpus, monkeypatch):
         return visible
 
     cfg = gpus(5, "ranks=2")
-    jobs = [places.taken(cfg) for _ in range(4)]
+    jobs = [gpu_slots.taken(cfg) for _ in range(4)]
     assert [enter(job) for job in jobs[:3]] == ["0,1", "2,3", "0,1"]  # the fifth GPU stays idle
-    with places.taken(gpus(5, "device=cuda")) as single:
+    with gpu_slots.taken(gpus(5, "device=cuda")) as single:
         assert single.device == "cuda:4"  # which no rank is on
     jobs[1].__exit__(None, None, None)
     assert enter(jobs[3]) == "2,3"
@@ -400,7 +404,7 @@ def test_ranks_see_the_gpus_of_their_place_only(gpus, monkeypatch):
         (["restarts=1"], "6"),
         (["ranks=2", "device=cpu"], "6, 4,GPU-8a,3"),
     ):
-        with places.taken(gpus(4, *words)):
+        with gpu_slots.taken(gpus(4, *words)):
             assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "6, 4,GPU-8a,3" and not gpus.current
 
@@ -435,10 +439,10 @@ def test_idle_gpus_are_told_of(gpus):
         (["ranks=5"], None),
     ):
         _, jobs, hydra = sweeps.jobs_of(Composer(scripts.TRAIN), ["seed=1,2", *words])
-        idle = places.check(jobs, hydra)
+        idle = gpu_slots.check(jobs, hydra)
         assert text in idle if text else idle is None
-    assert places.idle(2, 5, is_parallel=True) == "Jobs with ranks=2 leave 1 of 5 GPUs idle."
-    assert places.idle(2, 4, is_parallel=True) is None
+    assert gpu_slots.idle(2, 5, is_parallel=True) == "Jobs with ranks=2 leave 1 of 5 GPUs idle."
+    assert gpu_slots.idle(2, 4, is_parallel=True) is None
 
 
 def test_slurm_jobs_are_given_their_gpus_elsewhere(gpus):
@@ -447,9 +451,9 @@ def test_slurm_jobs_are_given_their_gpus_elsewhere(gpus):
     words = [*SLURM, "ranks=2", "seed=1,2", "hydra.launcher.gpus_per_node=3"]
     _, jobs, hydra = sweeps.jobs_of(Composer(scripts.TRAIN), words)
     idle = "Jobs with ranks=2 leave 1 idle of hydra.launcher.gpus_per_node=3."
-    assert places.check(jobs, hydra) == idle
+    assert gpu_slots.check(jobs, hydra) == idle
     hydra.launcher.gpus_per_node = None
-    assert places.check(jobs, hydra) is None
+    assert gpu_slots.check(jobs, hydra) is None
 
 
 def test_errors_can_be_pickled():

@@ -22,7 +22,7 @@ def others(monkeypatch):
             monkeypatch.setattr(module, name, gathered, raising=False)
         monkeypatch.setattr(agreement, "n_ranks", lambda: 1 + len(values))
         monkeypatch.setattr(agreement, "rank", lambda: rank)
-        monkeypatch.setattr(agreement, "place", lambda: f"rank {rank} on here")
+        monkeypatch.setattr(agreement, "rank_label", lambda: f"rank {rank} on here")
 
     return are
 

@@ -24,6 +24,17 @@ OBSERVATIONS = [
     (gym.Box(0, 255, (8, 9, 3), np.uint8), image(1, 3, 8, 9, **U8)),
     (gym.Box(0, 255, (4, 8, 9), np.uint8), image(1, 4, 8, 9, **U8)),
     (gym.Box(0, 1, (8, 9, 1), np.float64), image(1, 1, 8, 9, **F32)),
+    (gym.Box(0, 255, (8, 9), np.uint8), image(1, 1, 8, 9, **U8)),
+    (gym.Box(0, 1, (16, 17)), image(1, 1, 16, 17, **F32)),
+    (gym.Box(0, 1, (8, 17)), vector(1, 136, **F32)),
+    (gym.Box(-np.inf, np.inf, (16, 17)), vector(1, 272, **F32)),  # a stack of vectors
+    (gym.Box(0, 255, (12, 20, 30), np.uint8), image(1, 12, 20, 30, **U8)),
+    (gym.Box(0, 255, (20, 30, 12), np.uint8), image(1, 12, 20, 30, **U8)),
+    (gym.Box(0, 1, (8, 8, 111)), image(1, 111, 8, 8, **F32)),
+    (gym.Box(-np.inf, np.inf, (9, 9, 20)), image(1, 20, 9, 9, **F32)),
+    (gym.Box(-np.arange(512, dtype=np.float32).reshape(8, 8, 8), 1), vector(1, 512, **F32)),
+    (gym.Box(0, 255, (5, 8, 9, 3), np.uint8), image(1, 15, 8, 9, **U8)),
+    (gym.Box(0, 255, (5, 3, 8, 9), np.uint8), image(1, 15, 8, 9, **U8)),
     (gym.Discrete(5, start=-2), discrete(1, 5)),
     (gym.MultiDiscrete([3, 3], start=[1, 4]), discrete(2, 3)),
     (gym.MultiDiscrete([[3, 3], [3, 3]]), discrete(4, 3)),
@@ -86,6 +97,12 @@ def test_image_with_channels_last_is_turned():
     _, read = observation(gym.Box(0, 255, (8, 9, 3), np.uint8))
     pixels = np.arange(8 * 9 * 3, dtype=np.uint8).reshape(1, 8, 9, 3)
     assert read(pixels)[0, 0, 2, 4, 5] == pixels[0, 4, 5, 2]
+
+
+def test_stacked_images_are_channels_one_after_the_other():
+    _, read = observation(gym.Box(0, 255, (2, 8, 9, 3), np.uint8))
+    pixels = np.random.default_rng(1).integers(256, size=(1, 2, 8, 9, 3), dtype=np.uint8)
+    assert read(pixels)[0, 0, 5, 4, 7] == pixels[0, 1, 4, 7, 2]
 
 
 @named(ACTIONS)

@@ -102,7 +102,7 @@ def test_agents_that_differ_or_come_later_are_refused():
             PettingZoo(2, id=ID, kwargs=settings, device="cpu")
     for name, message in (
         (None, "env.id is missing"),
-        ("pettingzoo.sisl", "'pettingzoo.sisl' is no import path"),
+        ("pettingzoo.sisl", "'pettingzoo.sisl' is not an import path"),
         ("no_such_package:parallel_env", "no_such_package:parallel_env cannot be imported"),
     ):
         with pytest.raises(ValueError, match=message):

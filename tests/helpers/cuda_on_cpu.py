@@ -40,9 +40,9 @@ SPELLINGS = (
 )
 
 
-def _cluster(program, operation):
+def _cluster(library, operation):
     """Returns how many blocks are a cluster: the argument of BOUNDS, where that sets clusters."""
-    for text in program.sources(".cu").values():
+    for text in library.sources(".cu").values():
         found = re.search(rf"KERNEL BOUNDS\((\d+)\) {operation}\(", text)
         if found and "__cluster_dims__(n_blocks," in text:
             return int(found[1])
@@ -78,18 +78,18 @@ class CudaOnCpu:
         """Returns a tensor, of the same memory, that counts as on a GPU."""
         return tensor.as_subclass(TensorOnCpu)
 
-    def __call__(self, program, operation, device, shape, /, **fields):
+    def __call__(self, library, operation, device, shape, /, **fields):
         """Stands in for `launch`."""
         assert device.type == "cpu"
         blocks = shape if isinstance(shape, Blocks) else Blocks(-(-shape // BLOCK))
         if not all(blocks[:3]):
             return
-        packed = program.packers[program.cuda_operations[operation]](fields)
-        if program not in self._libraries:
-            self._libraries[program] = self._build(program)
-        function = getattr(self._libraries[program], f"run_{operation}")
+        packed = library.packers[library.cuda_operations[operation]](fields)
+        if library not in self._libraries:
+            self._libraries[library] = self._build(library)
+        function = getattr(self._libraries[library], f"run_{operation}")
         function.restype = ctypes.c_char_p
-        cluster = _cluster(program, operation)
+        cluster = _cluster(library, operation)
         numbers = *blocks, cluster, ORDERS.index(self.order), self.is_late
         numbers = map(ctypes.c_uint, numbers)
         message = function(ctypes.c_char_p(packed), *numbers)
@@ -113,10 +113,10 @@ class CudaOnCpu:
                 torch.testing.assert_close(*bits, rtol=0, atol=0)
         return results[0]
 
-    def _build(self, program):
+    def _build(self, library):
         folder = self.folder / str(len(self._libraries))
         folder.mkdir(exist_ok=True)
-        for name, text in program.sources(".h", ".cu").items():
+        for name, text in library.sources(".h", ".cu").items():
             for expression, replacement in SPELLINGS:
                 text = re.sub(expression, replacement, text)
             (folder / name).parent.mkdir(exist_ok=True)
@@ -124,9 +124,9 @@ class CudaOnCpu:
         for name, replacement in REPLACED.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_text(replacement.read_text())
-        kernels = program.sources(".cu")
+        kernels = library.sources(".cu")
         lines = [f'#include "{HEADER}"']
-        lines += [BACKEND] * ("--fmad=false" in program.cuda_flags)
+        lines += [BACKEND] * ("--fmad=false" in library.cuda_flags)
         lines += [f'#include "{name}"' for name in ("params.h", *kernels)]
         lines += [
             f'extern "C" const char* run_{operation}(const {struct}* p, unsigned int x, '
@@ -136,11 +136,11 @@ class CudaOnCpu:
             f"thread_order, is_late); }}"
             for operation, struct in headers.operations(kernels).items()
         ]
-        source, library = folder / "all.cpp", folder / "all.so"
+        source, binary = folder / "all.cpp", folder / "all.so"
         source.write_text("\n".join(lines))
         command = [compile.compiler()[0], *FLAGS, f"-I{folder}", f"-I{compile.KERNELS}"]
-        subprocess.run([*command, str(source), "-o", str(library)], check=True)
-        return ctypes.CDLL(str(library))
+        subprocess.run([*command, str(source), "-o", str(binary)], check=True)
+        return ctypes.CDLL(str(binary))
 
     def install(self, monkeypatch):
         """Replaces `launch` in all modules that import it."""

@@ -43,10 +43,10 @@ class GraphOnCpu:
         if GraphOnCpu.is_recording:
             raise RuntimeError("a graph is replayed during a recording")
         for operation, args, options, result in self.operations:
-            places = {_place(leaf) for leaf in _tensors((args, options))}
+            addresses = {_address(leaf) for leaf in _tensors((args, options))}
             again = operation(*args, **options)
             for old, new in zip(_tensors(result), _tensors(again), strict=True):
-                if _place(old) not in places:  # no view, and nothing changed in place
+                if _address(old) not in addresses:  # no view, and nothing changed in place
                     old.copy_(new)
 
 
@@ -54,7 +54,7 @@ def _tensors(tree):
     return [leaf for leaf in _pytree.tree_leaves(tree) if isinstance(leaf, torch.Tensor)]
 
 
-def _place(tensor):
+def _address(tensor):
     return tensor.untyped_storage().data_ptr()
 
 

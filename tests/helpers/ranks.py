@@ -10,6 +10,8 @@ import sys
 import time
 from pathlib import Path
 
+from tests.helpers.processes import Forked
+
 ROOT = Path(__file__).parents[2]
 #: Seconds after which ranks count as hung: ten times what they need on two busy cores.
 HUNG = 180
@@ -17,14 +19,14 @@ HUNG = 180
 
 @contextlib.contextmanager
 def started(words, n_ranks=2, **env):
-    """Starts `python *words` in R processes. A context, at whose end none is left.
+    """Starts `python *words` in R `Forked` processes. A context, at whose end none is left.
 
     Args:
         words: of the command line, such as `[ROOT / "train.py", "env=minimal"]`.
         env: environment variables besides torchrun's.
 
     Yields:
-        The processes, with pipes for stdout and stderr.
+        The processes.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -32,20 +34,16 @@ def started(words, n_ranks=2, **env):
     shared = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": f"{ROOT}"} | env
     shared |= dict(MASTER_ADDR="127.0.0.1", MASTER_PORT=f"{port}", WORLD_SIZE=f"{n_ranks}")
     shared |= dict(LOCAL_WORLD_SIZE=f"{n_ranks}", GLOO_SOCKET_IFNAME="lo")
-    command = [sys.executable, *map(str, words)]
-    options = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL)
     processes = []
     try:
         for rank in range(n_ranks):
             own = shared | {"RANK": f"{rank}", "LOCAL_RANK": f"{rank}"}
-            processes.append(subprocess.Popen(command, env=own, text=True, **options))
+            processes.append(Forked(words, None, own))
         yield processes
     finally:
         for process in processes:
             process.kill()
             process.wait()
-            process.stdout.close()
-            process.stderr.close()
 
 
 def finished(processes, seconds=HUNG):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import Blocks
-from megastep.kernels.build.program import Program
 from tests.helpers.cuda_on_cpu import ORDERS, SCHEDULES, CudaOnCpu
 
 CPU = torch.device("cpu")
@@ -46,13 +46,13 @@ def exchange(tmp_path):
         folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a loaded library stays loaded
         (folder / "params.h").write_text(PARAMS)
         (folder / "exchange.cu").write_text(KERNEL % body)
-        program, launch = Program(folder), CudaOnCpu(folder)
+        library, launch = KernelLibrary(folder), CudaOnCpu(folder)
         launch.order = order
 
         def after():
             after = np.full_like(numbers, -1)
             fields = dict(before=numbers.ctypes.data, after=after.ctypes.data, n=len(numbers))
-            launch(program, "exchange", CPU, Blocks(-(-len(numbers) // 64), shared=512), **fields)
+            launch(library, "exchange", CPU, Blocks(-(-len(numbers) // 64), shared=512), **fields)
             return [torch.from_numpy(after)]
 
         (after,) = launch.in_every_order(after) if in_every_order else after()
@@ -247,13 +247,13 @@ KERNEL BOUNDS(2) exchange(NumbersParams p) {
 def test_blocks_of_a_cluster_send_each_other_numbers(tmp_path, missing, message, order, is_late):
     (tmp_path / "params.h").write_text(PARAMS)
     (tmp_path / "exchange.cu").write_text(CLUSTER.replace(missing, ""))
-    program, launch = Program(tmp_path, ("--std=c++17",)), CudaOnCpu(tmp_path)
+    library, launch = KernelLibrary(tmp_path, ("--std=c++17",)), CudaOnCpu(tmp_path)
     launch.order, launch.is_late = order, is_late
     before = torch.arange(256, dtype=torch.int32)
     after = torch.full_like(before, -1)
 
     def run():
-        launch(program, "exchange", CPU, Blocks(4, shared=1024), before=before, after=after, n=256)
+        launch(library, "exchange", CPU, Blocks(4, shared=1024), before=before, after=after, n=256)
         return [after.clone()]
 
     if not message:

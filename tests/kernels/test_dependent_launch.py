@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from megastep.kernels.build import compile, launch
-from megastep.kernels.build.program import Program
+from megastep.kernels.build.kernel_library import KernelLibrary
 
 PARAMS = """
 #pragma once
@@ -52,7 +52,7 @@ CARELESS = """
 KERNEL careless(RelayParams p) { relay(p); }
 """
 OURS = pytest.mark.parametrize(
-    "program", check_kernels.programs(), ids=lambda program: "/".join(program.folder.parts[-3:])
+    "library", check_kernels.libraries(), ids=lambda library: "/".join(library.folder.parts[-3:])
 )
 
 
@@ -61,12 +61,12 @@ def relays(tmp_path):
     files = {"params.h": PARAMS, "relay.h": RELAY, "waits.cu": WAITS, "careless.cu": CARELESS}
     for name, text in files.items():
         (tmp_path / name).write_text(text)
-    return Program(tmp_path)
+    return KernelLibrary(tmp_path)
 
 
 @OURS
-def test_every_kernel_of_ours_waits_first(program):
-    assert program.early_operations == program.cuda_operations.keys() != set()
+def test_every_kernel_of_ours_waits_first(library):
+    assert library.early_operations == library.cuda_operations.keys() != set()
 
 
 def test_a_kernel_that_does_not_wait_does_not_start_early(relays):
@@ -105,7 +105,7 @@ def test_only_kernels_that_wait_are_launched_early(relays, monkeypatch, can_star
         cuLaunchKernelEx=lambda config, kernel, *_: configs.update({kernel: config}) or (0,),
     )
     monkeypatch.setattr(launch, "bindings", lambda: (driver, None))
-    monkeypatch.setattr(launch, "cuda", lambda program, index: dict(waits="w", careless="c"))
+    monkeypatch.setattr(launch, "cuda", lambda library, index: dict(waits="w", careless="c"))
     monkeypatch.setattr(launch, "_config", launch._config.__wrapped__)
     monkeypatch.setattr(launch, "_can_start_early", lambda index: can_start_early)
     monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
@@ -130,20 +130,20 @@ def test_gpus_since_hopper_start_kernels_early(monkeypatch, capability, can):
     assert launch._can_start_early.__wrapped__(0) == can
 
 
-def ptx(program):
-    """The PTX of a program, {kernel: text}. Skips if there is no NVRTC, which needs no GPU."""
+def ptx(library):
+    """The PTX of a library, {kernel: text}. Skips if there is no NVRTC, which needs no GPU."""
     nvrtc = pytest.importorskip("cuda.bindings.nvrtc")
     try:
         nvrtc.nvrtcVersion()
     except (RuntimeError, OSError) as error:
         pytest.skip(f"needs NVRTC: {error}")
-    files = program.sources(".h", ".cu")
+    files = library.sources(".h", ".cu")
     names, texts = [name.encode() for name in files], [text.encode() for text in files.values()]
     made = nvrtc.nvrtcCreateProgram(
         compile.joined(files).encode(), b"kernels.cu", len(files), texts, names
     )
     handle = compile.check_status(made, "NVRTC")
-    flags = [*program.cuda_flags, "--gpu-architecture=compute_90"]
+    flags = [*library.cuda_flags, "--gpu-architecture=compute_90"]
     result = nvrtc.nvrtcCompileProgram(handle, len(flags), [flag.encode() for flag in flags])
     compile.check_status(result, "NVRTC")
     text = bytearray(compile.check_status(nvrtc.nvrtcGetPTXSize(handle), "NVRTC"))
@@ -154,10 +154,10 @@ def ptx(program):
 
 
 @OURS
-def test_compiled_kernels_touch_global_memory_after_the_wait_only(program):
+def test_compiled_kernels_touch_global_memory_after_the_wait_only(library):
     """And never as read-only memory, whose reads the compiler may move before the wait."""
-    kernels = ptx(program)
-    assert kernels.keys() == program.cuda_operations.keys()
+    kernels = ptx(library)
+    assert kernels.keys() == library.cuda_operations.keys()
     for name, text in kernels.items():
         before, wait, after = text.partition("griddepcontrol.wait;")
         assert wait and "griddepcontrol.launch_dependents;" in after, name
@@ -167,7 +167,7 @@ def test_compiled_kernels_touch_global_memory_after_the_wait_only(program):
         assert not re.search(r"\bld\.global\S*\.nc", after), name
 
 
-def rounds(program, n_rounds, tensors, side):
+def rounds(library, n_rounds, tensors, side):
     """Each round adds 7 to `a`: six kernels and an operation of PyTorch, each 1.
 
     They read what a kernel, PyTorch, a copy, a memset and another stream wrote just before.
@@ -176,7 +176,7 @@ def rounds(program, n_rounds, tensors, side):
 
     def relay(operation, first, second, after, pause):
         fields = dict(first=first, second=second, after=after, n=len(a), pause=pause)
-        launch.launch(program, operation, a.device, len(a), **fields)
+        launch.launch(library, operation, a.device, len(a), **fields)
 
     for _ in range(n_rounds):
         relay("waits", a, a, b, 10_000)
@@ -194,12 +194,12 @@ def rounds(program, n_rounds, tensors, side):
         relay("waits", b, d, a, 100)
 
 
-def captured(program, tensors, side):
+def captured(library, tensors, side):
     """A CUDA graph of ten rounds."""
-    rounds(program, 1, tensors, side)  # builds the program, which a capture must not do
+    rounds(library, 1, tensors, side)  # builds the library, which a capture must not do
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        rounds(program, 10, tensors, side)
+        rounds(library, 10, tensors, side)
     return graph
 
 

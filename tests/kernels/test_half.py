@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from megastep import core, engine, scene, toys
-from megastep.kernels.build import compile, program
+from megastep.kernels.build import compile, kernel_library
 
 CANONICAL_NAN = 0x7FFF  # a GPU converts every NaN to this one
 SOURCE = """
@@ -27,7 +27,7 @@ def halves(tmp_path_factory):
     folder = tmp_path_factory.mktemp("half")
     (folder / "half.cpp").write_text(SOURCE)
     compiler, _ = compile.compiler()
-    flags = [*program.CPU_FLAGS, f"-I{compile.KERNELS}"]
+    flags = [*kernel_library.CPU_FLAGS, f"-I{compile.KERNELS}"]
     subprocess.run(
         [compiler, *flags, str(folder / "half.cpp"), "-o", str(folder / "half.so")], check=True
     )

@@ -7,54 +7,54 @@ import subprocess
 import pytest
 import torch
 
-from megastep.agents.algorithms.kernels import PROGRAM as ALGORITHMS
-from megastep.agents.networks.kernels.lstm_sequence import PROGRAM as SEQUENCES
-from megastep.agents.networks.kernels.mingru_step import PROGRAM as ACTING
-from megastep.agents.networks.kernels.program import CORES
-from megastep.agents.selfplay.opponents import PROGRAM as SELFPLAY
-from megastep.agents.storage.copies import PROGRAM as COPIES
-from megastep.agents.training.episode_stats import PROGRAM as TRAINING
-from megastep.envs.deathmatch.step import PROGRAM as DEATHMATCH
-from megastep.envs.explorer.step import PROGRAM as EXPLORER
-from megastep.envs.pointgoal.step import PROGRAM as POINTGOAL
-from megastep.envs.pong.step import PROGRAM as PONG
+from megastep.agents.algorithms.kernels import LIBRARY as ALGORITHMS
+from megastep.agents.networks.kernels.library import LIBRARY
+from megastep.agents.networks.kernels.lstm_sequence import LIBRARY as SEQUENCES
+from megastep.agents.networks.kernels.mingru_step import LIBRARY as ACTING
+from megastep.agents.selfplay.opponents import LIBRARY as SELFPLAY
+from megastep.agents.storage.copies import LIBRARY as COPIES
+from megastep.agents.training.episode_stats import LIBRARY as TRAINING
+from megastep.envs.deathmatch.step import LIBRARY as DEATHMATCH
+from megastep.envs.explorer.step import LIBRARY as EXPLORER
+from megastep.envs.pointgoal.step import LIBRARY as POINTGOAL
+from megastep.envs.pong.step import LIBRARY as PONG
 from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
 GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
-NETWORKS = dict(cores=CORES, sequences=SEQUENCES, acting=ACTING)
+NETWORKS = dict(cores=LIBRARY, sequences=SEQUENCES, acting=ACTING)
 LEARNER = dict(algorithms=ALGORITHMS, copies=COPIES, selfplay=SELFPLAY, training=TRAINING)
-PROGRAMS = dict(engine=ENGINE, **NETWORKS, **LEARNER, **GAMES)
-programs = pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
+LIBRARIES = dict(engine=ENGINE, **NETWORKS, **LEARNER, **GAMES)
+libraries = pytest.mark.parametrize("library", LIBRARIES.values(), ids=LIBRARIES)
 
 
-def compiled(folder, program, code):
-    """A library of `code`, which sees the program's headers."""
-    source, library = folder / "checks.cpp", folder / "checks.so"
+def compiled(folder, library, code):
+    """A library of `code`, which sees the library's headers."""
+    source, binary = folder / "checks.cpp", folder / "checks.so"
     source.write_text(code)
     command = [compile.compiler()[0], "-std=c++17", "-shared", "-fPIC"]
-    command += [f"-I{program.folder}", f"-I{compile.KERNELS}", str(source), "-o", str(library)]
+    command += [f"-I{library.folder}", f"-I{compile.KERNELS}", str(source), "-o", str(binary)]
     subprocess.run(command, check=True)
-    return ctypes.CDLL(str(library))
+    return ctypes.CDLL(str(binary))
 
 
-@programs
-def test_packed_structs_have_the_compilers_layout(program, tmp_path):
+@libraries
+def test_packed_structs_have_the_compilers_layout(library, tmp_path):
     """A compiler reads every field of every packed struct with the value that was packed."""
-    structs = headers.struct_fields(program.sources(".h"))
-    assert structs.keys() == vars(program.params).keys()
-    packed, code = {}, '#include "common/scenery.h"\n#include "params.h"\n'
+    structs = headers.struct_fields(library.sources(".h"))
+    assert structs.keys() == vars(library.params).keys()
+    packed, code = {}, '#include "common/objects.h"\n#include "params.h"\n'
     for name, fields in structs.items():
         values = {field: position + 1 for position, (field, _) in enumerate(fields)}
         values |= {field: bytes(int(kind[2:-1])) for field, kind in fields if kind[-1] == "s"}
-        packed[name] = getattr(program.params, name)(**values)
+        packed[name] = getattr(library.params, name)(**values)
         tests = [f"(long long)p->{f} == {values[f]}" for f, kind in fields if kind[-1] != "s"]
         tests.append(f"size == sizeof({name})")
         code += (
             f'extern "C" int check_{name}(const {name}* p, int size) '
             f"{{ return {' && '.join(tests)}; }}\n"
         )
-    checks = compiled(tmp_path, program, code)
+    checks = compiled(tmp_path, library, code)
     for name, data in packed.items():
         assert getattr(checks, f"check_{name}")(data, len(data)), name
 
@@ -142,9 +142,9 @@ def test_no_wall_that_occludes_a_light_is_ruled_out(tmp_path):
     """The light is 4 m from an agent whose outermost texels are 0.1 m from its centre. Walls are
     moved just far enough not to occlude the light from any texel, then a bit further.
     """
-    library = compiled(tmp_path, ENGINE, CORRIDOR)
-    library.occluded.argtypes = [ctypes.c_float] * 6
-    library.is_wall_ruled_out.argtypes = library.is_box_ruled_out.argtypes = [ctypes.c_float] * 4
+    binary = compiled(tmp_path, ENGINE, CORRIDOR)
+    binary.occluded.argtypes = [ctypes.c_float] * 6
+    binary.is_wall_ruled_out.argtypes = binary.is_box_ruled_out.argtypes = [ctypes.c_float] * 4
 
     def aside(y):  # begins just in front of a texel
         return 6.995, 2 + y, 8, 3
@@ -153,30 +153,30 @@ def test_no_wall_that_occludes_a_light_is_ruled_out(tmp_path):
         return x, 1, x, 3
 
     def is_ruled_out(ax, ay, bx, by):
-        either = {library.is_wall_ruled_out(ax, ay, bx, by)}
-        either.add(library.is_wall_ruled_out(bx, by, ax, ay))
+        either = {binary.is_wall_ruled_out(ax, ay, bx, by)}
+        either.add(binary.is_wall_ruled_out(bx, by, ax, ay))
         assert len(either) == 1  # whichever end comes first
         return either.pop()
 
-    assert library.occluded(*aside(0.0998), 7, 2.1) and not library.occluded(*aside(0.0999), 7, 2.1)
+    assert binary.occluded(*aside(0.0998), 7, 2.1) and not binary.occluded(*aside(0.0999), 7, 2.1)
     assert not is_ruled_out(*aside(0.0998)) and is_ruled_out(*aside(0.11))
-    assert not library.is_box_ruled_out(*aside(0.0998)) and library.is_box_ruled_out(*aside(0.11))
-    assert library.occluded(*across(7.09), 7.1, 2) and not library.occluded(*across(7.1), 7.1, 2)
+    assert not binary.is_box_ruled_out(*aside(0.0998)) and binary.is_box_ruled_out(*aside(0.11))
+    assert binary.occluded(*across(7.09), 7.1, 2) and not binary.occluded(*across(7.1), 7.1, 2)
     assert not is_ruled_out(*across(7.09)) and is_ruled_out(*across(7.11))  # behind the agent
-    assert library.occluded(*across(3.01), 7.1, 2) and not library.occluded(*across(2.99), 7.1, 2)
+    assert binary.occluded(*across(3.01), 7.1, 2) and not binary.occluded(*across(2.99), 7.1, 2)
     assert not is_ruled_out(*across(3.01)) and is_ruled_out(*across(2.99))  # behind the light
 
 
-@programs
-def test_constants_have_the_compilers_values(program, tmp_path):
-    own = '#include "constants.h"\n' if (program.folder / "constants.h").exists() else ""
+@libraries
+def test_constants_have_the_compilers_values(library, tmp_path):
+    own = '#include "constants.h"\n' if (library.folder / "constants.h").exists() else ""
     code = '#include "common/constants.h"\n' + own
-    for name in program.constants:
+    for name in library.constants:
         code += f'extern "C" double read_{name}() {{ return {name}; }}\n'
-    library = compiled(tmp_path, program, code)
-    assert {"BLOCK", "WARP"} <= program.constants.keys()
-    for name, number in program.constants.items():
-        read = getattr(library, f"read_{name}")
+    binary = compiled(tmp_path, library, code)
+    assert {"BLOCK", "WARP"} <= library.constants.keys()
+    for name, number in library.constants.items():
+        read = getattr(binary, f"read_{name}")
         read.restype = ctypes.c_double
         assert read() == pytest.approx(number, rel=1e-7, abs=0), name
 

@@ -1,4 +1,4 @@
-"""docs/kernels.md: its files are a program, and its Python code launches it."""
+"""docs/kernels.md: its files are a library, and its Python code launches it."""
 
 import re
 

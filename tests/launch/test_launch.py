@@ -17,7 +17,7 @@ from megastep.agents.launch.endings import Ending
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from tests.helpers import tiny
-from tests.helpers.processes import is_running, start, wait_until
+from tests.helpers.processes import forked, is_running, wait_until
 from tests.helpers.ranks import HUNG, ROOT
 
 pytestmark = pytest.mark.usefixtures("here")
@@ -39,11 +39,11 @@ TWO_GPUS = [
     [
         (["ranks=3", "device=auto"], 2, "ranks: 3 is more than the 2 GPUs"),
         (["ranks=3", "device=auto"], 1, "ranks: 3 is more than the 1 GPU "),
-        (["ranks=all", "device=auto"], 0, "ranks: 'all' is every GPU, and this machine has none"),
+        (["ranks=all", "device=auto"], 0, "ranks: 'all' uses every GPU, but this machine has none"),
         (["ranks=all", "device=cpu"], 2, "device=cpu; give a number"),
-        (["ranks=2", "device=cuda:1"], 2, "device: 'cuda:1' is one GPU"),
-        (["ranks=0"], 2, "ranks: 0 is no number of ranks"),
-        (["ranks=many"], 2, "ranks: 'many' is no number of ranks"),
+        (["ranks=2", "device=cuda:1"], 2, "device: 'cuda:1' names one GPU"),
+        (["ranks=0"], 2, "ranks: 0 is not a number of ranks"),
+        (["ranks=many"], 2, "ranks: 'many' is not a number of ranks"),
     ],
 )
 def test_bad_ranks(here, monkeypatch, capsys, words, n_gpus, cure):
@@ -149,9 +149,9 @@ def test_errors_of_launched_run(monkeypatch):
 
 
 def test_restart_is_announced(monkeypatch, capsys):
-    lost = Ending(launcher.LOST, "rank 1 hangs. Its last checkpoint is whole. To continue: train")
+    lost = Ending(launcher.LOST, "rank 1 hangs. Its last checkpoint is intact. To continue: train")
     assert launched(monkeypatch, lost, Ending(folder="run"))
-    sentence = "rank 1 hangs. Its last checkpoint is whole. Starting again, 1 of restarts=1."
+    sentence = "rank 1 hangs. Its last checkpoint is intact. Restarting, 1 of restarts=1."
     assert capsys.readouterr().err == f"warning: {sentence}\n"
 
 
@@ -188,7 +188,7 @@ def started(here, *words, base=TINY, **env):
     """
     (here / "tmp").mkdir(exist_ok=True)
     env = dict(TMPDIR=str(here / "tmp")) | env
-    process = start("train", *base, "ranks=2", *words, **env)
+    process = forked("train", *base, "ranks=2", *words, **env)
     try:
         yield process
     finally:
@@ -299,7 +299,7 @@ def test_restart(here):
         os.kill(pid_of(here, 1), signal.SIGKILL)
         code, out, err, _ = wait_for_end(run)
     assert code == 0 and out.count("Training on 2 x cpu in run") == 2
-    assert err.startswith("warning: rank 1 on ") and "Starting again, 1 of restarts=1" in err
+    assert err.startswith("warning: rank 1 on ") and "Restarting, 1 of restarts=1" in err
     rows = json_lines.read(here / "run" / "metrics.jsonl")
     assert [row["updates"] for row in rows] == [*range(1, 401)]
 

@@ -151,11 +151,11 @@ def test_killed_ranks_go_on_bit_for_bit(alone, here):
 
 def test_another_number_of_ranks_goes_on(alone, here, capsys):
     assert train.main(["resume=alone", "samples=1408", "ranks=1", *NO_FINISH]) == 0
-    line = "goes on, but not bit for bit: ranks was 2 and is 1."
+    line = "Resuming, but not bit for bit: ranks was 2 and is 1."
     assert line in capsys.readouterr().out
     assert not (here / "alone/checkpoints/step_1408/rank1.pt").exists()
     first, _ = ranks.train("resume=alone", "samples=1536", *NO_FINISH)
-    assert "ranks was 1 and is 2; ranks that it did not have begin new episodes." in first.stdout
+    assert "ranks was 1 and is 2; added ranks start new episodes." in first.stdout
     assert checkpoint.load_latest("alone/checkpoints/step_1536").n_ranks == 2
     states = whole(checkpoint.list_checkpoints("alone/checkpoints")[-1])
     generators = [state["learner"]["policy_generator"] for state in states.values()]
@@ -163,7 +163,7 @@ def test_another_number_of_ranks_goes_on(alone, here, capsys):
 
 
 def test_ranks_share_duels_and_evaluations(here):
-    """Together they play what one process plays: as often in each home and from each place."""
+    """Together they play what one process plays: as often in each home and from each slot."""
     words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=homes"]
     words += ["geometry.n=7", "samples=1", "folder=games", "agent.width=8"]
     device = "device=cpu"

@@ -3,33 +3,33 @@
 import pytest
 
 from megastep.agents.launch import watch
-from megastep.agents.launch.watch import Heartbeat, Patience
+from megastep.agents.launch.watch import Heartbeat, LossDetector
 
 
 def heartbeat(number, n_operations=100, n_updates=9, is_exempt=False, has_left=False):
     return Heartbeat(number, n_operations, n_updates, is_exempt, has_left, "node-7")
 
 
-def looks(ours, theirs, is_broken=False):
-    """Returns the number of the look, from 0, that finds the other rank lost, and what is said."""
-    patience = Patience()
+def polled(ours, theirs, is_broken=False):
+    """Returns the number of the poll, from 0, that finds the other rank lost, and what is said."""
+    detector = LossDetector()
     for number, pair in enumerate(zip(ours, theirs, strict=True)):
-        if problem := patience.look(*pair, is_broken):
+        if problem := detector.poll(*pair, is_broken):
             return number * watch.PERIOD, problem
     return None, None
 
 
 def test_silent_rank_is_lost():
     ours = [heartbeat(n) for n in range(20)]
-    seconds, problem = looks(ours, [heartbeat(3)] * 20)
+    seconds, problem = polled(ours, [heartbeat(3)] * 20)
     assert watch.LOST_SECONDS < seconds <= watch.LOST_SECONDS + 2 * watch.PERIOD
     assert "killed" in problem
-    seconds, _ = looks(ours, [heartbeat(3)] * 20, is_broken=True)
+    seconds, _ = polled(ours, [heartbeat(3)] * 20, is_broken=True)
     assert watch.BROKEN_SECONDS < seconds <= watch.BROKEN_SECONDS + 2 * watch.PERIOD
 
 
 def test_rank_that_left_is_not_lost():
-    assert looks([heartbeat(n) for n in range(50)], [heartbeat(3, has_left=True)] * 50)[1] is None
+    assert polled([heartbeat(n) for n in range(50)], [heartbeat(3, has_left=True)] * 50)[1] is None
 
 
 def behind(n, **options):
@@ -39,20 +39,20 @@ def behind(n, **options):
 
 
 def test_hanging_rank_is_lost():
-    seconds, problem = looks(*behind(30))
+    seconds, problem = polled(*behind(30))
     assert watch.LOST_SECONDS < seconds <= watch.LOST_SECONDS + 2 * watch.PERIOD
     assert "hangs" in problem
 
 
 @pytest.mark.parametrize("options", [dict(is_exempt=True), dict(n_updates=1)])
 def test_rank_that_compiles_or_saves_is_not_lost(options):
-    assert looks(*behind(30, **options))[1] is None
+    assert polled(*behind(30, **options))[1] is None
 
 
 def test_rank_that_is_waited_for_alone_can_hang():
     """A rank that waits is not ahead of the one that does: neither is lost."""
     ours, theirs = behind(30)
-    assert looks(theirs, ours)[1] is None
+    assert polled(theirs, ours)[1] is None
 
 
 def test_slow_rank_is_given_time():
@@ -60,5 +60,5 @@ def test_slow_rank_is_given_time():
     ours, theirs = behind(9)
     ours += [heartbeat(10 + i, n_operations=102) for i in range(31)]
     theirs += [heartbeat(10 + i, n_operations=101) for i in range(31)]
-    assert looks(ours, theirs)[1] is None
-    assert looks(*behind(40))[1] is not None
+    assert polled(ours, theirs)[1] is None
+    assert polled(*behind(40))[1] is not None

@@ -5,9 +5,10 @@ import re
 import torch
 
 from megastep import core, modules, scene, toys
+from megastep.modules.objects import TENSORS
 from tests.helpers import pages
 
-SIZES = dict(N=3, A=2, B=6, D=2, C=1, R=8, n=64)
+SIZES = dict(N=3, A=2, B=6, D=2, C=1, R=8, n=64, K=5)
 
 
 def objects():
@@ -18,15 +19,17 @@ def objects():
     classes = [kind for name, kind in vars(modules).items() if name in modules.__all__]
     arguments = {
         "FreePoints": (geometries, made, SIZES["n"]),
+        "Objects": (geometries, made, {"key": SIZES["K"]}, ("red",), False, SIZES["n"]),
         "RandomSpawns": (geometries, made),
         "CounterGenerator": (SIZES["B"], 1, "cpu"),
     }
     named = {
         kind.__name__: kind(*arguments.get(kind.__name__, (made,)))
         for kind in classes
-        if isinstance(kind, type)
+        if isinstance(kind, type) and not issubclass(kind, tuple)
     }
-    return named | {"Core": made, "Core.agents": made.agents}
+    kind = named["Objects"]["key"]
+    return named | {"Objects[...]": kind, "Core": made, "Core.agents": made.agents}
 
 
 def test_table_has_every_public_attribute_with_its_shape():
@@ -48,4 +51,5 @@ def test_table_has_every_public_attribute_with_its_shape():
         owner: sorted(name for name in vars(value) if not name.startswith("_"))
         for owner, value in present.items()
     }
+    public["Objects[...]"] = sorted([*public["Objects[...]"], *TENSORS])
     assert {owner: sorted(names) for owner, names in documented.items()} == public

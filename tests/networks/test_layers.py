@@ -8,7 +8,7 @@ from megastep import spaces
 from megastep.agents.networks import encoders, heads, intakes, layers
 from megastep.agents.networks.kernels import casts
 from megastep.agents.networks.kernels import layers as kernel_layers
-from megastep.agents.networks.kernels.program import aligned_rows
+from megastep.agents.networks.kernels.library import aligned_rows
 from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined, once
 from megastep.arrdict import arrdict
 

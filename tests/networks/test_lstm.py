@@ -12,8 +12,8 @@ from torch import nn
 from megastep import engine
 from megastep.agents.networks import lstm as lstm_module
 from megastep.agents.networks import lstm_cpu
+from megastep.agents.networks.kernels import library
 from megastep.agents.networks.kernels import lstm as kernels
-from megastep.agents.networks.kernels import program
 from megastep.agents.networks.lstm import LSTM
 from megastep.arrdict import arrdict
 from tests.helpers.recurrent import assert_close, check_captured
@@ -177,7 +177,7 @@ def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
 def test_aligned_is_contiguous_in_16_byte_words(offset, shape):
     tensor = torch.arange(40.0)[offset : offset + 32].view(shape)
     for source in (tensor, tensor.T):
-        aligned = program.aligned(source)
+        aligned = library.aligned(source)
         assert torch.equal(aligned, source)
         assert aligned.is_contiguous() and not aligned.data_ptr() % 16
 

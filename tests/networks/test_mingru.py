@@ -378,7 +378,7 @@ def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
 
 def test_each_width_has_a_kernel_that_fits():
     names = {f"mingru_step_{width}" for width in mingru_step.WIDTHS}
-    assert mingru_step.PROGRAM.cuda_operations.keys() == names
+    assert mingru_step.LIBRARY.cuda_operations.keys() == names
     assert max(map(mingru_step._shared, mingru_step.WIDTHS)) <= 227 * 1024  # of Hopper
 
 

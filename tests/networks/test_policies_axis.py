@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from megastep.agents.algorithms.gradient_steps import GradientSteps
-from megastep.agents.algorithms.kernels import PROGRAM as ALGORITHMS
+from megastep.agents.algorithms.kernels import LIBRARY as ALGORITHMS
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.kernels import (
     casts,
@@ -25,7 +25,7 @@ from megastep.agents.networks.kernels import (
     mingru_step,
     moments,
 )
-from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.value_output import ValueOutput
 from megastep.arrdict import arrdict
@@ -56,7 +56,7 @@ class Launch(NamedTuple):
     and tensors are copies.
     """
 
-    program: object
+    library: object
     operation: str
     device: torch.device
     blocks: Blocks
@@ -80,17 +80,17 @@ class Recorder:
         self.packed.append((packer, fields))
         return packer(fields)
 
-    def __call__(self, program, operation, device, shape, /, **fields):
+    def __call__(self, library, operation, device, shape, /, **fields):
         packed, self.packed = self.packed, []
         leaves = {name: value for name, value in fields.items() if not isinstance(value, bytes)}
         structs = next((name for name in fields if name not in leaves), None)
         for i, (_, values) in enumerate(packed):
             leaves |= {(i, name): self.known.get(value, value) for name, value in values.items()}
         before = copied(leaves)
-        self.run(program, operation, device, shape, **fields)
+        self.run(library, operation, device, shape, **fields)
         blocks = shape if isinstance(shape, Blocks) else Blocks(-(-shape // BLOCK))
         packers = [packer for packer, _ in packed]
-        case = program, operation, device, blocks, before, copied(leaves), structs, packers
+        case = library, operation, device, blocks, before, copied(leaves), structs, packers
         self.launches.append(Launch(*case))
 
     def of(self, function, i, operations):
@@ -102,7 +102,7 @@ class Recorder:
 
     def check_together(self, launches):
         """Repeats one launch of each policy as one of all."""
-        program, operation, device, blocks, before, _, structs, packers = launches[0]
+        library, operation, device, blocks, before, _, structs, packers = launches[0]
         stacked = {}
         for key, value in before.items():
             values = [one.before[key] for one in launches]
@@ -118,7 +118,7 @@ class Recorder:
             for key in stacked.keys() - fields.keys():
                 rows[key[0]][key[1]] = stacked[key]
             fields[structs] = b"".join(packer(row) for packer, row in zip(packers, rows))
-        self.run(program, operation, device, blocks._replace(y=P * blocks.y), **fields)
+        self.run(library, operation, device, blocks._replace(y=P * blocks.y), **fields)
         for key in stacked:
             if torch.is_tensor(stacked[key]):
                 _, back = LAYOUTS.get((operation, key), (None, torch.clone))
@@ -153,10 +153,10 @@ def recorder(request, monkeypatch):
     for path, module in list(sys.modules.items()):
         if path.startswith("megastep.") and vars(module).get("launch") is run:
             monkeypatch.setattr(module, "launch", recorder)
-    for program in (CORES, ALGORITHMS):
-        packers = program.packers.items()
+    for library in (LIBRARY, ALGORITHMS):
+        packers = library.packers.items()
         params = {name: functools.partial(recorder.pack, packer) for name, packer in packers}
-        monkeypatch.setattr(program, "params", SimpleNamespace(**params))
+        monkeypatch.setattr(library, "params", SimpleNamespace(**params))
     torch.manual_seed(0)
     with torch.device(request.param):
         yield recorder

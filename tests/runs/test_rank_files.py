@@ -83,7 +83,7 @@ def test_rank_that_hands_in_nothing_costs_a_warning(folder, monkeypatch):
     monkeypatch.setattr(rank_files, "SECONDS", 0.05)
     first, second = savers(folder)
     first(8, state(0))
-    with pytest.warns(UserWarning, match=r"rank 1 did not write its part within") as caught:
+    with pytest.warns(UserWarning, match=r"rank 1 did not write its state within") as caught:
         first.wait()
     assert len(caught) == 1 and not checkpoint.list_checkpoints(folder)
     for step in (8, 16):  # too late, and in time
@@ -129,7 +129,7 @@ def test_new_rank_has_rank_0s_optimizer_and_its_own_generators(tmp_path):
     new = make_trainer(tmp_path / "new")
     own = new.learner.state_dict()["generator"]
     new.load_state_dict(saved, is_new_rank=True)
-    assert new.lost == ["ranks that it did not have begin new episodes"]
+    assert new.lost == ["added ranks start new episodes"]
     now, then = new.learner.state_dict(), saved["learner"]
     assert now["generator"] == own and now["generator"].keys() != then["generator"].keys()
     assert str(now["optimizer"]) == str(then["optimizer"]) and now["optimizer"]

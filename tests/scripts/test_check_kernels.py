@@ -11,22 +11,22 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_finds_every_folder_with_cuda_kernels():
-    folders = {program.folder.resolve() for program in check_kernels.programs()}
+    folders = {library.folder.resolve() for library in check_kernels.libraries()}
     files = [*(ROOT / "megastep").glob("**/*.cu"), *(ROOT / "agents").glob("**/*.cu")]
     assert folders == {file.resolve().parent for file in files}
 
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_says_what_fails(fails, monkeypatch, capsys):
-    def build(program, architecture):
+    def build(library, architecture):
         assert architecture == "sm_80"
-        if fails and program.folder.parent.name == "pong":
+        if fails and library.folder.parent.name == "pong":
             raise EngineError("NVRTC could not build")
 
     monkeypatch.setattr(check_kernels, "build_cuda", build)
     assert check_kernels.main(["sm_80"]) == int(fails)
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(check_kernels.programs())
+    assert len(lines) == len(check_kernels.libraries())
     assert [line for line in lines if "failed" in line] == [
         "megastep/envs/pong/kernels: failed: NVRTC could not build"
     ] * fails

@@ -11,7 +11,7 @@ from megastep.agents.training.episode_stats import EpisodeStats
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from tests.training.test_trainer import UPDATE, Pairs, always, make_trainer
 
-PLACES = "rank 0 on here", "rank 1 on there"
+LABELS = "rank 0 on here", "rank 1 on there"
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def one_by_one(monkeypatch):
 
         monkeypatch.setattr(nonfinite_guard, "gather_if_any", gather)
         monkeypatch.setattr(nonfinite_guard, "rank", lambda: rank)
-        monkeypatch.setattr(nonfinite_guard, "place", lambda: PLACES[rank])
+        monkeypatch.setattr(nonfinite_guard, "rank_label", lambda: LABELS[rank])
 
     return act_as
 

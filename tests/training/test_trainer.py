@@ -332,7 +332,7 @@ def test_state_of_another_environment_begins_new_episodes_and_says_so(tmp_path):
     state = first.state_dict()
     state["env"] = {}
     second.load_state_dict(state)
-    assert [lost.endswith("new episodes begin") for lost in second.lost] == [True]
+    assert [lost.endswith("new episodes start") for lost in second.lost] == [True]
     assert first.episode_stats.returns.all() and not second.episode_stats.returns.any()
     assert second.episode_stats.pop()["episode/count"] == B, "finished ones still count"
 

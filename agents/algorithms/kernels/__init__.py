@@ -1,7 +1,7 @@
-"""The algorithms' kernels for the GPU as one program."""
+"""The kernel library of the algorithms, for GPUs."""
 
 from pathlib import Path
 
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 
-PROGRAM = Program(Path(__file__).parent, FAST_CUDA_FLAGS)
+LIBRARY = KernelLibrary(Path(__file__).parent, FAST_CUDA_FLAGS)

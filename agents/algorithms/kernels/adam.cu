@@ -13,14 +13,14 @@ static_assert(sizeof(SquaredNormParams::rows) == ADAM_ROWS * sizeof(AdamRowParam
 static_assert(sizeof(JudgeParams::metrics) == JUDGED_METRICS * sizeof(MetricParams));
 
 // Where a thread's word is: in a row, from a number on, `n` of its four numbers exist.
-struct Place {
+struct WordIndex {
     int row;
     long long first;
     int n;
     bool is_word;  // one instruction moves it
 };
 
-DEVICE Place find_place(const AdamRowParams* rows, int n_rows) {
+DEVICE WordIndex find_index(const AdamRowParams* rows, int n_rows) {
     int row = 0, end = n_rows;  // the last row that begins at or before this block
     while (end - row > 1) {
         int middle = (row + end) / 2;
@@ -33,9 +33,9 @@ DEVICE Place find_place(const AdamRowParams* rows, int n_rows) {
     return {row, of_policy + at, n, its.is_aligned && of_policy % 4 == 0 && n == 4};
 }
 
-DEVICE void read(float (&values)[4], const float* array, const Place& place) {
-    if (place.is_word) {
-        float4 word = *(const float4*)(array + place.first);
+DEVICE void read(float (&values)[4], const float* array, const WordIndex& index) {
+    if (index.is_word) {
+        float4 word = *(const float4*)(array + index.first);
         values[0] = word.x;
         values[1] = word.y;
         values[2] = word.z;
@@ -44,18 +44,18 @@ DEVICE void read(float (&values)[4], const float* array, const Place& place) {
     }
 #pragma unroll
     for (int i = 0; i < 4; i++)
-        values[i] = i < place.n ? array[place.first + i] : 0.f;
+        values[i] = i < index.n ? array[index.first + i] : 0.f;
 }
 
-DEVICE void write(float* array, const Place& place, const float (&values)[4]) {
-    if (place.is_word) {
-        *(float4*)(array + place.first) = make_float4(values[0], values[1], values[2], values[3]);
+DEVICE void write(float* array, const WordIndex& index, const float (&values)[4]) {
+    if (index.is_word) {
+        *(float4*)(array + index.first) = make_float4(values[0], values[1], values[2], values[3]);
         return;
     }
 #pragma unroll
     for (int i = 0; i < 4; i++)
-        if (i < place.n)
-            array[place.first + i] = values[i];
+        if (i < index.n)
+            array[index.first + i] = values[i];
 }
 
 // The sum over a block in a fixed order, for its first thread.
@@ -74,9 +74,9 @@ DEVICE float sum_of_block(float x) {
 
 KERNEL BOUNDS(256) squared_norm(SquaredNormParams p) {
     wait_for_previous();
-    Place place = find_place(p.rows, p.n_rows);
+    WordIndex index = find_index(p.rows, p.n_rows);
     float values[4], sum = 0.f;
-    read(values, p.rows[place.row].gradient, place);
+    read(values, p.rows[index.row].gradient, index);
     for (int i = 0; i < 4; i++)
         sum += values[i] * values[i];
     sum = sum_of_block(sum);
@@ -117,13 +117,13 @@ KERNEL BOUNDS(256) adam(AdamParams p) {
     unsigned int policy = blockIdx.y;
     if (!p.is_taken[policy])
         return;
-    Place place = find_place(p.rows, p.n_rows);
-    const AdamRowParams& row = p.rows[place.row];
+    WordIndex index = find_index(p.rows, p.n_rows);
+    const AdamRowParams& row = p.rows[index.row];
     float gradients[4], means[4], squares[4], parameters[4];
-    read(gradients, row.gradient, place);
-    read(means, row.mean, place);
-    read(squares, row.square, place);
-    read(parameters, row.parameter, place);
+    read(gradients, row.gradient, index);
+    read(means, row.mean, index);
+    read(squares, row.square, index);
+    read(parameters, row.parameter, index);
     float clip = p.grad_norm ? fminf(p.max_norm / (p.grad_norm[policy] + 1e-6f), 1.f) : 1.f;
     float lr = p.lr[policy] * row.lr_factor, n_steps = p.n_steps[policy];
     float step = lr / (1.f - powf(p.beta1, n_steps));
@@ -136,7 +136,7 @@ KERNEL BOUNDS(256) adam(AdamParams p) {
         parameters[i] = parameters[i] * (1.f - lr * row.weight_decay) -
                         step * means[i] / (sqrtf(squares[i]) * scale + p.eps);
     }
-    write(row.mean, place, means);
-    write(row.square, place, squares);
-    write(row.parameter, place, parameters);
+    write(row.mean, index, means);
+    write(row.square, index, squares);
+    write(row.parameter, index, parameters);
 }

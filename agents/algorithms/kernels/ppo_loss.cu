@@ -11,7 +11,7 @@ KERNEL ppo_loss(PpoLossParams p) {
     long long policy = blockIdx.y, row = policy * p.n_rows + of_policy;
     float sums[N_SUMS] = {};
     if (of_policy < p.n_rows) {
-        float share = p.valid[row] ? 1.f / (float)max(p.n_valid[policy], 1ll) : 0.f;
+        float weight = p.valid[row] ? 1.f / (float)max(p.n_valid[policy], 1ll) : 0.f;
         float d_logprob = 0.f, d_value = 0.f;
         if (p.valid[row]) {
             float log_ratio = p.logprobs[row] - p.old_logprobs[row], ratio = expf(log_ratio);
@@ -32,8 +32,8 @@ KERNEL ppo_loss(PpoLossParams p) {
                     squared = clipped_error * clipped_error;
                 }
             }
-            d_logprob = is_clipped ? 0.f : -surrogate * share;
-            d_value = is_limited ? 0.f : p.value_coef * 2.f * error / scale * share;
+            d_logprob = is_clipped ? 0.f : -surrogate * weight;
+            d_value = is_limited ? 0.f : p.value_coef * 2.f * error / scale * weight;
             sums[0] = -(is_clipped ? clipped * advantage : surrogate);
             sums[1] = squared;
             sums[2] = p.entropies[row];
@@ -43,13 +43,13 @@ KERNEL ppo_loss(PpoLossParams p) {
             sums[6] = sums[0] + p.value_coef * sums[1] - p.entropy_coef * sums[2] +
                       p.auxiliary_coef * sums[5];
             for (int i = 0; i < N_SUMS; i++)
-                sums[i] *= share;
+                sums[i] *= weight;
         }
         p.d_logprobs[row] = d_logprob;
         p.d_values[row] = d_value;
-        p.d_entropies[row] = -p.entropy_coef * share;
+        p.d_entropies[row] = -p.entropy_coef * weight;
         if (p.errors)
-            p.d_errors[row] = p.auxiliary_coef * share;
+            p.d_errors[row] = p.auxiliary_coef * weight;
     }
     __shared__ float of_warps[BLOCK / WARP][N_SUMS];
     for (int i = 0; i < N_SUMS; i++) {

@@ -170,13 +170,13 @@ KERNEL td_metrics(TdMetricsParams p) {
     if (threadIdx.x)
         return;
     float* metrics = p.metrics + policy * N_TD_METRICS;
-    float share = 1.f / fmaxf(totals[3], 1.f), n = (float)p.n_sequences;
-    metrics[0] = totals[0] * share;
-    metrics[1] = totals[1] * share;
-    metrics[2] = totals[2] * share;
+    float weight = 1.f / fmaxf(totals[3], 1.f), n = (float)p.n_sequences;
+    metrics[0] = totals[0] * weight;
+    metrics[1] = totals[1] * weight;
+    metrics[2] = totals[2] * weight;
     metrics[3] = totals[4] / n;
     float mean = totals[5] / n;
     metrics[4] = mean * mean / fmaxf(totals[6] / n, 1.17549435e-38f);
     metrics[5] = totals[3];
-    metrics[6] = share;
+    metrics[6] = weight;
 }

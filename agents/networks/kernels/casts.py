@@ -2,10 +2,10 @@
 
 import torch
 
-from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.kernels.build.launch import Blocks, launch
 
-_MAX_ROWS, _THREADS = CORES.constants["CAST_ROWS"], CORES.constants["CAST_THREADS"]
+_MAX_ROWS, _THREADS = LIBRARY.constants["CAST_ROWS"], LIBRARY.constants["CAST_THREADS"]
 
 
 def cast(weights: list[torch.Tensor], multiple: int) -> list[torch.Tensor]:
@@ -23,7 +23,7 @@ def cast(weights: list[torch.Tensor], multiple: int) -> list[torch.Tensor]:
         some, rows, n_blocks = slice(start, start + _MAX_ROWS), [], 0
         for weight, target in zip(weights[some], targets[some], strict=True):
             rows.append(
-                CORES.params.CastRowParams(
+                LIBRARY.params.CastRowParams(
                     source=weight,
                     target=target,
                     n=weight.numel(),
@@ -33,7 +33,7 @@ def cast(weights: list[torch.Tensor], multiple: int) -> list[torch.Tensor]:
             )
             n_blocks += max(1, -(-target.numel() // (8 * _THREADS)))
         launch(
-            *(CORES, "cast", memory.device, Blocks(n_blocks, threads=_THREADS)),
+            *(LIBRARY, "cast", memory.device, Blocks(n_blocks, threads=_THREADS)),
             rows=b"".join(rows),
             n_rows=len(rows),
         )

@@ -9,17 +9,17 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import aligned, aligned_rows
+from megastep.agents.networks.kernels.library import aligned, aligned_rows
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
 # Lambdas with type parameters are device code only if everything is.
 _FLAGS = *FAST_CUDA_FLAGS, "--device-as-default-execution-space"
-PROGRAM = Program(Path(__file__).parent / "convolutions", _FLAGS)
-MAX_CHANNELS = PROGRAM.constants["CONV_INPUTS"]
-CHANNELS = PROGRAM.constants["CONV_CHANNELS"]
+LIBRARY = KernelLibrary(Path(__file__).parent / "convolutions", _FLAGS)
+MAX_CHANNELS = LIBRARY.constants["CONV_INPUTS"]
+CHANNELS = LIBRARY.constants["CONV_CHANNELS"]
 _ROWS, _THREADS, _BLOCKS = (
-    PROGRAM.constants[f"CONV_{name}"] for name in "ROWS THREADS BLOCKS".split()
+    LIBRARY.constants[f"CONV_{name}"] for name in "ROWS THREADS BLOCKS".split()
 )
 ALIGNMENT = 8  # numbers in 16 bytes
 _BARRIER = 16  # bytes of shared memory that count copies
@@ -84,7 +84,7 @@ def conv_forward(
     n_blocks = min(-(-n_rows // _ROWS), _BLOCKS * gpu.multi_processor_count)
     kernel, blocks, sizes = forward_kernel(n_channels, n_columns, n_blocks)
     launch(
-        *(PROGRAM, kernel, rows.device, blocks),
+        *(LIBRARY, kernel, rows.device, blocks),
         rows=rows,
         **{name: aligned(weight) for name, weight in weights.items()},
         features=features,
@@ -170,7 +170,7 @@ def conv_backward(
     sums = rows.new_empty(n_blocks, sum(sizes), dtype=torch.float32)
     kernel, blocks, shared_sizes = backward_kernel(n_channels, n_columns, n_blocks)
     launch(
-        *(PROGRAM, kernel, rows.device, blocks),
+        *(LIBRARY, kernel, rows.device, blocks),
         d_features=d_features,
         features=features,
         rows=rows,

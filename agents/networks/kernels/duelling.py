@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 
-MAX_OUTPUTS = CORES.constants["DUELLING_OUTPUTS"]
-_STRIP, _THREADS = CORES.constants["DUELLING_STRIP"], CORES.constants["DUELLING_THREADS"]
+MAX_OUTPUTS = LIBRARY.constants["DUELLING_OUTPUTS"]
+_STRIP, _THREADS = LIBRARY.constants["DUELLING_STRIP"], LIBRARY.constants["DUELLING_THREADS"]
 _BLOCK_ROWS = BLOCK // WARP * (WARP // MAX_OUTPUTS)
 
 
@@ -68,7 +68,7 @@ def _forward(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors)
     optional = dict.fromkeys(("noise", "epsilon", "actions", "logprobs"))
     blocks = Blocks(-(-n_rows // _BLOCK_ROWS))
     launch(
-        *(CORES, f"duelling_{operation}", hidden.device, blocks),
+        *(LIBRARY, f"duelling_{operation}", hidden.device, blocks),
         **dict(zip(names, parameters, strict=True), hidden=hidden, values=values),
         **(optional | tensors),
         n_rows=n_rows,
@@ -105,7 +105,7 @@ def backward(
     d_hidden = torch.empty_like(hidden)
     sums = d_values.new_empty(n_strips, sum(sizes))
     launch(
-        *(CORES, "duelling_backward", hidden.device, Blocks(n_strips, n_parts, _THREADS)),
+        *(LIBRARY, "duelling_backward", hidden.device, Blocks(n_strips, n_parts, _THREADS)),
         hidden=hidden,
         value_weight=value_weight,
         advantage_weight=advantage_weight,

@@ -114,7 +114,7 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
 // ---- Backward ----
 
 // Where a thread reads and writes.
-struct HeadsPlace {
+struct HeadsIndex {
     long long policy, first;  // row of the policy
     int strip;
     int first_score, first_hidden, n_columns;
@@ -122,18 +122,18 @@ struct HeadsPlace {
 };
 
 // The gradient of the scores, one thread per row. The entropy's is -p (logit + entropy).
-DEVICE void scores_backward(const HeadsBackwardParams& p, const HeadsPlace& place) {
-    int row = place.strip * STRIP + (int)threadIdx.x;
+DEVICE void scores_backward(const HeadsBackwardParams& p, const HeadsIndex& index) {
+    int row = index.strip * STRIP + (int)threadIdx.x;
     if (threadIdx.x >= STRIP || row >= p.n_rows)
         return;
-    long long at = (place.first + row) * place.n_columns + place.first_score;
+    long long at = (index.first + row) * index.n_columns + index.first_score;
     const Bfloat16* scores = (const Bfloat16*)p.product + at;
     Bfloat16* d_scores = (Bfloat16*)p.d_product + at;
-    float d_logprob = p.d_logprobs[place.first + row], d_entropy = p.d_entropies[place.first + row];
+    float d_logprob = p.d_logprobs[index.first + row], d_entropy = p.d_entropies[index.first + row];
     int n = p.n_choices, n_scores = p.n_agents * n;
     for (int agent = 0; agent < p.n_agents; agent++) {
         Softmax softmax = softmax_of(scores + agent * n, n);
-        long long action = p.actions[(place.first + row) * p.n_agents + agent];
+        long long action = p.actions[(index.first + row) * p.n_agents + agent];
         for (int k = 0; k < n; k++) {
             float logit = logit_of(scores[agent * n + k], softmax), probability = expf(logit);
             float d = d_logprob * ((action == k ? 1.f : 0.f) - probability) -
@@ -146,27 +146,27 @@ DEVICE void scores_backward(const HeadsBackwardParams& p, const HeadsPlace& plac
 }
 
 // The gradients of the prediction and of the scores, and their sums.
-DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsPlace& place) {
-    scores_backward(p, place);
+DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index) {
+    scores_backward(p, index);
     __syncthreads();
-    int n_words = place.first_hidden / WORD;
+    int n_words = index.first_hidden / WORD;
     for (int first_word = 0; first_word < n_words; first_word += WARP) {
-        Strip strip = find_strip(place.strip, min(n_words - first_word, WARP), p.n_rows);
+        Strip strip = find_strip(index.strip, min(n_words - first_word, WARP), p.n_rows);
         int column = WORD * (first_word + strip.word);
-        bool is_score = column >= place.first_score;
+        bool is_score = column >= index.first_score;
         float sums[WORD];
         clear(sums);
         for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
             float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
 #pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
-                long long row = place.first + min(start + i * strip.step, strip.end - 1);
-                long long at = row * place.n_columns + column;
+                long long row = index.first + min(start + i * strip.step, strip.end - 1);
+                long long at = row * index.n_columns + column;
                 read<Bfloat16>(values[i], is_score ? p.d_product : p.product, at);
                 // a score has no target: reads whatever is in the first columns
                 int target = is_score ? 0 : column;
-                if (place.first_score)
-                    read<Bfloat16>(expected[i], p.target, row * place.first_score + target);
+                if (index.first_score)
+                    read<Bfloat16>(expected[i], p.target, row * index.first_score + target);
                 d_errors[i] = p.d_errors[row] * 2.f / (float)p.n_predicted;
             }
 #pragma unroll
@@ -179,35 +179,35 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsPlace& place
                         float d = d_errors[i] * (values[i][n] - expected[i][n]);
                         values[i][n] = column + n < p.n_predicted ? d : 0.f;
                     }
-                    write<Bfloat16>(p.d_product, (place.first + row) * place.n_columns + column,
+                    write<Bfloat16>(p.d_product, (index.first + row) * index.n_columns + column,
                                     values[i]);
                 }
                 for (int n = 0; n < WORD; n++)
                     sums[n] += values[i][n];
             }
         }
-        add_up(sums, strip, place.sums + WORD * first_word, WORD * strip.words);
+        add_up(sums, strip, index.sums + WORD * first_word, WORD * strip.words);
     }
 }
 
 // The gradients of 32 words of the critic's hidden layer and of the value's weights.
-DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsPlace& place, int part) {
+DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& index, int part) {
     int first_word = WARP * part;
-    Strip strip = find_strip(place.strip, min(p.width / WORD - first_word, WARP), p.n_rows);
+    Strip strip = find_strip(index.strip, min(p.width / WORD - first_word, WARP), p.n_rows);
     int column = WORD * (first_word + strip.word);
     float weight[WORD], sums[WORD], weight_sums[WORD], bias_sum[1];
-    read_word(weight, p.value_weight + place.policy * p.width + column);
+    read_word(weight, p.value_weight + index.policy * p.width + column);
     clear(sums);
     clear(weight_sums);
     clear(bias_sum);
-    float scale = p.value_scale[place.policy];
+    float scale = p.value_scale[index.policy];
     for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
         float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
 #pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
-            long long row = place.first + min(start + i * strip.step, strip.end - 1);
+            long long row = index.first + min(start + i * strip.step, strip.end - 1);
             read<Bfloat16>(hidden[i], p.product,
-                           row * place.n_columns + place.first_hidden + column);
+                           row * index.n_columns + index.first_hidden + column);
             d_values[i] = p.d_values[row] * scale;
         }
 #pragma unroll
@@ -223,32 +223,32 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsPlace& plac
                 sums[n] += hidden[i][n];
             }
             write<Bfloat16>(p.d_product,
-                            (place.first + row) * place.n_columns + place.first_hidden + column,
+                            (index.first + row) * index.n_columns + index.first_hidden + column,
                             hidden[i]);
         }
     }
-    float* target = place.sums + WORD * first_word;
-    add_up(sums, strip, target + place.first_hidden, WORD * strip.words);
-    add_up(weight_sums, strip, target + place.n_columns, WORD * strip.words);
+    float* target = index.sums + WORD * first_word;
+    add_up(sums, strip, target + index.first_hidden, WORD * strip.words);
+    add_up(weight_sums, strip, target + index.n_columns, WORD * strip.words);
     if (!part)
-        add_up(bias_sum, strip, place.sums + place.n_columns + p.width, 1);
+        add_up(bias_sum, strip, index.sums + index.n_columns + p.width, 1);
 }
 
 // Neighbouring blocks have one strip: one has prediction and scores, the others the hidden layer.
 KERNEL BOUNDS(256) heads_backward(HeadsBackwardParams p) {
     wait_for_previous();
     int n_parts = 1 + (p.width / WORD + WARP - 1) / WARP, part = blockIdx.x % n_parts;
-    HeadsPlace place;
-    place.policy = blockIdx.y;
-    place.first = place.policy * p.n_rows;
-    place.strip = blockIdx.x / n_parts;
-    place.first_score = padded(p.n_predicted);
-    place.first_hidden = place.first_score + padded(p.n_agents * p.n_choices);
-    place.n_columns = place.first_hidden + p.width;
-    long long n_strips = gridDim.x / n_parts, n_sums = place.n_columns + p.width + WORD;
-    place.sums = p.sums + (place.policy * n_strips + place.strip) * n_sums;
+    HeadsIndex index;
+    index.policy = blockIdx.y;
+    index.first = index.policy * p.n_rows;
+    index.strip = blockIdx.x / n_parts;
+    index.first_score = padded(p.n_predicted);
+    index.first_hidden = index.first_score + padded(p.n_agents * p.n_choices);
+    index.n_columns = index.first_hidden + p.width;
+    long long n_strips = gridDim.x / n_parts, n_sums = index.n_columns + p.width + WORD;
+    index.sums = p.sums + (index.policy * n_strips + index.strip) * n_sums;
     if (part)
-        critic_backward(p, place, part - 1);
+        critic_backward(p, index, part - 1);
     else
-        actor_backward(p, place);
+        actor_backward(p, index);
 }

@@ -11,12 +11,12 @@ from typing import NamedTuple
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.kernels.build.launch import WARP, Blocks, launch
 
 MULTIPLE = 8  # of which W is one
-MAX_ROWS = 2**31 - CORES.constants["STRIP"]
-_STRIP, _STRIP_THREADS = CORES.constants["STRIP"], CORES.constants["STRIP_THREADS"]
+MAX_ROWS = 2**31 - LIBRARY.constants["STRIP"]
+_STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_THREADS"]
 
 
 class Sizes(NamedTuple):
@@ -77,7 +77,7 @@ def _forward(columns, outputs, value, sizes):
     product = columns["product"]
     blocks = Blocks(_n_strips(product), threads=_STRIP_THREADS)
     launch(
-        *(CORES, "heads_forward", product.device, blocks),
+        *(LIBRARY, "heads_forward", product.device, blocks),
         **columns,
         **{f"value_{name}": leaf for name, leaf in value._asdict().items()},
         **outputs,
@@ -108,7 +108,7 @@ def backward(
     names = "d_logprobs", "d_entropies", "d_errors", "d_values"
     blocks = Blocks(n_strips * n_parts, threads=_STRIP_THREADS)
     launch(
-        *(CORES, "heads_backward", product.device, blocks),
+        *(LIBRARY, "heads_backward", product.device, blocks),
         product=product,
         target=target,
         actions=actions,

@@ -9,18 +9,18 @@
 
 // A thread's lane, and the offsets of its units in an array (B, W) and in the first gate of an
 // array (B, gates W).
-struct Place {
+struct UnitIndex {
     int lane;
     long long unit, gate;
 };
 
 template <int N_GATES, class Params>
-DEVICE bool find_place(const Params& p, Place& place) {
+DEVICE bool find_index(const Params& p, UnitIndex& index) {
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x;
     unsigned int threads_per_lane = p.width / p.n_units;
     unsigned int lane = thread / threads_per_lane;
     long long first = thread % threads_per_lane * p.n_units, row = (long long)lane * p.width;
-    place = {(int)lane, row + first, N_GATES * row + first};
+    index = {(int)lane, row + first, N_GATES * row + first};
     return lane < (unsigned int)p.n_lanes;
 }
 
@@ -33,11 +33,11 @@ DEVICE void clear(float (&values)[N]) {
 // Runs an operation on numbers of type T, for the lane and units of this thread.
 template <class Operation, class T, class Params>
 DEVICE void run(const Params& p) {
-    Place place;
-    if (!find_place<Operation::N_GATES>(p, place))
+    UnitIndex index;
+    if (!find_index<Operation::N_GATES>(p, index))
         return;
     if (p.n_units == 4)
-        Operation::template run<T, 4>(p, place);
+        Operation::template run<T, 4>(p, index);
     else
-        Operation::template run<T, 1>(p, place);
+        Operation::template run<T, 1>(p, index);
 }

@@ -8,14 +8,14 @@ import itertools
 
 import torch
 
-from megastep.agents.networks.kernels.program import CORES, kernel
+from megastep.agents.networks.kernels.library import LIBRARY, kernel
 from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 
-MAX_LEAVES = CORES.constants["MAX_LEAVES"]
-MAX_CHOICES = CORES.constants["ACT_THREADS"]
+MAX_LEAVES = LIBRARY.constants["MAX_LEAVES"]
+MAX_CHOICES = LIBRARY.constants["ACT_THREADS"]
 MAX_STEPS = 65_535  # of `normalise`; blocks along y
 _WORD = 16  # bytes that a thread reads at once
-_STRIP, _STRIP_THREADS = CORES.constants["STRIP"], CORES.constants["STRIP_THREADS"]
+_STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_THREADS"]
 
 
 def normalise(
@@ -40,7 +40,7 @@ def normalise(
     features = leaves[0].new_empty(n_steps, n_selected, n_columns, dtype=torch.bfloat16)
     plain = itertools.takewhile(lambda leaf: leaf.shape[-1] % 4 == 0, leaves)
     packed = [
-        CORES.params.IntakeLeafParams(
+        LIBRARY.params.IntakeLeafParams(
             values=leaf,
             mean=mean,
             scale=scale,
@@ -50,9 +50,9 @@ def normalise(
         )
         for leaf, mean, scale in zip(leaves, means, scales, strict=True)
     ]
-    n_threads = n_columns // 4 * -(-n_selected // CORES.constants["NORMALISED_ROWS"])
+    n_threads = n_columns // 4 * -(-n_selected // LIBRARY.constants["NORMALISED_ROWS"])
     launch(
-        *(CORES, "normalise", features.device, Blocks(-(-n_threads // BLOCK), n_steps)),
+        *(LIBRARY, "normalise", features.device, Blocks(-(-n_threads // BLOCK), n_steps)),
         leaves=b"".join(packed),
         lanes=lanes,
         features=features,
@@ -82,7 +82,7 @@ def bias_gradient(
     sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
     blocks = Blocks(n_strips, -(-n_words // WARP), _STRIP_THREADS)
     launch(
-        *(CORES, "bias_gradient", d.device, blocks),
+        *(LIBRARY, "bias_gradient", d.device, blocks),
         d=d,
         activated=activated,
         d_masked=None if activated is None else d_masked,
@@ -100,7 +100,7 @@ def sum_rows(rows: torch.Tensor) -> torch.Tensor:
     sums = rows.new_empty(rows.shape[1])
     blocks = Blocks(-(-rows.shape[1] // WARP), threads=_STRIP_THREADS)
     launch(
-        *(CORES, "sum_rows", rows.device, blocks),
+        *(LIBRARY, "sum_rows", rows.device, blocks),
         rows=rows,
         sums=sums,
         n_rows=rows.shape[0],
@@ -134,7 +134,7 @@ def act(
     logprobs = torch.empty_like(logits[:, 0, 0])
     operation, n_threads = kernel("categorical_act", features.dtype), MAX_CHOICES * n_lanes
     launch(
-        *(CORES, operation, features.device, n_threads),
+        *(LIBRARY, operation, features.device, n_threads),
         features=features,
         weight=weight,
         bias=bias,
@@ -159,7 +159,7 @@ def terms(logits: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, to
     """
     logprobs, entropies = logits.new_empty(2, len(logits))
     launch(
-        *(CORES, "categorical_terms", logits.device, len(logits)),
+        *(LIBRARY, "categorical_terms", logits.device, len(logits)),
         **_rows(logits, actions),
         logprobs=logprobs,
         entropies=entropies,
@@ -173,7 +173,7 @@ def terms_backward(
     """Returns the gradient of `terms`' logits."""
     d_logits = torch.empty_like(logits)
     launch(
-        *(CORES, "categorical_terms_backward", logits.device, len(logits)),
+        *(LIBRARY, "categorical_terms_backward", logits.device, len(logits)),
         **_rows(logits, actions),
         d_logprobs=d_logprobs,
         d_entropies=d_entropies,

@@ -15,11 +15,11 @@ struct LstmStep {
 
 // Computes a step whose cell `s.before` is set.
 template <class T, int N, class Params>
-DEVICE void activate(LstmStep<N>& s, const Params& p, const Place& place) {
-    read<T>(s.input, p.gates, place.gate);
-    read<T>(s.forget, p.gates, place.gate + p.width);
-    read<T>(s.candidate, p.gates, place.gate + 2 * p.width);
-    read<T>(s.output, p.gates, place.gate + 3 * p.width);
+DEVICE void activate(LstmStep<N>& s, const Params& p, const UnitIndex& index) {
+    read<T>(s.input, p.gates, index.gate);
+    read<T>(s.forget, p.gates, index.gate + p.width);
+    read<T>(s.candidate, p.gates, index.gate + 2 * p.width);
+    read<T>(s.output, p.gates, index.gate + 3 * p.width);
     for (int n = 0; n < N; n++) {
         s.input[n] = sigmoid(s.input[n]);
         s.forget[n] = sigmoid(s.forget[n]);
@@ -34,17 +34,17 @@ struct LstmStart {
     static constexpr int N_GATES = 4;
 
     template <class T, int N>
-    DEVICE void run(const LstmStartParams& p, const Place& place) {
+    DEVICE void run(const LstmStartParams& p, const UnitIndex& index) {
         float hidden[N], cell[N];
-        bool resets = p.reset[place.lane];
-        read<float>(hidden, p.last_output, place.unit);
+        bool resets = p.reset[index.lane];
+        read<float>(hidden, p.last_output, index.unit);
         if (resets)
             clear(hidden);
-        write<T>(p.hidden, place.unit, hidden);
-        read<float>(cell, p.last_cell, place.unit);
+        write<T>(p.hidden, index.unit, hidden);
+        read<float>(cell, p.last_cell, index.unit);
         if (resets)
             clear(cell);
-        write<float>(p.cell, place.unit, cell);
+        write<float>(p.cell, index.unit, cell);
     }
 };
 
@@ -53,14 +53,14 @@ struct LstmJoin {
     static constexpr int N_GATES = 2;
 
     template <class T, int N>
-    DEVICE void run(const LstmJoinParams& p, const Place& place) {
+    DEVICE void run(const LstmJoinParams& p, const UnitIndex& index) {
         float x[N], hidden[N];
-        read<T>(x, p.x, place.unit);
-        read<float>(hidden, p.last_output, place.unit);
-        if (p.reset[place.lane])
+        read<T>(x, p.x, index.unit);
+        read<float>(hidden, p.last_output, index.unit);
+        if (p.reset[index.lane])
             clear(hidden);
-        write<T>(p.joined, place.gate, x);
-        write<T>(p.joined, place.gate + p.width, hidden);
+        write<T>(p.joined, index.gate, x);
+        write<T>(p.joined, index.gate + p.width, hidden);
     }
 };
 
@@ -69,27 +69,27 @@ struct LstmAct {
     static constexpr int N_GATES = 4;
 
     template <class T, int N>
-    DEVICE void run(const LstmActParams& p, const Place& place) {
+    DEVICE void run(const LstmActParams& p, const UnitIndex& index) {
         LstmStep<N> s;
-        read<float>(s.before, p.last_cell, place.unit);
-        if (p.reset[place.lane])
+        read<float>(s.before, p.last_cell, index.unit);
+        if (p.reset[index.lane])
             clear(s.before);
-        activate<T>(s, p, place);
+        activate<T>(s, p, index);
         T output[N];
         float next_output[N];
         for (int n = 0; n < N; n++) {
             assign(output[n], s.output[n] * s.tanh_after[n]);
             next_output[n] = to_float(output[n]);
         }
-        write<float>(p.next_output, place.unit, next_output);
+        write<float>(p.next_output, index.unit, next_output);
         if (p.residual) {
             float residual[N];
-            read<T>(residual, p.residual, place.unit);
+            read<T>(residual, p.residual, index.unit);
             for (int n = 0; n < N; n++)
                 next_output[n] += residual[n];
         }
-        write<T>(p.output, place.unit, next_output);
-        write<float>(p.next_cell, place.unit, s.after);
+        write<T>(p.output, index.unit, next_output);
+        write<float>(p.next_cell, index.unit, s.after);
     }
 };
 
@@ -97,22 +97,22 @@ struct LstmForward {
     static constexpr int N_GATES = 4;
 
     template <class T, int N>
-    DEVICE void run(const LstmForwardParams& p, const Place& place) {
-        bool next_resets = p.next_reset && p.next_reset[place.lane];
+    DEVICE void run(const LstmForwardParams& p, const UnitIndex& index) {
+        bool next_resets = p.next_reset && p.next_reset[index.lane];
         LstmStep<N> s;
-        read<float>(s.before, p.cell, place.unit);
-        activate<T>(s, p, place);
+        read<float>(s.before, p.cell, index.unit);
+        activate<T>(s, p, index);
         float output[N];
         for (int n = 0; n < N; n++)
             output[n] = s.output[n] * s.tanh_after[n];
-        write<T>(p.output, place.unit, output);
+        write<T>(p.output, index.unit, output);
         if (next_resets) {
             clear(output);
             clear(s.after);
         }
         if (p.next_hidden)
-            write<T>(p.next_hidden, place.unit, output);
-        write<float>(p.next_cell, place.unit, s.after);
+            write<T>(p.next_hidden, index.unit, output);
+        write<float>(p.next_cell, index.unit, s.after);
     }
 };
 
@@ -120,19 +120,19 @@ struct LstmBackward {
     static constexpr int N_GATES = 4;
 
     template <class T, int N>
-    DEVICE void run(const LstmBackwardParams& p, const Place& place) {
+    DEVICE void run(const LstmBackwardParams& p, const UnitIndex& index) {
         float d_output[N], d_hidden[N], d_after[N];
-        read<T>(d_output, p.d_output, place.unit);
-        read<float>(d_after, p.d_next_cell, place.unit);
+        read<T>(d_output, p.d_output, index.unit);
+        read<float>(d_after, p.d_next_cell, index.unit);
         clear(d_hidden);
         bool next_resets = false;
         if (p.d_next_hidden) {  // even if the next step resets: no load waits for another
-            read<T>(d_hidden, p.d_next_hidden, place.unit);
-            next_resets = p.next_reset[place.lane];
+            read<T>(d_hidden, p.d_next_hidden, index.unit);
+            next_resets = p.next_reset[index.lane];
         }
         LstmStep<N> s;
-        read<float>(s.before, p.cell, place.unit);
-        activate<T>(s, p, place);
+        read<float>(s.before, p.cell, index.unit);
+        activate<T>(s, p, index);
         if (next_resets) {
             clear(d_hidden);
             clear(d_after);
@@ -147,11 +147,11 @@ struct LstmBackward {
             s.output[n] = d_h * s.tanh_after[n] * o * (1.f - o);
             d_after[n] = d_cell * f;
         }
-        write<T>(p.d_gates, place.gate, s.input);
-        write<T>(p.d_gates, place.gate + p.width, s.forget);
-        write<T>(p.d_gates, place.gate + 2 * p.width, s.candidate);
-        write<T>(p.d_gates, place.gate + 3 * p.width, s.output);
-        write<float>(p.d_cell, place.unit, d_after);
+        write<T>(p.d_gates, index.gate, s.input);
+        write<T>(p.d_gates, index.gate + p.width, s.forget);
+        write<T>(p.d_gates, index.gate + 2 * p.width, s.candidate);
+        write<T>(p.d_gates, index.gate + 3 * p.width, s.output);
+        write<float>(p.d_cell, index.unit, d_after);
     }
 };
 

@@ -6,7 +6,7 @@ four elements. Gates are before activation. Gates, outputs, hidden states and th
 the compute dtype, cells are float32, resets are bool. Each function writes to its last arguments.
 """
 
-from megastep.agents.networks.kernels.program import CORES, kernel, n_threads, sizes
+from megastep.agents.networks.kernels.library import LIBRARY, kernel, n_threads, sizes
 from megastep.kernels.build.launch import launch
 
 
@@ -21,7 +21,7 @@ def start(reset, last_output, last_cell, hidden, cell):
         cell: (B, W), written.
     """
     launch(
-        *(CORES, kernel("lstm_start", hidden.dtype), hidden.device, n_threads(hidden)),
+        *(LIBRARY, kernel("lstm_start", hidden.dtype), hidden.device, n_threads(hidden)),
         **sizes(hidden),
         reset=reset,
         last_output=last_output,
@@ -41,7 +41,7 @@ def join(reset, x, last_output, joined):
         joined: (B, 2 W), written.
     """
     launch(
-        *(CORES, kernel("lstm_join", x.dtype), last_output.device, n_threads(last_output)),
+        *(LIBRARY, kernel("lstm_join", x.dtype), last_output.device, n_threads(last_output)),
         **sizes(last_output),
         reset=reset,
         x=x,
@@ -63,7 +63,7 @@ def act(gates, reset, last_cell, residual, output, next_output, next_cell):
         next_cell: (B, W), written.
     """
     launch(
-        *(CORES, kernel("lstm_act", gates.dtype), last_cell.device, n_threads(last_cell)),
+        *(LIBRARY, kernel("lstm_act", gates.dtype), last_cell.device, n_threads(last_cell)),
         **sizes(last_cell),
         gates=gates,
         reset=reset,
@@ -88,7 +88,7 @@ def forward(gates, cell, next_reset, output, next_hidden, next_cell):
         next_cell: (B, W), written.
     """
     launch(
-        *(CORES, kernel("lstm_forward", gates.dtype), cell.device, n_threads(cell)),
+        *(LIBRARY, kernel("lstm_forward", gates.dtype), cell.device, n_threads(cell)),
         **sizes(cell),
         gates=gates,
         cell=cell,
@@ -102,7 +102,7 @@ def forward(gates, cell, next_reset, output, next_hidden, next_cell):
 def backward(gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell):
     """Computes the gradients of `forward`'s gates and cell from those of its outputs."""
     launch(
-        *(CORES, kernel("lstm_backward", gates.dtype), cell.device, n_threads(cell)),
+        *(LIBRARY, kernel("lstm_backward", gates.dtype), cell.device, n_threads(cell)),
         **sizes(cell),
         gates=gates,
         cell=cell,

@@ -10,20 +10,20 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
 # Lambdas with type parameters are device code only if everything is.
-PROGRAM = Program(
+LIBRARY = KernelLibrary(
     Path(__file__).parent / "clusters", (*FAST_CUDA_FLAGS, "--device-as-default-execution-space")
 )
 WIDTH = 256
 MIN_STEPS = 2  # for one step, loading the weights takes longer than the products
-MAX_STEPS = PROGRAM.constants["MAX_STEPS"]
-_THREADS = PROGRAM.constants["SEQUENCE_THREADS"]
-_LANES = PROGRAM.constants["SEQUENCE_LANES"]
-_RANKS = WIDTH // PROGRAM.constants["BLOCK_UNITS"]  # blocks of a cluster
-_MEMORY = max(PROGRAM.constants[f"{name}_MEMORY"] for name in ("FORWARD", "BACKWARD"))
+MAX_STEPS = LIBRARY.constants["MAX_STEPS"]
+_THREADS = LIBRARY.constants["SEQUENCE_THREADS"]
+_LANES = LIBRARY.constants["SEQUENCE_LANES"]
+_RANKS = WIDTH // LIBRARY.constants["BLOCK_UNITS"]  # blocks of a cluster
+_MEMORY = max(LIBRARY.constants[f"{name}_MEMORY"] for name in ("FORWARD", "BACKWARD"))
 
 
 def is_supported(x: torch.Tensor) -> bool:
@@ -134,6 +134,6 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
 
 def _where(direction, device, n_clusters):
     """Returns the arguments of a launch but its fields."""
-    shared = PROGRAM.constants[f"{direction.upper()}_MEMORY"]
+    shared = LIBRARY.constants[f"{direction.upper()}_MEMORY"]
     blocks = Blocks(_RANKS * n_clusters, threads=_THREADS, shared=shared)
-    return PROGRAM, f"lstm_sequence_{direction}_{WIDTH}", device, blocks
+    return LIBRARY, f"lstm_sequence_{direction}_{WIDTH}", device, blocks

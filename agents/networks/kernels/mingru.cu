@@ -19,21 +19,21 @@ struct MingruGates {
 
 // Where a thread's units are in step t of an array (T, B, W), and in that of gates (T, B, 2 W).
 template <class Params>
-DEVICE long long unit_at(const Params& p, const Place& place, int t) {
-    return place.unit + t * ((long long)p.n_lanes * p.width);
+DEVICE long long unit_at(const Params& p, const UnitIndex& index, int t) {
+    return index.unit + t * ((long long)p.n_lanes * p.width);
 }
 
 template <class Params>
-DEVICE long long gate_at(const Params& p, const Place& place, int t) {
-    return place.gate + t * (2ll * p.n_lanes * p.width);
+DEVICE long long gate_at(const Params& p, const UnitIndex& index, int t) {
+    return index.gate + t * (2ll * p.n_lanes * p.width);
 }
 
 template <class T, int N, class Params>
-DEVICE void load(MingruGates<T, N>& gates, const Params& p, const Place& place, int t) {
-    long long gate = gate_at(p, place, t);
+DEVICE void load(MingruGates<T, N>& gates, const Params& p, const UnitIndex& index, int t) {
+    long long gate = gate_at(p, index, t);
     load(gates.update, p.gates, gate);
     load(gates.candidate, p.gates, gate + p.width);
-    gates.reset = p.reset[(long long)t * p.n_lanes + place.lane];
+    gates.reset = p.reset[(long long)t * p.n_lanes + index.lane];
 }
 
 template <class T, int N>
@@ -43,11 +43,11 @@ struct MingruForwardInput {
 };
 
 template <class T, int N>
-DEVICE void load(MingruForwardInput<T, N>& input, const MingruForwardParams& p, const Place& place,
-                 int t) {
-    load(input.gates, p, place, t);
+DEVICE void load(MingruForwardInput<T, N>& input, const MingruForwardParams& p,
+                 const UnitIndex& index, int t) {
+    load(input.gates, p, index, t);
     if (p.residual)
-        load(input.residual, p.residual, unit_at(p, place, t));
+        load(input.residual, p.residual, unit_at(p, index, t));
 }
 
 // IS_STEP: the sequence is one step. That takes fewer than 33 registers, so that a multiprocessor
@@ -57,26 +57,26 @@ struct MingruForward {
     static constexpr int N_GATES = 2, AHEAD = IS_STEP ? 1 : STEPS_AHEAD;
 
     template <class T, int N>
-    DEVICE void run(const MingruForwardParams& p, const Place& place) {
+    DEVICE void run(const MingruForwardParams& p, const UnitIndex& index) {
         int n_steps = IS_STEP ? 1 : p.n_steps;
         float state[N];
         MingruForwardInput<T, N> inputs[AHEAD];
 #pragma unroll
         for (int i = 0; i < AHEAD; i++)
-            load(inputs[i], p, place, min(i, n_steps - 1));
-        read<float>(state, p.start, place.unit);
+            load(inputs[i], p, index, min(i, n_steps - 1));
+        read<float>(state, p.start, index.unit);
         for (int first = 0; first < n_steps; first += AHEAD) {
 #pragma unroll
             for (int i = 0; i < AHEAD; i++) {
                 int t = first + i;
                 if (t >= n_steps)
                     break;
-                step(p, unit_at(p, place, t), inputs[i], state);
+                step(p, unit_at(p, index, t), inputs[i], state);
                 if (!IS_STEP)
-                    load(inputs[i], p, place, min(t + AHEAD, n_steps - 1));
+                    load(inputs[i], p, index, min(t + AHEAD, n_steps - 1));
             }
         }
-        write<float>(p.last, place.unit, state);
+        write<float>(p.last, index.unit, state);
     }
 
     template <class T, int N>
@@ -110,10 +110,10 @@ struct MingruBackwardInput {
 // At the first step, `before` is not used.
 template <class T, int N>
 DEVICE void load(MingruBackwardInput<T, N>& input, const MingruBackwardParams& p,
-                 const Place& place, int t) {
-    load(input.gates, p, place, t);
-    load(input.d_output, p.d_outputs, unit_at(p, place, t));
-    load(input.before, p.states, unit_at(p, place, max(t - 1, 0)));
+                 const UnitIndex& index, int t) {
+    load(input.gates, p, index, t);
+    load(input.d_output, p.d_outputs, unit_at(p, index, t));
+    load(input.before, p.states, unit_at(p, index, max(t - 1, 0)));
 }
 
 // Gradients of a thread's units: of the state, and of the gates summed over steps.
@@ -123,7 +123,7 @@ struct MingruGradients {
 };
 
 template <class T, int N>
-DEVICE void backward_step(const MingruBackwardParams& p, const Place& place, int t,
+DEVICE void backward_step(const MingruBackwardParams& p, const UnitIndex& index, int t,
                           const MingruBackwardInput<T, N>& input, float (&before)[N],
                           MingruGradients<N>& d) {
     float update[N], candidate[N], d_output[N], d_update[N], d_candidate[N];
@@ -143,24 +143,24 @@ DEVICE void backward_step(const MingruBackwardParams& p, const Place& place, int
     if (input.gates.reset)
         clear(d.state);
     if (p.d_residual)
-        write<T>(p.d_residual, unit_at(p, place, t), d_output);
-    long long gate = gate_at(p, place, t);
+        write<T>(p.d_residual, unit_at(p, index, t), d_output);
+    long long gate = gate_at(p, index, t);
     write<T>(p.d_gates, gate, d_update);
     write<T>(p.d_gates, gate + p.width, d_candidate);
 }
 
 // All steps of a thread's units. Adds its gates' gradients to the sums of `d`.
 template <class T, int N>
-DEVICE void backward_steps(const MingruBackwardParams& p, const Place& place,
+DEVICE void backward_steps(const MingruBackwardParams& p, const UnitIndex& index,
                            MingruGradients<N>& d) {
     MingruBackwardInput<T, N> inputs[STEPS_AHEAD];
 #pragma unroll
     for (int i = 0; i < STEPS_AHEAD; i++)
-        load(inputs[i], p, place, max(p.n_steps - 1 - i, 0));
+        load(inputs[i], p, index, max(p.n_steps - 1 - i, 0));
     float start[N];
-    read<float>(start, p.start, place.unit);
+    read<float>(start, p.start, index.unit);
     if (p.d_last)
-        read<float>(d.state, p.d_last, place.unit);
+        read<float>(d.state, p.d_last, index.unit);
     for (int last = p.n_steps - 1; last >= 0; last -= STEPS_AHEAD) {
 #pragma unroll
         for (int i = 0; i < STEPS_AHEAD; i++) {
@@ -171,12 +171,12 @@ DEVICE void backward_steps(const MingruBackwardParams& p, const Place& place,
             unpack(before, inputs[i].before);
             for (int n = 0; n < N; n++)
                 before[n] = t ? before[n] : start[n];
-            backward_step(p, place, t, inputs[i], before, d);
-            load(inputs[i], p, place, max(t - STEPS_AHEAD, 0));
+            backward_step(p, index, t, inputs[i], before, d);
+            load(inputs[i], p, index, max(t - STEPS_AHEAD, 0));
         }
     }
     if (p.d_start)
-        write<float>(p.d_start, place.unit, d.state);
+        write<float>(p.d_start, index.unit, d.state);
 }
 
 // Adds up a gate's sums over the lanes of the block, in order, and writes its row of d_biases.
@@ -197,21 +197,21 @@ DEVICE void add_lanes(const float (&sums)[N], int width, float* target) {
 
 template <class T, int N>
 DEVICE void backward(const MingruBackwardParams& p) {
-    Place place;
-    bool exists = find_place<2>(p, place);
+    UnitIndex index;
+    bool exists = find_index<2>(p, index);
     MingruGradients<N> d;
     clear(d.state);
     clear(d.update_sum);
     clear(d.candidate_sum);
     if (exists)
-        backward_steps<T>(p, place, d);
+        backward_steps<T>(p, index, d);
     if (p.adds_lanes) {
         float* row = p.d_biases + 2ll * p.width * blockIdx.x;
         add_lanes(d.update_sum, p.width, row);
         add_lanes(d.candidate_sum, p.width, row + p.width);
     } else if (exists) {
-        write<float>(p.d_biases, place.gate, d.update_sum);
-        write<float>(p.d_biases, place.gate + p.width, d.candidate_sum);
+        write<float>(p.d_biases, index.gate, d.update_sum);
+        write<float>(p.d_biases, index.gate + p.width, d.candidate_sum);
     }
 }
 

@@ -7,8 +7,8 @@ bool.
 """
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.program import (
-    CORES,
+from megastep.agents.networks.kernels.library import (
+    LIBRARY,
     kernel,
     n_threads,
     sizes,
@@ -29,7 +29,7 @@ def forward(gates, reset, start, residual, states, outputs, last):
     """
     operation = "mingru_step" if len(gates) == 1 else "mingru_forward"
     launch(
-        *(CORES, kernel(operation, gates.dtype), start.device, n_threads(start)),
+        *(LIBRARY, kernel(operation, gates.dtype), start.device, n_threads(start)),
         **sizes(start),
         gates=gates,
         reset=reset,
@@ -62,7 +62,7 @@ def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d
     d_biases = start.new_empty(-(-n_lanes // per_block), gates.shape[-1])
     blocks = Blocks(-(-n_threads(start) // block), threads=block, shared=4 * n_units * block)
     launch(
-        *(CORES, kernel("mingru_backward", gates.dtype), start.device, blocks),
+        *(LIBRARY, kernel("mingru_backward", gates.dtype), start.device, blocks),
         **sizes(start),
         gates=gates,
         reset=reset,

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.library import aligned
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
-from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 
-PROGRAM = Program(Path(__file__).parent / "acting", FAST_CUDA_FLAGS)
+LIBRARY = KernelLibrary(Path(__file__).parent / "acting", FAST_CUDA_FLAGS)
 _LANES, _UNITS, _PARTS, _THREADS = (
-    PROGRAM.constants[f"STEP_{name}"] for name in "LANES UNITS PARTS THREADS".split()
+    LIBRARY.constants[f"STEP_{name}"] for name in "LANES UNITS PARTS THREADS".split()
 )
 WIDTHS = tuple(range(_UNITS, (_PARTS + 1) * _UNITS, _UNITS))
 
@@ -55,7 +55,7 @@ def forward(
     outputs, last = torch.empty_like(x), torch.empty_like(start)
     width = x.shape[-1]
     launch(
-        *(PROGRAM, f"mingru_step_{width}", x.device, blocks(len(start), width)),
+        *(LIBRARY, f"mingru_step_{width}", x.device, blocks(len(start), width)),
         x=x,
         weight=aligned(weight),
         bias=aligned(bias),
@@ -77,6 +77,6 @@ def blocks(n_lanes: int, width: int, n_policies: int = 1) -> Blocks:
 
 def _shared(width):
     """Returns the bytes of shared memory of a block."""
-    n_bytes = PROGRAM.constants
+    n_bytes = LIBRARY.constants
     of_parts = width // _UNITS * n_bytes["PART_BYTES"]
     return of_parts + _LANES * n_bytes["STATE_BYTES"] + n_bytes["BIAS_BYTES"]

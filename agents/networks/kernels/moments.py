@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import torch
 
-from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.kernels.build.launch import Blocks, launch
 
-MAX_LEAVES = CORES.constants["MAX_LEAVES"]
-MAX_ARRAYS = CORES.constants["MASKED_ARRAYS"]
-_THREADS = CORES.constants["MASKED_THREADS"]
-_MOMENTS_THREADS = CORES.constants["MOMENTS_THREADS"]
+MAX_LEAVES = LIBRARY.constants["MAX_LEAVES"]
+MAX_ARRAYS = LIBRARY.constants["MASKED_ARRAYS"]
+_THREADS = LIBRARY.constants["MASKED_THREADS"]
+_MOMENTS_THREADS = LIBRARY.constants["MOMENTS_THREADS"]
 
 
 def moments(
@@ -30,7 +30,7 @@ def moments(
     results = torch.empty(2 * total, device=device)
     n_counted = torch.empty((), dtype=torch.int64, device=device)
     packed = [
-        CORES.params.IntakeLeafParams(
+        LIBRARY.params.IntakeLeafParams(
             values=leaf,
             mean=None,
             scale=None,
@@ -41,7 +41,7 @@ def moments(
         for leaf, n in zip(leaves, n_statistics, strict=True)
     ]
     launch(
-        *(CORES, "moments", device, Blocks(total, threads=_MOMENTS_THREADS)),
+        *(LIBRARY, "moments", device, Blocks(total, threads=_MOMENTS_THREADS)),
         leaves=b"".join(packed),
         is_counted=is_counted.contiguous(),
         moments=results,
@@ -67,7 +67,7 @@ def add_moments(norms: list, all_moments: list, is_counted: torch.Tensor | None 
         mean, variance, n_counted = mean.contiguous(), variance.contiguous(), n_counted.long()
         kept += [mean, variance, n_counted]  # until the launch
         packed.append(
-            CORES.params.RunningNormParams(
+            LIBRARY.params.RunningNormParams(
                 mean=norm.mean,
                 scale=norm.scale,
                 count=norm.count,
@@ -79,7 +79,7 @@ def add_moments(norms: list, all_moments: list, is_counted: torch.Tensor | None 
         )
     blocks = Blocks(len(packed), threads=_MOMENTS_THREADS)
     launch(
-        *(CORES, "add_moments", norms[0].mean.device, blocks),
+        *(LIBRARY, "add_moments", norms[0].mean.device, blocks),
         norms=b"".join(packed),
         is_counted=is_counted,
     )
@@ -95,13 +95,13 @@ def masked_moments(
         valid: bool, of the same shape.
     """
     n_numbers, tensor = arrays[0].numel(), arrays[0]
-    n_parts = max(1, -(-n_numbers // (_THREADS * CORES.constants["MASKED_NUMBERS"])))
+    n_parts = max(1, -(-n_numbers // (_THREADS * LIBRARY.constants["MASKED_NUMBERS"])))
     parts = tensor.new_empty(len(arrays), n_parts, 3)
     moments = tensor.new_empty(len(arrays), 2)
     n_valid = torch.empty((), dtype=torch.int64, device=tensor.device)
-    pack = CORES.params.MaskedArrayParams
+    pack = LIBRARY.params.MaskedArrayParams
     launch(
-        *(CORES, "masked_parts", tensor.device, Blocks(n_parts, len(arrays), _THREADS)),
+        *(LIBRARY, "masked_parts", tensor.device, Blocks(n_parts, len(arrays), _THREADS)),
         arrays=b"".join(pack(values=array) for array in arrays),
         valid=valid,
         parts=parts,
@@ -109,7 +109,7 @@ def masked_moments(
         n_arrays=len(arrays),
     )
     launch(
-        *(CORES, "masked_moments", tensor.device, Blocks(1, len(arrays), _THREADS)),
+        *(LIBRARY, "masked_moments", tensor.device, Blocks(1, len(arrays), _THREADS)),
         parts=parts,
         moments=moments,
         n_valid=n_valid,
@@ -132,7 +132,7 @@ def normalise_masked(
     """
     normalised = torch.empty_like(x)
     launch(
-        *(CORES, "normalise_masked", x.device, x.numel()),
+        *(LIBRARY, "normalise_masked", x.device, x.numel()),
         **dict(values=x, valid=valid, mean=mean, variance=variance),
         normalised=normalised,
         n=x.numel(),
@@ -151,7 +151,7 @@ def add_returns(output, moments: tuple, is_counted: torch.Tensor | None, min_rat
     """
     n_valid, mean, variance = moments
     launch(
-        *(CORES, "add_returns", output.mean.device, Blocks(1, threads=_THREADS)),
+        *(LIBRARY, "add_returns", output.mean.device, Blocks(1, threads=_THREADS)),
         weight=output.linear.weight,
         bias=output.linear.bias,
         mean=output.mean,

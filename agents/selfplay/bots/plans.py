@@ -122,9 +122,9 @@ class Plans:
         """Returns the lengths (n, K) of straight ways from points (n, 2) to others (n, K, 2), more
         if they are narrow, and more than `BLOCKED` if there is a wall.
         """
-        share = torch.linspace(0, 1, n_samples + 1, device=start.device)[1:, None]
+        fraction = torch.linspace(0, 1, n_samples + 1, device=start.device)[1:, None]
         offsets = ends - start[:, None]
-        points = start[:, None, None] + share * offsets[:, :, None]
+        points = start[:, None, None] + fraction * offsets[:, :, None]
         room = self.clearances(plan, points).amin(-1) - self._radius
         lengths = offsets.norm(dim=-1) + NARROW * (WIDE - room).clamp(min=0)
         return lengths + BLOCKED * (room < -TIGHT)
@@ -133,8 +133,8 @@ class Plans:
         """Returns clearances that are interpolated between the centres of cells."""
         corner = points - CELL / 2
         origin = self._origins[plan].view(-1, *[1] * (points.ndim - 2), 2)
-        share = ((corner - origin) / CELL).frac()[..., None, :]
-        weights = torch.where(self._corners > 0, share, 1 - share).prod(-1)
+        fraction = ((corner - origin) / CELL).frac()[..., None, :]
+        weights = torch.where(self._corners > 0, fraction, 1 - fraction).prod(-1)
         beside = corner[..., None, :] + CELL * self._corners
         return (weights * self.clearances(plan, beside)).sum(-1)
 
@@ -144,8 +144,8 @@ class Plans:
 
     def _at(self, grids, plan, points, size):
         shape = len(plan), *[1] * (points.ndim - 2)
-        place = (points - self._origins[plan].view(*shape, 2)) / size
-        column, row = place.long().unbind(-1)
+        cells = (points - self._origins[plan].view(*shape, 2)) / size
+        column, row = cells.long().unbind(-1)
         height, width = grids.shape[1:]
         row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
         return grids.view(-1)[(plan.view(shape) * height + row) * width + column]

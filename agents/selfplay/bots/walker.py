@@ -55,8 +55,8 @@ class Walker:
             target = self.goal_index[steering.lanes].long()
         else:
             target = state["target"]
-            place = steering.plans.targets[pose.plan, target]
-            is_over = (place - pose.position).norm(dim=-1) < ARRIVED
+            goal = steering.plans.targets[pose.plan, target]
+            is_over = (goal - pose.position).norm(dim=-1) < ARRIVED
             is_over |= world["reset"] | (patience <= 0)
             lengths = steering.lengths(near).float()
             draws = torch.rand(lengths.shape, generator=generator, device=target.device)

@@ -46,10 +46,10 @@ struct SumTreeParams {
 
 struct SampleTreeParams {
     SumTreeParams tree;
-    const double* shares;  // (M) from 0 to 1
-    long long* index;      // (M), written
-    double* probability;   // (M), written
-    int n_samples;         // M
+    const double* fractions;  // (M) from 0 to 1
+    long long* index;         // (M), written
+    double* probability;      // (M), written
+    int n_samples;            // M
 };
 
 struct SetTreeParams {

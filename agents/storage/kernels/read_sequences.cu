@@ -90,8 +90,8 @@ DEVICE void read_weights(const ReadSequencesParams& p) {
     __shared__ double of_warps[READ_THREADS / WARP];
     double largest = 0.;
     for (unsigned int i = threadIdx.x; i < p.n_sequences; i += blockDim.x) {
-        double share = (double)*p.n_available * p.probability[i];
-        double weight = pow(share < 1e-30 ? 1e-30 : share, -(double)p.beta);
+        double ratio = (double)*p.n_available * p.probability[i];
+        double weight = pow(ratio < 1e-30 ? 1e-30 : ratio, -(double)p.beta);
         p.weights[i] = weight;
         largest = fmax(largest, weight);
         long long age = *p.n_added - 1 - start_of(p, i).slot, n = p.n_rollouts;

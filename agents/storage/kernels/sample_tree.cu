@@ -15,7 +15,7 @@ KERNEL sample_tree(SampleTreeParams p) {
             total = sum;
             for (int mask = WARP / 2; mask; mask /= 2)
                 total += __shfl_xor_sync(~0u, total, mask);
-            rest = (p.shares[sample] + sample) / p.n_samples * total;
+            rest = (p.fractions[sample] + sample) / p.n_samples * total;
         }
         int child = find_child(sum, rest);
         if (!level && lane == child) {

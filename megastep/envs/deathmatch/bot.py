@@ -8,11 +8,11 @@ import torch
 from megastep.arrdict import arrdict
 from megastep.engine import checks
 from megastep.engine.devices import threads
-from megastep.envs.deathmatch.step import PROGRAM
+from megastep.envs.deathmatch.step import LIBRARY
 from megastep.kernels.build.launch import WARP, launch
 
 _STATE = dict(lost=torch.int64, side=torch.int64, around=torch.int64, pushed=torch.bool)
-LOOK = PROGRAM.constants["LOOK"]
+LOOK = LIBRARY.constants["LOOK"]
 
 
 class Bot:
@@ -76,7 +76,7 @@ class Bot:
         )
         reset, lanes = reset.contiguous(), (n_lanes,)
         launch(
-            *(PROGRAM, "bot", device, WARP * n_lanes),
+            *(LIBRARY, "bot", device, WARP * n_lanes),
             rgb=rgb,
             depth=depth,
             imu=imu,

@@ -12,17 +12,17 @@ from megastep.engine.devices import threads
 from megastep.engine.launch_params import lanes_of, state_params
 from megastep.engine.outputs import Observation
 from megastep.engine.scenery import Scenery
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
-from megastep.kernels.build.program import Program
 
 __all__ = [
-    *("MAX_AGENTS", "PROGRAM", "TALLY_ROWS"),
+    *("MAX_AGENTS", "LIBRARY", "TALLY_ROWS"),
     *("DeathmatchStep", "deathmatch_step", "privileged_size"),
 ]
 
-PROGRAM = Program(Path(__file__).parent / "kernels")
-MAX_AGENTS = PROGRAM.constants["MAX_AGENTS"]  # per environment
-TALLY_ROWS = PROGRAM.constants["TALLY_ROWS"]
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
+MAX_AGENTS = LIBRARY.constants["MAX_AGENTS"]  # per environment
+TALLY_ROWS = LIBRARY.constants["TALLY_ROWS"]
 
 
 class DeathmatchStep(NamedTuple):
@@ -42,7 +42,7 @@ def privileged_size(n_agents: int) -> int:
     """Returns the size of the privileged observation: the agent's health, and five numbers per
     other agent.
     """
-    return 1 + PROGRAM.constants["PRIVILEGED_PER_OPPONENT"] * (n_agents - 1)
+    return 1 + LIBRARY.constants["PRIVILEGED_PER_OPPONENT"] * (n_agents - 1)
 
 
 def deathmatch_step(
@@ -133,7 +133,7 @@ def deathmatch_step(
         ),
     )
     launch(
-        *(PROGRAM, "deathmatch_step", device, n),
+        *(LIBRARY, "deathmatch_step", device, n),
         centre_line=checks.address(
             "view.centre_line", view.centre_line, lanes, torch.int32, device
         ),

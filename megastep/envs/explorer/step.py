@@ -16,15 +16,15 @@ from megastep.engine.launch_params import (
 )
 from megastep.engine.scenery import Scenery
 from megastep.envs.explorer.texel_runs import TexelRuns
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import WARP, launch
-from megastep.kernels.build.program import Program
 from megastep.modules.visibility import TEXELS_PER_POINT
 
-__all__ = ["N_BINS", "N_EPISODE", "PROGRAM", "ExplorerStep", "explorer_step"]
+__all__ = ["N_BINS", "N_EPISODE", "LIBRARY", "ExplorerStep", "explorer_step"]
 
-PROGRAM = Program(Path(__file__).parent / "kernels")
-N_EPISODE = PROGRAM.constants["N_EPISODE"]  # numbers that a critic sees of an episode
-N_BINS = PROGRAM.constants["BANDS"] * PROGRAM.constants["SECTORS"]
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
+N_EPISODE = LIBRARY.constants["N_EPISODE"]  # numbers that a critic sees of an episode
+N_BINS = LIBRARY.constants["BANDS"] * LIBRARY.constants["SECTORS"]
 
 
 class ExplorerStep(NamedTuple):
@@ -91,7 +91,7 @@ def explorer_step(
     if coverage or privileged:
         tables = checks.instance("runs", runs, TexelRuns).addresses(scenery, n_words)
     launch(
-        *(PROGRAM, "explorer_step", device, n_lanes * WARP if privileged else n_lanes),
+        *(LIBRARY, "explorer_step", device, n_lanes * WARP if privileged else n_lanes),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         newly_seen=checks.address("newly_seen", newly_seen, lanes, torch.int32, device),

@@ -44,7 +44,7 @@ class Gymnasium(VectorizedEnv):
         Terminal and truncated as the environment says. If it says both, terminal.
 
     Metrics:
-        None.
+        The numbers in the last ``info`` of an episode, such as ``is_success``, at most 16.
 
     Args:
         n_envs: number of environments, N.
@@ -54,7 +54,11 @@ class Gymnasium(VectorizedEnv):
         wrappers: import paths of Gymnasium's wrappers, ``package.module:Wrapper``, put around every
             environment in this order.
         vectorization: sync, async or own.
+        restart_failed: how often each environment is made anew after an error of its own. The
+            episode is then truncated. Not with own.
         seed: each environment is reset with a seed of its own, which derives from this one.
+        films: renders images from the start, if it can. Some environments make their renderer in
+            the constructor, and some step more slowly with it.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
 
@@ -67,10 +71,14 @@ class Gymnasium(VectorizedEnv):
         kwargs: dict[str, Any] | None = None,
         wrappers: tuple[str, ...] = (),
         vectorization: Literal["sync", "async", "own"] = "sync",
+        restart_failed: Annotated[int, Field(ge=0, le=1_000_000)] = 0,
         seed: int = 1,
+        films: bool = False,
         device: torch.device | str | None = None,
     ):
-        vector = vector_env(id, n_envs, kwargs or {}, wrappers, vectorization)
+        vector = vector_env(
+            id, n_envs, kwargs or {}, wrappers, vectorization, restart_failed, films
+        )
         # one seed for each, or one for all
         seeds = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
         seeds = seeds[0] if vectorization == "own" else seeds

@@ -1,5 +1,6 @@
 """Makes Gymnasium's vector environments. Errors are one sentence with the likely cure."""
 
+import contextlib
 import difflib
 import functools
 import importlib
@@ -7,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from megastep.imports import import_object, search_current_folder
+from megastep.sync_envs import SyncEnvs, make_env, names_of_numbers
 from megastep.vector_processes import VectorProcesses
 
 __all__ = ["vector_env"]
@@ -20,6 +22,8 @@ def vector_env(
     kwargs: Mapping[str, Any],
     wrappers: Sequence[str],
     vectorization: str,
+    restart_failed: int = 0,
+    films: bool = False,
 ) -> Any:
     """Returns a vector environment. The step after an episode's end resets it.
 
@@ -37,20 +41,31 @@ def vector_env(
         wrappers = [import_object(name) for name in wrappers]
     except ValueError as error:
         raise ValueError(f"env.wrappers: {error}") from None
-    make = functools.partial(gymnasium.make_vec, spec)
     try:
         if vectorization == "own":
-            return _checked(id, _own(make, spec, wrappers, n_envs, kwargs))
+            if restart_failed:
+                raise ValueError(
+                    "env.restart_failed makes single environments anew, which its own vector "
+                    "environment has not; use env.vectorization=sync or async"
+                )
+            make_vec = functools.partial(gymnasium.make_vec, spec)
+            return _checked(id, _own(make_vec, spec, wrappers, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
         settings = {"disable_env_checker": True, **kwargs}
-        make = functools.partial(
-            make,
-            vectorization_mode="sync",
-            vector_kwargs={"copy": False},
-            wrappers=wrappers,
-            **settings,
-        )
-        return make(num_envs=n_envs) if vectorization == "sync" else VectorProcesses(make, n_envs)
+        example = make_env(spec, wrappers, settings)
+        max_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
+        if films and "rgb_array" in (example.metadata.get("render_modes") or ()):
+            settings = {"render_mode": "rgb_array", **settings}
+        make_one = functools.partial(make_env, spec, wrappers, settings)
+        make = functools.partial(SyncEnvs, make_one, restart_failed=restart_failed)
+        if vectorization == "sync":
+            vector = make(n_envs=n_envs, names=names_of_numbers(example))
+        else:  # a fault may end the process that it happens in
+            vector = VectorProcesses(make, n_envs)
+            with contextlib.suppress(Exception):
+                example.close()
+        vector.max_episode_steps = max_steps
+        return vector
     except gymnasium.error.DependencyNotInstalled as error:
         raise ValueError(f"{id} needs a package that is missing: {_line(error)}") from None
     except ValueError as error:

@@ -1,5 +1,7 @@
 """Host memory through which worlds reach the learner's device and actions come back."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -19,11 +21,19 @@ class HostBuffers:
         obs_space: space of one lane's observation.
         action_space: space of one lane's actions.
         device: where worlds go and actions come from.
+        metrics: names of the metrics in worlds.
     """
 
     IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
 
-    def __init__(self, n_lanes: int, obs_space: Space, action_space: Space, device: torch.device):
+    def __init__(
+        self,
+        n_lanes: int,
+        obs_space: Space,
+        action_space: Space,
+        device: torch.device,
+        metrics: Sequence[str] = (),
+    ):
         self.device, self.on_gpu = device, device.type == "cuda"
 
         def empty(dtype, *shape):
@@ -37,6 +47,8 @@ class HostBuffers:
         self.world = arrdict(
             obs=spaces.map(of_space, obs_space), reward=empty(torch.float32), **flags
         )
+        if metrics:
+            self.world["metrics"] = arrdict({name: empty(torch.float32) for name in metrics})
         self.actions = spaces.map(of_space, action_space)
         self.arrays = [leaf.numpy() for leaf in leaves(self.world)]
         self.copied = torch.cuda.Event() if self.on_gpu else None

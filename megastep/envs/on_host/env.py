@@ -3,7 +3,9 @@
 N environments of A agents each, B = N A lanes.
 """
 
+import contextlib
 import functools
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,12 +14,21 @@ import torch
 
 from megastep import engine
 from megastep.arrdict import arrdict
+from megastep.contract import RESERVED
 from megastep.env_state import EnvState
 from megastep.envs.on_host.buffers import HostBuffers
-from megastep.envs.on_host.spaces import actions, observation
+from megastep.envs.on_host.frames import as_frame
+from megastep.envs.on_host.spaces import RESERVED as RESERVED_KEYS
+from megastep.envs.on_host.spaces import actions, identifiers, observation
+from megastep.sync_envs import EnvError
 from megastep.vector_processes import VectorProcesses, start_rendering
 
 __all__ = ["VectorizedEnv"]
+
+#: The most numbers of an ``info`` that become metrics.
+MAX_NUMBERS = 16
+#: Steps of an episode in an evaluation, of environments whose specification names no limit.
+MAX_EPISODE_STEPS = 10_000
 
 
 class VectorizedEnv:
@@ -27,7 +38,8 @@ class VectorizedEnv:
         id: name of the environments in messages.
         vector: has ``single_observation_space``, ``single_action_space``, ``metadata``,
             ``render_mode``, ``reset(seed=)``, ``step(actions)``, ``render()`` and ``close()``, as
-            Gymnasium's vector environments do, with a row per lane.
+            Gymnasium's vector environments do, with a row per lane. If it has ``names``, the fifth
+            part of a step is as that of :class:`~megastep.sync_envs.SyncEnvs`.
         n_envs: number of environments, N.
         n_agents: lanes per environment, A.
         seeds: passed to the first ``vector.reset``, one per environment or one for all.
@@ -38,6 +50,7 @@ class VectorizedEnv:
     """
 
     capturable = False
+    _has_warned = False  # of an environment that was made anew
 
     def __init__(
         self,
@@ -51,28 +64,95 @@ class VectorizedEnv:
         self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
         self.device, self._seeds = engine.device(device), seeds
         self.fps = float(vector.metadata.get("render_fps") or 10)
+        self.max_episode_steps = getattr(vector, "max_episode_steps", None) or MAX_EPISODE_STEPS
         try:
             self.obs_space, self._read = observation(vector.single_observation_space)
             self.action_space, self._write = actions(vector.single_action_space)
         except ValueError as error:
-            self.close()
+            with contextlib.suppress(EnvError):
+                self.close()
             raise ValueError(f"{id}: {error}") from None
         n_lanes = n_envs * n_agents
-        self._buffers = HostBuffers(n_lanes, self.obs_space, self.action_space, self.device)
+        names = getattr(vector, "names", ())
+        if left_out := names[MAX_NUMBERS:]:
+            warnings.warn(
+                f"{id}: the last info of an episode has {len(names)} numbers; {MAX_NUMBERS} become "
+                f"metrics, and {', '.join(left_out)} do not",
+                stacklevel=3,
+            )
+        names = names[:MAX_NUMBERS]
+        reserved = {*RESERVED_KEYS, *RESERVED, "restarts"}
+        self._metrics = {
+            name: (key, np.zeros(n_lanes, np.float32))
+            for name, key in zip(identifiers(names, reserved), names)
+        }
+        self._buffers = HostBuffers(
+            n_lanes, self.obs_space, self.action_space, self.device, [*self._metrics]
+        )
         self._ended = np.ones(n_lanes, bool)
+        self._n_restarts = np.zeros(1, np.int64)  # an array, so that checkpoints hold it
 
     def reset(self) -> arrdict:
-        """Starts a new episode in every lane. Returns the first world."""
-        obs, _ = self.vector.reset(seed=self._seeds)
+        """Starts a new episode in every lane. Returns the first world.
+
+        Raises:
+            EnvError: an environment failed.
+        """
+        obs, news = self._call(self.vector.reset, seed=self._seeds)
+        self._read_news(news, self._ended)
         self._seeds = None
         self._ended[:] = True
         return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended)
 
     def step(self, decision: Mapping) -> arrdict:
-        """Takes one step by ``decision["actions"]``. Returns a world."""
+        """Takes one step by ``decision["actions"]``. Returns a world.
+
+        Raises:
+            EnvError: an environment failed.
+        """
         actions = self._write(self._buffers.receive(decision["actions"]))
-        obs, reward, terminated, truncated, _ = self.vector.step(actions)
+        obs, reward, terminated, truncated, news = self._call(self.vector.step, actions)
+        self._read_news(news, terminated | truncated)
         return self._world(obs, reward, terminated, truncated)
+
+    def pop_restarts(self) -> int | None:
+        """Returns how many environments were made anew after an error since the last call, None if
+        none ever is.
+        """
+        if not getattr(self.vector, "restart_failed", 0):
+            return None
+        n_restarts = int(self._n_restarts[0])
+        self._n_restarts[:] = 0
+        return n_restarts
+
+    def _call(self, function, *arguments, **more):
+        """Calls a method of the environments. Raises EnvError for their errors."""
+        try:
+            return function(*arguments, **more)
+        except EnvError as error:
+            raise EnvError(f"{self.id}: {error}", error.trace) from error
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise EnvError.of(error, f"{self.id}: an environment") from error
+
+    def _read_news(self, news, ended):
+        """Keeps the numbers of episodes that ended, and counts environments that were made anew."""
+        if not news or not hasattr(self.vector, "names"):
+            return
+        for key, values in self._metrics.values():
+            if "numbers" in news:
+                np.copyto(values, news["numbers"][key], "unsafe", where=ended)
+        for failure in news.get("failures", ()):
+            if not self._has_warned:
+                self._has_warned = True
+                warnings.warn(
+                    f"{self.id}: {failure}; it was made anew, as it and the others will be up to "
+                    f"restart_failed={self.vector.restart_failed} times each; metrics count them "
+                    "as episode/restarts",
+                    stacklevel=3,
+                )
+            self._n_restarts += 1
 
     @functools.cached_property
     def resumable(self) -> bool:
@@ -83,14 +163,19 @@ class VectorizedEnv:
         return is_here and not EnvState(self).unreachable()
 
     def close(self) -> None:
-        """Closes the environments, and ends their processes."""
-        self.vector.close()
+        """Closes the environments, and ends their processes.
+
+        Raises:
+            EnvError: an environment failed at it.
+        """
+        self._call(self.vector.close)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns the frame of environment ``e``, (H, W, 3) uint8, as the environment renders it.
 
         Raises:
             ValueError: if it renders no images.
+            EnvError: if it fails.
         """
         start_rendering(self.vector)
         if self.vector.render_mode != "rgb_array":
@@ -98,7 +183,10 @@ class VectorizedEnv:
                 f"{self.id} renders no images: it has no render mode rgb_array, or env.kwargs "
                 "chooses another"
             )
-        return arrdict(frame=torch.from_numpy(np.array(self.vector.render()[e])))
+        try:
+            return arrdict(frame=torch.from_numpy(as_frame(self._call(self.vector.render)[e])))
+        except ValueError as error:
+            raise ValueError(f"{self.id}: {error}") from None
 
     @staticmethod
     def plot_state(state: arrdict) -> np.ndarray:
@@ -111,12 +199,13 @@ class VectorizedEnv:
         terminal = terminated > reset
         truncated = truncated > (reset | terminal)
         np.logical_or(terminal, truncated, out=self._ended)
-        return self._buffers.send(
-            arrdict(
-                obs=self._read(obs),
-                reward=np.where(reset, 0.0, reward),
-                reset=reset,
-                terminal=terminal,
-                truncated=truncated,
-            )
+        world = arrdict(
+            obs=self._read(obs),
+            reward=np.where(reset, 0.0, reward),
+            reset=reset,
+            terminal=terminal,
+            truncated=truncated,
         )
+        if self._metrics:
+            world["metrics"] = arrdict({name: of[1] for name, of in self._metrics.items()})
+        return self._buffers.send(world)

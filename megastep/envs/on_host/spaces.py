@@ -5,7 +5,7 @@ N environments, one agent each; `...` the shape of a Gymnasium space.
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -18,10 +18,11 @@ from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
 from megastep.types import Space
 
-__all__ = ["actions", "observation"]
+__all__ = ["actions", "identifiers", "observation"]
 
-#: The fewest rows and columns, and the most channels, of an image.
-MIN_SIDE, MAX_CHANNELS = 8, 4
+#: The fewest rows and columns of an image, those of one of floats without an axis for channels, and
+#: the channels up to which any array with so many rows and columns is an image.
+MIN_SIDE, MIN_FLOAT_SIDE, FEW_CHANNELS = 8, 16, 4
 CURE = "env.wrappers=[package.module:Wrapper]"
 #: Names that no part of a space can have: attributes of the trees and modules whose keys they are.
 RESERVED = {*dir(arrdict), *dir(nn.ModuleDict())}
@@ -54,7 +55,7 @@ def observation(space: Any, path: str = "observation") -> Conversion:
         if len({*sizes}) == 1:
             whole = spaces.MultiDiscrete(len(sizes), sizes[0])
             return whole, lambda x: (x - space.start).reshape(columns)
-        names = _identifiers(range(len(sizes)))
+        names = identifiers(range(len(sizes)))
         return _choices(names, sizes), lambda x: arrdict(
             zip(names, np.split((x - space.start).reshape(columns), len(names), 1))
         )
@@ -101,7 +102,7 @@ def actions(space: Any, path: str = "action") -> Conversion:
         if len({*sizes}) == 1:
             whole = spaces.MultiDiscrete(len(sizes), sizes[0])
             return whole, lambda x: (x.reshape(shape) + space.start).astype(dtype)
-        names = _identifiers(range(len(sizes)))
+        names = identifiers(range(len(sizes)))
         return _choices(names, sizes), lambda tree: (
             np.concatenate([tree[name] for name in names], 1).reshape(shape) + space.start
         ).astype(dtype)
@@ -133,20 +134,62 @@ def _reshaped(shape, dtype, array):
 
 
 def _image(space):
-    """Returns the conversion of a Box that is an image, channels last or first; None if it is not.
+    """Returns the conversion of a Box that is an image or a stack of images, None if it is not.
 
-    The rows and columns of an image tell which axis has its channels.
+    What has other axes than rows, columns and a few channels must be uint8 or have the same bounds
+    everywhere, unlike a stack of vectors.
     """
-    if type(space).__name__ != "Box" or len(space.shape) != 3:
+    if type(space).__name__ != "Box" or len(space.shape) not in (2, 3, 4) or 0 in space.shape:
         return None
-    dtype = torch.uint8 if space.dtype == np.uint8 else torch.float32
-    first, rows, last = space.shape
-    if min(first, rows) >= MIN_SIDE and last <= MAX_CHANNELS:
-        image = spaces.MultiImage(1, last, first, rows, dtype=dtype)
-        return image, lambda x: x.transpose(0, 3, 1, 2)[:, None]
-    if min(rows, last) >= MIN_SIDE and first <= MAX_CHANNELS:
-        return spaces.MultiImage(1, first, rows, last, dtype=dtype), lambda x: x[:, None]
-    return None
+    is_uint8, shape = space.dtype == np.uint8, space.shape
+    is_uniform = is_uint8 or all((x == x.flat[0]).all() for x in (space.low, space.high))
+    if len(shape) == 2:
+        is_bounded = is_uint8 or (is_uniform and np.isfinite([space.low, space.high]).all())
+        if not is_bounded or min(shape) < (MIN_SIDE if is_uint8 else MIN_FLOAT_SIDE):
+            return None
+        channels, rows = 1, shape
+        convert = _grey
+    else:
+        n_stacked, shape = math.prod(shape[:-3]), shape[-3:]
+        is_last = _has_channels_last(shape, is_uniform)
+        if is_last is None or (n_stacked > 1 and not is_uniform):
+            return None
+        channels = n_stacked * (shape[2] if is_last else shape[0])
+        rows = shape[:2] if is_last else shape[1:]
+        convert = _channels_last if is_last else _channels_first
+    dtype = torch.uint8 if is_uint8 else torch.float32
+    return spaces.MultiImage(1, channels, *rows, dtype=dtype), convert
+
+
+def _has_channels_last(shape, is_uniform):
+    """Returns which axis of an image has its channels: False for the first, None if it is none.
+
+    Few channels tell it, then two sides of one length, then the shorter axis.
+    """
+    first, middle, last = shape
+    can_be_last, can_be_first = min(first, middle) >= MIN_SIDE, min(middle, last) >= MIN_SIDE
+    if can_be_last and last <= FEW_CHANNELS:
+        return True
+    if can_be_first and first <= FEW_CHANNELS:
+        return False
+    if not is_uniform or not (can_be_last or can_be_first):
+        return None
+    if can_be_last and can_be_first:
+        is_square = first == middle, middle == last
+        return is_square[0] if is_square[0] != is_square[1] else last <= first
+    return can_be_last
+
+
+def _grey(x):
+    return x[:, None, None]
+
+
+def _channels_first(x):
+    return x.reshape(len(x), 1, -1, *x.shape[-2:])
+
+
+def _channels_last(x):
+    return _channels_first(np.moveaxis(x, -1, -3))
 
 
 def _parts(space, conversion, path):
@@ -154,7 +197,7 @@ def _parts(space, conversion, path):
     children = space.spaces if isinstance(space.spaces, Mapping) else dict(enumerate(space.spaces))
     return [
         (name, key, *conversion(child, f"{path}[{key!r}]"))
-        for name, (key, child) in zip(_identifiers(children), children.items())
+        for name, (key, child) in zip(identifiers(children), children.items())
     ]
 
 
@@ -166,13 +209,13 @@ def _choices(names, sizes):
     return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)})
 
 
-def _identifiers(keys):
+def identifiers(keys: Iterable[Any], reserved: Collection[str] = RESERVED) -> list[str]:
     """Returns a name for each key: `a-b` becomes a_b, 0 becomes part_0, `type` becomes type_."""
     names = []
     for key in keys:
         name = re.sub(r"\W", "_", str(key))
         name = name if name.isidentifier() else f"part_{name}"
-        while name in names or name in RESERVED:
+        while name in names or name in reserved:
             name += "_"
         names.append(name)
     return names

@@ -15,7 +15,7 @@ from megastep import cache, engine
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics, n_cells
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.geometry import content_hash
-from megastep.kernels.build.program import KERNELS
+from megastep.kernels.build.kernel_library import KERNELS
 from megastep.modules import spawning
 
 PREFIX = "geodesics-"  # of the cached files

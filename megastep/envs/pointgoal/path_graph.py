@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from megastep.engine.devices import threads
-from megastep.envs.pointgoal.program import PROGRAM
+from megastep.envs.pointgoal.library import LIBRARY
 from megastep.kernels.build.launch import BLOCK, launch
 
 __all__ = ["CELL", "MAX_GOALS", "PathGraph"]
@@ -20,7 +20,7 @@ SIDES = 16  # of the polygon around the end of a wall
 INFLATION = 1.001  # of the radius, as in physics
 SLACK = 5e-5  # metres between a path and the clearance that is tested, for rounding
 MAX_GOALS, GROUP, KEPT, N_SCRATCH = (
-    PROGRAM.constants[name] for name in ("MAX_GOALS", "GROUP", "KEPT", "N_SCRATCH")
+    LIBRARY.constants[name] for name in ("MAX_GOALS", "GROUP", "KEPT", "N_SCRATCH")
 )
 GROUP_SIDE = 1.5  # metres: walls with their middles in one square are neighbours
 STEP = 5e-3  # metres from a corner where it is tested if a path can turn there
@@ -89,7 +89,7 @@ class PathGraph:
     def _params(self):
         inradius = INFLATION * self.radius + 2 * SLACK
         circumradius = inradius / np.cos(np.pi / SIDES)
-        return PROGRAM.params.HomesParams(
+        return LIBRARY.params.HomesParams(
             **self.tensors,
             n_groups=self.n_groups,
             n_corners=len(self.corner_homes),
@@ -135,7 +135,7 @@ class PathGraph:
         """
         clearances = torch.empty(len(points), device=self.device)
         launch(
-            *(PROGRAM, "clearances", self.device, len(points)),
+            *(LIBRARY, "clearances", self.device, len(points)),
             homes=self._params(),
             points=points.float().contiguous(),
             home_index=home,
@@ -155,7 +155,7 @@ class PathGraph:
         always = dict(
             homes=self._params(), corner_homes=self.corner_homes, tangent=tangent, kept=kept
         )
-        where = PROGRAM, "corner_links", device, v
+        where = LIBRARY, "corner_links", device, v
         launch(*where, **always, counts=counts, starts=None, targets=None, metres=None)
         ends = counts.cumsum(0, dtype=torch.int32)
         n_links = int(ends[-1]) if v else 0
@@ -205,7 +205,7 @@ class PathGraph:
         goals = self.tensor(goals, np.float32)
         distances = torch.empty((len(self.corner_homes), MAX_GOALS), device=self.device)
         launch(
-            *(PROGRAM, "corner_distances", self.device, BLOCK * len(counts)),
+            *(LIBRARY, "corner_distances", self.device, BLOCK * len(counts)),
             homes=self._params(),
             goals=goals,
             distances=distances,
@@ -216,7 +216,7 @@ class PathGraph:
         lengths = torch.empty(n_points * n_goals, device=self.device)
         n_scratch = N_SCRATCH * len(self.corner_homes) if self.device.type == "cpu" else 0
         launch(
-            *(PROGRAM, "path_lengths", self.device, n_points),
+            *(LIBRARY, "path_lengths", self.device, n_points),
             homes=self._params(),
             goals=goals,
             distances=distances,

@@ -16,13 +16,13 @@ from megastep.engine.launch_params import (
 )
 from megastep.engine.scenery import Scenery
 from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.envs.pointgoal.program import PROGRAM
+from megastep.envs.pointgoal.library import LIBRARY
 from megastep.kernels.build.launch import launch
 
 __all__ = ["N_PRIVILEGED", "PROGRESS_ROWS", "PointGoalStep", "pointgoal_step"]
 
-PROGRESS_ROWS = PROGRAM.constants["PROGRESS_ROWS"]  # numbers that describe an episode so far
-N_PRIVILEGED = PROGRAM.constants["N_PRIVILEGED"]  # numbers that a critic sees
+PROGRESS_ROWS = LIBRARY.constants["PROGRESS_ROWS"]  # numbers that describe an episode so far
+N_PRIVILEGED = LIBRARY.constants["N_PRIVILEGED"]  # numbers that a critic sees
 
 
 class PointGoalStep(NamedTuple):
@@ -109,7 +109,7 @@ def pointgoal_step(
         privileged=privileged_out,
     )
     launch(
-        *(PROGRAM, "pointgoal_step", device, n_lanes),
+        *(LIBRARY, "pointgoal_step", device, n_lanes),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         free=0 if free is None else checks.address("free", free, lanes, torch.float32, device),

@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import torch
 
 from megastep.arrdict import arrdict
-from megastep.envs.pong.step import FEATURES, PIXELS, PROGRAM
+from megastep.envs.pong.step import FEATURES, LIBRARY, PIXELS
 
 __all__ = ["Tracker"]
 
 NOTHING, UP, DOWN = 0, 1, 2
 PADDLE_ROWS, PADDLE_GREY, BALL_GREY = (
-    PROGRAM.constants[name] for name in ("PADDLE_ROWS", "PADDLE_GREY", "BALL_GREY")
+    LIBRARY.constants[name] for name in ("PADDLE_ROWS", "PADDLE_GREY", "BALL_GREY")
 )
 BALL_OFFSET = 6  # the feature: how far the ball is below the paddle's centre, 1 at its edge
 NEAR = 0.5  # cells; a move is one cell, so one that starts nearer only overshoots

@@ -16,14 +16,14 @@ from megastep.arrdict import arrdict, numpyify
 from megastep.engine import checks
 from megastep.envs.common import DisplayedEnv
 from megastep.envs.pong.bot import Tracker
-from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, PROGRAM, pong_step
+from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, LIBRARY, PIXELS, pong_step
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Pong"]
 
 ROWS, COLUMNS = PIXELS
 PADDLE_ROWS, TRAIL_GREY, PADDLE_GREY, BALL_GREY = (
-    PROGRAM.constants[name] for name in ("PADDLE_ROWS", "TRAIL_GREY", "PADDLE_GREY", "BALL_GREY")
+    LIBRARY.constants[name] for name in ("PADDLE_ROWS", "TRAIL_GREY", "PADDLE_GREY", "BALL_GREY")
 )
 TEXT = {0: " ", TRAIL_GREY: ".", PADDLE_GREY: "|", BALL_GREY: "o"}  # character of each grey
 

@@ -10,16 +10,16 @@ from megastep.engine import checks
 from megastep.engine.agents import check_flag_on_cpu
 from megastep.engine.devices import threads
 from megastep.engine.launch_params import seed_params
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
-from megastep.kernels.build.program import Program
 
-__all__ = ["CELL", "FEATURES", "GAME_FIELDS", "PIXELS", "PROGRAM", "PongStep", "pong_step"]
+__all__ = ["CELL", "FEATURES", "GAME_FIELDS", "PIXELS", "LIBRARY", "PongStep", "pong_step"]
 
-PROGRAM = Program(Path(__file__).parent / "kernels")
-CELL = PROGRAM.constants["CELL"]  # units of position per cell; a cell is one pixel
-FEATURES = PROGRAM.constants["N_FEATURES"]  # of an observation
-GAME_FIELDS = PROGRAM.constants["GAME_FIELDS"]  # of a game's state
-PIXELS = PROGRAM.constants["ROWS"], PROGRAM.constants["COLUMNS"]
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
+CELL = LIBRARY.constants["CELL"]  # units of position per cell; a cell is one pixel
+FEATURES = LIBRARY.constants["N_FEATURES"]  # of an observation
+GAME_FIELDS = LIBRARY.constants["GAME_FIELDS"]  # of a game's state
+PIXELS = LIBRARY.constants["ROWS"], LIBRARY.constants["COLUMNS"]
 
 
 class PongStep(NamedTuple):
@@ -84,7 +84,7 @@ def pong_step(
     if speed < 0:
         raise ValueError(f"tracker_speed must be at least 0 cells per step, not {speed:g}")
     launch(
-        *(PROGRAM, "pong_step", device, n),
+        *(LIBRARY, "pong_step", device, n),
         games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, device),
         actions=checks.address("actions", actions, (n_lanes, 1), torch.int64, device),
         reward=reward,

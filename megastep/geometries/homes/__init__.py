@@ -97,6 +97,10 @@ def _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator):
     ]
 
 
+def _metres(segments, shift):
+    return ((np.reshape(segments, (-1, 2, 2)) + shift) / 100).astype(np.float32)
+
+
 def generate(seed: int, outer: bool = True, density: float = 1, clutter: float = 0) -> dotdict:
     """Returns the home of a seed.
 
@@ -111,9 +115,9 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
 
     Returns:
         A geometry with further keys: `rooms`, the kind of each room in the order of the masks'
-        numbers; `areas`, their clear areas in m2; `doors` and `openings`, the widths in metres of
-        the gaps with and without a door; `n_outer`, the number of walls, the last ones, that are
-        the envelope's outer face.
+        numbers; `areas`, their clear areas in m2; `doors` and `openings`, (K, 2, 2) float32, the
+        segments in metres across the gaps with and without a door; `n_outer`, the number of walls,
+        the last ones, that are the envelope's outer face.
     """
     generator, style = PortableGenerator(seed), plan.style(density, clutter)
     _, footprint, rooms, meetings, depth, gaps = _best_plan(generator, style)
@@ -153,7 +157,9 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
     if style.furniture:  # no line marks the cells that are wholly inside it
         y, x = ((np.arange(n) + 0.5) * geometry.RES * 100 for n in masks.shape)
         masks[(masks > 0) & ~walls.are_indoors(grid, x - shift[0], y[::-1] - shift[1])] = 0
-    doors = [[(g.high - g.low) / 100 for g in gaps if g.door is kind] for kind in (True, False)]
+    doors, open_ = (
+        [walls.across(g) for g in gaps if g.door is has_door] for has_door in (True, False)
+    )
     return dotdict(
         id=seed,
         walls=lines[: len(lines) if outer else len(inside)].astype(np.float32),
@@ -162,7 +168,7 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
         res=geometry.RES,
         rooms=[room.kind for room in rooms],
         areas=walls.areas(grid, [room.region for room in rooms]),
-        doors=doors[0],
-        openings=doors[1],
+        doors=_metres(doors, shift),
+        openings=_metres(open_, shift),
         n_outer=len(outside) if outer else 0,
     )

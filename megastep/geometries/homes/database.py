@@ -1,8 +1,9 @@
 """The 5,000 homes that come with the package: `data/homes.npz` and its sha256.
 
-`scripts/make_homes.py` writes them. The arrays of all homes lie end to end: `walls` (M, 2, 2) and
-`lights` (K, 2), int16 centimetres, and `masks` (cells,) int8. `widths` (homes, 5) has, per home,
-the number of walls, of walls in the outer face, of lights, and the height and width of the masks.
+`scripts/make_homes.py` writes them. The arrays of all homes lie end to end: `walls` (M, 2, 2),
+`doors` (K, 2, 2) and `lights` (L, 2), int16 centimetres, and `masks` (cells,) int8. `widths`
+(homes, 6) has, per home, the number of walls, of walls in the outer face, of lights, the height and
+width of the masks, and the number of doors.
 
 Denser and cluttered homes are generated when they are first asked for, on all cores, and cached on
 disk in the same format.
@@ -52,9 +53,11 @@ def pack(plans: Sequence[dotdict]) -> bytes:
     arrays = {
         "walls": np.concatenate([np.rint(g.walls * 100) for g in plans]).astype("<i2"),
         "lights": np.concatenate([np.rint(g.lights * 100) for g in plans]).astype("<i2"),
+        "doors": np.concatenate([np.rint(g.doors * 100) for g in plans]).astype("<i2"),
         "masks": np.concatenate([g.masks.ravel() for g in plans]).astype("i1"),
         "widths": np.array(
-            [(len(g.walls), g.n_outer, len(g.lights), *g.masks.shape) for g in plans], "<i4"
+            [(len(g.walls), g.n_outer, len(g.lights), *g.masks.shape, len(g.doors)) for g in plans],
+            "<i4",
         ),
     }
     buffer = io.BytesIO()
@@ -72,21 +75,21 @@ def _unpack(content):
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     widths = arrays["widths"]
-    sizes = np.stack([widths[:, 0], widths[:, 2], widths[:, 3] * widths[:, 4]], 1)
-    return arrays, np.concatenate([np.zeros((1, 3), int), sizes.cumsum(0)])
+    sizes = np.stack([widths[:, 0], widths[:, 2], widths[:, 3] * widths[:, 4], widths[:, 5]], 1)
+    return arrays, np.concatenate([np.zeros((1, 4), int), sizes.cumsum(0)])
 
 
 @functools.lru_cache(maxsize=COUNT)
 def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
-    """Returns the home of seed `index`, a geometry with `n_outer`. `outer` is as in `generate`."""
+    """Returns the home of seed `index`, with `doors` and `n_outer`. `outer` is as in `generate`."""
     return _home(*_arrays(path), index, index, outer)
 
 
 def _home(arrays, starts, index, seed, outer):
-    _, n_outer, _, height, width = arrays["widths"][index]
-    walls, lights, cells = (
-        arrays[key][a:b]
-        for key, a, b in zip(("walls", "lights", "masks"), starts[index], starts[index + 1])
+    _, n_outer, _, height, width, _ = arrays["widths"][index]
+    parts = ("walls", "lights", "masks", "doors")
+    walls, lights, cells, doors = (
+        arrays[key][a:b] for key, a, b in zip(parts, starts[index], starts[index + 1])
     )
     return dotdict(
         id=seed,
@@ -94,6 +97,7 @@ def _home(arrays, starts, index, seed, outer):
         lights=(lights / 100).astype(np.float32),
         masks=cells.reshape(height, width).astype(np.int16),
         res=geometry.RES,
+        doors=(doors / 100).astype(np.float32),
         n_outer=int(n_outer) if outer else 0,
     )
 

@@ -17,8 +17,8 @@ MIN_CONTACT = 95  # cm of clear wall that a door needs
 LOOPS = 0.45  # fraction of cheap contacts outside the tree that become doors too
 # Probability that a connection has no door.
 OPEN = {
-    frozenset(pair): share
-    for pair, share in {
+    frozenset(pair): fraction
+    for pair, fraction in {
         ("living", "kitchen"): 0.7,
         ("living", "entry"): 0.6,
         ("kitchen", "entry"): 0.6,

@@ -121,13 +121,13 @@ def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]
     ]
 
 
-def _notch(width, height, share, at_corner, generator):
-    """Draws a notch: a rectangle of about `share` of the bounding box, at a corner or in the middle
-    of a side. Returns None if it does not fit.
+def _notch(width, height, fraction, at_corner, generator):
+    """Draws a notch: a rectangle of about `fraction` of the bounding box, at a corner or in the
+    middle of a side. Returns None if it does not fit.
     """
     ratio = generator.uniform(0.6, 1.7)
-    across = int(sqrt(share * width * height * ratio)) // STEP * STEP
-    down = int(sqrt(share * width * height / ratio)) // STEP * STEP
+    across = int(sqrt(fraction * width * height * ratio)) // STEP * STEP
+    down = int(sqrt(fraction * width * height / ratio)) // STEP * STEP
     if min(across, down) < MIN_NOTCH or across > width - MIN_NECK or down > height - MIN_NECK:
         return None
     left, low = generator.below(2) * (width - across), generator.below(2) * (height - down)
@@ -149,19 +149,19 @@ def footprint(total: int, generator: PortableGenerator) -> regions.Region:
     notches. Returns a region.
     """
     aspect = min(max(generator.lognormal(MEDIAN_ASPECT, SIGMA_ASPECT), 1.0), MAX_ASPECT)
-    shares = [generator.uniform(0.03, 0.15) for _ in range(generator.pick(NOTCHES))]
+    fractions = [generator.uniform(0.03, 0.15) for _ in range(generator.pick(NOTCHES))]
     left = 1.0
-    for share in shares:
-        left -= share
+    for fraction in fractions:
+        left -= fraction
     long = sqrt(total * WALLS / left * aspect)
     sides = [max(int(side) // STEP * STEP, MIN_NECK) for side in (long, long / aspect)]
     width, height = sides if generator.chance(0.5) else sides[::-1]
 
     notches = []
-    for share in shares:
+    for fraction in fractions:
         at_corner = generator.chance(AT_CORNER)
         for _ in range(6):
-            notch = _notch(width, height, share, at_corner, generator)
+            notch = _notch(width, height, fraction, at_corner, generator)
             if notch and all(_apart(notch, other) >= MIN_NECK for other in notches):
                 notches.append(notch)
                 break

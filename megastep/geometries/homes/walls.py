@@ -64,6 +64,13 @@ def gap(opening: Opening, depth: Callable) -> tuple[int, int, int, int]:
     return _rectangle(opening.contact.axis, (at - before, at + after), (opening.low, opening.high))
 
 
+def across(opening: Opening) -> list[tuple[int, int]]:
+    """Returns the ends of the segment across an opening, in the middle of its wall."""
+    contact = opening.contact
+    ends = [(contact.at, opening.low), (contact.at, opening.high)]
+    return [end[::-1] for end in ends] if contact.axis else ends
+
+
 def paint(
     floor: regions.Region,
     walls: regions.Region,

@@ -1,4 +1,4 @@
-"""Builds a program for the CPU or a GPU at first use, and loads it.
+"""Builds a kernel library for the CPU or a GPU at first use, and loads it.
 
 The CPU library comes from the system's C++ compiler. The GPU's cubin comes from NVRTC, which is
 part of PyTorch's CUDA wheels, so nvcc is not needed. Both are cached under a hash of sources,
@@ -23,7 +23,7 @@ import torch
 
 from megastep import cache
 from megastep.kernels.build.forks import end_threads_at_forks
-from megastep.kernels.build.program import KERNELS, Program
+from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
 
 __all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
 
@@ -42,17 +42,17 @@ def _key(*parts):
 
 
 @functools.cache
-def cpu(program: Program) -> dict[str, Callable[[bytes], None]]:
-    """Returns a program's operations for the CPU: {name: function of its packed struct}."""
-    if not program.cpu_operations:
+def cpu(library: KernelLibrary) -> dict[str, Callable[[bytes], None]]:
+    """Returns a library's operations for the CPU: {name: function of its packed struct}."""
+    if not library.cpu_operations:
         return {}
     command, version = compiler()
-    files = program.sources(".h", ".cpp")
-    key = _key(*files, *files.values(), *program.cpu_flags, command, version, _processor())
+    files = library.sources(".h", ".cpp")
+    key = _key(*files, *files.values(), *library.cpu_flags, command, version, _processor())
     name = f"cpu-{key}.so"
-    library = _load(name, *cache.fetch(name, lambda: _build_cpu(program, command)))
-    end_threads_at_forks(library)
-    functions = {operation: getattr(library, operation) for operation in program.cpu_operations}
+    binary = _load(name, *cache.fetch(name, lambda: _build_cpu(library, command)))
+    end_threads_at_forks(binary)
+    functions = {operation: getattr(binary, operation) for operation in library.cpu_operations}
     for function in functions.values():
         function.argtypes, function.restype = [ctypes.c_char_p], None
     return functions
@@ -65,7 +65,9 @@ def compiler() -> tuple[str, str]:
         path = shutil.which(command)
         if path:
             return path, _run([path, "--version"]).stdout
-    problem = f"CXX={override} is not a program" if override else "c++, g++ and clang++ are missing"
+    problem = (
+        f"CXX={override} is not executable" if override else "c++, g++ and clang++ are missing"
+    )
     raise EngineError(
         f"The CPU engine needs a C++ compiler, and {problem}: install one (Debian: apt install "
         f"g++) or set CXX to yours."
@@ -102,14 +104,14 @@ def _processor():
         return platform.machine() + platform.processor()
 
 
-def _build_cpu(program, command):
-    """Returns a library of all ``.cpp`` files."""
-    files = [str(program.folder / name) for name in program.sources(".cpp")]
+def _build_cpu(library, command):
+    """Returns a shared library of all ``.cpp`` files."""
+    files = [str(library.folder / name) for name in library.sources(".cpp")]
     try:
         with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
             out = Path(folder) / "kernels.so"
             process = _run(
-                [command, *program.cpu_flags, f"-I{KERNELS}", *files, "-o", str(out)], TMPDIR=folder
+                [command, *library.cpu_flags, f"-I{KERNELS}", *files, "-o", str(out)], TMPDIR=folder
             )
             if not process.returncode:
                 return out.read_bytes()
@@ -119,14 +121,14 @@ def _build_cpu(program, command):
             f"make room there, or set TMPDIR to a folder that has some."
         ) from None
     raise EngineError(
-        f"{command} could not build the CPU kernels in {program.folder}; it needs C++17, OpenMP "
+        f"{command} could not build the CPU kernels in {library.folder}; it needs C++17, OpenMP "
         f"(Debian: apt install g++) and room in {tempfile.gettempdir()}. Its output: "
         f"{' '.join(process.stderr.split())[:500]}"
     )
 
 
 def _load(name, body, path):
-    """Loads a library from its cached file or, without a cache, from a temporary copy."""
+    """Loads a shared library from its cached file or, without a cache, from a temporary copy."""
     if path is not None:
         try:
             return ctypes.CDLL(str(path))
@@ -149,30 +151,30 @@ def _load(name, body, path):
 
 
 @functools.cache
-def cuda(program: Program, index: int) -> dict[str, Any]:
-    """Returns a program's operations on GPU ``index``: {name: CUfunction}."""
-    if not program.cuda_operations:
+def cuda(library: KernelLibrary, index: int) -> dict[str, Any]:
+    """Returns a library's operations on GPU ``index``: {name: CUfunction}."""
+    if not library.cuda_operations:
         return {}
     driver, _ = bindings()
     major, minor = torch.cuda.get_device_capability(index)
-    cubin = build_cuda(program, f"sm_{major}{minor}")
+    cubin = build_cuda(library, f"sm_{major}{minor}")
     loading = "Loading the GPU's kernels"
     with torch.cuda.device(index):
         torch.cuda.current_stream().synchronize()  # makes the device's primary context current
         module = check_status(driver.cuModuleLoadData(cubin), loading)
         return {
             operation: check_status(driver.cuModuleGetFunction(module, operation.encode()), loading)
-            for operation in program.cuda_operations
+            for operation in library.cuda_operations
         }
 
 
-def build_cuda(program: Program, architecture: str) -> bytes:
-    """Returns a program's kernels for GPUs of an architecture, such as ``sm_90``, from the cache if
+def build_cuda(library: KernelLibrary, architecture: str) -> bytes:
+    """Returns a library's kernels for GPUs of an architecture, such as ``sm_90``, from the cache if
     they are there. Needs NVRTC, but no GPU.
     """
     _, nvrtc = bindings()
-    files = program.sources(".h", ".cu")
-    flags = (*program.cuda_flags, f"--gpu-architecture={architecture}")
+    files = library.sources(".h", ".cu")
+    flags = (*library.cuda_flags, f"--gpu-architecture={architecture}")
     try:
         version = check_status(nvrtc.nvrtcVersion(), "NVRTC")
     except (RuntimeError, OSError) as error:

@@ -1,4 +1,5 @@
-"""Reads a program's headers, so that structs, constants and operations are declared in one place.
+"""Reads the headers of a kernel library, so that structs, constants and operations are
+declared once.
 
 Three kinds of declarations are recognised:
 

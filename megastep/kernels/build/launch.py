@@ -1,4 +1,4 @@
-"""Launches a program's operation on the device where its tensors are."""
+"""Launches an operation of a kernel library on the device where its tensors are."""
 
 import ctypes
 import functools
@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import torch
 
 from megastep.kernels.build.compile import EngineError, bindings, check_status, cpu, cuda
-from megastep.kernels.build.program import KERNELS, Program
+from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
 
 __all__ = ["ENGINE", "Blocks", "launch"]
 
 #: The engine's operations.
-ENGINE = Program(KERNELS)
+ENGINE = KernelLibrary(KERNELS)
 BLOCK = ENGINE.constants["BLOCK"]  # threads per block
 WARP = ENGINE.constants["WARP"]
 INVALID_CONTEXT = 201  # CUDA_ERROR_INVALID_CONTEXT
@@ -37,12 +37,18 @@ class Blocks(NamedTuple):
 
 
 def launch(
-    program: Program, operation: str, device: torch.device, shape: int | Blocks, /, **fields: Any
+    library: KernelLibrary,
+    operation: str,
+    device: torch.device,
+    shape: int | Blocks,
+    /,
+    **fields: Any,
 ) -> None:
-    """Runs an operation of a program: on a CPU before this returns, on a GPU on the current stream.
+    """Runs an operation of a kernel library: on a CPU before this returns, on a GPU on the
+    current stream.
 
     Args:
-        program: its kernels are built if this is its first launch on the device.
+        library: its kernels are built if this is its first launch on the device.
         operation: the kernel's name.
         device: where its tensors are.
         shape: number of GPU threads, rounded up to whole blocks of `BLOCK`; or the `Blocks`. A GPU
@@ -51,15 +57,15 @@ def launch(
             null.
 
     Raises:
-        EngineError: if the program has no such operation for the device, it cannot be built, or
+        EngineError: if the library has no such operation for the device, it cannot be built, or
             the GPU refuses the launch.
         TypeError: if a field is missing, or the struct has none of that name.
     """
     if device.type == "cpu":
-        struct = program.cpu_operations.get(operation)
+        struct = library.cpu_operations.get(operation)
         if struct is None:
-            raise _missing(program, operation, ".cpp", "a GPU (device=cuda)")
-        cpu(program)[operation](program.packers[struct](fields))
+            raise _missing(library, operation, ".cpp", "a GPU (device=cuda)")
+        cpu(library)[operation](library.packers[struct](fields))
         return
     blocks = shape if isinstance(shape, Blocks) else (-(-shape // BLOCK), 1, BLOCK, 0)
     x, y, n_threads, shared = blocks
@@ -70,18 +76,18 @@ def launch(
             f"{operation} needs {x * n_threads:,} threads on {device}, but a launch has at most "
             f"{MAX_THREADS:,}: use fewer environments."
         )
-    struct = program.cuda_operations.get(operation)
+    struct = library.cuda_operations.get(operation)
     if struct is None:
-        raise _missing(program, operation, ".cu", "a CPU (device=cpu)")
+        raise _missing(library, operation, ".cu", "a CPU (device=cpu)")
     index = torch.cuda.current_device() if device.index is None else device.index
-    function = cuda(program, index)[operation]
-    arguments = (ctypes.c_char_p * 1)(program.packers[struct](fields))
+    function = cuda(library, index)[operation]
+    arguments = (ctypes.c_char_p * 1)(library.packers[struct](fields))
     with torch.cuda.device(index):
         if shared > USUAL_SHARED:
             _allow_shared(function, shared, index)
         driver, _ = bindings()
         stream = torch.cuda.current_stream(index).cuda_stream
-        is_early = operation in program.early_operations and _can_start_early(index)
+        is_early = operation in library.early_operations and _can_start_early(index)
         call = _config(blocks, stream, is_early), function, ctypes.addressof(arguments), 0
         status = driver.cuLaunchKernelEx(*call)
         if int(status[0]) == INVALID_CONTEXT:
@@ -90,9 +96,9 @@ def launch(
     check_status(status, f"Launching {operation}")
 
 
-def _missing(program, operation, suffix, other):
+def _missing(library, operation, suffix, other):
     return EngineError(
-        f"No {suffix} file in {program.folder} defines the operation {operation}: add one, or run "
+        f"No {suffix} file in {library.folder} defines the operation {operation}: add one, or run "
         f"on {other}."
     )
 

@@ -1,5 +1,5 @@
-// Constants that every program shares. Python reads this file too: one constant per line, a plain
-// number each.
+// Constants that all kernel libraries share. Python reads this file too: one constant per line,
+// a plain number each.
 #pragma once
 
 constexpr int BLOCK = 64;      // threads per block, in every launch
@@ -13,3 +13,17 @@ constexpr int BAD_ACTION = 2;  // an action outside of the action space
 constexpr int BAD_LAYOUT = 3;  // a layout that the scenery does not have
 constexpr int BAD_GOAL = 4;    // a goal or a spawn point that the layout does not have
 constexpr int NAN_ACTION = 5;  // a continuous action that is NaN
+
+// Shapes of objects: a hexagon in a disc, a square, a segment.
+constexpr int DISC = 0;
+constexpr int CRATE = 1;
+constexpr int DOOR = 2;
+constexpr int OBJECT_BYTES = 32;  // of a record
+
+// Errors of objects. Their flag holds OBJECT_ERROR_KINDS * (O env + object) + kind.
+constexpr int OBJECT_ERROR_KINDS = 8;
+constexpr int BAD_POSE = 1;     // a pose that is not finite, or a size that is not above 0
+constexpr int BAD_COLOUR = 2;   // a colour that the palette does not have
+constexpr int BAD_CARRIER = 3;  // a carrier that is no agent
+constexpr int OUTSIDE = 4;      // a position outside of the home
+constexpr int NO_ROOM = 5;      // nowhere to put it

@@ -3,6 +3,7 @@
 // an agent's radius, which falls between two lines, may be missed.
 #pragma once
 #include "common/math.h"
+#include "common/objects.h"
 #include "common/scenery.h"
 
 // Returns 1 if the wall ab cuts the line from (x, y) to (x + dx, y + dy). A wall's ends count, so
@@ -27,11 +28,36 @@ HD void sync(const SingleThread&) {}
 
 HD unsigned int reduce_or(const SingleThread&, unsigned int bits) { return bits; }
 
-// Returns 1 if a disc of the agents' radius at (x + dx, y + dy) is visible from (x, y). The threads
-// of `group` divide the walls among them.
+// The lines of sight, of three, that environment `env`'s obstacles cut: a bit for each. The lines
+// run from (x, y) to (x + dx, y + dy) and to both sides of it.
 template <class Group>
-HD int is_visible(const SceneryParams& s, const Group& group, const Walls& walls, float x, float y,
-                  float dx, float dy) {
+HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int env, float x,
+                               float y, float dx, float dy, float side_x, float side_y) {
+    unsigned int cut = 0;
+    for (int k = group.rank; k < o.n_objects; k += Group::SIZE) {
+        Object object = objects_of(o)[env * o.n_objects + k];
+        if (!is_obstacle(object))
+            continue;
+        int shape = o.shapes[k];
+        Pose pose = pose_at(object.x, object.y, object.angle);
+        for (int m = 0; m < n_lines_of(shape); m++) {
+            Float4 side = line_of(shape, m, object.size, pose);
+            for (int line = 0; line < 3; line++) {
+                float aside = (float)(line - 1);
+                cut |= (unsigned int)cuts(side.x, side.y, side.z, side.w, x, y, dx + aside * side_x,
+                                          dy + aside * side_y)
+                       << line;
+            }
+        }
+    }
+    return cut;
+}
+
+// Returns 1 if a disc of the agents' radius at (x + dx, y + dy) is visible from (x, y). The threads
+// of `group` divide the walls, and environment `env`'s objects, among them.
+template <int with_objects, class Group>
+HD int is_visible(const SceneryParams& s, const ObjectsParams& o, const Group& group,
+                  const Walls& walls, int env, float x, float y, float dx, float dy) {
     float wide = s.radius / maxf(SQRT(dx * dx + dy * dy), s.radius);
     float side_x = -wide * dy, side_y = wide * dx;
     unsigned int cut = 0;
@@ -44,5 +70,7 @@ HD int is_visible(const SceneryParams& s, const Group& group, const Walls& walls
                    << line;
         }
     }
+    if (with_objects)
+        cut |= cut_by_objects(o, group, env, x, y, dx, dy, side_x, side_y);
     return reduce_or(group, cut) != 7;
 }

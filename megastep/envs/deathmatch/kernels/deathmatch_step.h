@@ -88,10 +88,10 @@ HD void finish_step(const DeathmatchStepParams& p, int first, int a, const Hits&
     int i = first + a, target = hits.target[a], reset = p.ended[i];
     float hit = 0.f, kill = 0.f, damage = 0.f;
     if (target >= 0) {
-        float share = 1.f / (float)hits.wounds[target];  // among those who hit the same target
+        float fraction = 1.f / (float)hits.wounds[target];  // among those who hit the same target
         hit = 1.f;
-        kill = hits.dies[target] ? share : 0.f;
-        damage = hits.loss[target] * share;
+        kill = hits.dies[target] ? fraction : 0.f;
+        damage = hits.loss[target] * fraction;
     }
     int dies = hits.dies[a], age = reset ? 0 : p.ages[i] + 1;
     int ends = !reset && (dies || age >= p.limit);

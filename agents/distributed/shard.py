@@ -1,8 +1,8 @@
-"""The share of an evaluation's environments that each rank plays.
+"""Shards of an evaluation: the environments that each rank plays.
 
-Of N environments in D homes, environment e plays in home e mod D. Rank r of R plays environments
-r, r + R, r + 2 R, ... So all ranks together play in the homes that one process plays in, in each
-as often; spawns and sampled actions are others.
+Of N environments in D homes, environment e is in home e mod D. Rank r of R plays environments r,
+r + R, r + 2 R, ... Together the ranks play each home as often as a single process does, but with
+other spawns and sampled actions.
 """
 
 from typing import TypeVar
@@ -15,18 +15,18 @@ from megastep.arrdict import arrdict
 Values = TypeVar("Values", torch.Tensor, arrdict)
 
 
-class Share:
-    """One rank's share.
+class Shard:
+    """The environments of one rank.
 
     Args:
         n_envs: N.
-        n_homes: D, at most N; 0 if there are no homes.
-        number, n_ranks: r and R, at most N.
+        n_homes: D, at most N; 0 without homes.
+        number: r.
+        n_ranks: R, at most N.
 
     Attributes:
-        envs: numbers of this rank's environments.
-        homes: numbers of the homes that it plays in: environment i of it in home i mod their
-            number.
+        envs: indices of its environments among the N.
+        homes: indices of its homes among the D; its i-th environment is in `homes[i % len(homes)]`.
     """
 
     def __init__(self, n_envs: int, n_homes: int, number: int = 0, n_ranks: int = 1):
@@ -35,17 +35,18 @@ class Share:
         self.homes = [*dict.fromkeys(env % n_homes for env in self.envs)] if n_homes else []
 
     @classmethod
-    def of_this_rank(cls, n_envs: int, n_homes: int) -> "Share":
-        """Returns this rank's share: all of them, if there are fewer environments than ranks."""
+    def of_this_rank(cls, n_envs: int, n_homes: int) -> "Shard":
+        """Returns this rank's shard; all N environments if there are fewer than ranks."""
         is_shared = n_ranks() <= n_envs
         return cls(n_envs, n_homes, rank(), n_ranks()) if is_shared else cls(n_envs, n_homes)
 
     def with_others(self, values: arrdict) -> arrdict:
-        """Returns the values of all environments, in their order. Waits for the other ranks.
+        """Gathers the values of all N environments, in order. Waits for the other ranks.
 
         Args:
-            values: tensors of this rank's environments, or of their lanes: (n, ...) or (n A, ...).
-                `envs` and `homes` hold numbers among those of this rank.
+            values: tensors (n, ...) of this rank's n environments, or (n A, ...) of their lanes.
+                Leaves called `envs` and `homes` hold indices within the shard, which become indices
+                among all.
         """
         if self.n_ranks == 1:
             return values
@@ -59,7 +60,7 @@ class Share:
         if not isinstance(values[0], torch.Tensor):
             names = values[0].keys()
             return arrdict({n: self._interleaved([part[n] for part in values]) for n in names})
-        n_each = len(values[0]) // len(range(0, self.n_envs, self.n_ranks))  # lanes of each
+        n_each = len(values[0]) // len(range(0, self.n_envs, self.n_ranks))  # lanes per environment
         rows = values[0].new_empty(self.n_envs, n_each, *values[0].shape[1:])
         for number, part in enumerate(values):
             rows[number :: self.n_ranks] = part.view(-1, *rows.shape[1:])

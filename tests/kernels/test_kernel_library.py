@@ -1,4 +1,4 @@
-"""A folder of kernels outside of megastep is a program: it is built and launched on CPU and GPU."""
+"""A folder of kernels outside of megastep is a kernel library: it runs on CPU and GPU."""
 
 from types import SimpleNamespace
 
@@ -7,8 +7,8 @@ import torch
 
 from megastep.kernels.build import launch as launches
 from megastep.kernels.build.compile import EngineError
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
-from megastep.kernels.build.program import Program
 
 FILES = {
     "constants.h": "#pragma once\nconstexpr int SIDES = 6;\n",
@@ -56,33 +56,33 @@ KERNEL roll_dice(RollDiceParams p) {
 
 
 def written(folder, *names):
-    """A program of these files; by default of all."""
+    """A library of these files; by default of all."""
     folder.mkdir(exist_ok=True)
     for name in names or FILES:
         (folder / name).write_text(FILES[name])
-    return Program(folder)
+    return KernelLibrary(folder)
 
 
-def roll(program, device, n=1000):
+def roll(library, device, n=1000):
     counts = torch.arange(n, device=device)
     out = torch.zeros(n, dtype=torch.int32, device=device)
     fields = dict(counts=counts, out=out, key0=1, key1=0, n_lanes=n, offset=1.0)
-    launch(program, "roll_dice", out.device, n, **fields)
+    launch(library, "roll_dice", out.device, n, **fields)
     return out
 
 
 def test_a_folder_of_kernels_runs(tmp_path, device):
     """With common headers, constants and a struct of its own."""
-    program = written(tmp_path / "dice")
-    assert program.constants["SIDES"] == 6
-    counts = roll(program, device).bincount(minlength=7).tolist()
+    library = written(tmp_path / "dice")
+    assert library.constants["SIDES"] == 6
+    counts = roll(library, device).bincount(minlength=7).tolist()
     assert counts[0] == 0 and len(counts) == 7 and min(counts[1:]) > 120
 
 
 @pytest.mark.cuda
 def test_cpu_and_gpu_agree(tmp_path):
-    program = written(tmp_path)
-    assert torch.equal(roll(program, "cpu"), roll(program, "cuda").cpu())
+    library = written(tmp_path)
+    assert torch.equal(roll(library, "cpu"), roll(library, "cuda").cpu())
 
 
 def test_a_changed_header_is_built_again(tmp_path):
@@ -90,29 +90,29 @@ def test_a_changed_header_is_built_again(tmp_path):
     other = tmp_path / "eight"
     written(other)
     (other / "constants.h").write_text("#pragma once\nconstexpr int SIDES = 8;\n")
-    after = roll(Program(other), "cpu")
+    after = roll(KernelLibrary(other), "cpu")
     assert before.max() == 6 and after.max() == 8
 
 
 def test_a_program_without_a_cpu_kernel_says_so(tmp_path):
-    program = written(tmp_path, "constants.h", "params.h", "roll_dice.h", "roll_dice.cu")
-    assert program.cuda_operations == dict(roll_dice="RollDiceParams")
+    library = written(tmp_path, "constants.h", "params.h", "roll_dice.h", "roll_dice.cu")
+    assert library.cuda_operations == dict(roll_dice="RollDiceParams")
     with pytest.raises(EngineError, match=rf"No \.cpp file in {tmp_path} .* roll_dice: add one"):
-        roll(program, "cpu")
+        roll(library, "cpu")
 
 
 @pytest.mark.cuda
 def test_a_program_without_a_gpu_kernel_says_so(tmp_path):
-    program = written(tmp_path, "constants.h", "params.h", "roll_dice.h", "roll_dice.cpp")
+    library = written(tmp_path, "constants.h", "params.h", "roll_dice.h", "roll_dice.cpp")
     with pytest.raises(EngineError, match=rf"No \.cu file in {tmp_path} .* roll_dice: add one"):
-        roll(program, "cuda")
+        roll(library, "cuda")
 
 
 def test_an_error_in_a_kernel_is_quoted(tmp_path):
-    program = written(tmp_path)
+    library = written(tmp_path)
     (tmp_path / "roll_dice.cpp").write_text("int broken = nonsense;\n" + FILES["roll_dice.cpp"])
     with pytest.raises(EngineError, match=rf"{tmp_path}.*nonsense"):
-        roll(program, "cpu")
+        roll(library, "cpu")
 
 
 def test_shared_memory_that_a_kernel_may_have_never_shrinks(monkeypatch):

@@ -1,7 +1,7 @@
-"""The GPUs of a sweep's jobs. A *place* is as many of this machine's GPUs as a job has ranks.
+"""Assigns the GPUs of this machine to the jobs of a sweep. A *slot* is one GPU per rank of a job.
 
-Jobs know of each other by locks on temporary files, one for each GPU and each job on it; the system
-drops them when a process ends.
+Jobs find each other through locks on temporary files, one per GPU and job on it. The system
+releases a lock when its process ends.
 """
 
 import contextlib
@@ -18,17 +18,19 @@ from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu, launcher
 
-#: The environment variable with the GPUs that a process sees.
+#: Environment variable with the GPUs that a process may use.
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 def check(jobs: Sequence[Any], hydra: Any) -> str | None:
-    """Checks that each job has a GPU for every rank, before the first begins. Returns a sentence
-    about GPUs that stay idle, None if none does.
+    """Checks that every job has a GPU per rank, before the first job starts.
 
     Args:
         jobs: the settings of each job.
         hydra: Hydra's part of the configuration.
+
+    Returns:
+        A sentence about idle GPUs; None if there are none.
 
     Raises:
         ConfigErrors: a job has more ranks than GPUs, or its launcher would run it several times.
@@ -53,7 +55,7 @@ def check(jobs: Sequence[Any], hydra: Any) -> str | None:
 
 
 def _check_on_node(cfg, n_gpus):
-    # a job of Slurm's is given so many GPUs; those of this machine do not matter
+    # Slurm assigns the GPUs, so those of this machine do not matter
     if not n_gpus or cfg.ranks == "all" or cfg.device == "cpu":
         return None
     given = f"hydra.launcher.gpus_per_node={n_gpus}"
@@ -65,44 +67,45 @@ def _check_on_node(cfg, n_gpus):
 
 
 def idle(n_ranks: int, n_gpus: int, is_parallel: bool) -> str | None:
-    """Returns a sentence about the GPUs of this machine that jobs leave idle, None if none is.
+    """Returns a sentence about the GPUs that jobs leave idle; None if there are none.
 
     Args:
-        n_ranks: of a job, at most `n_gpus`.
-        is_parallel: jobs run side by side.
+        n_ranks: ranks per job, at most `n_gpus`.
+        n_gpus: GPUs of this machine.
+        is_parallel: jobs run at the same time.
     """
-    n_places = n_gpus // n_ranks
-    n_idle = n_gpus - n_ranks * (n_places if is_parallel else 1)
+    n_slots = n_gpus // n_ranks
+    n_idle = n_gpus - n_ranks * (n_slots if is_parallel else 1)
     if not n_idle:
         return None
-    if is_parallel or n_places == 1:
+    if is_parallel or n_slots == 1:
         return f"Jobs with ranks={n_ranks} leave {n_idle} of {n_gpus} GPUs idle."
     which = f"Jobs with ranks={n_ranks} that run one after another"
-    cure = f"hydra/launcher=joblib hydra.launcher.n_jobs={n_places} runs {n_places} at a time"
+    cure = f"hydra/launcher=joblib hydra.launcher.n_jobs={n_slots} runs {n_slots} at a time"
     return f"{which} leave {n_idle} of {n_gpus} GPUs idle; {cure}."
 
 
 @contextlib.contextmanager
 def taken(cfg: Any) -> Iterator[Any]:
-    """Takes a place for a job, one with the fewest jobs on it, as long as this context lasts.
+    """Takes the slot with the fewest jobs for the duration of the context.
 
-    Ranks are other processes, and see the GPUs of their place only. A job of this process gets its
-    GPU as PyTorch's current one, which device=auto means. A job with a device of its own takes no
-    place.
+    Ranks are separate processes and see only the GPUs of their slot. For a job in this process, the
+    GPU becomes PyTorch's current device, which device=auto uses. A job with device=cpu or cuda:1
+    takes no slot.
 
     Args:
         cfg: the job's settings.
 
     Yields:
-        The settings, with the number of the GPU if they have device=cuda.
+        The settings; device=cuda is replaced by the GPU's number, such as cuda:1.
     """
     n_gpus = gpu.count() if cfg.device in ("auto", "cuda") else 0
     with contextlib.ExitStack() as stack:
         if n_gpus > 1:
             names = _names(n_gpus)
             if _has_ranks(cfg):
-                place = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
-                visible = {VISIBLE: ",".join(names[i] for i in place)}
+                slot = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
+                visible = {VISIBLE: ",".join(names[i] for i in slot)}
                 stack.enter_context(environment.variables(visible))
             else:
                 (number,) = stack.enter_context(_locked(names, 1))
@@ -115,7 +118,7 @@ def _has_ranks(cfg):
 
 
 def _names(n_gpus):
-    # of this process's GPUs, as the variable has them
+    # as in the variable, where GPUs may have other numbers or be UUIDs
     if visible := os.environ.get(VISIBLE):
         return [name.strip() for name in visible.split(",")][:n_gpus]
     return [*map(str, range(n_gpus))]
@@ -123,24 +126,24 @@ def _names(n_gpus):
 
 @contextlib.contextmanager
 def _locked(names: list[str], size: int) -> Iterator[range]:
-    """Locks the first place that has the fewest jobs on it. Yields the numbers of its GPUs.
+    """Locks the first of the slots with the fewest jobs. Yields the indices of its GPUs.
 
     Args:
-        names: of this process's GPUs.
-        size: number of GPUs of a place; the first place begins with the first GPU.
+        names: names of this process's GPUs.
+        size: GPUs per slot; the first slot starts at the first GPU.
     """
     starts = range(0, len(names) - size + 1, size)
     for n_jobs, start in ((n, start) for n in itertools.count() for start in starts):
-        place = range(start, start + size)
-        if locks := _lock([f"{names[i]}-{n_jobs}" for i in place]):
+        slot = range(start, start + size)
+        if locks := _lock([f"{names[i]}-{n_jobs}" for i in slot]):
             with locks:
-                yield place
+                yield slot
             return
 
 
 def _lock(names):
-    # all or none, which is None
-    import filelock  # which takes a while
+    # returns all locks, or None if one is taken
+    import filelock  # slow to import
 
     prefix = f"megastep-{os.getuid()}-gpu-"
     with contextlib.suppress(filelock.Timeout), contextlib.ExitStack() as stack:
@@ -151,7 +154,7 @@ def _lock(names):
 
 
 def _on_gpu(cfg: Any, number: int, stack: contextlib.ExitStack) -> Any:
-    """Makes a GPU the current one until the stack ends. Returns the settings of a job on it."""
+    """Makes a GPU the current device until the stack closes. Returns settings that use it."""
     import torch
 
     stack.callback(torch.cuda.set_device, torch.cuda.current_device())

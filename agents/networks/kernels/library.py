@@ -1,4 +1,4 @@
-"""The networks' kernels as one program for the CPU and the GPU."""
+"""The kernel library of the networks, for CPU and GPU, and helpers of its wrappers."""
 
 import functools
 from pathlib import Path
@@ -6,14 +6,16 @@ from pathlib import Path
 import torch
 
 from megastep.arrdict import arrdict
-from megastep.kernels.build import program
+from megastep.kernels.build import kernel_library
 from megastep.kernels.build.compile import EngineError, cpu
-from megastep.kernels.build.program import Program
+from megastep.kernels.build.kernel_library import KernelLibrary
 
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
 # Unlike in the engine, no bits have to agree: fused multiply-adds.
-CPU_FLAGS = tuple(flag.replace("contract=off", "contract=fast") for flag in program.CPU_FLAGS)
-CORES = Program(Path(__file__).parent, program.FAST_CUDA_FLAGS, CPU_FLAGS)
+CPU_FLAGS = tuple(
+    flag.replace("contract=off", "contract=fast") for flag in kernel_library.CPU_FLAGS
+)
+LIBRARY = KernelLibrary(Path(__file__).parent, kernel_library.FAST_CUDA_FLAGS, CPU_FLAGS)
 
 
 def units_per_thread(width: int) -> int:
@@ -50,7 +52,7 @@ def n_threads(state: torch.Tensor) -> int:
 def is_built_for_cpu() -> bool:
     """Returns whether the CPU's operations can be used, which takes a C++ compiler."""
     try:
-        return bool(cpu(CORES))
+        return bool(cpu(LIBRARY))
     except EngineError:
         return False
 

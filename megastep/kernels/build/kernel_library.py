@@ -1,4 +1,4 @@
-"""A folder of kernels as a program for the CPU and the GPU."""
+"""A folder of kernels, compiled together for the CPU and for the GPU."""
 
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
@@ -8,9 +8,9 @@ from typing import Any
 
 from megastep.kernels.build import headers
 
-__all__ = ["CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "Program"]
+__all__ = ["CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "KernelLibrary"]
 
-#: The folder of the engine's kernels. Its headers in ``common/`` are for all programs.
+#: The folder of the engine's kernels. Its headers in ``common/`` are for all kernel libraries.
 KERNELS = Path(__file__).parents[1]
 #: The C++ compiler's flags. No fused multiply-adds, as below.
 CPU_FLAGS = (
@@ -39,7 +39,7 @@ CUDA_FLAGS = (
 FAST_CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
 
 
-class Program:
+class KernelLibrary:
     """The kernels in one folder, which are built together when one is first launched.
 
     The folder holds one ``.cpp`` file per operation for the CPU, one ``.cu`` file for the GPU, or
@@ -74,7 +74,7 @@ class Program:
         self.folder, self.cuda_flags, self.cpu_flags = Path(folder), cuda_flags, cpu_flags
 
     def __repr__(self):
-        return f"Program({str(self.folder)!r})"
+        return f"KernelLibrary({str(self.folder)!r})"
 
     @cached_property
     def constants(self) -> dict[str, int | float]:

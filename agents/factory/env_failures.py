@@ -1,0 +1,88 @@
+"""What is said and kept of an error that an environment of somebody else raises."""
+
+import contextlib
+import inspect
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from megastep import engine
+from megastep.agents.errors import EnvFailed, UserError, memory_problem
+from megastep.agents.factory.settings import Env
+from megastep.imports import import_object
+from megastep.sync_envs import EnvError, one_line
+
+#: Has the traceback, in the run's folder.
+FILE = "env_error.txt"
+METHODS = "__init__", "reset", "step", "check", "desync"
+
+
+@contextlib.contextmanager
+def told(
+    env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
+) -> Iterator[None]:
+    """Turns an error of an environment into one sentence, and writes its traceback into a file.
+
+    Args:
+        env: settings of the environment.
+        folder: where the file goes.
+        saved: returns what else to say, such as the command that resumes.
+        rank: number of this process, which another's file than rank 0's has in its name.
+
+    Raises:
+        EnvFailed: in place of the error. Errors of megastep's own code are raised as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        if not (failure := _failure(error, env)):
+            raise
+        is_told = isinstance(error, UserError)  # that a video could not be made because of it
+        text = [str(error if is_told else failure).rstrip(".")]
+        if failure.trace:
+            name = f"rank_{rank}_{FILE}" if rank else FILE
+            text.append(f"Its traceback is in {_write(folder, name, failure.trace)}")
+        if getattr(env, "restart_failed", None) == 0 and not is_told:
+            text.append("env.restart_failed=3 would make it anew up to 3 times")
+        raise EnvFailed(". ".join(filter(None, [*text, saved()]))) from error
+
+
+def _failure(error, env):
+    """Returns the error of an environment as an EnvError, None if another's code raised it."""
+    if isinstance(error, EnvError):
+        return error
+    if isinstance(error, UserError):
+        return error.__cause__ and _failure_below(error.__cause__)
+    is_told = isinstance(error, engine.EngineError)
+    if isinstance(error, (MemoryError, RuntimeError)):
+        is_told |= memory_problem(error) is not None
+    if is_told or env.name.startswith("megastep."):
+        return None
+    codes = {_code(import_object(env.name), name) for name in METHODS} - {None}
+    frames = error.__traceback__
+    while frames and frames.tb_frame.f_code not in codes:
+        frames = frames.tb_next
+    trace = "".join(traceback.format_exception(type(error), error, frames))
+    return frames and EnvError(f"{env.name} failed: {one_line(error)}", trace)
+
+
+def _failure_below(error):
+    """Returns an EnvError that others were raised from."""
+    while error is not None and not isinstance(error, EnvError):
+        error = error.__cause__
+    return error
+
+
+def _code(kind, name):
+    return getattr(inspect.unwrap(getattr(kind, name, None) or kind), "__code__", None)
+
+
+def _write(folder, name, trace):
+    """Writes a traceback into a folder, or a temporary one. Returns the path."""
+    for place in (folder, Path(tempfile.gettempdir())):
+        with contextlib.suppress(OSError):
+            path = place / name
+            path.write_text(trace, "utf-8", "backslashreplace")
+            return path
+    return "no file, as none can be written"

@@ -1,0 +1,225 @@
+"""Objects: things in an environment that agents see, bump into and carry.
+
+N environments, O objects per environment, P colours, A agents per environment, D layouts.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from megastep.engine import checks
+from megastep.kernels.build.compile import EngineError
+from megastep.kernels.build.launch import ENGINE
+from megastep.read_only import SetOnce
+
+if TYPE_CHECKING:
+    from megastep.engine.scenery import Scenery
+
+__all__ = ["SHAPES", "Objects", "check_objects", "object_params"]
+
+#: {shape: number of lines it is drawn with}.
+SHAPES = {"disc": 6, "crate": 4, "door": 1}
+NUMBERS = {name: ENGINE.constants[name.upper()] for name in SHAPES}
+_BYTES = ENGINE.constants["OBJECT_BYTES"]
+MAX_OBJECTS = 256  # per environment, so that its lines fit into shared memory
+_KINDS = ENGINE.constants["OBJECT_ERROR_KINDS"]
+_MESSAGES = dict(
+    BAD_POSE="has a non-finite position or angle, or a size that is not above 0",
+    BAD_COLOUR="has a colour that the palette does not have: colours are integers from 0",
+    BAD_CARRIER="is carried by an agent that does not exist: carriers are agents, or -1 for none",
+    OUTSIDE="is outside of its home",
+    NO_ROOM="does not fit anywhere: use fewer or smaller objects, more points, or larger homes",
+)
+_ERRORS = {ENGINE.constants[name]: message for name, message in _MESSAGES.items()}
+
+
+class Objects(SetOnce):
+    """The objects of N environments, O each. ``scenery.objects = Objects(...)`` adds them.
+
+    Every environment has the same shapes. All else differs and may be written in place with
+    PyTorch. An object that is not ``visible``, or is ``open``, is as if it were not there.
+
+    Cameras see objects, in one colour each. A solid object stops agents and hides what is behind it
+    from respawning agents. An agent never sees what it carries.
+
+    Args:
+        n_envs: number of environments N.
+        shapes: "disc", "crate" or "door" of each object. A disc is drawn as a hexagon, a crate is a
+            square, and a door is a segment along its angle.
+        palette: (P, 3), linear light in [0, 1], the colours.
+        lit: the lights of the layout fall on objects, by one sample each. By default all have full
+            light, so that a colour looks the same everywhere.
+        names: of the objects, for error messages.
+        device: where to put them.
+
+    Attributes:
+        records: (N, O, 8) float32, the memory that the tensors below, to ``carriers``, share.
+        positions: (N, O, 2) metres. Of a carried object, its carrier's at each render.
+        angles: (N, O) degrees.
+        sizes: (N, O) metres: the radius of a disc, half the side of a crate, half a door's length.
+        colours: (N, O) int32, indices into ``palette``.
+        visible: (N, O) bool, at first False.
+        solid: (N, O) bool. Carried objects stop nobody.
+        open: (N, O) bool.
+        carriers: (N, O) int32, the agent that carries it, or -1.
+        lines: (N, L, 2, 2), written by every render, those of object 0 first.
+        texels: (N, O, 4), red, green, blue and light, written by every render.
+        line_starts: (O + 1,) int32, the first line of each object.
+        error_flag: (1,) int32, see :func:`check_objects`.
+
+    Raises:
+        ValueError: naming the argument that does not fit.
+    """
+
+    def __init__(
+        self,
+        n_envs: int,
+        shapes: Sequence[str],
+        palette: Any,
+        lit: bool = False,
+        names: Sequence[str] | None = None,
+        device: Any = "cpu",
+    ):
+        device = checks.device("device", device)
+        n = checks.integer("n_envs", n_envs, 1)
+        shapes = [
+            checks.word("shapes", shape, [*SHAPES]) for shape in checks.items("shapes", shapes)
+        ]
+        self.n_envs, self.n_objects = n, checks.integer("len(shapes)", len(shapes), 1, MAX_OBJECTS)
+        checks.integer("n_envs * len(shapes)", n * len(shapes), 1, (2**31 - 1) // _KINDS)
+        self.lit = checks.flag("lit", lit)
+        self.names = [*names] if names is not None else [f"object {k}" for k in range(len(shapes))]
+        self.palette = checks.floats("palette", palette, ("P", 3), device)
+        self.n_colours = checks.integer("len(palette)", len(self.palette), 1)
+        self.device = device
+
+        self.records = torch.zeros((n, len(shapes), _BYTES // 4), device=device)
+        self.sizes.fill_(0.1)
+        self.carriers.fill_(-1)
+        widths = torch.tensor([SHAPES[shape] for shape in shapes])
+        self.shapes = torch.tensor([NUMBERS[s] for s in shapes], dtype=torch.int32, device=device)
+        self.line_starts = torch.cat([widths[:1] * 0, widths.cumsum(0)]).int().to(device)
+        objects = torch.arange(len(shapes), dtype=torch.int32)
+        self.line_object = objects.repeat_interleave(widths).to(device)
+        self.lines = torch.zeros((n, int(widths.sum()), 2, 2), device=device)
+        self.texels = torch.zeros((n, len(shapes), 4), device=device)
+        self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
+
+    @property
+    def positions(self) -> torch.Tensor:
+        return self.records[..., :2]
+
+    @property
+    def angles(self) -> torch.Tensor:
+        return self.records[..., 2]
+
+    @property
+    def sizes(self) -> torch.Tensor:
+        return self.records[..., 3]
+
+    @property
+    def carriers(self) -> torch.Tensor:
+        return self.records.view(torch.int32)[..., 4]
+
+    @property
+    def colours(self) -> torch.Tensor:
+        return self.records.view(torch.int32)[..., 5]
+
+    @property
+    def visible(self) -> torch.Tensor:
+        return self.records.view(torch.bool)[..., 24]
+
+    @property
+    def solid(self) -> torch.Tensor:
+        return self.records.view(torch.bool)[..., 25]
+
+    @property
+    def open(self) -> torch.Tensor:
+        return self.records.view(torch.bool)[..., 26]
+
+    def at_lines(self, lines: torch.Tensor, n_agent_lines: int) -> torch.Tensor:
+        """Returns the object of each line, int64 and -1 for others.
+
+        Args:
+            lines: int32, indices into the lines of an environment, as ``Render.indices``.
+            n_agent_lines: those of agents, which come first.
+        """
+        index = lines.long() - n_agent_lines
+        is_object = (index >= 0) & (index < len(self.line_object))
+        objects = self.line_object.long()[index.clamp(0, len(self.line_object) - 1)]
+        return objects.masked_fill(~is_object, -1)
+
+
+_FIELDS = [
+    *("shapes", "line_starts", "line_object", "palette", "extents", "objects", "lines", "texels"),
+    *("error_flag", "n_objects", "n_lines", "n_colours", "lit"),
+]
+_NONE = ENGINE.params.ObjectsParams(**dict.fromkeys(_FIELDS, 0))
+
+
+class _Packed:
+    """The packed ObjectsParams, and the addresses and bytes that they were packed from. Has no
+    ``__dict__``, so that it is not part of the state.
+    """
+
+    __slots__ = ("inputs", "params", "tensors")
+
+
+def object_params(scenery: "Scenery") -> bytes:
+    """Returns the packed ObjectsParams of a scenery, of none if it has no objects.
+
+    Raises:
+        ValueError: naming the tensor that does not fit.
+    """
+    objects = scenery.objects
+    if objects is None:
+        return _NONE
+    packed = vars(objects).get("_packed")
+    if packed is None:
+        packed = vars(objects)["_packed"] = _Packed()
+        packed.inputs = None
+        packed.tensors = objects.records, objects.lines, objects.texels, objects.palette
+    inputs = [(t.data_ptr(), t.nbytes, t.untyped_storage().nbytes()) for t in packed.tensors]
+    if packed.inputs != inputs:
+        packed.params, packed.inputs = _pack(scenery, objects), inputs
+    return packed.params
+
+
+def _pack(scenery, o):
+    shape, n_lines = (o.n_envs, o.n_objects), len(o.line_object)
+
+    def address(name, tensor, *shape):
+        return checks.address(f"objects.{name}", tensor, shape, torch.float32, scenery.device)
+
+    return ENGINE.params.ObjectsParams(
+        shapes=o.shapes,
+        line_starts=o.line_starts,
+        line_object=o.line_object,
+        palette=address("palette", o.palette, o.n_colours, 3),
+        extents=scenery.layouts.extents,
+        objects=address("records", o.records, *shape, _BYTES // 4),
+        lines=address("lines", o.lines, o.n_envs, n_lines, 2, 2),
+        texels=address("texels", o.texels, *shape, 4),
+        error_flag=o.error_flag,
+        n_objects=o.n_objects,
+        n_lines=n_lines,
+        n_colours=o.n_colours,
+        lit=int(o.lit),
+    )
+
+
+def check_objects(objects: Objects) -> None:
+    """Raises the error of an object that the device flagged since the last check, if any.
+
+    :func:`megastep.engine.check` does so too. Synchronises host and device.
+
+    Raises:
+        EngineError: naming the environment and the object.
+    """
+    flag = checks.stored("objects.error_flag", objects.error_flag).item()
+    if flag:
+        objects.error_flag.zero_()
+        index, kind = divmod(flag, _KINDS)
+        env, k = divmod(index, objects.n_objects)
+        raise EngineError(f"In environment {env}, {objects.names[k]} {_ERRORS[kind]}.")

@@ -1,0 +1,91 @@
+// Objects: things in an environment that agents see, bump into and carry.
+//
+// N environments, O objects per environment, L lines of one environment's objects, P colours.
+#pragma once
+#include "common/math.h"
+#include "common/scenery.h"
+
+// An object, in 32 bytes that are read at once. Python's tensors of objects are views of its
+// fields.
+struct ALIGNED Object {
+    float x, y;             // metres; of a carried object, its carrier's
+    float angle;            // degrees
+    float size;             // metres: radius, or half the length of a side
+    int carrier;            // the agent that carries it; -1: none
+    int colour;             // index into the palette
+    unsigned char visible;  // 0: as if it were not there
+    unsigned char solid;    // 1: stops agents and lines of sight
+    unsigned char open;     // 1: as if it were not there
+    unsigned char unused[5];
+};
+static_assert(sizeof(Object) == OBJECT_BYTES, "Python views its fields");
+
+struct ObjectsParams {
+    const int* shapes;       // (O) DISC, CRATE or DOOR
+    const int* line_starts;  // (O + 1) first line of each object
+    const int* line_object;  // (L) the object of each line
+    const float* palette;    // (P, 3) linear light
+    const float* extents;    // (D, 4) min x, min y, max x, max y of each layout's walls
+    float* objects;          // (N, O) records of the struct Object
+    float* lines;            // (N, L, 4) out; an object that is not there has lines of 0 m
+    float* texels;           // (N, O, 4) out: red, green, blue, light
+    int* error_flag;         // (1) out: OBJECT_ERROR_KINDS * (O env + object) + kind
+    int n_objects;           // 0: there are none
+    int n_lines;
+    int n_colours;
+    int lit;  // 1: the layout's lights fall on them, else each has full light
+};
+
+HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
+
+HD void flag_object(const ObjectsParams& o, int i, int kind) {
+    *o.error_flag = OBJECT_ERROR_KINDS * i + kind;
+}
+
+HD int is_there(const Object& object) { return object.visible && !object.open; }
+
+// Returns 1 if an object stops agents.
+HD int is_obstacle(const Object& object) {
+    return object.solid && is_there(object) && object.carrier < 0;
+}
+
+HD int n_lines_of(int shape) { return shape == DISC ? 6 : shape == CRATE ? 4 : 1; }
+
+// Corner k of a shape of size 1 about its own origin.
+HD void corner_of(int shape, int k, float& x, float& y) {
+    if (shape == DISC) {  // a hexagon
+        int left = k == 2 || k == 3 || k == 4, beside = k == 0 || k == 3;
+        x = (left ? -1.f : 1.f) * (beside ? 1.f : 0.5f);
+        y = beside ? 0.f : (k < 3 ? 0.8660254f : -0.8660254f);
+    } else {
+        x = k == 0 || k == 3 ? -1.f : 1.f;
+        y = shape == DOOR ? 0.f : (k < 2 ? -1.f : 1.f);
+    }
+}
+
+// Line k of a shape of this size at a pose. Written with sums alone, as update_line.
+HD Float4 line_of(int shape, int k, float size, const Pose& pose) {
+    float ax, ay, bx, by, minus_sine = -pose.sine;
+    corner_of(shape, k, ax, ay);
+    corner_of(shape, k + 1 == n_lines_of(shape) && k ? 0 : k + 1, bx, by);
+    ax *= size;
+    ay *= size;
+    bx *= size;
+    by *= size;
+    return {pose.x + (pose.cosine * ax + minus_sine * ay),
+            pose.y + (pose.sine * ax + pose.cosine * ay),
+            pose.x + (pose.cosine * bx + minus_sine * by),
+            pose.y + (pose.sine * bx + pose.cosine * by)};
+}
+
+// Returns 1 if a disc of this radius touches no obstacle of an environment. Crates and doors count
+// as discs of their size.
+HD int is_clear(const ObjectsParams& o, int env, float x, float y, float radius) {
+    for (int i = env * o.n_objects; i < (env + 1) * o.n_objects; i++) {
+        Object object = objects_of(o)[i];
+        float dx = x - object.x, dy = y - object.y, apart = radius + object.size;
+        if (is_obstacle(object) && dx * dx + dy * dy < apart * apart)
+            return 0;
+    }
+    return 1;
+}

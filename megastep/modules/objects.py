@@ -1,0 +1,364 @@
+"""Objects: keys, crates and doors as an environment's author uses them.
+
+N environments, A agents per environment, K objects of a kind, D layouts.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from megastep import engine
+from megastep.colour import gamma_decode
+from megastep.core import Core
+from megastep.dotdict import dotdict
+from megastep.engine import checks
+from megastep.engine.objects import MAX_OBJECTS, NUMBERS
+from megastep.modules.spawning import MAX_SPAWNS, cached_points
+from megastep.ragged import Ragged, RaggedNumpy
+
+__all__ = ["COLOURS", "Crate", "Disc", "Door", "Kind", "Objects", "doorways"]
+
+#: Names of the colours, and the colours in sRGB. Each differs from the others in any light, and its
+#: weakest channel has less of its light than any wall's.
+COLOURS = {
+    "red": "e6194b",
+    "green": "1fa83a",
+    "blue": "2450e0",
+    "yellow": "e8d010",
+    "magenta": "d020d8",
+    "cyan": "10c0d8",
+    "orange": "f07010",
+    "violet": "6a18b8",
+}
+#: The tensors of a kind.
+TENSORS = "positions", "angles", "sizes", "colours", "visible", "solid", "open", "carriers"
+REACH = 0.05  # metres between surfaces at which an agent touches an object
+_DISC, _CRATE = NUMBERS["disc"], NUMBERS["crate"]
+_INTO_WALL = 0.001  # metres that a door is longer than its opening, on either side
+
+
+class Disc(NamedTuple):
+    """A kind of round objects.
+
+    Attributes:
+        count: objects per environment.
+        radius: metres.
+        solid: whether they stop agents.
+    """
+
+    count: int
+    radius: float = 0.1
+    solid: bool = False
+
+
+class Crate(NamedTuple):
+    """A kind of square objects.
+
+    Attributes:
+        count: objects per environment.
+        side: metres.
+        solid: whether they stop agents.
+    """
+
+    count: int
+    side: float = 0.3
+    solid: bool = True
+
+
+class Door(NamedTuple):
+    """A kind of solid objects that close the doorways of homes, one each.
+
+    Attributes:
+        count: of an environment at most; further doorways have no door. None: as many as the home
+            with the most doorways has.
+    """
+
+    count: int | None = None
+
+
+def doorways(geometries: Sequence[dotdict]) -> RaggedNumpy:
+    """Returns the segments (2, 2) across the doorways of each geometry, float32 metres; none of one
+    without the key `doors`.
+    """
+    segments = [np.reshape(g.get("doors", ()), (-1, 2, 2)).astype(np.float32) for g in geometries]
+    return Ragged(np.concatenate(segments), np.array([len(s) for s in segments]))
+
+
+class Objects:
+    """The objects of an environment, by kind. ``objects["key"]`` is a :class:`Kind`.
+
+    They are invisible until they are placed. Cameras see them, agents bump into the solid ones, and
+    all that an environment does with them is PyTorch on :attr:`Kind.positions` and other tensors.
+
+    Args:
+        geometries: those that the scenery was made from.
+        core: the environment's core, whose ``scenery.objects`` they become. It can have only one.
+        kinds: {name: :class:`Disc`, :class:`Crate`, :class:`Door`, or a number of discs}.
+        colours: names or hexadecimal sRGB of the colours. Default: ``COLOURS``.
+        lit: see :class:`megastep.engine.Objects`.
+        n_points: points per layout at which objects are placed.
+        seed: of the points and draws. Default: the core's.
+
+    Attributes:
+        all: the :class:`megastep.engine.Objects` of all kinds.
+        points: (D, n_points, 2) float32 metres, where the largest disc or crate is 5 cm clear of
+            every wall.
+
+    Raises:
+        ValueError: naming the argument that does not fit, or a geometry where nothing fits.
+    """
+
+    def __init__(
+        self,
+        geometries: Sequence[dotdict],
+        core: Core,
+        kinds: Mapping[str, int | Disc | Crate | Door],
+        colours: Sequence[str] = tuple(COLOURS),
+        lit: bool = False,
+        n_points: int = 128,
+        seed: int | None = None,
+    ):
+        self.core = core
+        geometries = geometries[: len(core.scenery.layouts)]
+        if not checks.instance("kinds", kinds, Mapping):
+            raise ValueError("kinds must hold at least one kind of objects, but is empty")
+        shapes, sizes, solid, names, slots = [], [], [], [], {}
+        openings = doorways(geometries)
+        for name, kind in kinds.items():
+            kind = Disc(kind) if isinstance(kind, int) else kind
+            count = _count(name, kind, openings)
+            size = {Disc: "radius", Crate: "side"}.get(type(kind))
+            length = checks.number(f"{size} of {name}", getattr(kind, size), 0, 100) if size else 0
+            slots[name] = slice(len(shapes), len(shapes) + count)
+            shapes += [type(kind).__name__.lower()] * count
+            sizes += [length / 2 if size == "side" else length] * count
+            solid += [getattr(kind, "solid", True)] * count
+            names += [f"{name} {k}" for k in range(count)]
+        self.all = engine.Objects(core.n_envs, shapes, _palette(colours), lit, names, core.device)
+        self.all.sizes.copy_(torch.tensor(sizes))
+        self.all.solid.copy_(torch.tensor(solid))
+        if core.scenery.objects is not None:
+            raise ValueError("core has objects: give all kinds to one Objects")
+        core.scenery.objects = self.all
+
+        seed = core.seed if seed is None else checks.integer("seed", seed, 0)
+        self.seed = seed + (5 << 32)  # differs from the spawns' seed
+        n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
+        loose = [size * 2**0.5 if shape == "crate" else size for shape, size in zip(shapes, sizes)]
+        radius = max(core.agents.radius, *loose)
+        points = cached_points(geometries, n_points, 1, radius, self.seed)
+        self.points = torch.as_tensor(points, device=core.device)
+        self.counts = torch.zeros_like(self.all.carriers)
+        self._mask = torch.zeros_like(self.all.carriers, dtype=torch.bool)
+        self.kinds = {
+            name: (Doors if isinstance(kinds[name], Door) else Kind)(self, name, slots[name])
+            for name in kinds
+        }
+        for kind in self.kinds.values():
+            if isinstance(kind, Doors):
+                kind.set_openings(openings)
+
+    def __getitem__(self, name: str) -> "Kind":
+        return self.kinds[name]
+
+    def place(self, mask: torch.Tensor) -> None:
+        """Puts objects where they fit, as :func:`megastep.engine.place_objects`.
+
+        Args:
+            mask: (N, O) bool.
+        """
+        core = self.core
+        engine.place_objects(core.scenery, core.agents, mask, self.points, self.counts, self.seed)
+
+
+class Kind:
+    """The objects of one kind. Its tensors are views of the engine's: write into them in place.
+
+    Attributes:
+        positions: (N, K, 2) metres; of a carried object, its carrier's.
+        angles: (N, K) degrees.
+        sizes: (N, K) metres.
+        colours: (N, K) int32, indices into the colours.
+        visible, solid, open: (N, K) bool. An open object is as if it were not there.
+        carriers: (N, K) int32, the agent that carries it, or -1.
+        slots: the kind's objects among all of an environment.
+    """
+
+    def __init__(self, objects: Objects, name: str, slots: slice):
+        self._objects, self.name, self.slots = objects, name, slots
+        self._agents = torch.arange(objects.core.n_agents, device=objects.core.device)
+
+    def __len__(self) -> int:
+        return self.slots.stop - self.slots.start
+
+    def __getattr__(self, name: str) -> torch.Tensor:
+        if name not in TENSORS:
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self._objects.all, name)[:, self.slots]
+
+    def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
+        """Puts objects at random points in rooms, on no agent and no other object.
+
+        Call it after the spawner: points are of the layout that an environment shows.
+
+        Args:
+            mask: (N,) or (N, K) bool.
+            colours: (N, K) or (K,) integers, or one; their new colours. Default: they keep theirs.
+        """
+        mask, whole = self._broadcast(mask), self._objects._mask
+        self._paint(mask, colours)
+        whole.zero_()
+        whole[:, self.slots] = mask
+        self._objects.place(whole)
+
+    def remove(self, mask: torch.Tensor) -> None:
+        """Has objects vanish where ``mask``, (N,) or (N, K) bool, is True."""
+        mask = self._broadcast(mask)
+        self.visible.logical_and_(~mask)
+        self.carriers.masked_fill_(mask, -1)
+
+    def touching(self, reach: float = REACH) -> torch.Tensor:
+        """Returns (N, A, K) bool: which agents are within ``reach`` metres of which objects' edges.
+
+        Nobody touches an object that is not there, or is carried.
+        """
+        agents, objects = self._objects.core.agents, self._objects.all
+        offset = agents.positions[:, :, None] - self.positions[:, None]
+        angle = torch.deg2rad(self.angles)[:, None]
+        sine, cosine = angle.sin(), angle.cos()
+        ahead = (cosine * offset[..., 0] + sine * offset[..., 1]).abs()
+        aside = (cosine * offset[..., 1] - sine * offset[..., 0]).abs()
+        shapes, sizes = objects.shapes[self.slots], self.sizes[:, None]
+        is_disc, is_crate = shapes == _DISC, shapes == _CRATE
+        ahead = (ahead - sizes * ~is_disc).clamp(min=0)
+        aside = (aside - sizes * is_crate).clamp(min=0)
+        limit = agents.radius + reach + sizes * is_disc
+        return (ahead.square() + aside.square() <= limit.square()) & self._loose()[:, None]
+
+    def looked_at(self, centre_line: torch.Tensor) -> torch.Tensor:
+        """Returns (N, A, K) bool: which objects are at the centre of which agents' screens.
+
+        Args:
+            centre_line: (N, A) or (N, A, C) int32, of :func:`megastep.engine.observe`.
+        """
+        core, n_agent_lines = self._objects.core, self._objects.core.scenery.agent_lines.shape[1]
+        objects = self._objects.all.at_lines(centre_line, n_agent_lines)
+        objects = objects.view(core.n_envs, core.n_agents, -1, 1)
+        return (objects == torch.arange(self.slots.start, self.slots.stop, device=core.device)).any(
+            2
+        )
+
+    def carry(self, mask: torch.Tensor) -> None:
+        """Has agents pick up objects where ``mask``, (N, A, K) bool, is True.
+
+        If several agents want one, the first has it. Nobody picks up what is not there, or carried.
+        """
+        taken = mask.any(1) & self._loose()
+        self.carriers.copy_(torch.where(taken, mask.int().argmax(1).int(), self.carriers))
+
+    def carried(self) -> torch.Tensor:
+        """Returns (N, A, K) bool: which agents carry which objects."""
+        return self.carriers[:, None] == self._agents[:, None]
+
+    def drop(self, mask: torch.Tensor) -> None:
+        """Has agents put down, where they are, what they carry, where ``mask``, (N, A) or (N, A, K)
+        bool, is True.
+        """
+        mask = mask if mask.ndim == 3 else mask[..., None]
+        self.carriers.masked_fill_((self.carried() & mask).any(1), -1)
+
+    def _loose(self):
+        return self.visible & ~self.open & (self.carriers < 0)
+
+    def _broadcast(self, mask):
+        n, k = self.visible.shape
+        if (
+            not isinstance(mask, torch.Tensor)
+            or mask.dtype != torch.bool
+            or mask.shape not in (*((n,), (n, 1), (n, k)),)
+        ):
+            raise ValueError(
+                f"mask must be a bool tensor of shape ({n},) or ({n}, {k}), one per environment or "
+                f"per {self.name}"
+            )
+        return mask.view(n, -1).expand(n, k)
+
+    def _paint(self, mask, colours):
+        if isinstance(colours, int):
+            self.colours.masked_fill_(mask, colours)
+        elif colours is not None:
+            self.colours.copy_(torch.where(mask, colours.to(self.colours), self.colours))
+
+
+class Doors(Kind):
+    """The doors of homes: a :class:`Kind` whose objects each close a doorway.
+
+    Attributes:
+        n_doorways: (D,) int64, doors that each layout has.
+    """
+
+    def set_openings(self, openings: RaggedNumpy) -> None:
+        """Takes the doorways (2, 2) of each layout."""
+        shape, device = (len(openings), len(self)), self.positions.device
+        poses = np.zeros((*shape, 4), np.float32)
+        for d in range(len(openings)):
+            a, b = openings[d][: len(self)].astype(float).swapaxes(0, 1)
+            along = b - a
+            poses[d, : len(a), :2] = (a + b) / 2
+            poses[d, : len(a), 2] = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
+            poses[d, : len(a), 3] = np.hypot(*along.T) / 2 + _INTO_WALL
+        self._poses = torch.as_tensor(poses, device=device)
+        self.n_doorways = torch.as_tensor(openings.widths, device=device).clamp(max=len(self))
+
+    def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
+        """Puts a shut door into each doorway of the layout that an environment shows.
+
+        Args:
+            mask: (N,) or (N, K) bool.
+            colours: (N, K) or (K,) integers, or one; their new colours. Default: they keep theirs.
+        """
+        mask = self._broadcast(mask)
+        self._paint(mask, colours)
+        layout = self._objects.core.scenery.layout.long()
+        poses = self._poses[layout]
+        for tensor, values in (
+            (self.positions, poses[..., :2]),
+            (self.angles, poses[..., 2]),
+            (self.sizes, poses[..., 3]),
+        ):
+            where = mask if values.ndim == 2 else mask[..., None]
+            tensor.copy_(torch.where(where, values, tensor))
+        exists = torch.arange(len(self), device=layout.device) < self.n_doorways[layout][:, None]
+        self.visible.copy_(torch.where(mask, exists, self.visible))
+        self.open.logical_and_(~mask)
+
+
+def _count(name, kind, openings):
+    if not isinstance(kind, (Disc, Crate, Door)):
+        raise ValueError(f"{name} must be a number, Disc, Crate or Door, but is {kind!r}")
+    if not isinstance(kind, Door):
+        return checks.integer(f"the number of {name}", kind.count, 1, MAX_OBJECTS)
+    most = int(openings.widths.max())
+    if not most:
+        raise ValueError(
+            f"{name}: none of the geometries has a doorway to put a door into; homes have, boxes "
+            "and mazes have not"
+        )
+    return most if kind.count is None else checks.integer(f"the number of {name}", kind.count, 1)
+
+
+def _palette(colours):
+    try:
+        hexadecimal = [COLOURS.get(colour, colour) for colour in checks.items("colours", colours)]
+        return gamma_decode(
+            np.array(
+                [[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in hexadecimal]
+            )
+        )
+    except (ValueError, TypeError, AttributeError):
+        raise ValueError(
+            f"colours must be of {', '.join(COLOURS)}, or hexadecimal such as 'e6194b', but "
+            f"{colours!r} was given"
+        ) from None

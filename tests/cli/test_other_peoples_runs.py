@@ -1,0 +1,122 @@
+"""Runs in environments of other people that fail."""
+
+import json
+
+import pytest
+
+from megastep import engine
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.runs import json_lines
+from megastep.agents.training.closing import close_env
+from megastep.envs.minimal import Minimal
+
+pytest.importorskip("gymnasium")
+pytestmark = pytest.mark.usefixtures("here")
+WORDS = [
+    *("env=gymnasium", "device=cpu", "env.n_envs=4", "agent.width=8"),
+    *("learner.n_steps=8", "learner.n_minibatches=2", "log_every=1", "logger=none"),
+]
+
+
+class Own(Minimal):
+    """Fails in its 20th step, with an error that nothing in megastep expects."""
+
+    count = 0
+
+    def step(self, decision):
+        self.count += 1
+        if self.count == 20:
+            raise KeyError("door")
+        return super().step(decision)
+
+
+def env_id(name):
+    return f"env.id=tests.helpers.odd_envs:Odd{name}-v0"
+
+
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_failed_environment_ends_the_run_with_all_saved(here, vectorization, capsys):
+    words = [*WORDS, env_id("Crash"), "samples=9600", "folder=run", "seed=2"]
+    assert train.main([*words, f"env.vectorization={vectorization}"]) == 4
+    (line,) = capsys.readouterr().err.splitlines()
+    text = "OddCrash-v0: environment {} failed: OSError: simulator does not answer. Its traceback "
+    assert any(text.format(i) in line for i in range(4))
+    n_samples = json_lines.read(here / "run/metrics.jsonl")[-1]["samples"]
+    assert f"All {n_samples} samples are saved. To continue: python train.py resume=run" in line
+    trace = (here / "run/env_error.txt").read_text()
+    assert trace.startswith("Traceback") and "odd_envs.py" in trace
+    assert "sync_envs" not in trace and trace.endswith("OSError: simulator does not answer\n")
+    words = ["resume=run", "samples=640", "env.restart_failed=50"]
+    assert train.main(words) == 0
+    rows = json_lines.read(here / "run/metrics.jsonl")
+    assert rows[-1]["samples"] == 640 and sum(row.get("episode/restarts", 0) for row in rows) > 0
+
+
+def test_failure_before_training_leaves_the_traceback(here, capsys):
+    assert train.main([*WORDS, env_id("CrashInReset"), "samples=64", "folder=run"]) == 4
+    assert "OddCrashInReset-v0: environment 0 failed: KeyError: 'map'" in capsys.readouterr().err
+    assert "odd_envs.py" in (here / "run/env_error.txt").read_text()
+
+
+def test_own_class_that_fails(here, capsys):
+    words = [f"env={__name__}:Own", "geometry=box", *WORDS[1:], "samples=640"]
+    assert train.main([*words, "env.res=8", "folder=run"]) == 4
+    text = capsys.readouterr().err
+    assert ":Own failed: KeyError: 'door'. Its traceback is in" in text
+    assert "saved. To continue: python train.py resume=run" in text
+    assert "in step" in (here / "run/env_error.txt").read_text()
+
+
+def test_environment_that_cannot_be_closed_is_a_warning(here, capsys):
+    words = [*WORDS, env_id("CloseFails"), "samples=64", "folder=run"]
+    assert train.main([*words, "finish.evaluate=true", "finish.episodes=4"]) == 0
+    assert "warning: The environment could not be closed: " in capsys.readouterr().err
+    assert len([*here.glob("run/evaluations/*.json")]) == 1
+
+
+def test_environment_that_hangs_in_close_is_left():
+    class Env:
+        def close(self):
+            while True:
+                pass
+
+    with pytest.warns(
+        UserWarning, match="could not be closed: TimeoutError: it took more than 0.1"
+    ):
+        close_env(Env(), seconds=0.1)
+
+
+def test_evaluation_cuts_endless_episodes_off(here, capsys):
+    assert train.main([*WORDS, env_id("Endless"), "samples=64", "folder=run"]) == 0
+    assert evaluate.main(["run=run", "episodes=4", "max_steps=100", "baseline=false"]) == 0
+    text = "warning: trained: 4 of 4 episodes had not ended after 100 steps and are counted as"
+    assert text in capsys.readouterr().err
+    (table,) = here.glob("run/evaluations/*.json")
+    (row,) = json.loads(table.read_text())["rows"]
+    assert (row["return"], row["length"], row["unfinished"]) == (100, 100, 4)
+
+
+def test_failure_in_an_evaluation(here, capsys):
+    words = [*WORDS, env_id("Crash"), "env.restart_failed=50", "samples=64", "folder=run"]
+    assert train.main(words) == 0
+    words = ["env=gymnasium", env_id("Crash"), "episodes=16", "run=run"]
+    assert evaluate.main(words) == 4
+    assert "OSError: simulator does not answer. Its traceback" in capsys.readouterr().err
+    assert (here / "run/env_error.txt").exists()
+
+
+@pytest.mark.parametrize("name, grey", [("BuildsRenderer", 9), ("Float255", 128)])
+def test_odd_renderers_are_filmed(here, name, grey):
+    from matplotlib.image import imread
+
+    words = ["env=gymnasium", env_id(name), "steps=2", "file=a.png", "device=cpu"]
+    assert record.main(words) == 0
+    assert (255 * imread(here / "a.png")[..., :3]).round().tolist() == [[[grey] * 3] * 8] * 8
+
+
+def test_space_that_is_too_large_is_refused_with_its_size(here, monkeypatch, capsys):
+    monkeypatch.setattr(engine, "free_memory", lambda device: 1e9)
+    assert train.main([*WORDS, env_id("ManyActions"), "samples=64"]) == 2
+    text = "OddManyActions-v0 has 1 numbers to observe and 3,000,000 actions, for which a network"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert text in line and "1.0 GB are free on cpu" in line and not [*here.glob("runs/*")]
