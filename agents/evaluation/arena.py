@@ -101,6 +101,7 @@ class Arena:
         env = settings.changed(env, n_envs=len(self.shard.envs))
         where |= dict(geometries=[homes[home] for home in self.shard.homes], seed=self.seed)
         self.env, self.sample = factory.construct(env, **where), sample
+        factory.load_wrappers(self.env, run)
         self.others = [
             player._replace(policy=factory.in_env(player.policy, env, self.env))
             for player in self.others

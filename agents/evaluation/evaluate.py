@@ -89,6 +89,7 @@ def play(
     where = dict(geometries=[homes[home] for home in shard.homes], seed=seed, device=device)
     env, rows = factory.construct(env_settings, **where), []
     policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    factory.load_wrappers(env, loaded)
     players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
     players += [("random", RandomActions(env.action_space), False)] * cfg.baseline
     sources = None if source else factory.sources_of(homes)

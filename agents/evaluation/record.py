@@ -39,6 +39,8 @@ def run(cfg: settings.Record) -> Path:
     env = factory.make_sample(env_settings, homes, seed=cfg.seed, device=device, films=True)
     random = RandomActions(env.action_space)
     policy = arena.load_player(loaded, env, loaded).policy if cfg.run else random
+    if cfg.run:
+        factory.load_wrappers(env, loaded)
     if cfg.against is not None:
         opponent = arena.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
         console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")

@@ -373,5 +373,22 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Pol
     return policy
 
 
+def load_wrappers(env: Any, loaded: checkpoint.Checkpoint, is_frozen: bool = True) -> None:
+    """Gives the wrappers of an environment what those of a checkpoint's have learnt.
+
+    Args:
+        is_frozen: it stays as it is from now on.
+
+    Raises:
+        UserError: the environment is not in the same wrappers.
+    """
+    if state := loaded.state.get("wrappers"):
+        load = optional(env, "load_wrapper_state")
+        with errors(f"{loaded.path} cannot be used here: "):
+            if load is None:
+                raise ValueError(f"{type(env).__name__} has no load_wrapper_state")
+            load(state, is_frozen)
+
+
 def _nbytes(env):
     return sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())

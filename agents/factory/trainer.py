@@ -74,6 +74,8 @@ def make_trainer(
         path = folders.find(cfg.resume or cfg.init)
         loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
+        if cfg.init:
+            factory.load_wrappers(env, loaded, is_frozen=False)
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)

@@ -7,14 +7,13 @@ B lanes; `...` any further axes.
 from collections.abc import Iterable, Sequence
 
 import torch
+from megastep.agents.networks.kernels.program import CORES
 from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.kernels import moments as kernels
-from megastep.agents.networks.kernels.program import CORES
 from megastep.agents.types import Moments
 from megastep.types import Space
-
 
 #: The version of the rules below. A run that began with others cannot continue bit for bit.
 VERSION = 2

@@ -7,6 +7,7 @@ maps names to strings:
     config    config.json of a checkpoint
     facts     how the agent was trained, such as samples, seconds, command and commit; JSON
     tables    its evaluations: a list of {title, command, rows}; JSON
+    wrappers  what wrappers around its environment have learnt, if anything; JSON
     sha256    hash of all bytes after the header, those of the tensors
 
 Weights are float16, statistics float32. Without a device, reading does not import PyTorch.
@@ -48,6 +49,7 @@ def write(
     config: dict[str, Any],
     facts: Mapping[str, Any],
     tables: Sequence[dict[str, Any]] = (),
+    wrappers: Mapping[str, Any] | None = None,
 ) -> None:
     """Writes an agent file atomically.
 
@@ -57,6 +59,7 @@ def write(
         config: configuration as in a checkpoint.
         facts: plain values by name, among them `samples`.
         tables: evaluations.
+        wrappers: of the environment, what they have learnt, by path: tensors and numbers.
 
     Raises:
         ValueError: a dtype is not in `DTYPES`.
@@ -71,8 +74,13 @@ def write(
             raise ValueError(f"{name} is {array.dtype}, but agent files hold {allowed}")
     _, data = _split(save(arrays))
     metadata = {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
-    for name, value in (("config", config), ("facts", dict(facts)), ("tables", [*tables])):
-        metadata[name] = json.dumps(value)
+    texts = dict(config=config, facts=dict(facts), tables=[*tables])
+    if wrappers:
+        texts["wrappers"] = {
+            path: value.tolist() if hasattr(value, "tolist") else value
+            for path, value in wrappers.items()
+        }
+    metadata |= {name: json.dumps(value) for name, value in texts.items()}
     write_atomically(path, save(arrays, metadata))
 
 
@@ -100,14 +108,16 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
         numbers={},
         config=metadata["config"],
         made_with={},
-        state=None if device is None else {"policy": _tensors(entries, device)},
+        state=None
+        if device is None
+        else {"policy": _tensors(entries, device), "wrappers": metadata["wrappers"]},
         untrusted=metadata["untrusted"],
     )
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
-    """Returns `config`, `facts` and `tables` of an agent file, and `untrusted`: the import paths
-    outside megastep in its configuration.
+    """Returns `config`, `facts`, `tables` and `wrappers` of an agent file, and `untrusted`: the
+    import paths outside megastep in its configuration.
 
     Raises:
         CheckpointError: as `read`.
@@ -134,6 +144,7 @@ def _read(path):
             if any(entry["dtype"] not in DTYPES for entry in entries.values()):
                 raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
             metadata = {name: json.loads(texts[name]) for name in ("config", "facts", "tables")}
+            metadata["wrappers"] = json.loads(texts.get("wrappers", "{}"))
             if type(metadata["facts"]["samples"]) is not int:
                 raise ValueError("invalid number of samples")
             if not {"train", "spaces"} <= metadata["config"].keys():

@@ -81,6 +81,8 @@ class RunState:
             parts["opponents"] = self.opponents.state_dict()
         if self.curriculum is not None:
             parts["curriculum"] = self.curriculum.state_dict()
+        if wrappers := optional(self.env_state.env, "wrapper_state")():
+            parts["wrappers"] = wrappers
         if self.replay_buffer is not None:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
@@ -136,6 +138,8 @@ class RunState:
                 self.env_state.load_state_dict(state["env"])
             except ValueError as error:
                 lost.append(f"{error}; new episodes start")
+        if lost and "wrappers" in state:
+            optional(self.env_state.env, "load_wrapper_state")(state["wrappers"], False)
         if lost:  # unfinished episodes are lost
             state["episode_stats"] = {
                 name: state["episode_stats"][name] for name in ("sums", "windows")

@@ -6,13 +6,13 @@ N environments of A agents each, B = N A lanes.
 import contextlib
 import functools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 import torch
 
-from megastep import engine
+from megastep import engine, spaces
 from megastep.arrdict import arrdict
 from megastep.contract import RESERVED
 from megastep.env_state import EnvState
@@ -20,7 +20,7 @@ from megastep.envs.on_host.buffers import HostBuffers
 from megastep.envs.on_host.frames import as_frame
 from megastep.envs.on_host.spaces import RESERVED as RESERVED_KEYS
 from megastep.envs.on_host.spaces import actions, identifiers, observation
-from megastep.sync_envs import EnvError
+from megastep.sync_envs import BadValue, EnvError
 from megastep.vector_processes import VectorProcesses, start_rendering
 
 __all__ = ["VectorizedEnv"]
@@ -44,6 +44,7 @@ class VectorizedEnv:
         n_agents: lanes per environment, A.
         seeds: passed to the first ``vector.reset``, one per environment or one for all.
         device: where worlds and actions are. Default: a GPU if there is one.
+        check: refuses actions that are not finite.
 
     Raises:
         ValueError: if a space has no conversion, with its name and the cure.
@@ -60,7 +61,9 @@ class VectorizedEnv:
         n_agents: int,
         seeds: list[int] | int,
         device: torch.device | str | None,
+        check: bool = True,
     ):
+        self._checks = check
         self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
         self.device, self._seeds = engine.device(device), seeds
         self.fps = float(vector.metadata.get("render_fps") or 10)
@@ -110,10 +113,49 @@ class VectorizedEnv:
         Raises:
             EnvError: an environment failed.
         """
-        actions = self._write(self._buffers.receive(decision["actions"]))
+        actions = self._buffers.receive(decision["actions"])
+        if self._checks:
+            self._check_actions(actions)
+        actions = self._write(actions)
         obs, reward, terminated, truncated, news = self._call(self.vector.step, actions)
         self._read_news(news, terminated | truncated)
         return self._world(obs, reward, terminated, truncated)
+
+    def _check_actions(self, actions):
+        """Raises BadValue for a NaN or an infinity."""
+        for path, leaf in spaces.leaves(actions, "the action").items():
+            if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
+                lane = int(np.argwhere(~np.isfinite(leaf))[0][0])
+                raise BadValue.of(
+                    f"{path} for lane {lane} is not finite, so the policy's weights or "
+                    "observations are not",
+                    self.id,
+                )
+
+    def wrapper_state(self) -> dict[str, Any]:
+        """Returns what the wrappers of an environment have learnt, such as running statistics, as
+        tensors and numbers by path.
+        """
+        state = getattr(self.vector, "wrapper_state", dict)()
+        return {path: _plain(value) for path, value in state.items()}
+
+    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
+        """Gives the wrappers of all environments what those of others have learnt.
+
+        Args:
+            state: of `wrapper_state`, on any device.
+            is_frozen: it stays as it is from now on.
+
+        Raises:
+            ValueError: the environments are not in such wrappers.
+        """
+        state = {
+            path: value.cpu().numpy() if isinstance(value, torch.Tensor) else value
+            for path, value in state.items()
+        }
+        if not hasattr(self.vector, "load_wrapper_state"):
+            raise ValueError(f"{self.id} is in no wrappers, as in the training of the agent")
+        self.vector.load_wrapper_state(state, is_frozen)
 
     def pop_restarts(self) -> int | None:
         """Returns how many environments were made anew after an error since the last call, None if
@@ -209,3 +251,12 @@ class VectorizedEnv:
         if self._metrics:
             world["metrics"] = arrdict({name: of[1] for name, of in self._metrics.items()})
         return self._buffers.send(world)
+
+
+def _plain(value):
+    """Returns a value of a wrapper in a form that checkpoints hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.array(value, order="C"))
+    if isinstance(value, Collection):
+        return [getattr(part, "item", lambda part=part: part)() for part in value]
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,98 @@
+"""Checks the form of what an environment of Gymnasium returns. Workers import it, so without
+PyTorch.
+"""
+
+import numbers
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+__all__ = ["problem_of_error", "problem_of_observation", "problem_of_result"]
+
+FORMS = {
+    "reset": "(observation, info)",
+    "step": "(observation, reward, terminated, truncated, info)",
+}
+
+
+def problem_of_result(method: str, result: Any, space: Any) -> str | None:
+    """Returns what is wrong with the result of `reset` or `step`, as a clause, None if nothing is.
+
+    Args:
+        method: its name.
+        result: what it returned.
+        space: the environment's observation space.
+    """
+    n_values = FORMS[method].count(",") + 1
+    if not isinstance(result, (tuple, list)) or len(result) != n_values:
+        n = len(result) if isinstance(result, (tuple, list)) else 1
+        return f"{method}() must return {FORMS[method]}, and returned {n} value{'s' * (n > 1)}"
+    if not isinstance(result[-1], Mapping):
+        return f"{method}() must return a dict as info, and returned {_shown(result[-1])}"
+    if method == "step":
+        _, reward, *ends, _ = result
+        if np.ndim(reward) or not isinstance(reward, (numbers.Real, np.bool_, np.ndarray)):
+            return f"step() must return a number as reward, and returned {_shown(reward)}"
+        for name, flag in zip(("terminated", "truncated"), ends):
+            if np.ndim(flag) or not isinstance(flag, (numbers.Real, np.bool_, np.ndarray)):
+                return f"step() must return a bool as {name}, and returned {_shown(flag)}"
+    problem = problem_of_observation(space, result[0])
+    return problem and f"{method}() returned an observation that is not in its space: {problem}"
+
+
+def problem_of_error(method: str, error: Exception) -> str | None:
+    """Returns what is wrong with the result of `reset` or `step` that a wrapper could not unpack,
+    as a clause, None if the error tells of something else.
+    """
+    if not re.search("values? to unpack|cannot unpack", str(error)):
+        return None
+    return f"{method}() must return {FORMS[method]}, and returned something else ({error})"
+
+
+def problem_of_observation(space: Any, value: Any, path: str = "it") -> str | None:
+    """Returns why a value is not in a space of Gymnasium's, as a clause, None if it is.
+
+    Numbers beyond the bounds of a Box are left to the environment, and so is their dtype: nothing
+    is scaled by these bounds.
+    """
+    from gymnasium import spaces
+
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        is_dict = isinstance(space, spaces.Dict)
+        if not isinstance(value, Mapping if is_dict else (tuple, list)):
+            return f"{path} must be a {'dict' if is_dict else 'tuple'}, not {_shown(value)}"
+        keys = space.spaces.keys() if is_dict else range(len(space.spaces))
+        present = value.keys() if is_dict else range(len(value))
+        if {*keys} != {*present}:
+            return f"{path} must have {[*keys]}, not {[*present]}"
+        parts = (problem_of_observation(space[k], value[k], f"its part {k!r}") for k in keys)
+        return next(filter(None, parts), None)
+    if not isinstance(
+        space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+    ):
+        return None if space.contains(value) else f"{path} is {_shown(value)}"
+    shape = space.shape or ()
+    try:
+        array = np.asarray(value)
+    except ValueError:  # of parts with different shapes
+        return f"{path} must be an array of shape {shape}, not {_shown(value)}"
+    if array.shape != shape or array.dtype.kind not in "biuf":
+        kind = "an array" if shape else "a number"
+        return f"{path} must be {kind} of shape {shape}, not {_shown(value)}"
+    if isinstance(space, spaces.Box):
+        return None
+    start = getattr(space, "start", 0)
+    n = 2 if isinstance(space, spaces.MultiBinary) else getattr(space, "nvec", None)
+    n = space.n if n is None else n
+    if not ((array >= start) & (array < start + n) & (array % 1 == 0)).all():
+        return f"{path} is {_shown(value)}, and the space is {space}"
+    return None
+
+
+def _shown(value):
+    if isinstance(value, np.ndarray) and value.size > 4:
+        return f"an array of shape {value.shape}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"a {type(value).__name__}"
