@@ -7,20 +7,20 @@ B lanes; `...` any further axes.
 from collections.abc import Iterable, Sequence
 
 import torch
-from megastep.agents.networks.kernels.program import CORES
 from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.kernels import moments as kernels
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.agents.types import Moments
 from megastep.types import Space
 
 #: The version of the rules below. A run that began with others cannot continue bit for bit.
 VERSION = 2
 #: The scale of a number that has not varied yet, which makes it 0.
-UNKNOWN_SCALE = CORES.constants["UNKNOWN_SCALE"]
+UNKNOWN_SCALE = LIBRARY.constants["UNKNOWN_SCALE"]
 #: A standard deviation below this fraction of the mean may be rounding errors.
-RESOLUTION = CORES.constants["RESOLUTION"]
+RESOLUTION = LIBRARY.constants["RESOLUTION"]
 
 
 class RunningNorm(nn.Module):
