@@ -4,7 +4,7 @@ PyTorch.
 
 import numbers
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,18 +17,34 @@ FORMS = {
 }
 
 
-def problem_of_result(method: str, result: Any, space: Any) -> str | None:
+def problem_of_result(
+    method: str, result: Any, space: Any, agents: Collection[str] = ()
+) -> str | None:
     """Returns what is wrong with the result of `reset` or `step`, as a clause, None if nothing is.
 
     Args:
         method: its name.
         result: what it returned.
-        space: the environment's observation space.
+        space: the observation space.
+        agents: of an environment of PettingZoo, each part of whose results is a dict by agent.
     """
     n_values = FORMS[method].count(",") + 1
     if not isinstance(result, (tuple, list)) or len(result) != n_values:
         n = len(result) if isinstance(result, (tuple, list)) else 1
         return f"{method}() must return {FORMS[method]}, and returned {n} value{'s' * (n > 1)}"
+    if agents:
+        names = FORMS[method].strip("()").split(", ")
+        for name, part in zip(names, result):
+            if not isinstance(part, Mapping):
+                return f"{method}() must return dicts by agent; {name} is {_shown(part)}"
+        of_agents = [[part.get(agent) for part in result] for agent in agents if agent in result[0]]
+        return next(
+            filter(None, (_problem_of_values(method, one, space) for one in of_agents)), None
+        )
+    return _problem_of_values(method, result, space)
+
+
+def _problem_of_values(method, result, space):
     if not isinstance(result[-1], Mapping):
         return f"{method}() must return a dict as info, and returned {_shown(result[-1])}"
     if method == "step":

@@ -118,6 +118,8 @@ def first_episodes(
     returns, lengths = (torch.zeros(n_lanes(env), device=device) for _ in range(2))
     done = torch.zeros(n_lanes(env), dtype=torch.bool, device=device)
     learns = torch.ones_like(done) if "learns" not in world else world["learns"].clone()
+    if learns.any():  # the others are not counted, and may be of agents that are not there
+        done |= ~learns
     metrics = arrdict(
         {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}
     )

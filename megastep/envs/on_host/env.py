@@ -14,7 +14,7 @@ import torch
 
 from megastep import engine, spaces
 from megastep.arrdict import arrdict
-from megastep.contract import RESERVED
+from megastep.contract import FLAGS, RESERVED
 from megastep.env_state import EnvState
 from megastep.envs.on_host.buffers import HostBuffers
 from megastep.envs.on_host.frames import as_frame
@@ -38,8 +38,10 @@ class VectorizedEnv:
         id: name of the environments in messages.
         vector: has ``single_observation_space``, ``single_action_space``, ``metadata``,
             ``render_mode``, ``reset(seed=)``, ``step(actions)``, ``render()`` and ``close()``, as
-            Gymnasium's vector environments do, with a row per lane. If it has ``names``, the fifth
-            part of a step is as that of :class:`~megastep.sync_envs.SyncEnvs`.
+            Gymnasium's vector environments do, with a row per lane. If it has ``names``, the last
+            part of a result is as that of :class:`~megastep.sync_envs.SyncEnvs`; if it has
+            ``present``, that is a dict with ``present``, (B,) bool, the lanes whose next action is
+            used.
         n_envs: number of environments, N.
         n_agents: lanes per environment, A.
         seeds: passed to the first ``vector.reset``, one per environment or one for all.
@@ -90,7 +92,8 @@ class VectorizedEnv:
             for name, key in zip(identifiers(names, reserved), names)
         }
         self._buffers = HostBuffers(
-            n_lanes, self.obs_space, self.action_space, self.device, [*self._metrics]
+            *(n_lanes, self.obs_space, self.action_space, self.device, [*self._metrics]),
+            flags=(*FLAGS, *["learns"] * hasattr(vector, "present")),
         )
         self._ended = np.ones(n_lanes, bool)
         self._n_restarts = np.zeros(1, np.int64)  # an array, so that checkpoints hold it
@@ -105,7 +108,7 @@ class VectorizedEnv:
         self._read_news(news, self._ended)
         self._seeds = None
         self._ended[:] = True
-        return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended)
+        return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended, news)
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world.
@@ -119,7 +122,7 @@ class VectorizedEnv:
         actions = self._write(actions)
         obs, reward, terminated, truncated, news = self._call(self.vector.step, actions)
         self._read_news(news, terminated | truncated)
-        return self._world(obs, reward, terminated, truncated)
+        return self._world(obs, reward, terminated, truncated, news)
 
     def _check_actions(self, actions):
         """Raises BadValue for a NaN or an infinity."""
@@ -172,7 +175,7 @@ class VectorizedEnv:
         try:
             return function(*arguments, **more)
         except EnvError as error:
-            raise EnvError(f"{self.id}: {error}", error.trace) from error
+            raise type(error)(f"{self.id}: {error}", error.trace) from error
         except MemoryError:
             raise
         except Exception as error:
@@ -235,12 +238,13 @@ class VectorizedEnv:
         """Returns the frame of a numpyified :meth:`state`."""
         return state.frame
 
-    def _world(self, obs, reward, terminated, truncated):
+    def _world(self, obs, reward, terminated, truncated, news):
         """Returns the world after a step, in which lanes that had ended before it began again."""
         reset = self._ended.copy()
         terminal = terminated > reset
         truncated = truncated > (reset | terminal)
-        np.logical_or(terminal, truncated, out=self._ended)
+        present = news.get("present") if isinstance(news, Mapping) else None
+        self._ended[:] = (terminal | truncated) if present is None else ~present
         world = arrdict(
             obs=self._read(obs),
             reward=np.where(reset, 0.0, reward),
@@ -248,6 +252,8 @@ class VectorizedEnv:
             terminal=terminal,
             truncated=truncated,
         )
+        if present is not None:
+            world["learns"] = present.copy()
         if self._metrics:
             world["metrics"] = arrdict({name: of[1] for name, of in self._metrics.items()})
         return self._buffers.send(world)
