@@ -37,10 +37,12 @@ def problem_of_result(
         for name, part in zip(names, result):
             if not isinstance(part, Mapping):
                 return f"{method}() must return dicts by agent; {name} is {_shown(part)}"
-        of_agents = [[part.get(agent) for part in result] for agent in agents if agent in result[0]]
-        return next(
-            filter(None, (_problem_of_values(method, one, space) for one in of_agents)), None
-        )
+        absent = [None, {}] if method == "reset" else [None, 0.0, False, False, {}]
+        for agent in (agent for agent in agents if agent in result[0]):
+            own = [part.get(agent, value) for part, value in zip(result, absent)]
+            if problem := _problem_of_values(method, own, space):
+                return problem
+        return None
     return _problem_of_values(method, result, space)
 
 

@@ -60,6 +60,8 @@ class EnvError(RuntimeError):
             place: what failed, such as `environment 3`.
         """
         frames = error.__traceback__ and error.__traceback__.tb_next  # without the caller's
+        while frames and frames.tb_frame.f_code.co_filename == __file__:
+            frames = frames.tb_next
         trace = "".join(traceback.format_exception(type(error), error, frames))
         return cls(f"{place} failed: {one_line(error)}", trace)
 
