@@ -166,8 +166,9 @@ class VTrace(GradientLearner):
         is_finite, _ = self.steps.begin(rollout.floats())
         if self.replay_buffer is not None:
             self.replay_buffer.add(rollout, is_finite)
-        # The first rollout tells only the size of returns. It counts as skipped if not finite.
-        is_enabled = ~(self.policy.critic.output.is_clear & is_finite)
+        # The first rollout with rewards tells only their size. It counts as skipped if not finite.
+        is_unknown = self.policy.critic.output.is_clear & rollout.reward.any()
+        is_enabled = ~(is_unknown & is_finite)
         all_estimates = []
         for _ in range(self.n_epochs):
             generator = self.generator.on(self.device)

@@ -90,7 +90,8 @@ class ValueOutput(nn.Module):
         """Adds moments of returns to the statistics, the n-th call with weight max(min_rate, 1/n).
         On a GPU in one kernel.
 
-        Changes nothing if there is no return, or if mean or variance is not finite.
+        Changes nothing if there is no return, if mean or variance is not finite, or if all returns
+        have been 0, which tells nothing about their size.
 
         Args:
             moments: number of returns, their mean and variance.
@@ -105,10 +106,11 @@ class ValueOutput(nn.Module):
         count = self.count + 1
         rate = (1 / count).clamp(min=min_rate, max=1.0)
         mean, scale = mix_moments(self, mean, variance, rate)
+        is_nothing = (self.count == 0) & (scale == 0) & (mean == 0)
         scale = torch.maximum(scale, (RESOLUTION * mean.abs()).clamp(min=self.min_scale))
         weight = self.linear.weight * (self.scale / scale)
         bias = (self.linear.bias * self.scale + (self.mean - mean)) / scale
-        is_stored = (n_valid > 0) & (mean + scale).isfinite()
+        is_stored = (n_valid > 0) & (mean + scale).isfinite() & ~is_nothing
         if is_counted is not None:
             is_stored = is_stored & is_counted
         old = self.linear.weight, self.linear.bias, self.mean, self.scale, self.count

@@ -125,12 +125,10 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
         assert -16.3 * 20 < row["metrics"]["true_return"]["mean"] < 0
     path = here / "agent.safetensors"
     weights = {name: leaf.float() for name, leaf in saved.state["policy"].items()}
-    agent_file.write(
-        path, weights, saved.config, {"samples": 256}, wrappers=saved.state["wrappers"]
-    )
+    expected, facts = saved.state["wrappers"], {"samples": 256}
+    agent_file.write(path, weights, saved.config, facts, wrappers=expected)
     env = factory.construct(factory.config_of(saved).env, device="cpu")
     factory.load_wrappers(env, agent_file.read(path, "cpu"))
-    expected = saved.state["wrappers"]
     assert all(np.array_equal(value, expected[k]) for k, value in env.wrapper_state().items())
     env.close()
 
