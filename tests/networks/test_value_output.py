@@ -56,7 +56,7 @@ def test_cleared_output_predicts_0_until_returns_tell_their_size():
     value.clear()
     assert value.is_clear and not value(x).any()
     value.update_stats(torch.randn(64) * 1e5 + 1e6, VALID)
-    assert not value.is_clear and not value(x).any()
+    assert not value.is_clear and value(x).abs().max() < 1  # float32 at a mean of 1e6
     before = value.linear.bias.item()
     value.clear()
     assert value.linear.bias.item() == before != 0
