@@ -15,7 +15,7 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-slow test-nightly test-gpu lint wheel setup lock clean
+.PHONY: train test test-slow test-nightly test-gpu lint docs wheel setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
@@ -34,10 +34,14 @@ test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour
 test-gpu: $(SETUP)         ## run the tests that need a GPU
 	$(PYTHON) -m pytest -q -m cuda
 
-lint: $(SETUP)             ## check style and formatting of Python and kernels
+lint: $(SETUP)             ## check style, formatting and types of Python, and the format of kernels
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(PYTHON) -m pyright --pythonpath $(PYTHON)
 	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
+
+docs: $(SETUP)             ## build the site in docs/_build; warnings are errors
+	$(PYTHON) -m sphinx -W --keep-going -q docs docs/_build
 
 wheel:                     ## build sdist and wheel into dist/, check them, train with the wheel alone
 	rm -rf dist build
@@ -53,21 +57,23 @@ wheel:                     ## build sdist and wheel into dist/, check them, trai
 setup: $(SETUP)            ## create .venv
 
 # Python 3.10 to 3.13 get the versions in requirements/, checked against their hashes; other Pythons,
-# and those for which that fails, the newest versions. PyTorch comes from wherever pip finds it.
+# and those for which that fails, the newest versions. PyTorch comes from wherever pip finds it. Some
+# packages are built from source, without isolation: with the setuptools whose hash is checked.
 LOCKED = $(BASE) -c 'import sys; sys.exit(sys.version_info >= (3, 14))' \
-	&& .venv/bin/python -m pip install --no-deps --require-hashes -r requirements/build.txt -r requirements/packages.txt
+	&& .venv/bin/python -m pip install --no-deps --require-hashes -r requirements/build.txt \
+	&& .venv/bin/python -m pip install --no-deps --require-hashes --no-build-isolation -r requirements/packages.txt
 
 .venv/stamp: pyproject.toml constraints.txt $(wildcard requirements/*.txt)
 	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "megastep needs Python 3.10 or newer. Choose one with: make BASE=python3.12"; exit 1; }
 	@$(BASE) -c 'import ensurepip' 2>/dev/null || { echo "This Python cannot create virtual environments. On Debian: apt install python3-venv"; exit 1; }
 	$(BASE) -m venv .venv
-	{ $(LOCKED); } || echo "The versions in requirements/ cannot be installed here; taking the newest that fit."
+	{ $(LOCKED); } || { echo "The versions in requirements/ cannot be installed here; taking the newest that fit."; .venv/bin/python -m pip install setuptools; }
 	.venv/bin/python -m pip install -c constraints.txt torch==2.13.0
-	.venv/bin/python -m pip install -c constraints.txt -e '.[test]'
+	.venv/bin/python -m pip install -c constraints.txt --no-build-isolation -e '.[test]'
 	touch .venv/stamp
 
 lock:                      ## resolve the versions in requirements/ anew; needs uv
 	$(BASE) scripts/lock.py
 
 clean:                     ## delete .venv, build folders and caches
-	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv docs/_build build dist *.egg-info .pytest_cache .ruff_cache

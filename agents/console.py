@@ -4,6 +4,7 @@ a full disk or a closed pipe, never ends the work.
 
 import contextlib
 import os
+import re
 import sys
 import textwrap
 import threading
@@ -38,7 +39,7 @@ class TolerantStream:
     def flush(self) -> None:
         self._attempt(self._stream.flush)
 
-    def _attempt(self, method, *arguments):
+    def _attempt(self, method, *arguments) -> None:
         try:
             method(*arguments)
         except (OSError, ValueError):
@@ -60,13 +61,24 @@ def open_streams() -> None:
         setattr(sys, name, TolerantStream(stream))
 
 
+#: What a terminal acts upon instead of showing it: control characters but tab and newline, and
+#: those that turn the direction of what follows.
+CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
+def visible(text: str) -> str:
+    """Returns a text that may be from a stranger's file, with control characters as `\\x1b`."""
+    return CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
+
+
 def say(text: str, file: TextIO | None = None) -> None:
     if is_silent and file is None:
         return
+    text = visible(text)
     print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
 
 
-def warn(sentence: object, *_: Any, **__: Any) -> None:
+def warn(sentence: object, *_: object, **__: object) -> None:
     """One line on stderr; can stand in for `warnings.showwarning`."""
     say(f"warning: {sentence}", sys.stderr)
 
@@ -83,7 +95,8 @@ def warned(prefix: str = "") -> Iterator[None]:
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
     """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
     if isinstance(failure.exc_value, OSError):
-        warn(f"{failure.thread.name} stopped: {failure.exc_value}")
+        name = failure.thread.name if failure.thread else "a thread"
+        warn(f"{name} stopped: {failure.exc_value}")
     else:
         threading.__excepthook__(failure)
 
@@ -102,7 +115,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool 
     grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
     for row in rows:
         grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
-    plain = dict(markup=False, emoji=False, color_system=None)
+    plain: dict = dict(markup=False, emoji=False, color_system=None)
     Console(file=text, width=10_000, force_terminal=False, **plain).print(grid)
     return text.getvalue().strip()
 
@@ -117,7 +130,7 @@ def restore() -> None:
 class Progress:
     """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         from rich import progress  # only for those who wait
 
         is_dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")

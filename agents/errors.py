@@ -4,6 +4,22 @@ import contextlib
 import re
 from collections.abc import Iterable, Iterator
 
+#: The exit codes of every command.
+EXIT_CODES = {
+    0: "done",
+    1: "training stopped because of NaN or infinite numbers, a checkpoint is damaged, a job of a "
+    "sweep failed, or a result or a run was not reproduced",
+    2: "error in the configuration, environment, a file, or memory: one sentence with the cure",
+    3: "one of several ranks was killed or hangs; the last checkpoint is intact",
+    4: "an environment of another package or of your own raised an error: all is saved, and its "
+    "traceback is in the run's `env_error.txt`",
+    129: "stopped by SIGHUP; a checkpoint was saved",
+    130: "stopped by Ctrl-C; a checkpoint was saved",
+    138: "stopped by SIGUSR1; a checkpoint was saved",
+    140: "stopped by SIGUSR2; a checkpoint was saved",
+    143: "stopped by SIGTERM; a checkpoint was saved",
+}
+
 
 class UserError(Exception):
     """Something the user can put right, in one sentence.
@@ -39,7 +55,7 @@ class ConfigErrors(UserError):
         self.errors = list(errors)
         super().__init__(self.errors)
 
-    def __str__(self):
+    def __str__(self) -> str:
         head = f"{len(self.errors)} error{'s' * (len(self.errors) > 1)} in the configuration"
         return "\n  ".join([head, *(f"{key}: {shortened(text, 400)}" for key, text in self.errors)])
 
@@ -55,7 +71,7 @@ def user_errors(
         raise UserError(prefix + shortened(error, 400)) from error
 
 
-def memory_problem(error: MemoryError | RuntimeError) -> str | None:
+def memory_problem(error: Exception) -> str | None:
     """Returns what Python or PyTorch says of too little memory; None if the error is another."""
     if isinstance(error, MemoryError):
         return "Out of memory"
@@ -64,5 +80,6 @@ def memory_problem(error: MemoryError | RuntimeError) -> str | None:
 
 
 def shortened(text: object, length: int = 120) -> str:
+    """Returns a text, or an error's message, on one line of at most so many characters."""
     text = " ".join(str(text).split()) or type(text).__name__
     return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -8,8 +8,9 @@ what the class `X` of megastep and any stand-in for it have in common. The rules
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 
@@ -19,17 +20,26 @@ __all__ = [
     "Actor",
     "CollectorLike",
     "CollectorOptions",
+    "Config",
     "Learner",
     "LearnerOptions",
     "Logger",
     "Moments",
     "OpponentPool",
     "RolloutLike",
+    "Row",
     "RunLogger",
     "SaverLike",
+    "StateDict",
     "with_defaults",
 ]
 
+#: What an object saves: tensors and plain values by name, in nested dicts and lists.
+StateDict = dict[str, Any]
+#: The settings of a run as nested dicts, as config.yaml holds them.
+Config = dict[str, Any]
+#: Numbers and texts by name: a row of a table, or of a file of JSON Lines.
+Row = dict[str, Any]
 #: Number of entries, their mean and their variance; () or, for several quantities, mean and
 #: variance of one shape.
 Moments = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -45,6 +55,7 @@ class Actor(PolicyLike, Protocol):
 
     def compute_dtype(self) -> torch.autocast:
         """Returns the autocast context in which the actor runs."""
+        ...
 
 
 class RolloutLike(Protocol):
@@ -55,24 +66,37 @@ class RolloutLike(Protocol):
     n_steps: int  # T
     n_lanes: int  # B
     reward: torch.Tensor  # (T, B)
-    reset: torch.Tensor  # (T, B) bool: the action was ignored because an episode started
     terminal: torch.Tensor  # (T, B) bool
     truncated: torch.Tensor  # (T, B) bool
-    metrics: Mapping[str, torch.Tensor]  # (T, B) each, read where an episode ends
     learns: torch.Tensor  # (T+1, B) bool: transitions to learn from
     learners: torch.Tensor | None  # bool per lane of the environment: True if stored; None: all
 
+    @property
+    def reset(self) -> torch.Tensor:
+        """(T, B) bool: the action was ignored because an episode started."""
+        ...
+
+    @property
+    def metrics(self) -> Mapping[str, torch.Tensor]:
+        """(T, B) each, read where an episode ends."""
+        ...
+
     def floats(self) -> dict[str, torch.Tensor]:
         """Returns the float tensors by name, (T, B, ...) or (T+1, B, ...), to check them."""
+        ...
 
 
 class CollectorLike(Protocol):
     """Acts in an environment and stores what happened. `CollectorOptions` has what is optional."""
 
-    rollout: RolloutLike  # what the last call returned; allocated and empty before the first call
+    @property
+    def rollout(self) -> RolloutLike:
+        """What the last call returned; allocated and empty before the first call."""
+        ...
 
     def __call__(self) -> RolloutLike:
         """Takes T steps in every lane and returns them."""
+        ...
 
 
 class CollectorOptions(Protocol):
@@ -91,14 +115,14 @@ class CollectorOptions(Protocol):
         """Blocks until nothing acts in the environment, for a collector in the background."""
 
     @staticmethod
-    def state_dict() -> dict[str, Any]:
+    def state_dict() -> StateDict:
         """Returns all that it carries from rollout to rollout, so that a run can be resumed bit for
         bit. Empty: a resumed run begins new episodes.
         """
         return {}
 
     @staticmethod
-    def load_state_dict(state: Mapping[str, Any]) -> None:
+    def load_state_dict(state: StateDict) -> None:
         """Continues from a `state_dict`."""
 
 
@@ -113,14 +137,17 @@ class Learner(Protocol):
 
     def collector(self, env: Env) -> CollectorLike:
         """Returns a collector for `env`."""
+        ...
 
     def update(self, rollout: RolloutLike) -> dict[str, torch.Tensor]:
         """Learns from a rollout and returns metrics, tensors () or numbers by name."""
+        ...
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns everything that changes, except the policy's weights."""
+        ...
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`."""
 
 
@@ -156,12 +183,13 @@ class LearnerOptions(Protocol):
         return 0, 0.0
 
 
-def with_defaults(owner: Any, options: type[T]) -> T:
+def with_defaults(owner: object, options: type[T]) -> T:
     """Returns the attributes of `options`, a protocol with defaults: those that `owner` has, and
     the defaults of the others.
     """
     names = (name for name in vars(options) if not name.startswith("_"))
-    return SimpleNamespace(**{name: getattr(owner, name, getattr(options, name)) for name in names})
+    values = {name: getattr(owner, name, getattr(options, name)) for name in names}
+    return cast(T, SimpleNamespace(**values))
 
 
 class Logger(Protocol):
@@ -201,11 +229,15 @@ class SaverLike(Protocol):
 
     error: str | None  # why the last checkpoint that was begun could not be saved
     lacks_replay: bool  # it was not due to hold the replay buffer
-    is_writing: bool
+    folder: Path  # where the checkpoints go
+    config: Config  # that of the run, and its spaces
 
-    def __call__(
-        self, step: int, state: dict[str, Any], score: float | None, is_last: bool
-    ) -> None: ...
+    @property
+    def is_writing(self) -> bool:
+        """Whether a checkpoint is being written."""
+        ...
+
+    def __call__(self, step: int, state: StateDict, score: float | None, is_last: bool) -> None: ...
 
     def give_up(self) -> None:
         """Waits no longer for the parts of other ranks, as one has ended."""
@@ -220,12 +252,18 @@ class OpponentPool(Protocol):
     env: Env  # without the opponents
     scripted: Any  # the bot, or None
 
-    def refresh_snapshots(self, policy: Actor, n_updates: int) -> None: ...
+    def refresh_snapshots(self, policy: Actor, n_updates: int) -> None:
+        """Replaces the oldest snapshot by the policy if it is time to."""
 
     def pop_win_rates(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]
-    ) -> dict[str, float]: ...
+    ) -> dict[str, float]:
+        """Returns the fraction won against each kind of opponent since the last call."""
+        ...
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> StateDict:
+        """Returns everything that changes."""
+        ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: StateDict) -> None:
+        """Continues from a `state_dict`."""

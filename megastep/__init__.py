@@ -7,6 +7,10 @@ Importing the package loads nothing else. Its modules are imported at their firs
 """
 
 import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from types import ModuleType
 
 _MODULES = (
     "agents",
@@ -33,11 +37,11 @@ _MODULES = (
 )
 
 
-def __getattr__(name):
+def __getattr__(name) -> "ModuleType":
     if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"megastep has no module '{name}'; its modules are {', '.join(_MODULES)}")
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return sorted({*globals(), *_MODULES})

@@ -6,7 +6,7 @@ numbers.
 
 import copy
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from torch.utils import _pytree
 from megastep.dotdict import _map, dotdict, leaves, mapping
 
 __all__ = ["arrdict", "stack", "cat", "torchify", "numpyify", "clone", "leaves", "mapping"]
+
+Array = np.ndarray | torch.Tensor
 
 
 class arrdict(dotdict):
@@ -33,12 +35,12 @@ class arrdict(dotdict):
     __hash__ = None
     __array_ufunc__ = None  # makes numpy leave `array + tree` to __radd__
 
-    def __getitem__(self, index):
+    def __getitem__(self, index) -> Any:
         if isinstance(index, str):
             return super().__getitem__(index)
         return _combine(operator.getitem, self, index)
 
-    def __setitem__(self, index, value):
+    def __setitem__(self, index, value) -> None:
         if isinstance(index, str):
             super().__setitem__(index, value)
         elif isinstance(value, dict):
@@ -47,25 +49,25 @@ class arrdict(dotdict):
             _map(lambda leaf: operator.setitem(leaf, index, value), self)
 
 
-def _combine(op, tree, other):
+def _combine(op: Callable, tree: dict, other) -> Any:
     if isinstance(other, dict):
         return _map(op, tree, other)
     return _map(lambda leaf: op(leaf, other), tree)
 
 
-def _forward(op):
+def _forward(op: Callable) -> Callable:
     return lambda self, other: _combine(op, self, other)
 
 
-def _reflected(op):
+def _reflected(op: Callable) -> Callable:
     return lambda self, other: _combine(lambda leaf, value: op(value, leaf), self, other)
 
 
-def _unary(op):
+def _unary(op: Callable) -> Callable:
     return lambda self: _map(op, self)
 
 
-def _operators():
+def _operators() -> Iterator[tuple[str, Callable]]:
     """Yields (name, method) of the operators of arithmetic, comparison and sign."""
     names = "add sub mul matmul truediv floordiv mod pow lshift rshift and or xor".split()
     arithmetic = {name: getattr(operator, f"__{name}__") for name in names}
@@ -93,12 +95,12 @@ def cat(trees: Iterable, dim: int = 0) -> Any:
     return _join("cat", torch.cat, np.concatenate, trees, dim)
 
 
-def _join(name, torch_join, numpy_join, trees, dim):
+def _join(name: str, torch_join: Callable, numpy_join: Callable, trees: Iterable, dim: int) -> Any:
     trees = list(trees)
     if not trees:
         raise ValueError(f"{name} needs at least one tree, but got none")
 
-    def join(*values):
+    def join(*values) -> Array:
         if isinstance(values[0], torch.Tensor):
             return torch_join(values, dim)
         return numpy_join([np.asarray(value) for value in values], dim)
@@ -107,7 +109,7 @@ def _join(name, torch_join, numpy_join, trees, dim):
 
 
 @mapping
-def torchify(leaf: Any) -> Any:
+def torchify(leaf: Any) -> torch.Tensor:
     """Converts arrays, numbers and Raggeds to CPU tensors. Tensors are returned unchanged.
 
     float64, numpy's default, becomes float32. Other dtypes stay, and share memory with the result.
@@ -132,7 +134,7 @@ def torchify(leaf: Any) -> Any:
 
 
 @mapping
-def numpyify(leaf: Any) -> Any:
+def numpyify(leaf: Any) -> object:
     """Converts tensors and Raggeds to numpy arrays, also in lists and tuples. Other leaves are
     returned unchanged.
 
@@ -150,22 +152,23 @@ def numpyify(leaf: Any) -> Any:
 
 
 @mapping
-def clone(leaf: Any) -> Any:
+def clone(leaf: object) -> object:
     """Returns a copy that shares no memory with the original."""
     return leaf.clone() if isinstance(leaf, torch.Tensor) else copy.deepcopy(leaf)
 
 
-def _register(cls):
+def _flattened(tree: Any) -> tuple[list, list]:
+    return [(_pytree.MappingKey(key), value) for key, value in tree.items()], list(tree)
+
+
+def _register(cls: type[dotdict]) -> None:
     """Registers a tree type with torch's pytrees, for torch.compile, torch.func and others."""
     _pytree.register_pytree_node(
         cls,
         lambda tree: (list(tree.values()), list(tree)),
         lambda values, keys: cls(zip(keys, values, strict=True)),
         serialized_type_name=f"{cls.__module__}.{cls.__name__}",
-        flatten_with_keys_fn=lambda tree: (
-            [(_pytree.MappingKey(k), v) for k, v in tree.items()],
-            list(tree),
-        ),
+        flatten_with_keys_fn=_flattened,
     )
 
 

@@ -84,19 +84,19 @@ def intact(path: Path) -> bytes | None:
     return body if body and _digest(path.name, body) == digest else None
 
 
-def _digest(name, body):
+def _digest(name, body) -> bytes:
     digest = hashlib.sha256(f"{name}\0".encode())
     digest.update(body)
     return digest.digest()
 
 
-def _folder():
+def _folder() -> Path:
     override = os.environ.get("MEGASTEP_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(override) if override else Path(base) / "megastep"
 
 
-def _problem(folder):
+def _problem(folder) -> str | None:
     """Creates the folder if necessary. Returns why it cannot be the cache, or None if it can."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -111,13 +111,13 @@ def _problem(folder):
     return None
 
 
-def _is_private(status):
+def _is_private(status) -> bool:
     """True if only this user and root can write to the file."""
     ours = status.st_uid in (os.geteuid(), 0)
     return ours and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
-def _write(path, body):
+def _write(path, body) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
     try:
         with os.fdopen(handle, "wb") as file:

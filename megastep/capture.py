@@ -10,8 +10,8 @@ import collections
 import contextlib
 import traceback
 import warnings
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, cast
 
 import torch
 from torch.utils import _pytree
@@ -40,12 +40,12 @@ class _StateBefore:
     them, before a function is called.
     """
 
-    def __init__(self, roots):
+    def __init__(self, roots) -> None:
         self.roots = dict(enumerate(roots))
         self.tensors, self.scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
         self.containers = [(node, _members(node)) for node in _containers(self.roots)]
 
-    def keep_in_place(self, output=None):
+    def keep_in_place(self, output=None) -> object:
         """Copies each tensor that replaced another into the old one, and puts the old one back.
         Called after the function. Returns its output, with copies of what is overwritten.
 
@@ -68,18 +68,18 @@ class _StateBefore:
                 replaced.append((path, parent, step, old, new))
         overwritten = {_storage(old) for *_, old, _ in replaced}
 
-        def kept(leaf):
+        def kept(leaf) -> object:
             is_tensor = overwritten and isinstance(leaf, torch.Tensor)
             return leaf.clone() if is_tensor and _storage(leaf) in overwritten else leaf
 
         # all are read before the first is written, as in `self.last, self.now = self.now, new`
         output = _pytree.tree_map(kept, output)
         replaced = [(*place, old, kept(new)) for *place, old, new in replaced]
-        for change in replaced:
-            _copy_back(*change)
+        for path, parent, step, old, new in replaced:
+            _copy_back(path, parent, step, old, new)
         return output
 
-    def _refuse_changed_scalars(self, tensors, scalars):
+    def _refuse_changed_scalars(self, tensors, scalars) -> None:
         for path, (_, _, old) in self.scalars.items():
             new = scalars[path][2] if path in scalars else old
             is_tensor = path in tensors and old is not None
@@ -91,7 +91,7 @@ class _StateBefore:
                     f"replays tensors only: make it a tensor on the device."
                 )
 
-    def undo(self):
+    def undo(self) -> None:
         """Puts back every tensor and scalar that was replaced, wherever assignment works, and what
         containers held.
         """
@@ -107,7 +107,7 @@ class _StateBefore:
                         rebind(parent, step, leaf)
 
 
-def _containers(root):
+def _containers(root) -> Iterator[list | collections.deque | dict]:
     """Yields every list, deque and dict that is reachable."""
     visited, stack = set(), [root]
     while stack:
@@ -121,31 +121,34 @@ def _containers(root):
             stack += [child for _, child in children(node)]
 
 
-def _members(container):
+def _members(container) -> list:
     """Returns what a container holds: its items, or keys and values in turn."""
     if isinstance(container, dict):
         return [part for pair in dict.items(container) for part in pair]
     return [*container]
 
 
-def _refill(container, members):
-    if isinstance(container, dict):
-        # not a method of a subclass, which may do something else; an OrderedDict needs its own
-        kind = type(container) if isinstance(container, collections.OrderedDict) else dict
-        kind.clear(container)
-        kind.update(container, zip(members[::2], members[1::2]))
-    else:
+def _refill(container, members) -> None:
+    if isinstance(container, (list, collections.deque)):
         container.clear()
         container.extend(members)
+        return
+    pairs = zip(members[::2], members[1::2])
+    if isinstance(container, collections.OrderedDict):
+        container.clear()
+        container.update(pairs)
+    else:  # not methods of a subclass, which may do something else
+        dict.clear(container)
+        dict.update(container, pairs)
 
 
-def _storage(tensor):
+def _storage(tensor) -> tuple[torch.device, int]:
     """Returns what is equal for tensors that share memory."""
     with torch._C.DisableTorchFunctionSubclass():  # a ReadOnlyTensor would copy it
         return tensor.device, tensor.untyped_storage().data_ptr()
 
 
-def _copy_back(path, parent, step, old, new):
+def _copy_back(path, parent, step, old, new) -> None:
     if old.shape != new.shape or old.dtype != new.dtype:
         raise CaptureError(
             f"{_readable(path)} changed its shape or dtype during the call, from "
@@ -160,12 +163,12 @@ def _copy_back(path, parent, step, old, new):
         ) from None
 
 
-def _readable(path):
+def _readable(path) -> str:
     """Returns a path for messages, without the number of its root."""
     return path.partition("]")[2].lstrip(".")
 
 
-def _renew_generators(roots):
+def _renew_generators(roots) -> None:
     """Replaces the generators on GPUs: a failed recording leaves those that it registered marked as
     being captured.
     """
@@ -211,17 +214,17 @@ class Graph:
         leaves, self._spec = _pytree.tree_flatten(args)
         self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
         inputs = _pytree.tree_unflatten(self._leaves, self._spec)
-        roots = dict(enumerate(roots))
+        numbered = dict(enumerate(roots))
         tensors = [
             leaf
-            for leaf in [*leaves, *state_tree(roots).values()]
+            for leaf in [*leaves, *state_tree(numbered).values()]
             if isinstance(leaf, torch.Tensor)
         ]
         self._device = next((leaf.device for leaf in tensors if leaf.device.type == "cuda"), None)
         with torch.cuda.device(self._device):
-            saved, original = snapshot(roots), _StateBefore(roots.values())
+            saved, original = snapshot(numbered), _StateBefore(roots)
             try:
-                self._record(function, inputs, roots, saved, warmup)
+                self._record(function, inputs, numbered, saved, warmup)
                 if name := changed():
                     raise CaptureError(
                         f"{name} changed during the call, but a CUDA graph replays tensors only: "
@@ -231,15 +234,15 @@ class Graph:
                 original.undo()
                 if isinstance(error, Exception):
                     end_failed_recording()
-                    _renew_generators(roots)
+                    _renew_generators(numbered)
                 raise
             finally:
-                restore(roots, saved)
+                restore(numbered, saved)
         # not the objects: those that hold their graph would be freed late, by garbage collection
-        leaves = walk(roots, (torch.Tensor,), only_state=False).values()
+        leaves = walk(numbered, torch.Tensor, only_state=False).values()
         self._tensors = [leaf for _, _, leaf in leaves]
 
-    def _record(self, function, inputs, roots, saved, warmup):
+    def _record(self, function, inputs, roots, saved, warmup) -> None:
         self._graph = torch.cuda.CUDAGraph()
         for leaf in state_tree(roots).values():
             if isinstance(leaf, torch.Generator) and leaf.device.type == "cuda":
@@ -257,7 +260,7 @@ class Graph:
         with torch.cuda.graph(self._graph, stream=side):
             self._out = before.keep_in_place(function(*inputs))
 
-    def __call__(self, *args):
+    def __call__(self, *args) -> Any:
         leaves, spec = _pytree.tree_flatten(args)
         if spec != self._spec:
             raise ValueError(
@@ -313,7 +316,7 @@ def capture(
         return function
 
 
-def _line(error):
+def _line(error) -> str:
     """Returns the line outside PyTorch and this file that raised an error, as the end of a
     sentence.
     """
@@ -343,7 +346,7 @@ class Captured:
             raise AttributeError(name)
         return getattr(self.env, name)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         return {"env": self.env, "_step": None}  # a copy records a graph of its own
 
     def step(self, decision: Mapping) -> World:
@@ -351,7 +354,7 @@ class Captured:
 
         On a GPU the returned world is valid until the next step.
         """
-        decision = type(decision)(actions=decision["actions"])
+        decision = cast("type[dict]", type(decision))(actions=decision["actions"])
         if self._step is None:
             on_gpu = torch.device(self.env.device).type == "cuda"
             self._step = (

@@ -3,12 +3,13 @@
 """
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 #: Values in [0, 1], of any shape.
-Values = np.ndarray | torch.Tensor
+Values = TypeVar("Values", np.ndarray, torch.Tensor)
 
 _KNEE = 0.0031308  # linear light below which sRGB is a straight line
 _SLOPE, _SCALE, _POWER = 12.92, 1.055, 2.4

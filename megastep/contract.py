@@ -30,6 +30,7 @@ INTEGERS = tuple(
     getattr(torch, f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)
 )
 RESERVED = "count", "window", "return", "length", "return_std"  # reported of every episode
+#: Required attributes of an environment, and what each is.
 ATTRIBUTES = {
     "n_envs": "the number of environments, N",
     "device": "the device that the tensors are on",
@@ -68,9 +69,9 @@ def check_environment(env: Env) -> None:
         )
     names = "n_agents", "fps", "check", "layout", "roles"
     n_agents, fps, check, layout, roles = (optional(env, name) for name in names)
-    is_count = isinstance(n_agents, numbers.Integral) and n_agents > 0
+    is_count = isinstance(n_agents, numbers.Integral) and int(n_agents) > 0
     _require(env, is_count, f"n_agents must be a positive integer, not {n_agents!r}")
-    is_rate = isinstance(fps, numbers.Real) and fps > 0
+    is_rate = isinstance(fps, numbers.Real) and float(fps) > 0
     _require(env, is_rate, f"fps must be a positive number, not {fps!r}")
     _require(env, callable(check), f"check must be a method without arguments, not {check!r}")
     check()
@@ -87,7 +88,7 @@ def check_environment(env: Env) -> None:
     )
 
 
-def _are_names(words):
+def _are_names(words) -> bool:
     return all(isinstance(word, str) and word.isidentifier() for word in words)
 
 
@@ -126,7 +127,7 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
         _check_per_lane(env, "learns", world["learns"], torch.bool)
 
 
-def _check_tensor(env, path, values, shape, dtypes, kind=None):
+def _check_tensor(env, path, values, shape, dtypes, kind=None) -> None:
     """Requires a tensor of this shape, of one of the dtypes, on the environment's device."""
     described = repr(values)
     if isinstance(values, torch.Tensor):
@@ -143,7 +144,7 @@ def _check_tensor(env, path, values, shape, dtypes, kind=None):
     )
 
 
-def _check_per_lane(env, path, values, dtype):
+def _check_per_lane(env, path, values, dtype) -> None:
     _check_tensor(env, path, values, (n_lanes(env),), (dtype,))
 
 
@@ -159,7 +160,7 @@ def _leaves(env: Env, space: Space, values: Tree, name: str) -> Iterator[tuple[s
         yield path, leaf, present[path]
 
 
-def _check_observation(env, path, space, values):
+def _check_observation(env, path, space, values) -> None:
     shape = n_lanes(env), *space.shape
     if isinstance(space, spaces.MultiDiscrete):
         _check_tensor(env, path, values, shape, INTEGERS, "integers")
@@ -171,7 +172,7 @@ def _check_observation(env, path, space, values):
     _require(env, bool(values.isfinite().all()), f"{path} must be finite")
 
 
-def _check_privileged(env, world):
+def _check_privileged(env, world) -> None:
     space = optional(env, "privileged_space")
     has_values, has_space = "privileged" in world, space is not None
     _require(
@@ -187,7 +188,7 @@ def _check_privileged(env, world):
         _require(env, bool(values.isfinite().all()), f"{path} must be finite")
 
 
-def _check_episodes(env, world, last):
+def _check_episodes(env, world, last) -> None:
     """Requires finite rewards, and flags that agree with those of the last step."""
     reward, (reset, terminal, truncated) = world["reward"], (world[key] for key in FLAGS)
     _require(env, bool(reward.isfinite().all()), "reward must be finite")
@@ -214,7 +215,7 @@ def _check_episodes(env, world, last):
     )
 
 
-def _check_metrics(env, world, last):
+def _check_metrics(env, world, last) -> None:
     metrics = world.get("metrics", {})
     _require(env, isinstance(metrics, Mapping), "metrics must be a dict of tensors")
     _require(
@@ -240,7 +241,7 @@ def random_actions(env: Env, generator: torch.Generator) -> Tree:
     device. ``generator`` is a CPU generator, so the actions are the same on every device.
     """
 
-    def draw(space):
+    def draw(space) -> torch.Tensor:
         return spaces.random_actions(space, n_lanes(env), generator=generator).to(env.device)
 
     return spaces.map(draw, env.action_space)
@@ -262,7 +263,7 @@ def rollout(env: Env, n_steps: int, seed: int = 1, check: bool = True) -> list[a
         check_environment(env)
     generator, worlds = torch.Generator().manual_seed(seed), []
 
-    def add(world):
+    def add(world) -> None:
         if check:
             check_world(env, world, worlds[-1] if worlds else None)
         worlds.append(world.clone())

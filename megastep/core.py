@@ -1,7 +1,7 @@
 """Core: scenery, agents and camera settings in one object."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from megastep.colour import gamma_decode, gamma_encode
 from megastep.engine import checks
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH
 from megastep.scene import TEXEL
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]
 
@@ -56,11 +59,11 @@ class Core:
         )
         self.res, self.fov, self.fps = self.agents.res, self.agents.fov, self.agents.fps
 
-    def agent_full(self, value: Any) -> torch.Tensor:
+    def agent_full(self, value: float) -> torch.Tensor:
         """Returns an (N, A) tensor filled with ``value``, of the dtype that suits it."""
         return torch.full((self.n_envs, self.n_agents), value, device=self.device)
 
-    def env_full(self, value: Any) -> torch.Tensor:
+    def env_full(self, value: float) -> torch.Tensor:
         """Returns an (N,) tensor filled with ``value``, of the dtype that suits it."""
         return torch.full((self.n_envs,), value, device=self.device)
 
@@ -93,7 +96,12 @@ class Core:
         )
 
     @staticmethod
-    def plot_state(state: dict, ax: Any = None, seen: Any = None, distances: Any = None) -> Any:
+    def plot_state(
+        state: arrdict,
+        ax: "Axes | None" = None,
+        seen: np.ndarray | None = None,
+        distances: np.ndarray | None = None,
+    ) -> "Axes":
         """Draws a numpyified :meth:`state` from above, with each camera's field of view.
 
         Args:
@@ -109,10 +117,11 @@ class Core:
 
         ends = state.widths.cumsum()
         colours = np.split(state.texels, ends[:-1])
+        parts = None
         if seen is not None:
             n_moving = int(state.widths[: int(state.n_moving_lines)].sum())
-            seen = np.split(np.concatenate([np.ones(n_moving, bool), seen]), ends[:-1])
-        ax = plotting.plot_scenery(state.lines, colours, state.lights, seen=seen, ax=ax)
+            parts = np.split(np.concatenate([np.ones(n_moving, bool), seen]), ends[:-1])
+        ax = plotting.plot_scenery(state.lines, colours, state.lights, seen=parts, ax=ax)
         marks = plotting.camera_colours(len(state.yaws))
         for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):
             for c, (yaw, mark) in enumerate(zip(state.yaws, marks, strict=True)):

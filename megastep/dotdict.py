@@ -5,10 +5,15 @@ A *tree* is a nested dict; a leaf is anything that is not a dict. This file does
 
 import difflib
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["dotdict", "leaves", "mapping"]
+
+T = TypeVar("T")
 
 _INDENT = 4
 _WIDTH = 120
@@ -25,7 +30,7 @@ class dotdict(dict):
 
     __slots__ = ()
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> Any:
         if name in self:
             return self[name]
         if name.startswith("_"):
@@ -38,47 +43,47 @@ class dotdict(dict):
             raise AttributeError(_absent(self, name))
         return type(self)(attributes)
 
-    def __setattr__(self, name, value):
+    def __setattr__(self, name: str, value: object) -> NoReturn:
         raise AttributeError(
             f"a {type(self).__name__} is assigned by key: write d['{name}'] = ..., not "
             f"d.{name} = ..."
         )
 
-    def __delattr__(self, name):
+    def __delattr__(self, name: str) -> NoReturn:
         raise AttributeError(
             f"a {type(self).__name__}'s items are deleted by key: write del d['{name}'], not "
             f"del d.{name}"
         )
 
-    def __missing__(self, key):
+    def __missing__(self, key: object) -> NoReturn:
         raise KeyError(f"{key!r} is not a key; {_listing(self, key)}")
 
-    def __dir__(self):
+    def __dir__(self) -> list[str]:
         return [*super().__dir__(), *(key for key in self if isinstance(key, str))]
 
-    def __call__(self, *args, **kwargs):
+    def __call__(self, *args: object, **kwargs: object) -> "Self":
         """Calls every leaf with these arguments. Returns the tree of results."""
         return self.map(lambda leaf: leaf(*args, **kwargs))
 
-    def __or__(self, other):
+    def __or__(self, other: dict) -> "Self":
         return type(self)({**self, **other}) if isinstance(other, dict) else NotImplemented
 
-    def __ror__(self, other):
+    def __ror__(self, other: dict) -> "Self":
         return type(self)({**other, **self}) if isinstance(other, dict) else NotImplemented
 
-    def copy(self) -> "dotdict":
+    def copy(self) -> "Self":
         """Returns a new tree of the same type with the same values."""
         return type(self)(self)
 
-    def pipe(self, f: Callable, *args, **kwargs) -> Any:
+    def pipe(self, f: "Callable[..., T]", *args: object, **kwargs: object) -> "T":
         """Returns ``f(self, ...)``, for chains that read from left to right."""
         return f(self, *args, **kwargs)
 
-    def map(self, f: Callable, *args, **kwargs) -> "dotdict":
+    def map(self, f: Callable, *args: object, **kwargs: object) -> "Self":
         """Returns the tree of ``f(leaf, ...)``."""
         return _map(lambda leaf: f(leaf, *args, **kwargs), self)
 
-    def starmap(self, f: Callable, *others: dict, **kwargs) -> "dotdict":
+    def starmap(self, f: Callable, *others: dict, **kwargs: object) -> "Self":
         """Returns the tree of ``f(leaf, other_leaf, ...)``.
 
         Raises:
@@ -86,14 +91,14 @@ class dotdict(dict):
         """
         return _map(functools.partial(f, **kwargs), self, *others)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return "\n".join([f"{type(self).__name__}:", *_rows(self)])
 
-    def _repr_pretty_(self, printer, cycle):
+    def _repr_pretty_(self, printer, cycle: bool) -> None:
         printer.text(f"{type(self).__name__}(...)" if cycle else repr(self))
 
 
-def leaves(tree: Any) -> list:
+def leaves(tree: object) -> list:
     """Returns the list of a tree's leaves in order. A value that is no dict is its own leaf."""
     if isinstance(tree, dict):
         return [leaf for value in tree.values() for leaf in leaves(value)]
@@ -106,13 +111,13 @@ def mapping(f: Callable) -> Callable:
     """
 
     @functools.wraps(f)
-    def mapped(tree, *args, **kwargs):
+    def mapped(tree, *args, **kwargs) -> Any:
         return _map(lambda leaf: f(leaf, *args, **kwargs), tree)
 
     return mapped
 
 
-def _map(f, tree, *others):
+def _map(f: Callable, tree, *others) -> Any:
     if not isinstance(tree, dict):
         return f(tree, *others)
     for other in others:
@@ -122,7 +127,7 @@ def _map(f, tree, *others):
     )
 
 
-def _check_keys(tree, other):
+def _check_keys(tree: dict, other: object) -> None:
     if not isinstance(other, dict):
         raise ValueError(
             f"a tree with keys {_names(tree)} needs another tree, but got a {type(other).__name__}"
@@ -135,11 +140,11 @@ def _check_keys(tree, other):
 
 
 class _Missing(Exception):
-    def __init__(self, leaf):
+    def __init__(self, leaf: object):
         self.leaf = leaf
 
 
-def _attribute(value, name):
+def _attribute(value, name: str) -> Any:
     """Returns ``value.name``. For a dict, returns its item of that name, or the tree of its values'
     attributes.
     """
@@ -153,22 +158,22 @@ def _attribute(value, name):
         raise _Missing(value) from None
 
 
-def _names(tree):
+def _names(tree: dict) -> str:
     return ", ".join(map(str, tree)) if tree else "none"
 
 
-def _listing(tree, key):
+def _listing(tree: dict, key: object) -> str:
     nearest = difflib.get_close_matches(str(key), map(str, tree), n=1)
     hint = f" (did you mean '{nearest[0]}'?)" if nearest else ""
     return f"its keys are {_names(tree)}{hint}"
 
 
-def _absent(tree, name, leaf=None):
+def _absent(tree: dict, name: str, leaf: object = None) -> str:
     values = "" if leaf is None else f" or an attribute of its values (type {type(leaf).__name__})"
     return f"'{name}' is not a key of this {type(tree).__name__}{values}; {_listing(tree, name)}"
 
 
-def _rows(tree):
+def _rows(tree: dict) -> Iterator[str]:
     """Yields one line per item, the key and the value. The items of a nested tree are indented to
     below its name.
     """
@@ -181,7 +186,7 @@ def _rows(tree):
             yield f"{key!s:<{column}}{_summary(value, column)}"
 
 
-def _summary(value, column):
+def _summary(value, column: int) -> str:
     """Returns one line for a leaf: shape and dtype of an array, a shape in full, the length of
     another collection, or the text of any other value.
     """
@@ -197,7 +202,7 @@ def _summary(value, column):
     return text if len(text) <= width else f"{text[: width - 3]}..."
 
 
-def _is_shape(value):
+def _is_shape(value: object) -> bool:
     return (
         isinstance(value, tuple)
         and len(value) <= _MAX_AXES

@@ -5,10 +5,13 @@ what the environments of users keep besides tensors.
 import collections
 import contextlib
 import enum
+import functools
+import inspect
 import pathlib
 import random
 import re
 import types as python_types
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,9 +19,12 @@ import torch
 
 from megastep.engine.state_tree import OPAQUE, children, is_expanded, node_at, rebind, walk
 from megastep.read_only import ReadOnlyTensor
+from megastep.types import Env
 
 __all__ = ["EnvState"]
 
+#: A part of the state by name, such as the arrays, by path.
+State = dict[str, dict[str, Any]]
 _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
 _NUMBERS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
@@ -52,7 +58,7 @@ class EnvState:
         host_only: it is used for `host_state` only, so no large tensor is read.
     """
 
-    def __init__(self, env: Any, bot: Any = None, host_only: bool = False):
+    def __init__(self, env: Env, bot: object = None, host_only: bool = False):
         self.env, device = env, torch.device(env.device)
         generators = dict(torch=torch.default_generator)
         if device.type == "cuda":
@@ -73,7 +79,7 @@ class EnvState:
 
     # ---- Saving ----
 
-    def state_dict(self) -> dict[str, dict[str, Any]]:
+    def state_dict(self) -> State:
         """Returns the state by path. Tensors share their memory with the environment; all else is
         a copy, in types that `torch.load(weights_only=True)` reads.
         """
@@ -99,7 +105,7 @@ class EnvState:
         arrays = {path: leaf for path, leaf in arrays.items() if path not in unchanged}
         return state | dict(arrays=arrays, aliases=aliases, unchanged=unchanged)
 
-    def host_state(self) -> dict[str, dict[str, Any]]:
+    def host_state(self) -> State:
         """Returns the part of the state that is not in tensors, for `restore_host`."""
         arrays, kinds, generators, frozen = {}, {}, {}, {}
         is_on_gpu = torch.device(self.env.device).type == "cuda"
@@ -120,13 +126,13 @@ class EnvState:
         none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
         return state | none
 
-    def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
+    def restore_host(self, state: State) -> None:
         """Restores a `host_state` in the same process: of plain values, those that have changed."""
         now = {path: repr(_encoded(node)) for path, node in self._plain_values()}
         values = {k: value for k, value in state["values"].items() if now.get(k) != repr(value)}
         self._load(state | {"values": values})
 
-    def changed_on_host(self, before: dict[str, dict[str, Any]]) -> str | None:
+    def changed_on_host(self, before: State) -> str | None:
         """Returns the name of something that has changed since an earlier `host_state` and that no
         CUDA graph repeats: a plain value, an array, the length of a list, a generator of NumPy or
         Python, and a tensor or a generator on the CPU where the environment is on a GPU. None if
@@ -134,14 +140,14 @@ class EnvState:
         """
         if not any(True for _ in self._nodes_of_user()):
             return None
-        before, now = map(_comparable, (before, self.host_state()))
-        changed = sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
+        was, now = _comparable(before), _comparable(self.host_state())
+        changed = sorted(path for path in {*was, *now} if was.get(path) != now.get(path))
         if not changed:
             return None
         is_global = re.match(r"\.generators\['(\w+)'\]", changed[0])
         return f"the global generator of {is_global[1]}" if is_global else _name(changed[0])
 
-    def _members(self):
+    def _members(self) -> State:
         """Returns the classes of objects, the lengths of lists and the keys of dicts that hold
         tensors or objects.
         """
@@ -153,7 +159,7 @@ class EnvState:
             keys={path: _encoded([*node]) for path, node in nodes if _is_dict(node)},
         )
 
-    def _aliases(self, arrays):
+    def _aliases(self, arrays) -> dict[str, str]:
         """Returns {path: an earlier path} of tensors that are the same."""
         first, aliases = {}, {}
         for path, leaf in arrays.items():
@@ -164,7 +170,7 @@ class EnvState:
 
     # ---- Restoring ----
 
-    def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:
+    def load_state_dict(self, state: State) -> None:
         """Restores a `state_dict`, whose tensors may be on any device. Tensors change in place, so
         that whatever refers to them sees it.
 
@@ -183,7 +189,7 @@ class EnvState:
             ) from error
 
     @torch.no_grad()
-    def _load(self, state):
+    def _load(self, state) -> None:
         for path, length in state["lengths"].items():
             if not _is_list(node_at(self.root, path)):
                 self._replace(path, [])
@@ -208,8 +214,9 @@ class EnvState:
                 raise ValueError(f"{_name(path)} was a {name} and is a {now}")
         for path, value in state["arrays"].items():
             now, owner = leaves.get(path), node_at(self.root, _parent(path))
-            is_fixed = isinstance(now, torch.Tensor) and _is_ours(owner) and not _is_dict(owner)
-            if is_fixed and now.shape != value.shape:  # of another version of megastep
+            is_fixed = _is_ours(owner) and not _is_dict(owner)
+            # of another version of megastep
+            if isinstance(now, torch.Tensor) and is_fixed and now.shape != value.shape:
                 shapes = f"was {tuple(value.shape)} and is {tuple(now.shape)}"
                 raise ValueError(f"the shape of {_name(path)} {shapes}")
         for path, value in state["generators"].items():
@@ -228,11 +235,11 @@ class EnvState:
             if _identity(same) != _identity(now):
                 self._replace(path, same)
 
-    def _set_value(self, path, value):
+    def _set_value(self, path, value) -> None:
         now, value = node_at(self.root, path), _decoded(value)
         if isinstance(now, enum.Enum):
-            value = type(now)[value]
-        if isinstance(now, (list, collections.deque)) and type(now) is type(value):
+            self._replace(path, type(now)[value])
+        elif isinstance(now, (list, collections.deque)) and type(now) is type(value):
             now.clear()
             now.extend(value)
         elif isinstance(now, (dict, set)) and type(now) is type(value):
@@ -241,10 +248,12 @@ class EnvState:
         else:
             self._replace(path, value)
 
-    def _replace(self, path, value):
+    def _replace(self, path, value) -> None:
         parent, step = node_at(self.root, _parent(path)), path[len(_parent(path)) :]
         if parent is None:
             raise ValueError(f"it has no {_name(path)}")
+        if not _is_state(self.root, parent, step, value):
+            raise ValueError(f"{_name(path)} is not state of the environment")
         if _is_list(parent) and step == f"[{len(parent)}]":
             parent.append(value)
         else:
@@ -260,7 +269,7 @@ class EnvState:
             if not self._is_reached(path, node)
         ]
 
-    def _is_reached(self, path, node):
+    def _is_reached(self, path, node) -> bool:
         if isinstance(node, np.ndarray):
             return _is_savable(node)
         if isinstance(node, _CONSTANT):
@@ -268,13 +277,13 @@ class EnvState:
         is_known = isinstance(node, (*_STATEFUL, *_NUMBERS, list, tuple, dict, collections.deque))
         return is_known or _is_plain(node) or hasattr(node, "__dict__")
 
-    def _plain_values(self):
+    def _plain_values(self) -> Iterator[tuple[str, Any]]:
         """Yields (path, value) of plain values but those of megastep's own objects, which never
         change or are addresses.
         """
         return ((path, node) for path, node in self._nodes_of_user() if _is_plain(node))
 
-    def _nodes_of_user(self):
+    def _nodes_of_user(self) -> Iterator[tuple[str, Any]]:
         """Yields (path, node) of what is below objects of a class that is not megastep's."""
         visited, stack = set(), [("", self.root, False)]
         while stack:
@@ -290,7 +299,7 @@ class EnvState:
             stack += [(path + step, child, is_users) for step, child in reversed(children(node))]
 
 
-def _comparable(host_state):
+def _comparable(host_state) -> dict[str, object]:
     """Returns {path: what is equal for equal values}."""
     same = {path: repr(value) for path, value in host_state["values"].items()}
     same |= {path: array.numpy().tobytes() for path, array in host_state["arrays"].items()}
@@ -300,44 +309,62 @@ def _comparable(host_state):
     return same | host_state["frozen"]
 
 
-def _bytes(tensor):
+def _bytes(tensor) -> bytes:
     return tensor.detach().contiguous().view(-1).view(torch.uint8).numpy().tobytes()
 
 
-def _is_ours(node):
+def _is_ours(node) -> bool:
     return type(node).__module__.startswith(("megastep.", "torch."))
 
 
-def _is_object(node):
+def _is_state(root, parent, step, value) -> bool:
+    """Returns whether a step from a node leads to what may be replaced by a saved value: files may
+    come from strangers, and name methods.
+    """
+    now = dict(children(parent)).get(step)
+    if parent is root or (_is_ours(parent) and _is_plain(value) and not _is_dict(parent)):
+        return False
+    if not isinstance(now, (*_STATEFUL, *_NUMBERS, *_CONTAINERS)):
+        return False
+    if step.startswith("["):
+        return True
+    name = step[1:]
+    of_class = inspect.getattr_static(type(parent), name, None)
+    kinds = (*_STATEFUL, *_NUMBERS, *_CONTAINERS, functools.cached_property)
+    is_data = isinstance(of_class, kinds)
+    return is_data and not (name.startswith("__") and name.endswith("__"))
+
+
+def _is_object(node) -> bool:
     return hasattr(node, "__dict__") and not isinstance(node, (*_STATEFUL, *_CONSTANT))
 
 
-def _is_list(node):
+def _is_list(node) -> bool:
     return isinstance(node, (list, collections.deque))
 
 
-def _is_dict(node):
+def _is_dict(node) -> bool:
     return isinstance(node, dict) and _is_plain([*node])
 
 
-def _is_plain(node):
+def _is_plain(node) -> bool:
     if type(node) in _CONTAINERS:
         parts = [*node, *node.values()] if type(node) is dict else node
         return all(map(_is_plain, parts))
     return isinstance(node, _NUMBERS)
 
 
-def _is_savable(array):
+def _is_savable(array) -> bool:
     return _is_of_numbers(array.dtype) or (array.dtype.kind in "SUmM" and array.dtype.itemsize > 0)
 
 
-def _is_of_numbers(dtype):
+def _is_of_numbers(dtype) -> bool:
     """Returns whether PyTorch has this type of NumPy's."""
     is_long = dtype.itemsize > 16 or dtype == np.longdouble
     return dtype.kind in "biufc" and not is_long and dtype.isnative
 
 
-def _as_tensor(leaf):
+def _as_tensor(leaf) -> torch.Tensor:
     """Returns a tensor, or an array as a tensor that shares its memory: of characters or times, as
     bytes on a last axis.
     """
@@ -347,29 +374,29 @@ def _as_tensor(leaf):
     return torch.from_numpy(leaf if is_of_numbers else leaf[..., None].view(np.uint8))
 
 
-def _copied(array):
+def _copied(array) -> tuple[torch.Tensor, str]:
     """Returns a copy of an array as a tensor, and the kind from which `_as_kind` makes it again."""
     kind = "numpy" if _is_of_numbers(array.dtype) else f"numpy {array.dtype.str}"
     return _as_tensor(np.array(array, order="C")), kind
 
 
-def _parent(path):
+def _parent(path) -> str:
     """Returns a path without its last step."""
     return re.sub(r"(\.[^.\[\]]+|\[('[^']*'|[^\]]*)\])$", "", path)
 
 
-def _name(path):
+def _name(path) -> str:
     return path.removeprefix(".env").lstrip(".")
 
 
-def _identity(leaf):
+def _identity(leaf) -> object:
     """Returns what is equal for tensors that are the same."""
     if not isinstance(leaf, torch.Tensor):
         return id(leaf)
     return leaf.device, leaf.data_ptr(), leaf.shape, leaf.stride(), leaf.dtype
 
 
-def _digest(tensor):
+def _digest(tensor) -> int:
     """Returns a number that differs if a tensor has other bytes or these in another order."""
     data = tensor.detach().contiguous().view(-1).view(torch.uint8)
     data = data.view(torch.int32) if len(data) % 4 == 0 else data
@@ -381,7 +408,7 @@ def _digest(tensor):
     return int(total)
 
 
-def _fits(leaf, value):
+def _fits(leaf, value) -> bool:
     """Returns whether a tensor or array can take a saved value in place."""
     if isinstance(leaf, np.ndarray):
         is_usable = _is_savable(leaf) and leaf.flags.writeable and min(leaf.strides, default=0) >= 0
@@ -391,13 +418,13 @@ def _fits(leaf, value):
     return leaf.shape == value.shape and leaf.dtype == value.dtype and not is_expanded(leaf)
 
 
-def _equal(leaf, value):
+def _equal(leaf, value) -> bool:
     # as bytes, since NaN is not equal to itself
     pair = (_as_tensor(one).cpu().contiguous().view(-1) for one in (leaf, value))
     return torch.equal(*(one.view(torch.uint8) for one in pair))
 
 
-def _as_kind(value, kind):
+def _as_kind(value, kind) -> np.ndarray | torch.Tensor:
     """Returns a saved tensor as what it was: an array, or a tensor on a kind of device."""
     if kind.startswith("numpy"):
         array, dtype = value.cpu().numpy().copy(), kind.removeprefix("numpy ")
@@ -409,7 +436,7 @@ def _as_kind(value, kind):
 # ---- Plain values and generators, in types that a file without code can hold ----
 
 
-def _encoded(value):
+def _encoded(value) -> Any:
     if isinstance(value, np.generic):
         return {"numpy": (value.dtype.str, value.tobytes().hex())}
     if isinstance(value, enum.Enum):
@@ -432,7 +459,7 @@ def _encoded(value):
     return next((kind(value) for kind in kinds if isinstance(value, kind)), value)
 
 
-def _decoded(value):
+def _decoded(value) -> Any:
     if isinstance(value, list):
         return [*map(_decoded, value)]
     match value:
@@ -455,7 +482,7 @@ def _decoded(value):
     return value
 
 
-def _generator_state(generator):
+def _generator_state(generator) -> Any:
     if isinstance(generator, torch.Generator):
         return generator.get_state()
     if isinstance(generator, random.Random):
@@ -465,7 +492,7 @@ def _generator_state(generator):
     return _encoded(_without_arrays(generator.bit_generator.state))
 
 
-def _set_generator_state(generator, state):
+def _set_generator_state(generator, state) -> bool:
     """Returns False if the state is that of another kind of generator."""
     try:
         if isinstance(generator, torch.Generator):
@@ -481,14 +508,14 @@ def _set_generator_state(generator, state):
     return True
 
 
-def _without_arrays(state):
+def _without_arrays(state) -> object:
     """Returns the state of one of NumPy's generators as plain values."""
     if isinstance(state, dict):
         return {key: _without_arrays(value) for key, value in state.items()}
     return (state.dtype.name, state.tolist()) if isinstance(state, np.ndarray) else state
 
 
-def _with_arrays(state):
+def _with_arrays(state) -> Any:
     if isinstance(state, dict):
         return {key: _with_arrays(value) for key, value in state.items()}
     return np.array(state[1], state[0]) if isinstance(state, tuple) else state

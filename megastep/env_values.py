@@ -46,7 +46,7 @@ def problem_of_result(
     return _problem_of_values(method, result, space)
 
 
-def _problem_of_values(method, result, space):
+def _problem_of_values(method, result, space) -> str | None:
     if not isinstance(result[-1], Mapping):
         return f"{method}() must return a dict as info, and returned {_shown(result[-1])}"
     if method == "step":
@@ -109,7 +109,7 @@ def problem_of_observation(space: Any, value: Any, path: str = "it") -> str | No
     return None
 
 
-def _shown(value):
+def _shown(value) -> str:
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of shape {value.shape}"
     text = " ".join(repr(value).split())

@@ -16,12 +16,15 @@ this file `shape` is the (H, W) of the masks, and an index is an (i, j) pair of 
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from megastep.dotdict import dotdict
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = [
     "centers",
@@ -32,6 +35,8 @@ __all__ = [
     "mirror_image",
     "validate_geometry",
 ]
+
+G = TypeVar("G", bound=dict)
 
 # Metres per cell, as in the original: coarse enough to be cheap, fine enough for a 0.6 m door.
 RES = 0.2
@@ -65,7 +70,7 @@ def indices(coords: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.n
     return np.stack([shape[0] - 1 - cells[..., 1], cells[..., 0]], -1)
 
 
-def _runs(lows, highs):
+def _runs(lows, highs) -> tuple[np.ndarray, np.ndarray]:
     """Returns (the number of the range, the integer) for each integer of the closed ranges
     low..high, given as vectors of integers.
     """
@@ -75,7 +80,7 @@ def _runs(lows, highs):
     return ranges, offsets + lows[ranges]
 
 
-def _touched(walls, shape):
+def _touched(walls, shape) -> np.ndarray:
     """Returns the cells that a wall touches, (H, W) bool with row 0 at the *bottom*. Walls
     (M, 2, 2) are in units of cells.
 
@@ -104,7 +109,7 @@ def _touched(walls, shape):
     return marks.reshape(height, width + 1).cumsum(1)[:, :width] > 0
 
 
-def _inside(rings, shape):
+def _inside(rings, shape) -> np.ndarray:
     """Returns the cells whose centre an odd number of rings encloses, (H, W) bool with row 0 at the
     bottom. Rings (P, 2) are in units of cells.
     """
@@ -124,7 +129,7 @@ def _inside(rings, shape):
     return flips.cumsum(1)[:, :width] % 2 == 1
 
 
-def masks(walls: ArrayLike, rooms: Sequence[Any], res: float = RES) -> np.ndarray:
+def masks(walls: ArrayLike, rooms: Sequence, res: float = RES) -> np.ndarray:
     """Returns the masks of a geometry, (H, W) int16.
 
     A room holds the cells whose centre it contains. Walls take every cell that they touch, even at
@@ -158,7 +163,7 @@ def masks(walls: ArrayLike, rooms: Sequence[Any], res: float = RES) -> np.ndarra
     return np.ascontiguousarray(result[::-1])
 
 
-def _array(g, key, kinds, shape):
+def _array(g, key, kinds, shape) -> np.ndarray:
     """Returns entry `key` of a geometry as an array. It must be of one of numpy's `kinds` and of
     `shape`, in which None stands for any length.
     """
@@ -175,7 +180,7 @@ def _array(g, key, kinds, shape):
     return value
 
 
-def _coordinates(g, key, shape, limit):
+def _coordinates(g, key, shape, limit) -> np.ndarray:
     """Returns points of a geometry as float32. They must be finite, above 0, within the extent, and
     at most `limit`.
     """
@@ -198,7 +203,7 @@ def _coordinates(g, key, shape, limit):
     return points
 
 
-def validate_geometry(g: dict) -> dict:
+def validate_geometry(g: G) -> G:
     """Returns a copy of a geometry with the documented dtypes and without walls of length 0.
 
     Raises:
@@ -223,10 +228,10 @@ def validate_geometry(g: dict) -> dict:
     if not 0.01 <= res <= 10:
         raise ValueError(f"'res' must be from 0.01 to 10 m per cell, but is {res:g}")
     number = int(_array(g, "id", "iu", ()))
-    parts = dict(id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
+    parts: dict = dict(id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
     if "doors" in g:
         parts["doors"] = _coordinates(g, "doors", (None, 2, 2), MAX_WALLS)
-    return type(g)(g, **parts)
+    return cast(G, type(g)(g, **parts))
 
 
 def mirror_image(g: dotdict) -> dotdict:
@@ -263,7 +268,7 @@ def content_hash(geometries: Sequence[dotdict]) -> "hashlib._Hash":
     return key
 
 
-def display(g: dotdict, ax: Any = None) -> Any:
+def display(g: dotdict, ax: "Axes | None" = None) -> "Axes":
     """Draws the floor plan of a geometry: rooms tinted, walls black, lights yellow. Returns the
     matplotlib axes.
     """

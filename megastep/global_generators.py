@@ -81,7 +81,7 @@ def changed_kinds(before: dict[str, tuple]) -> tuple[str, ...]:
     )
 
 
-def _plain(state):
+def _plain(state) -> list | None:
     if isinstance(state, tuple):
         return [part.tolist() if isinstance(part, np.ndarray) else part for part in state]
     return None if state is None else state.tolist()

@@ -8,12 +8,17 @@
 """
 
 import operator
+from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import numpy as np
 import torch
 
 from megastep.read_only import SetOnce
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["Ragged", "RaggedNumpy", "RaggedTorch"]
 
@@ -34,9 +39,20 @@ class Ragged(SetOnce):
         ValueError: if ``widths`` does not fit.
     """
 
-    def __new__(cls, *args):
+    vals: Array
+    widths: Array
+    inverse: Array
+    torchify: Callable[[], "RaggedTorch"]
+    numpyify: Callable[[], "RaggedNumpy"]
+    _asarray: Callable[..., Array]
+    _asarray_like: Callable[..., Array]
+    _int64: Callable[..., Array]
+    _cat: Callable[..., Array]
+
+    def __new__(cls, *args: object) -> "Self":
         if cls is Ragged:
-            cls = RaggedTorch if isinstance(args[0], torch.Tensor) else RaggedNumpy
+            kind = RaggedTorch if isinstance(args[0], torch.Tensor) else RaggedNumpy
+            return super().__new__(kind)  # pyright: ignore[reportArgumentType]
         return super().__new__(cls)
 
     def __init__(self, vals: Array, widths: Array):
@@ -56,11 +72,11 @@ class Ragged(SetOnce):
         return self.ends - self.widths
 
     @cached_property
-    def _host(self):
+    def _host(self) -> tuple[list[int], list[int]]:
         """Starts and ends as lists, so that only the first indexing synchronises."""
         return self.starts.tolist(), self.ends.tolist()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.widths)
 
     def __getitem__(self, index: int | slice) -> "Array | Ragged":
@@ -81,7 +97,7 @@ class Ragged(SetOnce):
         i = self._index(index)
         return self.vals[starts[i] : ends[i]]
 
-    def _index(self, index):
+    def _index(self, index: SupportsIndex) -> int:
         """Returns a subarray's index from 0 up."""
         try:
             i = operator.index(index)
@@ -93,91 +109,107 @@ class Ragged(SetOnce):
             raise IndexError(f"index {i} is out of range for a Ragged of {len(self)} subarrays")
         return i % len(self)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"{type(self).__name__}({np.array(self.widths.tolist(), int)})"
 
-    def __reduce__(self):
+    def __reduce__(self) -> tuple:
         return Ragged, (self.vals, self.widths)
 
 
 class RaggedNumpy(Ragged):
     """A Ragged of numpy arrays."""
 
+    vals: np.ndarray
+    widths: np.ndarray
+    starts: np.ndarray
+    ends: np.ndarray
+
     _asarray = staticmethod(np.asarray)
     _cat = staticmethod(np.concatenate)
 
-    def _asarray_like(self, widths):
+    def _asarray_like(self, widths: Array) -> np.ndarray:
         widths = widths.cpu() if isinstance(widths, torch.Tensor) else widths
         return np.zeros(0, int) if np.size(widths) == 0 else np.asarray(widths)
 
     @staticmethod
-    def _int64(widths):
+    def _int64(widths: np.ndarray) -> np.ndarray:
         return widths.astype(np.int64, copy=False)
 
     @cached_property
-    def inverse(self) -> Array:
+    def inverse(self) -> np.ndarray:
         """(V,) the subarray that each element of ``vals`` belongs to."""
         return np.repeat(np.arange(len(self)), self.widths)
 
     def torchify(self) -> "RaggedTorch":
         """Returns the same Ragged on CPU tensors. float64 becomes float32."""
         vals = self.vals.astype(np.float32) if self.vals.dtype == np.float64 else self.vals
-        return Ragged(torch.as_tensor(vals), torch.as_tensor(self.widths))
+        return RaggedTorch(torch.as_tensor(vals), torch.as_tensor(self.widths))
 
     def numpyify(self) -> "RaggedNumpy":
+        """Returns itself."""
         return self
 
 
 class RaggedTorch(Ragged):
     """A Ragged of tensors on the device of ``vals``."""
 
+    vals: torch.Tensor
+    widths: torch.Tensor
+    starts: torch.Tensor
+    ends: torch.Tensor
+
     _asarray = staticmethod(torch.as_tensor)
     _cat = staticmethod(torch.cat)
 
-    def _asarray_like(self, widths):
+    def _asarray_like(self, widths: Array) -> torch.Tensor:
         widths = np.zeros(0, int) if len(widths) == 0 else widths
         return torch.as_tensor(widths, device=self.vals.device)
 
     @staticmethod
-    def _int64(widths):
+    def _int64(widths: torch.Tensor) -> torch.Tensor:
         return widths.to(torch.int64)
 
     @cached_property
-    def inverse(self) -> Array:
+    def inverse(self) -> torch.Tensor:
         """(V,) the subarray that each element of ``vals`` belongs to."""
         return torch.repeat_interleave(torch.arange(len(self), device=self.device), self.widths)
 
     @property
     def device(self) -> torch.device:
+        """The device of ``vals``."""
         return self.vals.device
 
     def torchify(self) -> "RaggedTorch":
+        """Returns itself."""
         return self
 
     def numpyify(self) -> RaggedNumpy:
         """Returns the same Ragged on numpy arrays. bfloat16 becomes float32."""
         vals = self.vals.detach().cpu()
-        return Ragged(
+        return RaggedNumpy(
             (vals.float() if vals.dtype == torch.bfloat16 else vals).numpy(),
             self.widths.cpu().numpy(),
         )
 
-    def to(self, *args, **kwargs) -> "RaggedTorch":
+    def to(self, *args: Any, **kwargs: Any) -> "RaggedTorch":
         """Returns a Ragged of ``vals.to(...)``, with the widths on the same device."""
         vals = self.vals.to(*args, **kwargs)
-        return Ragged(vals, self.widths.to(vals.device))
+        return RaggedTorch(vals, self.widths.to(vals.device))
 
     def cpu(self) -> "RaggedTorch":
+        """Returns it on the CPU."""
         return self.to("cpu")
 
     def cuda(self, device: torch.device | str = "cuda") -> "RaggedTorch":
+        """Returns it on a GPU."""
         return self.to(device)
 
     def clone(self) -> "RaggedTorch":
-        return Ragged(self.vals.clone(), self.widths.clone())
+        """Returns a copy with tensors of its own."""
+        return RaggedTorch(self.vals.clone(), self.widths.clone())
 
 
-def _check(vals, widths):
+def _check(vals: Array, widths: Array) -> None:
     if vals.ndim == 0:
         raise ValueError("the vals of a Ragged need at least one axis, but are a single number")
     if widths.ndim != 1:
@@ -199,7 +231,7 @@ def _check(vals, widths):
         )
 
 
-def _are_integers(widths):
+def _are_integers(widths: Array) -> bool:
     if isinstance(widths, torch.Tensor):
         return not (widths.is_floating_point() or widths.is_complex() or widths.dtype == torch.bool)
     return np.issubdtype(widths.dtype, np.integer)

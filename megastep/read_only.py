@@ -1,6 +1,6 @@
 """Read-only tensors, and objects whose attributes cannot be replaced."""
 
-from typing import Any
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -20,13 +20,15 @@ class ReadOnlyTensor(torch.Tensor):
         refusal: message of the ValueError that a write raises.
     """
 
-    def __new__(cls, tensor: torch.Tensor, refusal: str):
+    refusal: str
+
+    def __new__(cls, tensor: torch.Tensor, refusal: str) -> "ReadOnlyTensor":
         self = tensor.as_subclass(cls)
         self.refusal = refusal
         return self
 
     @classmethod
-    def __torch_function__(cls, function, types, args=(), kwargs=None):
+    def __torch_function__(cls, function, types, args=(), kwargs=None) -> object:
         kwargs = kwargs or {}
         name = getattr(function, "__name__", "")
         for tensor in tree_leaves([kwargs.get("out"), args[:1] if _writes(name) else None]):
@@ -34,13 +36,13 @@ class ReadOnlyTensor(torch.Tensor):
                 raise ValueError(tensor.refusal)
         refusals = {}
 
-        def plain(tensor):
+        def plain(tensor: ReadOnlyTensor) -> torch.Tensor:
             with torch._C.DisableTorchFunctionSubclass():
                 plain = tensor.as_subclass(torch.Tensor)
                 refusals[plain.untyped_storage()._cdata] = tensor.refusal
                 return plain.clone() if name == "__dlpack__" else plain
 
-        def guarded(tensor):
+        def guarded(tensor: torch.Tensor) -> torch.Tensor:
             refusal = refusals.get(tensor.untyped_storage()._cdata)
             return cls(tensor, refusal) if refusal else tensor
 
@@ -53,11 +55,13 @@ class ReadOnlyTensor(torch.Tensor):
             return out
         return tree_map_only(torch.Tensor, guarded, out)
 
-    def set_(self, *args, **kwargs):  # the one method that skips __torch_function__
+    def set_(
+        self, *args: object, **kwargs: object
+    ) -> NoReturn:  # the one method that skips __torch_function__
         raise ValueError(self.refusal)
 
 
-def _writes(name):
+def _writes(name: str) -> bool:
     """Returns True if the PyTorch function of this name, such as add_ or __iadd__, writes into its
     first argument.
     """
@@ -79,7 +83,7 @@ class SetOnce:
 
     _replaceable: tuple[str, ...] = ()
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         current = self.__dict__.get(name, value)
         if current is not value and name not in self._replaceable:
             raise AttributeError(self._refusal(name))
@@ -88,7 +92,7 @@ class SetOnce:
     def __delattr__(self, name: str) -> None:
         raise AttributeError(self._refusal(name))
 
-    def _refusal(self, name):
+    def _refusal(self, name: str) -> str:
         kind = type(self).__name__
         if isinstance(self.__dict__.get(name), torch.Tensor):
             return f"{name} of a {kind} cannot be replaced: write into it, .{name}[...] = ..."

@@ -22,7 +22,7 @@ import pathlib
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,11 @@ from megastep.types import Tree, n_lanes, optional
 from megastep.video import Mp4Writer, as_image
 
 if TYPE_CHECKING:
-    from IPython.display import HTML
+    from IPython.display import HTML  # pyright: ignore[reportMissingImports]
+    from loky import ProcessPoolExecutor
+    from typing_extensions import Self
+
+    from megastep.types import Env, PolicyLike
 
 __all__ = ["ParallelEncoder", "draw"]
 
@@ -70,7 +74,9 @@ class ParallelEncoder:
             raise ValueError(f"n_workers must be at least 1, but {n_workers} was given")
         self._plot_state, self._pickled_plot_state = plot_state, _pickled(plot_state)
         self._fps, self._n_workers = fps, n_workers
-        self._pool = self._writer = self._bytes = None
+        self._pool: ProcessPoolExecutor | None = None
+        self._writer: Mp4Writer | None = None
+        self._bytes: bytes | None = None
         self._pending = collections.deque()  # (frame number, image or future), oldest first
 
     def __enter__(self) -> ParallelEncoder:
@@ -97,17 +103,21 @@ class ParallelEncoder:
         self._check_open()
         self._add(as_image(array))
 
-    def __exit__(self, kind, error, trace):
+    def __exit__(self, kind, error, trace) -> None:
         try:
             if kind is None:
                 self._encode_until(0)
-                self._bytes = self._writer.close()
+                self._close()
         finally:
             self._stop_workers(kill=bool(self._pending))
             if self._bytes is None:  # raise the error that ended the block, not one of closing
                 with contextlib.suppress(Exception):
-                    self._bytes = self._writer.close()
+                    self._close()
             self._writer = None
+
+    def _close(self) -> None:
+        assert self._writer is not None
+        self._bytes = self._writer.close()
 
     def save(self, path: str | os.PathLike) -> pathlib.Path:
         """Writes the video to ``path``, an mp4, and returns the path.
@@ -138,7 +148,7 @@ class ParallelEncoder:
         """Returns the video as an object that notebooks display."""
         video = self._finished()
         try:
-            from IPython.display import HTML
+            from IPython.display import HTML  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise ImportError(
                 "showing a video in a notebook needs IPython, which is not installed: pip install "
@@ -149,14 +159,14 @@ class ParallelEncoder:
             f'{base64.b64encode(video).decode()}"></video>'
         )
 
-    def _check_open(self):
+    def _check_open(self) -> None:
         if self._writer is None:
             raise RuntimeError(
                 "frames can only be added inside the with block: with ParallelEncoder(...) as "
                 "encoder"
             )
 
-    def _finished(self):
+    def _finished(self) -> bytes:
         if self._bytes is None:
             raise RuntimeError(
                 "the video is finished when the with block ends: call save or notebook after it"
@@ -167,7 +177,7 @@ class ParallelEncoder:
             )
         return self._bytes
 
-    def _workers(self):
+    def _workers(self) -> ProcessPoolExecutor:
         """Returns the pool of worker processes, started at the first call."""
         if self._pool is None:
             import loky
@@ -184,10 +194,11 @@ class ParallelEncoder:
     def _add(self, image: np.ndarray | Future) -> None:
         self._pending.append((self._n_frames, image))
         self._n_frames += 1
-        self._encode_until(2 * self._n_workers if self._pool else 0)
+        self._encode_until(2 * (self._n_workers or 0) if self._pool else 0)
 
     def _encode_until(self, n_pending: int) -> None:
         """Encodes the oldest frames until ``n_pending`` are left, then those that are ready."""
+        assert self._writer is not None
         while self._pending:
             number, image = self._pending[0]
             if len(self._pending) <= n_pending and not _is_ready(image):
@@ -196,7 +207,7 @@ class ParallelEncoder:
                 self._writer.add(image if isinstance(image, np.ndarray) else image.result())
             self._pending.popleft()
 
-    def _stop_workers(self, kill):
+    def _stop_workers(self, kill) -> None:
         self._pending.clear()
         if self._pool is not None:
             self._pool.shutdown(wait=True, kill_workers=kill)
@@ -213,10 +224,10 @@ class _frame_errors:
     def __init__(self, number: int):
         self.number = number
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind, error, trace):
+    def __exit__(self, kind, error, trace) -> None:
         if isinstance(error, Exception):
             first_line = next(iter(str(error).splitlines()), "")
             raise RuntimeError(
@@ -289,7 +300,12 @@ def draw(plot_state: Callable, state: Tree) -> np.ndarray:
 
 @torch.no_grad()
 def film(
-    env: Any, policy: Any, path: str | pathlib.Path, steps: int, greedy: bool = False, seed: int = 1
+    env: Env,
+    policy: PolicyLike,
+    path: str | pathlib.Path,
+    steps: int,
+    greedy: bool = False,
+    seed: int = 1,
 ) -> pathlib.Path:
     """Films environment 0 of `env` for some steps from its reset, each a frame, at the
     environment's own frames per second. Returns the path.
@@ -301,7 +317,8 @@ def film(
         ValueError: for another kind of file, or an environment that cannot be drawn.
         RuntimeError: naming the first frame that failed.
     """
-    if not (hasattr(env, "state") and hasattr(env, "plot_state")):
+    plot_state = getattr(env, "plot_state", None)
+    if plot_state is None or not hasattr(env, "state"):
         raise ValueError(
             f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
             "plot_state(state), which docs/new-environment.md shows"
@@ -312,15 +329,15 @@ def film(
 
         (last,) = collections.deque(states, maxlen=1)
         path.parent.mkdir(parents=True, exist_ok=True)
-        imsave(path, draw(env.plot_state, numpyify(last)))
+        imsave(path, draw(plot_state, numpyify(last)))
         return path
-    with ParallelEncoder(env.plot_state, fps=optional(env, "fps")) as encoder:
+    with ParallelEncoder(plot_state, fps=optional(env, "fps")) as encoder:
         for state in states:
             encoder(state)
     return encoder.save(path)
 
 
-def _states(env, policy, steps, greedy, seed):
+def _states(env: Any, policy, steps, greedy, seed) -> Iterator[dict]:
     world, hidden = env.reset(), policy.initial(n_lanes(env), env.device)
     generator = torch.Generator(env.device).manual_seed(seed)
     yield env.state(0)

@@ -1,7 +1,7 @@
 """Scenery from geometries: textures, lights, the agents' model, baked light."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +11,9 @@ from megastep.colour import gamma_decode
 from megastep.engine import checks
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["TEXEL", "agent_model", "display", "scenery", "spread", "texel_widths", "wall_textures"]
 
@@ -54,7 +57,7 @@ AGENT_PALETTE = (
 FRONT = "ff3020"
 
 
-def _linear(palette):
+def _linear(palette) -> np.ndarray:
     """Returns the linear light, (n, 3), of hexadecimal colours."""
     return gamma_decode(
         np.array([[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in palette])
@@ -78,7 +81,7 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
     return np.stack([corners, np.roll(corners, -1, 0)], 1)
 
 
-def _agent_textures(n_agents, model):
+def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
     """Returns the texels of an environment's agents, (K, 3), and the number of texels per line,
     (A M,). Agents have different colours (16, then they repeat) and a red front.
     """
@@ -108,7 +111,7 @@ def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray
     return np.concatenate([base, stripe]).astype(np.float32)[wall + n * striped]
 
 
-def _sort_along_z_curve(walls):
+def _sort_along_z_curve(walls) -> np.ndarray:
     """Sorts walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each group of 32 walls
     lies close together.
     """
@@ -119,7 +122,7 @@ def _sort_along_z_curve(walls):
     return walls[np.argsort(order, kind="stable")]
 
 
-def _part(geometries, name, shape):
+def _part(geometries, name, shape) -> list:
     """Returns one part of all geometries as arrays. Raises ValueError if one does not fit."""
     parts = []
     for i, g in enumerate(geometries):
@@ -140,7 +143,7 @@ def _part(geometries, name, shape):
     return parts
 
 
-def _first_layouts(n_envs, n_layouts):
+def _first_layouts(n_envs, n_layouts) -> torch.Tensor:
     """Returns the layout that each environment starts with, (N,) int64."""
     environments = torch.arange(n_envs)
     if n_envs < n_layouts:
@@ -165,7 +168,7 @@ def scenery(
     n_agents: int = 1,
     n_envs: int | None = None,
     seed: int = 1,
-    device: Any = None,
+    device: torch.device | str | None = None,
 ) -> Scenery:
     """Returns the baked :class:`~megastep.engine.Scenery` of ``n_envs`` environments.
 
@@ -217,7 +220,7 @@ def scenery(
     return result
 
 
-def display(scenery: Scenery, e: int = 0, ax: Any = None) -> Any:
+def display(scenery: Scenery, e: int = 0, ax: "Axes | None" = None) -> "Axes":
     """Draws environment ``e`` in its lit colours, with its lights and agents.
 
     Returns the matplotlib axes.

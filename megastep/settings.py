@@ -16,13 +16,16 @@ import inspect
 import math
 import numbers
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import annotated_types
 import pydantic.dataclasses
 from pydantic.fields import FieldInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
+
+if TYPE_CHECKING:
+    from typing_extensions import dataclass_transform
 
 __all__ = [
     "MAX_ENVS",
@@ -38,6 +41,9 @@ __all__ = [
     "settings_of",
 ]
 
+T = TypeVar("T")
+F = TypeVar("F", bound=Callable)
+
 #: 2**26 copies of the smallest environment fill the largest GPU there is; more is a typing error.
 MAX_ENVS = 2**26
 CONFIG = pydantic.ConfigDict(
@@ -52,8 +58,15 @@ class AtMost:
     key: str
 
 
-#: Class decorator: a frozen dataclass whose fields are checked against their annotations.
-frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
+if TYPE_CHECKING:
+
+    @dataclass_transform(kw_only_default=True, frozen_default=True)
+    def frozen(kind: type[T]) -> type[T]: ...
+
+else:
+    #: Class decorator: a frozen dataclass whose fields are checked against their annotations.
+    frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
+
 
 # the expected type, by the first part of pydantic's name of the error
 WANTED = {
@@ -137,7 +150,7 @@ def parameters_of(constructor: Callable) -> dict[str, inspect.Parameter]:
     return found
 
 
-def _signatures(constructor):
+def _signatures(constructor) -> Iterator[tuple[Callable, dict[str, inspect.Parameter]]]:
     """Yields (function, {name: parameter}) of a class or function, and of the base classes that its
     `**kwargs` go to.
     """
@@ -161,7 +174,7 @@ def settings_class(name: str, fields: Mapping[str, tuple]) -> type:
     return frozen(_class(name, fields))
 
 
-def _field(hint, default):
+def _field(hint, default) -> tuple:
     """Returns (type,) or (type, default) of an argument."""
     if default is inspect.Parameter.empty:
         return (Any if hint is None else hint,)
@@ -170,9 +183,9 @@ def _field(hint, default):
     return hint, default
 
 
-def _class(name, fields):
+def _class(name, fields) -> type:
     """Returns a class with annotations, and defaults as attributes, for `dataclass` to decorate."""
-    body = {"__annotations__": {key: field[0] for key, field in fields.items()}}
+    body: dict = {"__annotations__": {key: field[0] for key, field in fields.items()}}
     for key, (_, *default) in fields.items():
         if default and type(default[0]).__hash__ is None:  # one that could change, such as a list
             body[key] = dataclasses.field(default_factory=functools.partial(_identity, default[0]))
@@ -181,11 +194,11 @@ def _class(name, fields):
     return type(name, (), body)
 
 
-def _identity(value):
+def _identity(value: T) -> T:
     return value
 
 
-def checked(function: Callable) -> Callable:
+def checked(function: F) -> F:
     """Decorator: checks a function's arguments against its annotations.
 
     The function gets its arguments as they are, not copies, unlike with `pydantic.validate_call`.
@@ -197,7 +210,7 @@ def checked(function: Callable) -> Callable:
     settings = functools.cache(functools.partial(settings_of, function, ("self",)))
 
     @functools.wraps(function)
-    def wrapped(*args, **kwargs):
+    def wrapped(*args, **kwargs) -> object:
         arguments = signature.bind(*args, **kwargs).arguments
         fields = settings().__pydantic_fields__
         values = {name: _plain(value) for name, value in arguments.items() if name in fields}
@@ -206,15 +219,15 @@ def checked(function: Callable) -> Callable:
         except ValidationError as error:
             errors = {}
             for line in error.errors():
-                name = line["loc"][0]
+                name = str(line["loc"][0])
                 errors.setdefault(name, sentence(line, fields[name], values[name]))
             raise ValueError("; ".join(f"{k}: {text}" for k, text in errors.items())) from None
         return function(*args, **kwargs)
 
-    return wrapped
+    return typing.cast(F, wrapped)
 
 
-def _plain(value):
+def _plain(value) -> object:
     """Converts NumPy's numbers to Python's."""
     if isinstance(value, numbers.Real) and not isinstance(value, (bool, int, float)):
         return int(value) if isinstance(value, numbers.Integral) else float(value)
@@ -224,7 +237,7 @@ def _plain(value):
 # ---- What is wrong, in words ----
 
 
-def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
+def sentence(error: Mapping, field: FieldInfo | None, value: object) -> str:
     """Returns what is wrong with the `value` of a `field`, from one of pydantic's errors: what is
     allowed, and what was given.
     """
@@ -240,7 +253,7 @@ def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
         return f"a list of {n} is out of range: allowed is {bound}"
     if kind in OUTSIDE or isinstance(value, float) and not math.isfinite(value):
         return f"{value} is out of range: allowed is {allowed(field)}"
-    if kind == "literal_error":
+    if kind == "literal_error" and field:
         return f"{value!r} is unknown; {closest(value, _words(field.annotation))}"
     if wanted := WANTED.get(kind.split("_")[0]):
         return f"expected {wanted}, got {got}"
@@ -249,11 +262,11 @@ def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
     return f"{error['msg'][0].lower()}{error['msg'][1:]}, got {got}"
 
 
-def allowed(field: FieldInfo) -> str:
+def allowed(field: FieldInfo | None) -> str:
     """Returns the bounds of a number in words."""
     bounds = {
         key: getattr(extra, key)
-        for extra in _metadata(field)
+        for extra in (_metadata(field) if field else ())
         for key in BOUNDS
         if isinstance(extra, annotated_types.BaseMetadata) and hasattr(extra, key)
     }
@@ -262,7 +275,7 @@ def allowed(field: FieldInfo) -> str:
     return " ".join(texts) or "any finite number"
 
 
-def _metadata(field):
+def _metadata(field) -> Iterator[object]:
     """Yields the metadata of `Annotated`, also inside `X | None`."""
     yield from field.metadata
     for option in typing.get_args(field.annotation):
@@ -270,7 +283,7 @@ def _metadata(field):
             yield from extra.metadata if isinstance(extra, FieldInfo) else [extra]
 
 
-def _words(hint):
+def _words(hint) -> Iterator[str]:
     """Yields the words of a Literal, also of `Literal | None`."""
     for option in typing.get_args(hint):
         yield from [option] if isinstance(option, str) else _words(option)

@@ -22,15 +22,16 @@ __all__ = ["MultiContinuous", "MultiDiscrete", "MultiEmpty", "MultiImage", "Mult
 DTYPES = torch.uint8, torch.float16, torch.float32
 
 
+@dataclass(frozen=True)
 class _Space:
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, size in self._sizes().items():
             if isinstance(size, bool) or not isinstance(size, int) or size < 1:
                 raise ValueError(
                     f"{type(self).__name__} needs a positive integer for {name}, not {size!r}"
                 )
 
-    def _sizes(self):
+    def _sizes(self) -> dict[str, int]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "dtype"}
 
     @property
@@ -43,7 +44,7 @@ class _Space:
 class _Numbers(_Space):
     dtype: torch.dtype | None = field(default=None, kw_only=True)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
         if self.dtype not in (None, *DTYPES):
             allowed = ", ".join(str(dtype) for dtype in DTYPES)
@@ -51,7 +52,7 @@ class _Numbers(_Space):
                 f"{type(self).__name__} cannot have dtype={self.dtype!r}: allowed are {allowed}"
             )
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         # without a dtype of None: checkpoints compare spaces as text
         dtype = {"dtype": self.dtype} if self.dtype else {}
         values = ", ".join(
@@ -112,8 +113,9 @@ class MultiContinuous(_Space):
 
     dtype = torch.float32
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         super().__post_init__()
+        bounds = []
         for name in "low", "high":
             given = getattr(self, name)
             try:
@@ -126,20 +128,21 @@ class MultiContinuous(_Space):
                     f"not {given!r}"
                 )
             object.__setattr__(self, name, values)
-        if not all(low < high for low, high in zip(self.low, self.high)):
+            bounds.append(values)
+        if not all(low < high for low, high in zip(*bounds)):
             raise ValueError(
                 f"MultiContinuous needs each low below its high, not {self.low} and {self.high}"
             )
 
-    def _sizes(self):
+    def _sizes(self) -> dict[str, int]:
         return {"n_agents": self.n_agents, "dim": self.dim}
 
-    def tensors(self, device: torch.device | str | None = None) -> tuple[torch.Tensor, ...]:
+    def tensors(
+        self, device: torch.device | str | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns (low, high), (dim,) float32 each."""
-        return tuple(
-            torch.tensor(bound, dtype=torch.float32, device=device)
-            for bound in (self.low, self.high)
-        )
+        options: dict = dict(dtype=torch.float32, device=device)
+        return torch.tensor(self.low, **options), torch.tensor(self.high, **options)
 
 
 @dataclass(frozen=True)
@@ -162,7 +165,8 @@ def random_actions(
     Args:
         generator: on the same device.
     """
-    shape, options = (n_lanes, *space.shape), dict(device=device, generator=generator)
+    options: dict = dict(device=device, generator=generator)
+    shape = n_lanes, *space.shape
     if isinstance(space, MultiContinuous):
         low, high = space.tensors(device)
         return (low + (high - low) * torch.rand(shape, **options)).clamp(low, high)
@@ -180,7 +184,7 @@ def are_actions(space: MultiDiscrete | MultiContinuous, values: torch.Tensor) ->
     return is_integer and bool(((values >= 0) & (values < space.n_actions)).all())
 
 
-def leaves(space: Any, name: str = "") -> dict[str, Any]:
+def leaves(space: object, name: str = "") -> dict[str, Any]:
     """Returns the leaves of a tree by dotted path, such as ``{"obs.rgb": MultiImage(...)}``.
 
     Args:
@@ -195,7 +199,7 @@ def leaves(space: Any, name: str = "") -> dict[str, Any]:
     return paths
 
 
-def map(function: Callable, space: Any, *trees: Any) -> Any:
+def map(function: Callable, space: object, *trees: Any) -> Any:
     """Returns ``function(leaf_space, *leaf_values)`` for each leaf, as an arrdict with the keys of
     the space. For a space that is no dict, returns the function's result itself.
 

@@ -11,13 +11,17 @@ import itertools
 import numbers
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from megastep.env_values import problem_of_error, problem_of_result
 from megastep.global_generators import KINDS, GlobalGenerators
 from megastep.wrapper_state import freeze, load_wrapper_state, wrapper_state
+
+if TYPE_CHECKING:
+    import gymnasium
+    from gymnasium.envs.registration import EnvSpec
 
 __all__ = [
     "TRUE_RETURN",
@@ -72,7 +76,9 @@ def one_line(error: BaseException) -> str:
     return ": ".join(filter(None, [type(error).__name__, line[:300]]))
 
 
-def make_env(spec: Any, wrappers: Sequence[Callable], settings: Mapping[str, Any]) -> Any:
+def make_env(
+    spec: "EnvSpec", wrappers: Sequence[Callable], settings: Mapping[str, Any]
+) -> "gymnasium.Env":
     """Returns an environment of Gymnasium by its specification, inside wrappers."""
     import gymnasium
 
@@ -99,11 +105,11 @@ class RewardRecorder:
 
     @staticmethod
     @functools.cache
-    def _wrapper():
+    def _wrapper() -> type:
         import gymnasium
 
         class Recorder(gymnasium.Wrapper, RewardRecorder):
-            def step(self, action):
+            def step(self, action) -> tuple:
                 result = super().step(action)
                 self.recorded_reward = result[1]
                 return result
@@ -146,9 +152,11 @@ class SyncEnvs:
         ValueError: the environments have different spaces.
     """
 
+    max_episode_steps: int | None = None
+
     def __init__(
         self,
-        make: Callable[[], Any],
+        make: "Callable[[], gymnasium.Env]",
         n_envs: int,
         restart_failed: int = 0,
         names: Sequence[str] = (),
@@ -235,7 +243,7 @@ class SyncEnvs:
         flags = self.terminated.copy(), self.truncated.copy()
         return self._observations(latest), self.rewards.copy(), *flags, self._news(numbers)
 
-    def render(self) -> list[Any]:
+    def render(self) -> list:
         """Returns a frame of every environment."""
         return [env.render() for env in self.envs]
 
@@ -262,11 +270,11 @@ class SyncEnvs:
                 freeze(env)
         self.frozen = state if is_frozen else None
 
-    def _make(self, i):
+    def _make(self, i) -> "gymnasium.Env":
         with self.generators[i].installed(self.kinds) if self.kinds else contextlib.nullcontext():
             return self.make()
 
-    def _call(self, i, method, *arguments, **more):
+    def _call(self, i, method, *arguments, **more) -> Any:
         """Calls a method of an environment, which draws from global generators of its own."""
         env, problem = self.envs[i], None
         is_checked = self.checks and self.n_checked[i] < CHECKED_STEPS
@@ -288,25 +296,25 @@ class SyncEnvs:
                 raise BadValue.of(problem, f"environment {self.first + i}")
         return result
 
-    def _observations(self, latest):
+    def _observations(self, latest) -> object:
         from gymnasium.vector.utils import concatenate
 
         self.batch = concatenate(self.single_observation_space, latest, self.batch)
         return self.batch
 
-    def _news(self, numbers):
+    def _news(self, numbers) -> dict[str, np.ndarray]:
         failures, self._failures = self._failures, []
         news = {"numbers": numbers, "failures": failures}
         return {key: value for key, value in news.items() if value}
 
-    def _last(self, i):
+    def _last(self, i) -> object:
         """Returns a copy of the last observation of an environment."""
         from gymnasium.vector.utils import batch_space, iterate
 
         rows = iterate(batch_space(self.single_observation_space, len(self.envs)), self.batch)
         return copy.deepcopy(next(itertools.islice(rows, i, None)))
 
-    def _reset(self, i, seed=None):
+    def _reset(self, i, seed=None) -> object:
         while True:
             if self.is_new[i]:  # draws that no other environment has
                 number = [int(self.seeds[i]), int(self.restarts[i])]
@@ -341,7 +349,7 @@ class SyncEnvs:
         self.is_new[i] = True
 
 
-def close_all(envs: Sequence[Any]) -> None:
+def close_all(envs: "Sequence[gymnasium.Env]") -> None:
     """Closes environments. Raises the first error once all are closed, a TimeoutError at once."""
     errors = []
     for env in envs:
@@ -358,7 +366,7 @@ def close_all(envs: Sequence[Any]) -> None:
 # ---- Numbers of an episode's last info ----
 
 
-def numbers_of(info: Any) -> dict[str, float]:
+def numbers_of(info: object) -> dict[str, float]:
     """Returns the numbers of an `info` by key, without those in dicts and arrays of several."""
     values = {}
     for key, value in info.items() if isinstance(info, Mapping) else ():

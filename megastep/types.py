@@ -22,23 +22,27 @@ class World(Protocol):
     """The dict of tensors that ``reset`` and ``step`` return: an
     :class:`~megastep.arrdict.arrdict` with a leading axis B, whose keys are also attributes.
 
+    Keys:
+        obs: per ``env.obs_space``.
+        reward: (B,) float32, of the transition that led here.
+        reset: (B,) bool: the first observation of an episode.
+        terminal: (B,) bool: the episode ended here by its own rule.
+        truncated: (B,) bool: a time limit ended the episode here.
+
     Optional keys:
         metrics: dict of (B,) float32, statistics of an episode, read on its last step only.
         learns: (B,) bool, lanes whose transitions are used for learning. Default: all.
         privileged: per ``env.privileged_space``, inputs of the critic that no agent observes.
     """
 
-    obs: Tree  # per env.obs_space
-    reward: torch.Tensor  # (B,) float32, of the transition that led here
-    reset: torch.Tensor  # (B,) bool: the first observation of an episode
-    terminal: torch.Tensor  # (B,) bool: the episode ended here by its own rule
-    truncated: torch.Tensor  # (B,) bool: a time limit ended the episode here
+    def __getattr__(self, name: str) -> Tree: ...
 
-    def __getitem__(self, key: str) -> Any: ...
+    def __getitem__(self, key: str, /) -> Tree: ...
 
     def __iter__(self) -> Iterator[str]: ...
 
-    def get(self, key: str, default: Any = None) -> Any: ...
+    def get(self, key: str, default: Tree = None, /) -> Tree:
+        """Returns an entry, or the default if it is absent."""
 
 
 @runtime_checkable
@@ -84,9 +88,11 @@ class Env(Protocol):
 
     def reset(self) -> World:
         """Starts a new episode in every lane. Returns the first world."""
+        ...
 
     def step(self, decision: Mapping) -> World:
         """Takes one step by ``decision["actions"]``, (B, ...) per leaf of the action space."""
+        ...
 
 
 #: Optional attributes of an environment, with their defaults.
@@ -115,7 +121,7 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
-def optional(owner: Any, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
+def optional(owner: object, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
     """Returns an optional attribute of an environment, or its default.
 
     Args:
@@ -143,6 +149,7 @@ class PolicyLike(Protocol):
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> Tree:
         """Returns the hidden state of ``n_lanes`` lanes at the start of an episode."""
+        ...
 
     def __call__(
         self,
@@ -159,3 +166,4 @@ class PolicyLike(Protocol):
             sample: draw from the action distribution; otherwise take the most likely action.
             generator: random number generator of the draws.
         """
+        ...

@@ -39,6 +39,8 @@ class VectorProcesses:
         n_processes: number of processes. Default: one per core, shared among the ranks of a host.
     """
 
+    max_episode_steps: int | None = None
+
     def __init__(self, make: Callable[..., SyncEnvs], n_envs: int, n_processes: int | None = None):
         import loky
         from gymnasium.vector.utils import create_empty_array
@@ -63,7 +65,7 @@ class VectorProcesses:
         with workers.terminal_signals_blocked():
             for rows in self.rows:
                 pipe, far_end = multiprocessing.Pipe()
-                process = context.Process(
+                process = context.Process(  # pyright: ignore[reportAttributeAccessIssue]
                     target=_serve,
                     args=(far_end, make, rows),
                     daemon=True,
@@ -96,7 +98,7 @@ class VectorProcesses:
             _write(self.results, rows, results)
         return self.observations, *self.results, self._news([news for *_, news in answers])
 
-    def render(self) -> list[Any]:
+    def render(self) -> list:
         """Returns a frame of every environment."""
         return [frame for frames in self._ask("render", self.rows) for frame in frames]
 
@@ -138,7 +140,7 @@ class VectorProcesses:
             if isinstance(answer, Exception):
                 raise answer
 
-    def _ask(self, command, arguments):
+    def _ask(self, command, arguments) -> list:
         """Returns the answer of each process to a command."""
         for pipe, argument in zip(self.pipes, arguments, strict=True):
             with contextlib.suppress(OSError):  # of a process that has ended, as its answer tells
@@ -149,7 +151,7 @@ class VectorProcesses:
                 raise error
         return answers
 
-    def _receive(self, number):
+    def _receive(self, number) -> Any:
         """Returns the answer of a process, which may be an error of an environment.
 
         Raises:
@@ -171,9 +173,11 @@ class VectorProcesses:
             f"the process that steps environments {rows.start} to {rows.stop - 1} was ended {how}"
         )
 
-    def _news(self, of_processes):
+    def _news(self, of_processes) -> dict:
         """Returns the news of all environments."""
-        news = {"failures": [one for part in of_processes for one in part.get("failures", ())]}
+        news: dict = {
+            "failures": [one for part in of_processes for one in part.get("failures", ())]
+        }
         if any("numbers" in part for part in of_processes):
             n_envs = self.rows[-1].stop
             news["numbers"] = {name: np.full(n_envs, np.nan) for name in self.names}
@@ -197,7 +201,7 @@ def start_rendering(vector: Any) -> None:
         vector.render_mode = "rgb_array"
 
 
-def _serve(pipe, make, rows):
+def _serve(pipe, make, rows) -> None:
     """Answers commands until the pipe is closed, which it is when the other process ends."""
     envs = _attempt(make, n_envs=rows.stop - rows.start, first=rows.start)
     with contextlib.suppress(EOFError, OSError):
@@ -210,10 +214,11 @@ def _serve(pipe, make, rows):
             if command == "close":
                 return
     with contextlib.suppress(Exception):
-        envs.close()
+        if not isinstance(envs, Exception):
+            envs.close()
 
 
-def _answer(envs, command, argument):
+def _answer(envs, command, argument) -> object:
     if command == "reset":
         return envs.reset(seed=argument)
     if command == "step":
@@ -232,7 +237,7 @@ def _answer(envs, command, argument):
     return envs.render()
 
 
-def _attempt(function, *arguments, **more):
+def _attempt(function, *arguments, **more) -> Any:
     """Returns what a function returns, or its error, in a form that can be sent."""
     try:
         return function(*arguments, **more)
@@ -242,7 +247,7 @@ def _attempt(function, *arguments, **more):
         return EnvError.of(error, "an environment")
 
 
-def _end(pipes, processes):
+def _end(pipes, processes) -> None:
     for pipe in pipes:
         pipe.close()
     for process in processes:
@@ -252,7 +257,7 @@ def _end(pipes, processes):
             process.join()
 
 
-def _write(to, rows, values):
+def _write(to, rows, values) -> None:
     """Copies the values of some environments into the batch of all."""
     if isinstance(to, dict):
         to, values = to.values(), values.values()
@@ -263,7 +268,7 @@ def _write(to, rows, values):
             _write(part, rows, value)
 
 
-def _read(batch, rows):
+def _read(batch, rows) -> object:
     """Returns the rows of a batch of actions."""
     if isinstance(batch, dict):
         return {key: _read(part, rows) for key, part in batch.items()}

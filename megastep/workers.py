@@ -46,7 +46,7 @@ def end_with(is_running: Callable[[], bool]) -> None:
     For a process whose starter may be killed, which then stops nothing itself.
     """
 
-    def watch():
+    def watch() -> None:
         while is_running():
             time.sleep(1)
         os.kill(os.getpid(), signal.SIGTERM)

@@ -43,7 +43,7 @@ def load_wrapper_state(env: Any, state: Mapping[str, Any]) -> None:
     """
     wrappers = dict(_wrappers(env))
     for path, value in state.items():
-        number, kind, *keys, last = path.split(".")
+        number, kind, *keys, last = path.split(".") if _is_safe(path, value) else ("", "", "")
         holder = wrappers.get(f"{number}.{kind}")
         for key in keys:
             holder = _children(holder).get(key)
@@ -67,6 +67,19 @@ def load_wrapper_state(env: Any, state: Mapping[str, Any]) -> None:
             setattr(holder, last, value)
 
 
+def _is_safe(path, value) -> bool:
+    """Returns whether a part of a state from a file may be set: numbers, in no special attribute."""
+    _, *names = str(path).split(".")
+    is_named = len(names) > 1 and all(name.isidentifier() for name in names)
+    is_special = any(name.startswith("__") or name in SKIPPED for name in names)
+    return is_named and not is_special and _are_numbers(value)
+
+
+def _are_numbers(value) -> bool:
+    is_nested = isinstance(value, SEQUENCES)  # as arrays are in the files of agents
+    return all(map(_are_numbers, value)) if is_nested else _is_value(value)
+
+
 def freeze(env: Any) -> None:
     """Stops the running statistics of Gymnasium's own wrappers."""
     for _, wrapper in _wrappers(env):
@@ -84,7 +97,7 @@ def _wrappers(env) -> Iterator[tuple[str, Any]]:
         env, number = env.env, number + 1
 
 
-def _children(node):
+def _children(node) -> dict:
     return node if isinstance(node, dict) else getattr(node, "__dict__", {})
 
 
@@ -102,7 +115,7 @@ def _values(path, node, visited) -> Iterator[tuple[str, Any]]:
             yield from _values(f"{path}.{key}", value, visited)
 
 
-def _is_value(value):
+def _is_value(value) -> bool:
     if isinstance(value, np.ndarray):
         return value.dtype.kind in "biuf"
     if isinstance(value, SEQUENCES):
@@ -110,7 +123,7 @@ def _is_value(value):
     return isinstance(value, (numbers.Real, np.bool_))
 
 
-def _has_values(value):
+def _has_values(value) -> bool:
     """Returns whether a value may be a wrapper's own object: no environment, space or function."""
     import gymnasium
 

@@ -35,7 +35,7 @@ from mutation import executed_lines, mutants
 
 ROOT = mutants.ROOT
 EQUIVALENT = ROOT / "docs" / "lab" / "equivalent_mutants.jsonl"
-PYTHON = [f"agents/{name}" for name in "algorithms networks storage training selfplay".split()]
+PYTHON = [f"agents/{name}" for name in "algorithms networks runs storage training selfplay".split()]
 PYTHON += [f"megastep/{name}" for name in "capture.py modules envs geometries engine".split()]
 HEADERS = ["megastep", "agents"]
 #: Ends although a thread that a failed test left still runs. Modules of the current folder do not

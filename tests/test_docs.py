@@ -6,12 +6,13 @@ import re
 import shlex
 
 import pytest
+import reference
 
 from megastep import envs
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
-FOLDERS = DOCS, DOCS / "lab", DOCS / "decisions"
+FOLDERS = DOCS, DOCS / "lab", DOCS / "decisions", DOCS / "reference"
 PAGES = [page for folder in (ROOT, *FOLDERS) for page in folder.glob("*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.
 NEEDS_FILES = (
@@ -42,9 +43,10 @@ def test_command_composes(page, script, arguments, tmp_path, monkeypatch, capsys
     assert code == 0, capsys.readouterr().err
 
 
+@functools.cache
 def headings(page):
     """Returns a page's anchors as GitHub names them."""
-    titles = re.findall(r"^#+ (.*)", page.read_text(), re.M)
+    titles = re.findall(r"^#+ (.*)", reference.expand(page.read_text()), re.M)
     return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
 
 
@@ -102,4 +104,4 @@ def test_tests_of_all_faults_exist():
             # every case of a test may have a mark of its own
             is_of_tier = marks == {tier} - {""} or not marks and f"mark.{tier}" in decorators
             assert is_of_tier, (fault, path, name)
-    assert len(rows) == 62
+    assert len(rows) == 71

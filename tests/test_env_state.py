@@ -186,6 +186,36 @@ def test_state_of_another_version_is_refused_and_changes_nothing():
     assert torch.equal(env.tally, before)
 
 
+@pytest.mark.parametrize(
+    "path",
+    [".env.step", ".env.draw", ".env.__class__", ".env.by_name[2].__init__", ".env", ".generators"]
+    + [".env.helper", ".bot", ".env.__dict__", ".env.frames.append", ".env.__doc__", ".env.length"],
+)
+@pytest.mark.parametrize("value", [5, torch.zeros(1)])
+def test_what_is_no_state_is_never_set(path, value, monkeypatch):
+    monkeypatch.setattr(Env, "length", property(lambda env: 3), raising=False)
+    env = Env()
+    env.helper = env.draw
+    env_state, before = EnvState(env), str(facts(env))
+    saved, attributes = env_state.state_dict(), vars(env).copy()
+    kind = (
+        {"values": {path: 5}} if value == 5 else {"arrays": {path: value}, "kinds": {path: "cpu"}}
+    )
+    with pytest.raises(ValueError, match=r"is not state of the environment|it has no"):
+        env_state.load_state_dict(saved | kind)
+    assert str(facts(env)) == before and vars(env).keys() == attributes.keys()
+    assert type(env) is Env and env.helper == env.draw and env.step() is not None
+
+
+def test_no_plain_value_of_megasteps_own_objects_is_set():
+    env = envs.Deathmatch(2, [toys.box()], device="cpu")
+    env.reset()
+    env_state = EnvState(env)
+    for name in ("step", "limit", "n_envs", "n_agents", "unheard_of"):
+        with pytest.raises(ValueError, match=f"{name} is not state"):
+            env_state.load_state_dict(env_state.state_dict() | {"values": {f".env.{name}": 5}})
+
+
 def test_state_of_a_gpu_is_restored_without_one():
     env = Env()
     saved = EnvState(env).state_dict()

@@ -45,7 +45,7 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("errors", "generator", "package", "types"),
+    ("errors", "generator", "package", "private_ops", "types"),
     ("distributed",),
     ("console", "networks"),
     ("storage",),

@@ -4,13 +4,14 @@ also clips their gradients. PyTorch's takes ten times as long there for networks
 `torch.optim.Adam` imports PyTorch's compiler first, which takes more than a second.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any
 
 import torch
 
 from megastep.agents.algorithms.kernels import LIBRARY
+from megastep.agents.private_ops import adamw_
+from megastep.agents.types import StateDict
 from megastep.kernels.build.launch import Blocks, launch
 
 _MAX_ROWS = LIBRARY.constants["ADAM_ROWS"]
@@ -105,23 +106,11 @@ class Adam:
             return
         if grad_norm is not None:
             torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
-        found_inf = (~is_taken).float()
         for (factor, weight_decay), members in self._groups.items():
             rows = [(p, p.grad, *moments) for p, *moments in members if p.grad is not None]
             if rows:
-                torch._fused_adamw_(
-                    *map(list, zip(*rows)),
-                    [],
-                    [self.n_steps] * len(rows),
-                    lr=self.lr if factor == 1 else self.lr * factor,
-                    beta1=self.betas[0],
-                    beta2=self.betas[1],
-                    weight_decay=weight_decay,
-                    eps=self.eps,
-                    amsgrad=False,
-                    maximize=False,
-                    found_inf=found_inf,
-                )
+                lr = self.lr if factor == 1 else self.lr * factor
+                adamw_(rows, self.n_steps, lr, self.betas, weight_decay, self.eps, is_taken)
 
     def step_on_gpu(
         self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None, max_norm: float
@@ -142,7 +131,7 @@ class Adam:
                 eps=self.eps,
             )
 
-    def _launches(self):
+    def _launches(self) -> Iterator[tuple[list[bytes], int]]:
         """Yields the packed rows of a launch, at most `_MAX_ROWS`, and its number of blocks."""
         rows, n_blocks = [], 0
         for (factor, weight_decay), members in self._groups.items():
@@ -172,11 +161,11 @@ class Adam:
         for p in self.parameters:
             p.grad = None
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns the number of steps and both running means."""
         return dict(n_steps=self.n_steps, means=self.means, squares=self.squares)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`, in place."""
         self.n_steps.copy_(state["n_steps"])
         saved = state["means"] + state["squares"]

@@ -36,7 +36,7 @@ class CudaGraphUpdate:
 
     def __init__(
         self,
-        update: Callable[[RolloutLike], Metrics],
+        update: Callable[..., Metrics],
         device: torch.device,
         graph: bool,
         generators: tuple[SeededGenerator, ...] = (),
@@ -65,12 +65,15 @@ class CudaGraphUpdate:
                 generators = [generator.on(self.device) for generator in self.generators]
                 self.graph = SegmentedGraph(lambda: self.update(rollout), self.stream, generators)
                 self._rollout = rollout
-            self.graph.replay()
-            return _copies(self.graph.output)
+            graph = self.graph
+            assert graph is not None
+            graph.replay()
+            return _copies(graph.output)
 
-    def _warm_up(self, rollout):
+    def _warm_up(self, rollout) -> Metrics:
         # PyTorch would warn of gradients accumulated on another stream, which this one waits for
         torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
+        assert self.stream is not None
         self.stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self.stream):
             metrics = self.update(rollout)
@@ -78,7 +81,7 @@ class CudaGraphUpdate:
         return metrics
 
 
-def _copies(metrics):
+def _copies(metrics) -> dict[str, torch.Tensor]:
     copies = {name: torch.empty_like(value) for name, value in metrics.items()}
     copy_all((copies[name], value) for name, value in metrics.items())
     return copies

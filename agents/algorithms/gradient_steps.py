@@ -9,6 +9,7 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
+from megastep.agents.types import StateDict
 from megastep.kernels.build.launch import Blocks, launch
 
 
@@ -51,7 +52,9 @@ class GradientSteps:
         self.optimizer = Adam(parameters, self._lr, **options)
         self.check = NonFiniteCheck(device)
         # of the update in progress; totals are those of metrics, then steps taken and skipped
-        self._is_finite, self._totals, self._metrics = None, None, {}
+        self._is_finite: torch.Tensor | None = None
+        self._totals: torch.Tensor | None = None
+        self._metrics: dict[str, torch.Tensor] = {}
 
     def set_lr(self, lr: float) -> None:
         """Changes Adam's step size, also for a captured update."""
@@ -113,10 +116,11 @@ class GradientSteps:
         self._metrics["grad_norm"] = grad_norm
         return is_taken
 
-    def _judge(self, is_enabled):
+    def _judge(self, is_enabled) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the gradients' norm and whether the step is taken, () each, and adds up the
         metrics of steps that are.
         """
+        assert self._is_finite is not None
         grad_norm = self.optimizer.grad_norm()
         is_finite = grad_norm.isfinite() & self._is_finite
         is_taken = is_finite & is_enabled & (self._n_valid > 0)
@@ -126,11 +130,12 @@ class GradientSteps:
         self._totals = row if self._totals is None else self._totals + row
         return grad_norm, is_taken
 
-    def _judge_on_gpu(self, is_enabled):
+    def _judge_on_gpu(self, is_enabled) -> tuple[torch.Tensor, torch.Tensor]:
         """Does `_judge` in two kernels, and counts the step."""
         sums, device = self.optimizer.squared_norms(), self._lr.device
         metrics = [value.float() for value in self._metrics.values()]
         pack = LIBRARY.params.MetricParams
+        assert self._is_finite is not None
         is_first = self._totals is None
         if is_first:
             self._totals = sums.new_empty(len(metrics) + 3)
@@ -158,17 +163,18 @@ class GradientSteps:
 
         Without a step, the means are NaN: a trainer leaves them out of its report.
         """
+        assert self._totals is not None
         n_taken, n_skipped = self._totals[-2], self._totals[-1]
         self.check.count((n_taken == 0) & (n_skipped > 0))
         means = (self._totals[:-2] / n_taken).unbind()
         return {**dict(zip(self._metrics, means, strict=True)), "skipped_steps": n_skipped}
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns the optimizer's state, the step size and what `check` has counted."""
         check = self.check.state_dict()
         return dict(optimizer=self.optimizer.state_dict(), lr=self._lr.clone(), check=check)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`."""
         self.optimizer.load_state_dict(state["optimizer"])
         self._lr.copy_(state["lr"])

@@ -37,7 +37,7 @@ Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_r
 `cuda_graph.CudaGraphUpdate`, `masked_stats` and `returns`.
 """
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -48,6 +48,7 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import VERSION
 from megastep.agents.storage.rollout import Rollout
+from megastep.agents.types import StateDict
 
 # Types of settings that several learners have.
 Coefficient = Annotated[float, Field(ge=0, le=10**6)]
@@ -67,7 +68,7 @@ class LearnerError(AssertionError):
     """A class does not keep the contract of learners. The message names the missing attribute."""
 
 
-def check_learner(learner: Any) -> None:
+def check_learner(learner: object) -> None:
     """Raises LearnerError if a required attribute is missing."""
     for name, description in _ATTRIBUTES.items():
         if not hasattr(learner, name):
@@ -99,6 +100,10 @@ class GradientLearner:
         weight_decay: Adam's weight decay, of parameters of two or more axes whose name contains
             "weight": those of layers, but no biases and no standard deviations.
 
+    Metrics:
+        loss/grad_norm: norm of the gradient before it is clipped.
+        loss/skipped_steps: gradient steps skipped because of non-finite numbers.
+
     Attributes:
         steps: the `GradientSteps` of the policy's parameters.
         check: finds non-finite numbers in rollouts and counts skipped updates.
@@ -118,14 +123,16 @@ class GradientLearner:
         weight_decay: float = 0.0,
     ):
         self.policy, self.device, self.lr = policy, policy.device, lr
-        critic = () if critic_lr is None else policy.critic.parameters()
+        factors = {}
+        if critic_lr is not None and policy.critic is not None:
+            factors = dict.fromkeys(policy.critic.parameters(), critic_lr / lr)
         layers = (p for name, p in policy.named_parameters() if p.ndim > 1 and "weight" in name)
         self.steps = GradientSteps(
             policy.parameters(),
             lr,
             max_grad_norm,
             self.device,
-            lr_factors={p: critic_lr / lr for p in critic},
+            lr_factors=factors,
             weight_decays=dict.fromkeys(layers, weight_decay),
         )
         self.check, self.optimizer = self.steps.check, self.steps.optimizer
@@ -152,7 +159,7 @@ class GradientLearner:
         """Changes Adam's step size, the critic's by the same factor, also for a captured update."""
         self.steps.set_lr(lr)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns optimizer, learning rate and generators as plain tensors and numbers.
 
         Does not include the policy's weights, rollouts or what a replay buffer holds.
@@ -165,7 +172,7 @@ class GradientLearner:
             policy_generator=self.policy.generator.state_dict(),
         )
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`, which may come from another device.
 
         Raises:

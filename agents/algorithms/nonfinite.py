@@ -6,13 +6,13 @@ T time, B lanes.
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch.utils._pytree import tree_leaves_with_path
 
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.kernels.build.launch import Blocks, launch
+from megastep.types import Tree
 
 #: Largest magnitude allowed in a rollout. With such rewards, squared returns summed over millions
 #: of steps still fit into float32 (3e38). float16 overflows to inf, which is above the limit, too.
@@ -84,7 +84,7 @@ class NonFiniteValue:
             n_agents=n_agents,
         )
 
-    def __str__(self):
+    def __str__(self) -> str:
         texts = [
             f"{one.name} of {lane_name(one.lane, one.n_agents)} was {one.size:.3g} at step "
             f"{one.step:,}"
@@ -143,7 +143,7 @@ class NonFiniteCheck:
         first.copy_(torch.where((n_bad == 0) | self.found, first, latest))
         return n_bad == 0
 
-    def _check_on_gpu(self, floats):
+    def _check_on_gpu(self, floats) -> torch.Tensor:
         """Implements `__call__` with two kernels."""
         tensors = list(floats.values())
         n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
@@ -220,7 +220,7 @@ class NonFiniteCheck:
         return dataclasses.replace(values[0], others=others, n_lanes=int(n_bad)), int(n_skipped)
 
 
-def _is_fused(floats):
+def _is_fused(floats) -> bool:
     """Returns True if the kernels can check these tensors."""
     tensors = list(floats.values())
     return len(tensors) <= LIBRARY.constants["CHECKED_TENSORS"] and all(
@@ -233,7 +233,7 @@ def _is_fused(floats):
     )
 
 
-def _sizes(floats):
+def _sizes(floats) -> torch.Tensor:
     """Returns the largest magnitudes, ((T+1) F, B) for F tensors, NaN where there is a NaN.
 
     Rows are ordered by time, then by tensor. Row t of a tensor with T rows belongs to world t+1.
@@ -246,7 +246,7 @@ def _sizes(floats):
     return sizes.flatten(0, 1)
 
 
-def _largest(values):
+def _largest(values) -> torch.Tensor:
     """Returns the largest magnitude per time and lane, (T, B), NaN where there is a NaN."""
     if values.dim() > 2:
         values = values.flatten(2)
@@ -259,7 +259,7 @@ def _largest(values):
     return values.abs()
 
 
-def _value_at(floats, rollout, index, size):
+def _value_at(floats, rollout, index, size) -> NonFiniteValue:
     """Returns the number at an index of `_sizes`."""
     n_steps, n_lanes = min(map(len, floats.values())), next(iter(floats.values())).shape[1]
     row, lane = divmod(index, n_lanes)
@@ -273,7 +273,7 @@ def lane_name(lane: int, n_agents: int) -> str:
     return f"lane {lane}" + (f" (environment {lane // n_agents})" if n_agents > 1 else "")
 
 
-def nonfinite_leaf(tree: Any) -> str | None:
+def nonfinite_leaf(tree: Tree) -> str | None:
     """Returns the dotted path of the first non-finite tensor in nested dicts and lists, or None.
 
     Ignores plain numbers, which may well be infinite, such as an initial best loss.

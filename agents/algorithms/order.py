@@ -25,7 +25,7 @@ def order(keys: torch.Tensor) -> torch.Tensor:
     return keys.argsort(stable=True)
 
 
-def _order_on_gpu(keys):
+def _order_on_gpu(keys) -> torch.Tensor:
     """Does `order` in one kernel."""
     n, result = len(keys), torch.empty_like(keys, dtype=torch.int64)
     launch(LIBRARY, "order", keys.device, n * WARP, keys=keys, order=result, n=n)

@@ -5,7 +5,7 @@ over valid steps: those that the environment took, of lanes that learn. An updat
 synchronises: conditions are bool tensors on the device.
 """
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -21,6 +21,9 @@ from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
+
+if TYPE_CHECKING:
+    pass
 
 _PARTS = "starts", "actions", "logprobs"  # of a rollout, that a minibatch copies
 
@@ -53,6 +56,16 @@ class PPO(GradientLearner):
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
         seed: seed of the minibatch order.
 
+    Metrics:
+        loss/policy: policy loss.
+        loss/value: value loss, in units of the return's variance.
+        loss/entropy: entropy of the policy; of continuous actions the differential entropy, which
+            may be negative.
+        loss/auxiliary: auxiliary loss of predicting the privileged observation.
+        loss/kl: KL divergence from the acting policy, in nats.
+        loss/clip_fraction: fraction of ratios beyond `clip`.
+        loss/explained_variance: fraction of the returns' variance that the value explains.
+
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic. `check` names the number and counts the updates skipped in a row.
     """
@@ -84,6 +97,7 @@ class PPO(GradientLearner):
         if policy.critic is None:
             raise ValueError("PPO needs a policy with a critic: use agent.output=softmax")
         super().__init__(policy, lr, max_grad_norm, graph, seed, critic_lr, weight_decay)
+        self.critic = policy.critic
         self.n_steps, self.gamma, self.lambda_ = n_steps, gamma, lambda_
         self.coefficients = Coefficients(clip, value_clip, value_coef, entropy_coef, auxiliary_coef)
         self.normalise_advantage = normalise_advantage
@@ -104,10 +118,11 @@ class PPO(GradientLearner):
         per_step = rollout + (minibatch + 4 * self.policy.width)
         return optional(env, "n_agents") * (self.n_steps + 1) * per_step
 
-    def _update(self, rollout):
+    def _update(self, rollout) -> "dict[str, torch.Tensor]":
         transitions = rollout.transitions()
-        traces = dict(gamma=self.gamma, lambda_=self.lambda_)
-        estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **traces)
+        estimates = returns.gae(
+            **transitions, learns=rollout.learns[:-1], gamma=self.gamma, lambda_=self.lambda_
+        )
         advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
         moments = masked_moments(valid, targets, advantages)
         (_, _, variance), (_, _, error) = moments  # an advantage is the error of the value
@@ -117,7 +132,7 @@ class PPO(GradientLearner):
         own_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])
         is_finite, pooled = self.steps.begin(rollout.floats(), *moments, *own_obs)
         of_targets, of_advantages, *of_obs = pooled
-        self.policy.critic.output.add(of_targets, is_finite)
+        self.critic.output.add(of_targets, is_finite)
         if self.normalise_advantage == "rollout":
             estimates["advantages"] = normalise_masked(advantages, valid, of_advantages)
         if self.coefficients.value_clip is not None:
@@ -142,7 +157,7 @@ class PPO(GradientLearner):
         self.policy.add_moments(of_obs, is_finite)
         return {**self.steps.end(), "explained_variance": explained}
 
-    def _losses(self, rollout, lanes, batch):
+    def _losses(self, rollout, lanes, batch) -> "tuple[torch.Tensor, dict[str, torch.Tensor]]":
         """Returns the loss of a minibatch and its metrics, tensors ().
 
         Args:
@@ -157,6 +172,6 @@ class PPO(GradientLearner):
         return ppo_loss(
             **terms,
             batch=batch,
-            value_scale=policy.critic.output.scale,
+            value_scale=self.critic.output.scale,
             coefficients=self.coefficients,
         )

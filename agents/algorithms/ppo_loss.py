@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean
+from megastep.agents.private_ops import scale_all
 from megastep.arrdict import arrdict
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
@@ -52,8 +53,8 @@ def ppo_loss(
     """
     if logprobs.is_cuda:
         inputs = logprobs, entropies, values, errors
-        loss, metrics = _FusedLoss.apply(*inputs, batch, value_scale, coefficients)
-        metrics = dict(zip(METRICS, metrics.unbind(), strict=True))
+        loss, means = _FusedLoss.apply(*inputs, batch, value_scale, coefficients)
+        metrics: dict[str, torch.Tensor] = dict(zip(METRICS, means.unbind(), strict=True))
     else:
         loss, metrics = plain_loss(
             logprobs, entropies, values, errors, batch, value_scale, coefficients
@@ -63,7 +64,9 @@ def ppo_loss(
     return loss, metrics
 
 
-def plain_loss(logprobs, entropies, values, errors, batch, value_scale, coefficients):
+def plain_loss(
+    logprobs, entropies, values, errors, batch, value_scale, coefficients
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Does the same in PyTorch."""
     clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
     valid = batch.valid
@@ -95,7 +98,9 @@ class _FusedLoss(torch.autograd.Function):
     """`plain_loss` in one kernel, which leaves the gradients for the backward pass."""
 
     @staticmethod
-    def forward(ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients):
+    def forward(
+        ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
         inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
@@ -131,7 +136,7 @@ class _FusedLoss(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_loss, d_metrics):
+    def backward(ctx, d_loss, d_metrics) -> tuple[torch.Tensor | None, ...]:
         # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
-        gradients = torch._foreach_mul(list(ctx.saved_tensors), d_loss)
+        gradients = scale_all(ctx.saved_tensors, d_loss)
         return *gradients, *[None] * (7 - len(gradients))

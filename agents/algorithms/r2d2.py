@@ -4,24 +4,25 @@ T steps of a rollout, B lanes, L steps of a sequence, M sequences of a minibatch
 valid steps: those that the environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
 
 from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
 from megastep.agents.algorithms.masked_stats import pooled_mean
-from megastep.agents.algorithms.td_loss import Settings, td_loss
+from megastep.agents.algorithms.td_loss import Result, Settings, td_loss
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings, defaults_from
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout
+from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import MAX_ENVS, checked
-from megastep.types import Env, optional
+from megastep.types import Env, Tree, World, optional
 
 #: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
@@ -43,8 +44,14 @@ class EpsilonGreedy:
         self.policy, self.epsilon = policy, epsilon
         self.initial, self.compute_dtype = policy.initial, policy.compute_dtype
 
-    def __call__(self, world: arrdict, state: arrdict) -> tuple[arrdict, arrdict]:
-        decision, state = self.policy(world, state, epsilon=self.epsilon)
+    def __call__(
+        self,
+        world: World,
+        state: Tree,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> tuple[arrdict, arrdict]:
+        decision, state = self.policy(world, state, sample, generator, epsilon=self.epsilon)
         return arrdict(actions=decision.actions), state
 
 
@@ -83,6 +90,15 @@ class R2D2(GradientLearner):
         replay: settings of the replay buffer.
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
         seed: seed of replay sampling.
+
+    Metrics:
+        loss/td: squared TD error, in rescaled values.
+        loss/td_error: mean absolute TD error.
+        loss/q: mean Q-value of the actions taken, in units of reward.
+        loss/staleness: mean age of the replayed sequences, in updates.
+        loss/effective_samples: effective sample size of the importance weights, as a fraction.
+        loss/priority_max: largest priority of the stored sequences.
+        loss/priority_mean: mean priority of the stored sequences.
 
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic, and is never drawn. `state_dict` does not include the replay buffer, which has one
@@ -167,37 +183,39 @@ class R2D2(GradientLearner):
         n_bytes = bytes_per_observation(env, self.policy, self.n_steps, settings, logprobs=False)
         return settings.capacity, n_bytes
 
-    def _update(self, rollout):
+    def _update(self, rollout) -> dict[str, torch.Tensor]:
+        replay = self.replay_buffer
+        assert replay is not None
         is_finite, _ = self.steps.begin(rollout.floats())
-        self.replay_buffer.add(rollout, is_finite)
+        replay.add(rollout, is_finite)
         valid = ~rollout.reset & rollout.learns[:-1]
         size = pooled_mean(rollout.reward.square(), valid).sqrt()
         is_first = is_finite & (self.reward_scale == 0) & (size > 0)
         size = size.masked_fill((size > _USUAL[0]) & (size < _USUAL[1]), 1.0)
         self.reward_scale.copy_(torch.where(is_first, size, self.reward_scale))
         # A non-finite rollout counts as skipped even while the replay buffer is not ready.
-        is_enabled = self.replay_buffer.is_ready | ~is_finite
+        is_enabled = replay.is_ready | ~is_finite
         generator = self.generator.on(self.device)
         ratio = self.replay_settings.ratio
         n_sequences = round(ratio * rollout.n_lanes / self.gradient_steps)
         for _ in range(self.gradient_steps):
             copy_all(self._target_copies, self.n_taken % self.target_period == 0)
-            batch = self.replay_buffer.sample(n_sequences, generator)
+            batch = replay.sample(n_sequences, generator)
             result = self._losses(batch)
             self.steps.backward(result.loss, result.metrics, result.n_valid)
             self.n_taken += self.steps.take(is_enabled)
-            self.replay_buffer.set_priorities(batch.index, result.priorities)
+            replay.set_priorities(batch.index, result.priorities)
         last = rollout.world(-1)
         self.policy.update_stats(last.obs, is_counted=is_finite & rollout.learns[-1])
-        priorities = self.replay_buffer.tree.priorities
-        n_available = self.replay_buffer.n_available.clamp(min=1)
+        priorities = replay.tree.priorities
+        n_available = replay.n_available.clamp(min=1)
         return {
             **self.steps.end(),  # NaN until the replay buffer is ready, as no step is taken
             "priority_max": priorities.amax().float(),
             "priority_mean": (priorities.sum() / n_available).float(),
         }
 
-    def _losses(self, batch):
+    def _losses(self, batch) -> Result:
         """Returns the `td_loss.Result` of a minibatch."""
         burn_in = self.replay_settings.burn_in
         sequence = batch.obs, batch.starts, batch.state
@@ -217,14 +235,14 @@ class R2D2(GradientLearner):
         result.metrics["q"] = result.metrics["q"] * scale
         return result
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns the base's state, the target network, the number of gradient steps taken and the
         scale of rewards.
         """
         own = dict(n_taken=self.n_taken.clone(), reward_scale=self.reward_scale.clone())
         return dict(super().state_dict(), target=self.target.state_dict(), **own)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`, which may come from another device.
 
         Raises:

@@ -25,7 +25,7 @@ def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor
     return linear_scan(terms, discounts, reverse=True)
 
 
-def _following(value, last_value):
+def _following(value, last_value) -> torch.Tensor:
     return torch.cat([value[1:], last_value[None]])
 
 
@@ -66,7 +66,7 @@ def gae(
     return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=valid)
 
 
-def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_):
+def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_) -> arrdict.arrdict:
     """Computes `gae` in one kernel, lane by lane."""
     n_steps, n_lanes = reward.shape
     advantages, targets = reward.new_empty(2, n_steps, n_lanes)
@@ -143,7 +143,7 @@ def vtrace(
     )
 
 
-def _vtrace_on_gpu(steps, value, last_value, settings):
+def _vtrace_on_gpu(steps, value, last_value, settings) -> arrdict.arrdict:
     """Computes `vtrace` in one kernel, lane by lane."""
     n_steps, n_lanes = value.shape
     advantages, targets = value.new_empty(2, n_steps, n_lanes)

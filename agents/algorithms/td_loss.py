@@ -107,7 +107,9 @@ class _FusedLoss(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, q, target_q, batch, settings):
+    def forward(
+        ctx, q, target_q, batch, settings
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         n_rows, n_sequences, n_agents, n_choices = q.shape
         n_blocks = -(-n_sequences // _SEQUENCES)
         d_q = torch.empty_like(q, memory_format=torch.contiguous_format)
@@ -147,6 +149,6 @@ class _FusedLoss(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_loss, d_metrics, d_priorities):
+    def backward(ctx, d_loss, d_metrics, d_priorities) -> tuple[torch.Tensor | None, ...]:
         d_q, metrics = ctx.saved_tensors
         return d_q * (d_loss * metrics[-1]), None, None, None

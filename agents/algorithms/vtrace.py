@@ -7,7 +7,7 @@ replayed sequences if there is a replay buffer. Means are over valid steps: thos
 environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -32,6 +32,9 @@ from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
+
+if TYPE_CHECKING:
+    from megastep.arrdict import arrdict
 
 # Metrics count larger ratios as e^20, so that their squares stay finite.
 _MAX_LOG_RATIO = 20.0
@@ -73,6 +76,22 @@ class VTrace(GradientLearner):
         replay: settings of the replay buffer.
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
         seed: seed of the minibatch order and of replay sampling.
+
+    Metrics:
+        loss/policy: policy loss.
+        loss/value: value loss, in units of the return's variance.
+        loss/entropy: entropy of the policy; of continuous actions the differential entropy, which
+            may be negative.
+        loss/auxiliary: auxiliary loss of predicting the privileged observation.
+        loss/kl: KL divergence from the acting policy, in nats.
+        loss/clip_fraction: fraction of ratios beyond `rho_clip`.
+        loss/explained_variance: fraction of the returns' variance that the value explains.
+        loss/advantage: root mean square of the advantages, in standard deviations of the return.
+        loss/rho: mean clipped ratio.
+        loss/effective_samples: effective sample size as a fraction: near 1, samples are as good as
+            on-policy ones.
+        loss/replayed_NAME: kl, rho, clip_fraction and effective_samples of replayed sequences.
+        loss/staleness: with replay, mean age of the replayed sequences, in updates.
 
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic. `check` names the number and counts the updates skipped in a row.
@@ -118,7 +137,7 @@ class VTrace(GradientLearner):
                 "leave replay.length out"
             )
         super().__init__(policy, lr, max_grad_norm, graph, seed, critic_lr, weight_decay)
-        self.n_steps, self.lag = n_steps, lag
+        self.critic, self.n_steps, self.lag = policy.critic, n_steps, lag
         self.traces = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
         self.advantage_floor, self.entropy_coef = advantage_floor, entropy_coef
         self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
@@ -162,7 +181,7 @@ class VTrace(GradientLearner):
             return 0, 0.0
         return settings.capacity, bytes_per_observation(env, self.policy, self.n_steps, settings)
 
-    def _update(self, rollout):
+    def _update(self, rollout) -> dict[str, torch.Tensor]:
         is_finite, _ = self.steps.begin(rollout.floats())
         if self.replay_buffer is not None:
             self.replay_buffer.add(rollout, is_finite)
@@ -187,13 +206,13 @@ class VTrace(GradientLearner):
         last = rollout.world(-1)
         own_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])
         of_targets, *of_obs = pool_moments(*masked_moments(valid, targets), *own_obs)
-        self.policy.critic.output.add(of_targets, is_finite)
+        self.critic.output.add(of_targets, is_finite)
         self.policy.add_moments(of_obs, is_finite)
         return self.steps.end()
 
-    def _batch(self, rollout, lanes):
+    def _batch(self, rollout, lanes) -> "arrdict":
         batch = mixed_batches.from_rollout(rollout, lanes)
-        if self.replay_buffer is None:
+        if self.replay_buffer is None or self.replay_settings is None:
             return batch
         n_replayed = max(1, round(self.replay_settings.ratio * len(lanes)))
         generator = self.generator.on(self.device)
@@ -201,7 +220,7 @@ class VTrace(GradientLearner):
             batch, self.replay_buffer, self.policy, n_replayed, generator
         )
 
-    def _losses(self, batch, n_fresh):
+    def _losses(self, batch, n_fresh) -> "tuple[torch.Tensor, dict[str, torch.Tensor], arrdict]":
         """Returns the loss of a minibatch, its metrics, tensors (), and V-trace's estimates.
 
         Args:
@@ -227,7 +246,7 @@ class VTrace(GradientLearner):
             **self.traces,
         )
         estimates["valid"] = valid
-        scale = policy.critic.output.scale
+        scale = self.critic.output.scale
         error = (value[:-1] - estimates.targets) / scale
         advantages = estimates.advantages / scale  # in standard deviations of the return
         size = pooled_mean(advantages.square(), valid).sqrt()
@@ -257,7 +276,7 @@ class VTrace(GradientLearner):
             self.replay_buffer.set_priorities(batch.index, mean_error)
         return loss, metrics, estimates
 
-    def _ratio_metrics(self, log_ratio, valid):
+    def _ratio_metrics(self, log_ratio, valid) -> dict[str, torch.Tensor]:
         """Returns how far the current policy is from the one that acted, by several measures."""
         log_ratio = log_ratio.clamp(max=_MAX_LOG_RATIO)
         ratio, rho_clip = log_ratio.exp(), self.traces["rho_clip"]

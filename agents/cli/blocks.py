@@ -11,23 +11,29 @@ one. A learner of a user has the blocks of the built-in learner that it derives 
 """
 
 import functools
+import os
+from collections.abc import Callable
 from contextlib import suppress
 from types import NoneType
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from hydra.core import plugins
 from hydra.plugins.config_source import ConfigSource
 from omegaconf import DictConfig, OmegaConf
 
+from megastep.agents.cli import config_files
 from megastep.agents.factory import check, components, settings
 from megastep.agents.launch import gpu
 from megastep.imports import import_object
+
+if TYPE_CHECKING:
+    from hydra.plugins.config_source import ConfigResult
 
 #: The names of blocks, the last of which wins, and whether they are laid over their files.
 applied: dict[str, bool] = {}
 
 
-def apply(device: Any, learner: Any) -> None:
+def apply(device: object, learner: object) -> None:
     """Has Hydra lay the blocks of a device, and of a learner as `built_in` takes it, over the files
     that it loads from here on. Values of other types are told when the settings are checked.
     """
@@ -52,12 +58,14 @@ def built_in(learner: str) -> str | None:
     return learner if learner in names.values() else next(iter(known), None)
 
 
-def merged(tree: dict[str, Any]) -> dict[str, Any]:
+def merged(tree: check.Tree) -> check.Tree:
     """Returns what a file holds with its blocks merged into it."""
     blocks = [name for name in applied if isinstance(tree.get(name, False), (dict, NoneType))]
     content = {key: value for key, value in tree.items() if key not in blocks}
     layers = [merged(tree[name] or {}) for name in blocks if applied[name]]
-    return functools.reduce(_laid, layers, content)
+    for layer in layers:
+        content = _laid(content, layer)
+    return content
 
 
 def fit(config: DictConfig, learner: str | None) -> None:
@@ -77,7 +85,7 @@ def fit(config: DictConfig, learner: str | None) -> None:
 def note(config: DictConfig, typed: list[str]) -> str:
     """Returns a sentence on what a user's learner has from files; "" if it has nothing."""
     name = OmegaConf.select(config, "learner.name")
-    values = check.leaves(OmegaConf.to_container(config.learner)) if _fields(name) else ()
+    values = check.leaves(plain(config.learner)) if _fields(name) else ()
     typed = [*typed, "learner.name"]
     taken = [f"{key}={value}" for key, value in values if f"learner.{key}" not in typed]
     if not taken:
@@ -91,7 +99,12 @@ def note(config: DictConfig, typed: list[str]) -> str:
     return f"learner={name} takes {', '.join(taken)} from {sources}"
 
 
-def _fields(learner):
+def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
+    """Returns a configuration as nested dicts."""
+    return cast(check.Tree, OmegaConf.to_container(config, resolve=resolve))
+
+
+def _fields(learner) -> dict | None:
     # of the settings of a user's learner; None if it is built in, or cannot be used, which is told
     # when the settings are checked
     if isinstance(learner, str) and ("learner", learner) not in components.built_in():
@@ -99,23 +112,27 @@ def _fields(learner):
             return settings.kind_of("learner", learner).__pydantic_fields__
 
 
-def _laid(below, above):
+def _laid(below, above) -> Any:
     # one value over another: nested dicts key by key
     if not (isinstance(below, dict) and isinstance(above, dict)):
         return above
     return below | {key: _laid(below.get(key), value) for key, value in above.items()}
 
 
-def _with_blocks(load_config):
+def _with_blocks(load_config) -> Callable:
     @functools.wraps(load_config)
-    def load(source, config_path):
+    def load(source, config_path) -> "ConfigResult":
+        if source.scheme() == "file":
+            path = os.path.join(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
+            if os.path.exists(path):  # Hydra tells of those that do not
+                config_files.check(path)
         result = load_config(source, config_path)
         if OmegaConf.is_dict(result.config) and any(name in result.config for name in applied):
-            result.config = OmegaConf.create(merged(OmegaConf.to_container(result.config)))
+            result.config = OmegaConf.create(merged(plain(result.config)))
         return result
 
     return load
 
 
-for _source in plugins.Plugins.instance().discover(ConfigSource):
+for _source in cast("list[type[ConfigSource]]", plugins.Plugins.instance().discover(ConfigSource)):
     _source.load_config = _with_blocks(_source.load_config)

@@ -56,12 +56,23 @@ def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
     warnings.showwarning, arguments = console.warn, sys.argv[:]
     words = sys.argv[1:] if argv is None else argv
     try:
-        ending = endings.ending_of(lambda: _run(script, [*map(script.reword, words)]))
+        words = [script.reword(without_dashes(word)) for word in words]
+        ending = endings.ending_of(lambda: _run(script, words))
     finally:
         sys.argv[:] = arguments
     if ending.text:
         console.say(f"{package.command(script.name)}: {ending.text}", sys.stderr)
     return ending.code
+
+
+def without_dashes(word: str) -> str:
+    """Returns `--learner.lr=0.1`, as agents of W&B's sweeps write it, as `learner.lr=0.1`; options
+    are left as they are.
+    """
+    name, is_given, _ = word.partition("=")
+    options = {option for names in OPTIONS for option in names.split()}
+    is_key = is_given and name.startswith("--") and name not in options
+    return word.removeprefix("--") if is_key else word
 
 
 def _run(script: scripts.Script, argv: list[str]) -> int:
@@ -124,7 +135,7 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
     return 0
 
 
-def _checked(composer: compose.Composer, words: list[str]) -> tuple[Any, Any]:
+def _checked(composer: compose.Composer, words: list[str]) -> tuple:
     """Returns settings that can be run, and the configuration they are from."""
     settings, config = composer.compose(words)
     if config.hydra.mode != RunMode.MULTIRUN:

@@ -8,10 +8,11 @@ Jobs of sweeps compose in the same way, in whichever process they run.
 
 import copy
 import functools
+import itertools
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -21,8 +22,14 @@ from hydra.core import config_store, global_hydra, plugins
 from hydra.core.override_parser import overrides_parser, types
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf import DictConfig, OmegaConf, grammar_parser
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    GrammarParseError,
+    OmegaConfBaseException,
+)
+from omegaconf.grammar_parser import OmegaConfGrammarParser  # pyright: ignore[reportPrivateImportUsage]
 
 from megastep.agents import package
 from megastep.agents.cli import blocks
@@ -49,12 +56,21 @@ OPEN = {
 }
 #: The learner whose blocks are tried first where none is typed.
 GUESS = "ppo"
+#: Resolvers that settings may call: none that reads what is not in the configuration, or reads its
+#: argument as a value that may call others.
+RESOLVERS = ("now", "oc.dict.keys", "oc.dict.values", "oc.select", "python_version")
+ENVIRONMENT = ("oc.env", "env")
 #: What Hydra raises for words that it cannot use.
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
+#: What files of configurations raise beside these: Hydra and YAML have no errors of their own for
+#: defaults that are no list or lead back to their own file, and for numbers of 5,000 digits.
+FILE_ERRORS = (*HYDRA_ERRORS, ValueError, TypeError, LookupError, RecursionError)
 STORE = config_store.ConfigStore.instance()
 # Hydra copies its sources of files time and again, and in them this one, which took a third of a
 # second: there is only one
-config_store.ConfigStore.__deepcopy__ = lambda store, memo: store
+config_store.ConfigStore.__deepcopy__ = (  # pyright: ignore[reportAttributeAccessIssue]
+    lambda store, memo: store
+)
 STORE.store(name="open", node=OmegaConf.create(OPEN))
 STORE.store(group="logger", name="none", node={})
 for label, path in settings.loggers().items():
@@ -66,7 +82,7 @@ class FolderOfUser(SearchPathPlugin):
 
     path: str | None = None
 
-    def manipulate_search_path(self, search_path):
+    def manipulate_search_path(self, search_path) -> None:
         if self.path:
             search_path.append("command-line", f"file://{self.path}")
 
@@ -85,7 +101,11 @@ class Composer:
     """
 
     def __init__(
-        self, script: Script, name: str | None = None, folder: str | None = None, main: Any = None
+        self,
+        script: Script,
+        name: str | None = None,
+        folder: str | None = None,
+        main: str | None = None,
     ):
         self.script, self.name, self.folder = script, name or script.name, folder
         self.main = os.path.abspath(main or package.CONFIGS)
@@ -101,9 +121,8 @@ class Composer:
         global_hydra.GlobalHydra.instance().clear()
         hydra.initialize_config_dir(self.main, job_name=script.name, version_base="1.3")
         self.loader = global_hydra.GlobalHydra.instance().config_loader()
-        self.members, self.composed = map(
-            functools.cache, (self.loader.get_group_options, self._composed)
-        )
+        self.members = functools.cache(self.loader.get_group_options)
+        self.composed = functools.cache(self._composed)
 
     def groups(self) -> dict[str, list[str]]:
         """Returns {group: members} of the groups to choose from."""
@@ -155,8 +174,7 @@ class Composer:
         """
         overrides = self.parse(words)
         config, errors = self.config(overrides)
-        cure = "is an environment variable, and would be written to config.yaml; type its value"
-        secret = [(k, cure) for k, value in check.leaves(own(config)) if "${oc.env:" in str(value)]
+        secret = [*refused_resolvers(own(config))]
         try:
             typed = [key for key in map(key_of, overrides) if not key.startswith("hydra")]
             tree = self.script.prepare(own(config, resolve=not secret), typed)
@@ -210,8 +228,8 @@ class Composer:
             elif not options or isinstance(value, dict):
                 keys[key] = override
             elif group in settings.IMPORTED and all(map(is_import_path, others)):
-                for name in others:
-                    node = {"name": name}
+                for name in map(str, others):
+                    node: dict = {"name": name}
                     if group == "logger":
                         node = {settings.label(name): node}
                     elif group == "learner":  # it has the file of the one that it derives from
@@ -231,7 +249,7 @@ class Composer:
             )
             config = copy.deepcopy(self.composed(*groups, device=device, learner=learner))
             blocks.fit(config, learner)
-        except HYDRA_ERRORS as error:
+        except FILE_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
             text = shortened(text, 400)
@@ -245,7 +263,9 @@ class Composer:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
             except (ConfigKeyError, ConfigAttributeError, TypeError):  # TypeError: below a value
-                hint = check.closest_key(key, dict(check.leaves({"hydra": plain(config.hydra)})))
+                hint = check.closest_key(
+                    key, dict(check.leaves({"hydra": blocks.plain(config.hydra)}))
+                )
                 errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:
                 errors.append((key, str(error).partition("\n")[0]))
@@ -280,16 +300,53 @@ def key_of(override: types.Override) -> str:
     return override.get_key_element().lstrip("+~")
 
 
-def is_import_path(value: Any) -> bool:
+def refused_resolvers(tree: check.Tree) -> Iterator[tuple[str, str]]:
+    """Yields (key, sentence) of values that call a resolver which is not one of `RESOLVERS`, as
+    OmegaConf's grammar reads them: in any part of a value, with any blanks.
+    """
+    for key, value in check.leaves(tree):
+        for name in dict.fromkeys(itertools.chain(*map(resolvers_in, strings_in(value)))):
+            if name in ENVIRONMENT:
+                cure = "would be written to config.yaml; type its value"
+                yield key, f"is an environment variable, and {cure}"
+            elif name not in RESOLVERS:
+                cure = f"settings may call {', '.join(RESOLVERS)}; type the value"
+                yield key, f"calls {shortened(repr(name), 60)}; {cure}"
+
+
+def strings_in(value: object) -> Iterator[str]:
+    """Yields the texts in nested lists and dicts."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, (list, dict)):
+        for part in [*value, *value.values()] if isinstance(value, dict) else value:
+            yield from strings_in(part)
+
+
+def resolvers_in(text: str) -> Iterator[str]:
+    """Yields the names of the resolvers that a value calls, those in arguments of others too.
+
+    What cannot be read is no call: resolving it is an error.
+    """
+    stack = []
+    if "${" in text:
+        with suppress(GrammarParseError):
+            stack.append(grammar_parser.parse(text))
+    while stack:
+        node = stack.pop()
+        if isinstance(node, OmegaConfGrammarParser.InterpolationResolverContext):
+            if (resolver := node.resolverName()) is not None:
+                yield resolver.getText()
+        stack += getattr(node, "children", None) or []
+
+
+def is_import_path(value: object) -> bool:
     # Hydra would interpolate a $
     return isinstance(value, str) and ":" in value and "$" not in value and len(value) <= LONGEST
 
 
 def own(config: DictConfig, resolve: bool = False) -> check.Tree:
     """Nested dicts of all but Hydra's part, without groups that nothing is in."""
-    tree = plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]), resolve)
+    keys = [str(key) for key in config if key != "hydra"]
+    tree = blocks.plain(OmegaConf.masked_copy(config, keys), resolve)
     return {key: value for key, value in tree.items() if value != {}}
-
-
-def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
-    return OmegaConf.to_container(config, resolve=resolve)

@@ -4,11 +4,16 @@ import datetime
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents import console
 from megastep.agents.errors import UserError
 from megastep.agents.runs import agent_file, checkpoint, checkpoint_format, folders
+
+if TYPE_CHECKING:
+    import torch
+
+    from megastep.agents.types import StateDict
 
 HELP = """Verifies a run's checkpoints and prints what is in them.
 
@@ -58,7 +63,9 @@ def _lines(path: Path) -> Iterator[str]:
     for name, entry in manifest["files"].items():
         yield f"  {name:<14}{console.number(entry['bytes'])} bytes, sha256 {entry['sha256'][:16]}"
     head = ["part", "tensors", "numbers", "bytes", "largest"]
-    rows = [_row(name, part) for name, part in loaded.state.items() if isinstance(part, dict)]
+    rows = [
+        _row(name, part) for name, part in (loaded.state or {}).items() if isinstance(part, dict)
+    ]
     yield from (f"  {line}" for line in console.table(head, rows).splitlines())
 
 
@@ -68,13 +75,13 @@ def _lines_of_agent(path: Path) -> Iterator[str]:
     yield f"{path}: intact, {console.number(path.stat().st_size)} bytes"
     yield from (f"  {name}: {value}" for name, value in about["facts"].items())
     head = ["part", "tensors", "numbers", "bytes", "largest"]
-    rows = [_row(name, part) for name, part in loaded.state.items()]
+    rows = [_row(name, part) for name, part in (loaded.state or {}).items()]
     yield from (f"  {line}" for line in console.table(head, rows).splitlines())
     for table in about["tables"]:
         yield f"  {table['title']}: {len(table['rows'])} rows"
 
 
-def _row(name: str, part: dict[str, Any]) -> list[str]:
+def _row(name: str, part: "StateDict") -> list[str]:
     """Returns the cells about a part of a checkpoint's state."""
     tensors = dict(_tensors(part))
     n_numbers = sum(math.prod(leaf.shape) for leaf in tensors.values())
@@ -85,7 +92,7 @@ def _row(name: str, part: dict[str, Any]) -> list[str]:
     return [name, *numbers, largest]
 
 
-def _tensors(tree, path=""):
+def _tensors(tree, path="") -> "Iterator[tuple[str, torch.Tensor]]":
     """Yields (path, tensor) of nested dicts and lists."""
     if hasattr(tree, "nbytes"):
         yield path, tree

@@ -10,7 +10,7 @@ import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import yaml
 
@@ -44,16 +44,21 @@ class Result(NamedTuple):
     metric: str
     text: str
 
-    def __str__(self):
-        value, percent, lower, upper = STATED.fullmatch(self.text).groups(default="")
+    def __str__(self) -> str:
+        value, percent, lower, upper = self._parts()
         return f"{self.metric} {value}{percent} ({lower} to {upper})"
 
     def contains(self, value: float) -> bool:
         """Returns true if a value, rounded as the interval's bounds are, lies in the interval."""
-        _, percent, *bounds = STATED.fullmatch(self.text).groups()
+        _, percent, *bounds = self._parts()
         decimals = max(len(bound.partition(".")[2]) for bound in bounds)
         lower, upper = map(float, bounds)
         return lower <= round(100 * value if percent else value, decimals) <= upper
+
+    def _parts(self) -> Sequence[str]:
+        match = STATED.fullmatch(self.text)
+        assert match is not None
+        return match.groups(default="")
 
 
 class Row(NamedTuple):
@@ -71,7 +76,7 @@ class Row(NamedTuple):
     train: str
     results: list[Result]
     minutes: int | None = None
-    exact: Sequence[dict[str, Any]] = ()
+    exact: Sequence[dict] = ()
 
 
 def read() -> dict[str, Row]:
@@ -200,7 +205,7 @@ def compare(row: Row, folder: Path, values: Sequence[float]) -> int:
     return 0 if is_reproduced else 1
 
 
-def machine(device: str) -> dict[str, Any]:
+def machine(device: str) -> dict:
     """Returns what the bits of a run depend on, besides configuration and code."""
     import torch  # after OMP_NUM_THREADS is set
 
@@ -213,9 +218,7 @@ def machine(device: str) -> dict[str, Any]:
     return facts
 
 
-def compare_bits(
-    known: Sequence[dict[str, Any]], here: dict[str, Any], digest: str
-) -> tuple[bool | None, str]:
+def compare_bits(known: Sequence[dict], here: dict, digest: str) -> tuple[bool | None, str]:
     """Compares the digest of a run's metrics.jsonl with those known for its row.
 
     Returns:

@@ -3,6 +3,7 @@ before PyTorch is imported.
 """
 
 import contextlib
+import dataclasses
 import importlib
 import re
 from collections.abc import Callable, Iterator
@@ -10,9 +11,10 @@ from typing import Any, NamedTuple
 
 from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
-from megastep.agents.factory import settings
+from megastep.agents.factory import check, settings
 from megastep.agents.launch import launcher
-from megastep.agents.runs import agent_file, folders
+from megastep.agents.launch.again import AUTO, RESUMABLE, automatic
+from megastep.agents.runs import agent_file, folders, formats
 
 Tree = dict[str, Any]
 
@@ -56,6 +58,8 @@ The most common words:
                                values err most
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
                                more_seconds=60 more_samples=1e6 extend its budget
+  folder=X resume=auto         start a run in X, or continue it if it has begun, as when a cluster
+                               starts the same command again
   ranks=2                      two processes that train together, on a GPU each; all: every GPU;
                                restarts=2 starts them again if one is killed; dry_run=true only
                                prints what would run
@@ -66,32 +70,6 @@ The most common words:
   env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
   logger=[tensorboard,wandb] logger.wandb.mode=offline
                                several loggers; csv, none, or a class of your own"""
-#: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
-#: what it learns.
-RESUMABLE = (
-    "resume",
-    "samples",
-    "seconds",
-    "more_samples",
-    "more_seconds",
-    "device",
-    "trust",
-    "log_every",
-    "checkpoint_seconds",
-    "keep_checkpoints",
-    "replay_every",
-    "desync",
-    "profile",
-    "snapshots",
-    "ranks",
-    "restarts",
-    "dry_run",
-    "logger",
-    "finish",
-    "env.restart_failed",
-)
-
-
 #: What may differ when a run is repeated.
 REPEATABLE = (
     "rerun",
@@ -126,6 +104,8 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     set_ranks(tree, typed)
     tree.setdefault("logger", {})  # as it is with logger=none
     given = [key for key in CURES if isinstance(tree.get(key), str)]
+    if tree.get("resume") == AUTO and "rerun" not in given:
+        given.remove("resume")  # what there is to resume is looked up when training begins
     if len(given) > 1:
         raise ConfigErrors([(given[1], f"cannot be combined with {given[0]}")])
     if not given:
@@ -153,7 +133,11 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
             f"{loaded.path} is a snapshot, which has the weights only. init={loaded.path} starts "
             f"a new run from it; {how}= takes the run's folder"
         )
-    elif how == "rerun":
+    if how != "init":
+        with user_errors(f"{loaded.path} cannot be used: ", (ValueError, ConfigErrors)):
+            formats.check(formats.Progress, loaded.numbers)
+            check.check(settings.Train, saved | {"logger": {}})  # a typed one replaces it
+    if how == "rerun":
         saved |= {"resume": None, "folder": None}
     for key in typed:
         *groups, leaf = key.split(".")
@@ -205,7 +189,9 @@ def check_training(cfg: settings.Train) -> None:
     if environment.rank() > 0:  # rank 0 checks
         return
     launcher.n_ranks(cfg)
-    if cfg.resume is None:
+    if cfg.resume == AUTO:
+        automatic(cfg)
+    elif cfg.resume is None:
         folders.check_free(cfg.folder)
     else:
         with folders.locked(folders.folder_of(folders.find(cfg.resume))):
@@ -248,7 +234,8 @@ def check_run(cfg: settings.Evaluate | settings.Record) -> None:
 
 def without_training(tree: Tree, typed: list[str]) -> Tree:
     """Returns the tree without what files, such as environments', set for training alone."""
-    train, played = ({*kind.__pydantic_fields__} for kind in (settings.Train, settings.Played))
+    kinds = settings.Train, settings.Played
+    train, played = ({field.name for field in dataclasses.fields(kind)} for kind in kinds)
     absent = train - played - {key.split(".")[0] for key in typed}
     return {key: value for key, value in tree.items() if key not in absent}
 

@@ -14,6 +14,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -24,7 +25,7 @@ import uuid
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
@@ -37,8 +38,12 @@ from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
+from megastep.agents.launch.again import AUTO
 from megastep.agents.runs import folders, scores
 from megastep.agents.runs.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: Columns of the table beside the job and the keys that vary.
@@ -58,7 +63,7 @@ OmegaConf.register_new_resolver(
 # ---- Before the first job ----
 
 
-def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list[Any], Any]:
+def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list, Any]:
     """Returns (the words of each job that is known beforehand; their settings, all of them checked;
     Hydra's configuration of the first).
 
@@ -80,12 +85,13 @@ def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list
     elif wide := [key for key, options in values.items() if options[0] is None]:
         cure = "interval() needs a sweeper that searches, such as hydra/sweeper=optuna"
         raise ConfigErrors((key, cure) for key in wide)
-    return jobs, [composer.settings(job) for job in jobs], config
+    words_of_jobs = cast("list[list[str]]", jobs)
+    return words_of_jobs, [composer.settings(job) for job in words_of_jobs], config
 
 
 def _values(override: Override) -> list[str | None]:
     """The words that a word of a sweep may become; None where a search leaves it out."""
-    key, sweep = override.get_key_element(), override.value()
+    key, sweep = override.get_key_element(), cast(Any, override.value())
     if override.is_interval_sweep():
         # a point inside that is no integer, even if the bounds are 1.0 and 4.0
         inside = sweep.start + 0.38 * (sweep.end - sweep.start)
@@ -125,7 +131,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
         ),
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
-    words += [override.input_line for override in overrides.values()]
+    words += [str(override.input_line) for override in overrides.values()]
     # processes of launchers find megastep, in a checkout too; a job's settings find modules of the
     # current folder
     if (package.ROOT / "train.py").exists():
@@ -205,7 +211,7 @@ class Job:
     process: int
     start: str
 
-    def __call__(self, config: Any) -> float | None:
+    def __call__(self, config: object) -> float | None:
         """Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
         alone.
         """
@@ -214,22 +220,26 @@ class Job:
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
         pairs = (word.lstrip("+~").partition("=") for word in words)
         fixed = hydra.job.config.override_dirname.exclude_keys
-        row = dict(
+        row: Row = dict(
             number=number,
             varied={key: value.strip("\"'") for key, _, value in pairs if key not in fixed},
             state=RUNNING,
             folder=hydra.runtime.output_dir,
         )
         words += [word for word in hydra.overrides.hydra if "searchpath" in word]
-        if self.path(f"{number}.json").exists():  # it started before joblib lost a worker
-            row = self.recorded(number)
-        elif hydra.runtime.choices["hydra/launcher"] != "joblib":
+        launcher = hydra.runtime.choices["hydra/launcher"]
+        if self.path(f"{number}.json").exists():
+            # it started before joblib lost a worker, or a cluster starts it again
+            earlier = self.recorded(number)
+            is_over = launcher == "joblib" or earlier["state"] == DONE
+            row = earlier if is_over else self.run(row, words, is_again=True)
+        elif launcher != "joblib":
             row = self.run(row, words)
         elif not self.path("stopped").exists():
             row = self.start_apart(row, words)
         return row.get("score")
 
-    def start_apart(self, row: dict[str, Any], words: list[str]) -> dict[str, Any]:
+    def start_apart(self, row: "Row", words: list[str]) -> "Row":
         """Runs a job in a process of its own. Returns what became of it."""
         read, write = os.pipe()  # which closes when that process ends, however it does
         job = json.dumps([dataclasses.asdict(self), row, words])
@@ -247,8 +257,23 @@ class Job:
             console.say(f"Job {row['number']} {LOST}", sys.stderr)
         return row
 
-    def run(self, row: dict[str, Any], words: list[str]) -> dict[str, Any]:
-        """Runs a job in this process. Returns what became of it."""
+    def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
+        """Runs a job in this process. Returns what became of it.
+
+        In a job of submitit's, SIGUSR1 and SIGUSR2 get to its own handler once the job is saved,
+        and it has the job started again.
+
+        Args:
+            is_again: it was started before, and continues from what it saved.
+        """
+        try:
+            return self._run(row, words, is_again)
+        except signals.Interrupted as stop:
+            if stop.args[0] in signals.ANNOUNCING and "SUBMITIT_EXECUTOR" in os.environ:
+                signal.raise_signal(stop.args[0])
+            raise
+
+    def _run(self, row, words, is_again) -> "Row":
         began, number, result = time.monotonic(), row["number"], None
         if os.getpid() != self.process:  # its lines are among those of others
             warnings.showwarning, console.prefix = console.warn, f"job {number}: "
@@ -262,6 +287,8 @@ class Job:
                     if composer.note:
                         console.say(composer.note)
                     cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
+                    if is_again:  # not for evaluations, which begin again
+                        cfg = settings.changed(cfg, resume=AUTO)
                     grouped = {
                         label: settings.changed(one, group=Path(self.folder).name)
                         for label, one in getattr(cfg, "logger", {}).items()
@@ -293,13 +320,13 @@ class Job:
     def path(self, name: str) -> Path:
         return Path(self.records, name)
 
-    def record(self, row: dict[str, Any]) -> None:
+    def record(self, row: "Row") -> None:
         """Writes what is known of a job, and the table of all jobs so far."""
         with contextlib.suppress(OSError):  # a full disk: the job is worth more
             write_atomically(self.path(f"{row['number']}.json"), json.dumps(row).encode())
             write_table(Path(self.folder), self.rows())
 
-    def recorded(self, number: int) -> dict[str, Any]:
+    def recorded(self, number: int) -> "Row":
         """Returns what became of a job."""
         row = {"number": number, "varied": {}, "state": RUNNING}
         with contextlib.suppress(OSError):  # of a process that ended before it wrote this
@@ -307,7 +334,7 @@ class Job:
         is_lost = row["state"] == RUNNING and not _is_locked(self.path(f"{number}.lock"))
         return row | {"state": LOST} if is_lost else row
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> "list[Row]":
         """Returns what the jobs of this sweep recorded, in order."""
         return [self.recorded(n) for n in sorted(int(p.stem) for p in self.path("").glob("*.json"))]
 
@@ -328,10 +355,10 @@ class Job:
         return [pid for pid in pids if pid != os.getpid()]
 
 
-def run_apart(pipe: str, job: str) -> None:
+def run_apart(pipe: str, text: str) -> None:
     """Runs a job of `Job.start_apart`, and ends with the sweep."""
     os.set_inheritable(int(pipe), False)
-    fields, row, words = json.loads(job)
+    fields, row, words = json.loads(text)
     job = Job(**fields)
     signals.exit_on_signals(job.source[0])
     console.open_streams()
@@ -363,7 +390,7 @@ def _is_locked(path: Path) -> bool:
 # ---- The table ----
 
 
-def report(folder: Path, rows: list[dict[str, Any]]) -> None:
+def report(folder: Path, rows: "list[Row]") -> None:
     """Prints the table of a sweep and writes it into its folder."""
     console.say(f"Sweep\n{console.table(*_cells(rows))}")
     with console.warned(f"{folder} cannot be written: "):
@@ -371,7 +398,7 @@ def report(folder: Path, rows: list[dict[str, Any]]) -> None:
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
 
 
-def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
+def write_table(folder: Path, rows: "list[Row]") -> None:
     """Writes sweep.md, the table as it is printed, and sweep.csv, with all digits and folders."""
     table = console.table(*_cells(rows), is_markdown=True)
     write_atomically(folder / "sweep.md", table.encode())
@@ -381,17 +408,17 @@ def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
     write_atomically(folder / "sweep.csv", text.getvalue().encode())
 
 
-def _head(rows):
+def _head(rows) -> list[str]:
     return ["job", *dict.fromkeys(key for row in rows for key in row["varied"]), *COLUMNS]
 
 
-def _cells(rows):
+def _cells(rows) -> tuple[list[str], list[list[str]]]:
     """Returns the head and the rows of a table, as text."""
     rows, head = [row | row["varied"] | {"job": row["number"]} for row in rows], _head(rows)
     return head, [[_brief(row.get(name)) for name in head] for row in rows]
 
 
-def _brief(value: Any) -> str:
+def _brief(value: object) -> str:
     # with at most four digits: what a search tries has up to 17
     text = "" if value is None else str(value)
     return f"{float(text):.4g}" if re.fullmatch(r"-?\d*\.\d{5,}(e-?\d+)?", text) else text

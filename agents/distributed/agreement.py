@@ -5,7 +5,7 @@ Each function waits for the other ranks. In a single process it just calls its a
 
 import pickle
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from megastep.agents.distributed.process_group import (
     exchange,
@@ -44,7 +44,7 @@ def together(function: Callable[[], T]) -> T:
     for number, first in enumerate(failures):
         if first is not None:
             raise first if failure is None or number != rank() else failure
-    return value
+    return cast(T, value)
 
 
 def from_rank_0(function: Callable[[], T]) -> T:
@@ -53,10 +53,11 @@ def from_rank_0(function: Callable[[], T]) -> T:
     Args:
         function: returns a small value that can be pickled.
     """
-    return gather_objects(together(lambda: function() if rank() == 0 else None))[0]
+    values = gather_objects(together(lambda: function() if rank() == 0 else None))
+    return cast(T, values[0])
 
 
-def _portable(error):
+def _portable(error) -> Exception | None:
     """Returns an error that can be pickled, None for None. Adds the label of ranks other than 0."""
     if error is None:
         return None

@@ -54,7 +54,7 @@ def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
         return torch.stack(parts) if parts else torch.zeros(0, dtype=torch.int64)
 
 
-def _bits(tensor):
+def _bits(tensor) -> torch.Tensor:
     if tensor.is_complex():
         tensor = torch.view_as_real(tensor)
     return tensor if tensor.dtype == torch.bool else tensor.view(INTEGERS[tensor.element_size()])
@@ -71,16 +71,16 @@ def first_differing_fact(facts: dict[str, object]) -> str | None:
         None if all are equal.
     """
     everyones = gather_objects({name: str(value) for name, value in facts.items()})
-    for name in dict.fromkeys(name for facts in everyones for name in facts):
+    for name in dict.fromkeys(name for theirs in everyones for name in theirs):
         holders: dict[str, list[int]] = {}
-        for rank, facts in enumerate(everyones):
-            holders.setdefault(facts.get(name, "missing"), []).append(rank)
+        for rank, theirs in enumerate(everyones):
+            holders.setdefault(theirs.get(name, "missing"), []).append(rank)
         if len(holders) > 1:
             values = (f"{value} on {_ranks(ranks)}" for value, ranks in holders.items())
             return f"{name} is {', and '.join(values)}"
     return None
 
 
-def _ranks(ranks):
+def _ranks(ranks) -> str:
     *others, last = map(str, ranks)
     return f"ranks {', '.join(others)} and {last}" if others else f"rank {last}"

@@ -46,6 +46,13 @@ def rank_info() -> RankInfo | None:
     return RankInfo(*map(int, texts))
 
 
+def token() -> str:
+    """Returns the name of this job, by which its keys in a store begin: random where `ranks=`
+    started it, and otherwise torchrun's `--rdzv-id`.
+    """
+    return os.environ.get("TORCHELASTIC_RUN_ID", "")
+
+
 def rank() -> int:
     """Returns the rank of this process, 0 for a single process."""
     info = rank_info()

@@ -4,19 +4,21 @@ R ranks.
 """
 
 from collections.abc import Iterable, Sequence
+from typing import cast
 
 import torch
 from torch import distributed
 
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
+from megastep.agents.private_ops import copy_all_
 from megastep.agents.types import Moments
 
 
 def all_reduce(tensor: torch.Tensor) -> torch.Tensor:
     """Sums a tensor over the ranks, in place, and returns it."""
 
-    def call():
+    def call() -> None:
         with communicating():
             distributed.all_reduce(tensor)
 
@@ -68,13 +70,14 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     variance = (counts * (variances + (means - mean).square())).sum(0) / divisor
     mean, variance = _in_common_dtype(torch.stack([mean, variance]), own_means)
     pooled = zip(n, mean.split(sizes), variance.split(sizes), strict=True)
-    return [
+    moments_of_all = [
         tuple(new.view_as(old).to(old.dtype) for new, old in zip(each, before, strict=True))
         for each, before in zip(pooled, moments, strict=True)
     ]
+    return cast("list[Moments]", moments_of_all)
 
 
-def _in_common_dtype(x, others):
+def _in_common_dtype(x, others) -> torch.Tensor:
     """Returns x in the dtype of the others if they agree: one kernel instead of one for each."""
     dtypes = {other.dtype for other in others}
     return x.to(*dtypes) if len(dtypes) == 1 else x
@@ -114,8 +117,8 @@ def average_gradients(
     if n_ranks() == 1:
         return n_valid, means
     with torch.no_grad():
-        held = [p for p in parameters if p.grad is not None]
-        gradients = [p.grad.flatten() for p in held]
+        held = [(p, p.grad) for p in parameters if p.grad is not None]
+        gradients = [gradient.flatten() for _, gradient in held]
         numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
         # one buffer; each gradient starts at a multiple of 16 bytes, for Adam's vector loads
         sizes = [n + -n % 4 for n in map(len, gradients)]
@@ -123,10 +126,10 @@ def average_gradients(
         bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)
         *parts, pooled = bucket.split([*sizes, len(numbers)])
         parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
-        torch._foreach_copy_([*parts, *pooled.unbind()], [*gradients, *numbers])
+        copy_all_([*parts, *pooled.unbind()], [*gradients, *numbers])
         all_reduce(bucket.mul_(n_valid))
         n = pooled[-1].clone()
         bucket /= n.clamp(min=1)
-        for p, part in zip(held, parts, strict=True):
+        for (p, _), part in zip(held, parts, strict=True):
             p.grad = part.view_as(p)
     return n, list(pooled[:-1].unbind())

@@ -14,12 +14,17 @@ import functools
 import itertools
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.environment import hostname, rank_info
+from megastep.agents.distributed.environment import hostname, rank_info, token
+
+if TYPE_CHECKING:
+    from torch.distributed import Store, TCPStore  # pyright: ignore[reportPrivateImportUsage]
+
+T = TypeVar("T")
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
@@ -74,7 +79,8 @@ def start(seconds: float = START_SECONDS) -> None:
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # a new prefix: after a restart the store may still hold addresses of the ended ranks
-    keys = distributed.PrefixStore(f"ranks {info.attempt} {next(_STARTS)}", _store())
+    name = f"ranks {token()} {info.attempt} {next(_STARTS)}"
+    keys = _prefixed(name, _store())
     distributed.init_process_group(
         backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
     )
@@ -85,14 +91,15 @@ _STARTS = itertools.count()
 
 
 @functools.cache
-def _store() -> distributed.Store:
+def _store() -> Store:
     """Returns the ranks' key-value store, which torchrun's agent hosts, or else rank 0."""
     info, has_agent = rank_info(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    return _connection(is_master=info.rank == 0 and not has_agent)
+    is_master = info is not None and info.rank == 0 and not has_agent
+    return _connection(is_master)
 
 
-def _connection(is_master=False):
-    return distributed.TCPStore(
+def _connection(is_master=False) -> TCPStore:
+    return distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
         os.environ["MASTER_ADDR"],
         int(os.environ["MASTER_PORT"]),
         is_master=is_master,
@@ -101,13 +108,17 @@ def _connection(is_master=False):
     )
 
 
-def store(name: str) -> distributed.Store:
+def store(name: str) -> Store:
     """Opens another connection to the ranks' key-value store, for use by another thread.
 
     Args:
         name: prefix of its keys.
     """
-    return distributed.PrefixStore(f"megastep {name}", _connection())
+    return _prefixed(f"megastep {token()} {name}", _connection())
+
+
+def _prefixed(name: str, keys: Store) -> Store:
+    return distributed.PrefixStore(name, keys)  # pyright: ignore[reportPrivateImportUsage]
 
 
 def stop() -> None:
@@ -162,11 +173,11 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     return [other.tolist() for other in rows]
 
 
-def gather_objects(value: Any) -> list[Any]:
+def gather_objects(value: T) -> list[T]:
     """Returns a small picklable value of every rank, by rank. Waits for the other ranks."""
     if n_ranks() == 1:
         return [value]
-    values = [None] * n_ranks()
+    values: list = [None] * n_ranks()
     with communicating():
         distributed.all_gather_object(values, value)
     return values

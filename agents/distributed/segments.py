@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import torch
 
@@ -46,7 +45,7 @@ class SegmentedGraph:
 
     def __init__(
         self,
-        function: Callable[[], Any],
+        function: Callable,
         stream: torch.cuda.Stream,
         generators: Iterable[torch.Generator] = (),
     ):
@@ -70,14 +69,14 @@ class SegmentedGraph:
         finally:
             _recording = None
 
-    def _begin(self):
+    def _begin(self) -> None:
         self.graph = torch.cuda.CUDAGraph()
         for generator in self.generators:
             self.graph.register_generator_state(generator)
         # thread_local, since NCCL's threads may query events meanwhile
         self.graph.capture_begin(self.pool, capture_error_mode="thread_local")
 
-    def _end(self):
+    def _end(self) -> None:
         self.graph.capture_end()
         self.parts.append(self.graph.replay)
 

@@ -3,7 +3,7 @@
 import functools
 import itertools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
@@ -15,12 +15,17 @@ from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.slots import rotating_slots
-from megastep.types import optional
+from megastep.types import Env, PolicyLike, optional
+
+if TYPE_CHECKING:
+    import torch
+
+    from megastep.arrdict import arrdict
 
 
 class Player(NamedTuple):
     name: str
-    policy: Any
+    policy: PolicyLike
     step: int | None = None  # the number of samples it has learnt from
 
 
@@ -29,7 +34,7 @@ class Player(NamedTuple):
 FOR_TWO = {"n_agents": 2, "self_play": True, "resample": False}
 
 
-def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpoint) -> Player:
+def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpoint) -> Player:
     """Returns the player of a checkpoint, to meet the agent of `run` in `env`.
 
     Raises:
@@ -46,7 +51,7 @@ def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpo
 
 
 def find_player(
-    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Any, trust: bool
+    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env | None, env: Env, trust: bool
 ) -> Player:
     """Returns who is to meet the agent of `run` in `env`.
 
@@ -67,6 +72,7 @@ def find_player(
     if name == "bot":
         name = factory.config_of(run).opponents.bot_class or name
     if name in ("bot", *BOTS) or (":" in name and not Path(name).exists()):
+        assert env_settings is not None
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
 
@@ -83,9 +89,9 @@ class Arena:
         cfg,
         run: checkpoint.Checkpoint,
         env: settings.Env,
-        geometry: Any,
+        geometry: settings.Geometry,
         homes: list,
-        device: Any,
+        device: "torch.device",
     ):
         self.cfg, self.run, env = cfg, run, settings.changed(env, **FOR_TWO)
         where = dict(seed=cfg.seed, device=device)
@@ -112,7 +118,8 @@ class Arena:
         self.sources = factory.sources_of(homes)
         warn_without_layout(self.env, homes)
 
-    def play(self, player: Player, opponent: Player) -> Any:
+    def play(self, player: Player, opponent: Player) -> "arrdict":
+        """Returns the duels of two players, those of all ranks."""
         policies = player.policy, opponent.policy
         with factory.errors():
             limit = self.cfg.max_steps or duels.MAX_STEPS
@@ -175,7 +182,7 @@ class Arena:
         return folder / "ratings.csv"
 
 
-def warn_without_layout(env: Any, homes: list) -> None:
+def warn_without_layout(env: Env, homes: list) -> None:
     """Warns if environments share homes and it is unknown which."""
     if optional(env, "layout") is None and 1 < len(homes) < env.n_envs:
         console.warn(

@@ -4,7 +4,7 @@ Axes: N environments, A agents, B = N A lanes. A slot is the index of an agent i
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,6 +16,10 @@ from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.arrdict import arrdict
 from megastep.types import Env, PolicyLike, n_lanes, optional
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
+    from megastep.types import World
 
 #: A duel is a draw after this many steps.
 MAX_STEPS = 500
@@ -64,21 +68,23 @@ def play(
         - slots: (N,) int64, the agent that `policy` controlled
         - homes: (N,) int32, the layouts after the reset; only if `env.layout` exists
     """
-    device, shape = torch.device(env.device), (env.n_envs, env.n_agents)
+    device, n_agents = torch.device(env.device), optional(env, "n_agents")
+    shape = env.n_envs, n_agents
     draws = SeededGenerator(seed)
     slots = rotating_slots(*shape, device) if slots is None else slots
-    both = duel_policy(policy, opponent, slots, env.n_agents)
+    both = duel_policy(policy, opponent, slots, n_agents)
     world, state = env.reset(), both.initial(n_lanes(env), device)
-    homes = {} if optional(env, "layout") is None else {"homes": env.layout.clone()}
+    layout = optional(env, "layout")
+    homes = {} if layout is None else {"homes": layout.clone()}
     returns, lengths = torch.zeros(shape, device=device), torch.zeros(env.n_envs, device=device)
     score, is_over = torch.full_like(lengths, 0.5), torch.zeros_like(lengths, dtype=torch.bool)
 
-    def step(world, state):
+    def step(world, state) -> "tuple[World, arrdict]":
         decision, state = both(world, state, sample=not greedy, generator=draws.on(is_over.device))
         world = env.step(decision)
-        reward, terminal, truncated = (
-            world[key].view(shape) for key in ("reward", "terminal", "truncated")
-        )
+        names = "reward", "terminal", "truncated"
+        outcome: list[torch.Tensor] = [world[name].view(shape) for name in names]
+        reward, terminal, truncated = outcome
         returns.add_(reward)
         lengths.add_(~is_over)
         won, decided = score_pairs(terminal, returns, slots)
@@ -94,7 +100,7 @@ def play(
 
 def summaries(
     played: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
-) -> list[dict[str, Any]]:
+) -> "list[Row]":
     """Returns table rows for the result of `play`: one overall, then one per role and one per
     source of homes.
 
@@ -107,7 +113,8 @@ def summaries(
     """
     arrays = {key: values.cpu().numpy() for key, values in played.items()}
     rows, slots = [_summary(arrays)], arrays["slots"]
-    for role in dict.fromkeys(roles or ()):
+    roles = roles or ()
+    for role in dict.fromkeys(roles):
         has_role = np.array([name == role for name in roles])[slots]
         if has_role.any():
             rows.append({"role": role, **_summary(_of(arrays, has_role))})
@@ -116,7 +123,7 @@ def summaries(
     return rows
 
 
-def worst_summary(played: Mapping) -> dict[str, Any]:
+def worst_summary(played: Mapping) -> "Row":
     """Returns a table row of the worst homes, `statistics.worst_homes`, from a result of `play`."""
     arrays = {key: values.cpu().numpy() for key, values in played.items()}
     numbers, means = worst_homes({"won": arrays["score"]}, arrays["homes"])
@@ -125,11 +132,11 @@ def worst_summary(played: Mapping) -> dict[str, Any]:
     return row | {"won": won["mean"], "lower": won["lower"], "upper": won["upper"]}
 
 
-def _of(arrays, is_included):
+def _of(arrays, is_included) -> dict[str, np.ndarray]:
     return {key: values[is_included] for key, values in arrays.items()}
 
 
-def _summary(arrays):
+def _summary(arrays) -> "Row":
     score, homes = arrays["score"], arrays.get("homes")
     mean, lower, upper = interval(score, homes)
     return {

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
@@ -13,6 +13,9 @@ from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import optional
+
+if TYPE_CHECKING:
+    import torch
 
 
 def run(cfg: settings.Evaluate) -> Path:
@@ -44,7 +47,7 @@ def measure(
     env_settings: settings.Env,
     geometry: settings.Geometry,
     homes: list,
-    device: Any,
+    device: "torch.device",
 ) -> Path:
     """Does what `run` does, with what its settings name."""
     if cfg.ratings:
@@ -78,7 +81,7 @@ def play(
     loaded: checkpoint.Checkpoint,
     env_settings: settings.Env,
     homes: list,
-    device: Any,
+    device: "torch.device",
     source: str | None = None,
 ) -> list[dict]:
     """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the table rows."""
@@ -118,7 +121,7 @@ def duel(
     env: settings.Env,
     geometry: settings.Geometry,
     homes: list,
-    device: Any,
+    device: "torch.device",
 ) -> Path:
     """Plays the run's agent against each of `cfg.against`, of a suite in each source. Prints and
     writes a table, and returns the path of its .json.
@@ -136,7 +139,7 @@ def duel(
     return tables.write_table(
         cfg,
         run,
-        ["duels", labels.source, cfg.split, str(run.step), "against", *cfg.against],
+        ["duels", labels.source, cfg.split, str(run.step), "against", *(cfg.against or ())],
         f"{meeting.agent.name}, in {title}, seed {cfg.seed}",
         rows,
         [*map(tables.duel_cells, rows)],

@@ -44,7 +44,7 @@ def step_until(
         max_steps: maximum number of steps.
     """
 
-    def several(world, state, n_steps=STEPS_PER_GRAPH):
+    def several(world, state, n_steps=STEPS_PER_GRAPH) -> tuple[World, Tree]:
         for _ in range(n_steps):
             world, state = step(world, state)
         return world, state
@@ -76,7 +76,7 @@ def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
     )
 
 
-def _has_fixed_form(before, after):
+def _has_fixed_form(before, after) -> bool:
     """Returns whether both trees have tensors only, under the same names."""
     (_, spec), (leaves, other) = map(_pytree.tree_flatten, (before, after))
     return spec == other and all(isinstance(leaf, torch.Tensor) for leaf in leaves)
@@ -124,7 +124,7 @@ def first_episodes(
         {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}
     )
 
-    def step(world, state):
+    def step(world, state) -> tuple[World, Tree]:
         decision, state = policy(world, state, sample=not greedy, generator=draws.on(done.device))
         world = env.step(decision)
         returns.add_(torch.where(done, 0.0, world.reward))
@@ -136,8 +136,8 @@ def first_episodes(
         return world, state
 
     changed = draws, returns, lengths, metrics
-    max_steps = optional(env, "max_episode_steps") if max_steps is None else max_steps
-    step_until(done, step, world, state, env, (policy,), changed, max_steps)
+    most: int = optional(env, "max_episode_steps") if max_steps is None else max_steps
+    step_until(done, step, world, state, env, (policy,), changed, most)
     return arrdict(
         returns=returns,
         lengths=lengths,

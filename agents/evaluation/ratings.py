@@ -9,11 +9,14 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from megastep.agents.runs.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
 #: Number of orders that ratings are averaged over.
 N_ORDERS = 10
@@ -35,7 +38,7 @@ def rate(n_players: int, scores: Scores, seed: int = 1) -> list[tuple[float, flo
     return [(float(mean), float(sigma)) for mean, sigma in np.mean(ratings, 0)]
 
 
-def _rate_in_order(n_players, duels):
+def _rate_in_order(n_players, duels) -> list[tuple[float, float]]:
     from openskill.models import PlackettLuce
 
     model = PlackettLuce(tau=0.0)  # the strength of a player does not drift between duels
@@ -47,9 +50,7 @@ def _rate_in_order(n_players, duels):
     return [(player.mu, player.sigma) for player in players]
 
 
-def rows(
-    players: Sequence[tuple[str, int | None]], scores: Scores, seed: int = 1
-) -> list[dict[str, Any]]:
+def rows(players: Sequence[tuple[str, int | None]], scores: Scores, seed: int = 1) -> "list[Row]":
     """Returns a table row per player: rating, fraction of duels won (a draw is half), and duels.
 
     Args:
@@ -73,7 +74,7 @@ def rows(
     return table
 
 
-def write(folder: Path, table: Sequence[dict[str, Any]], title: str) -> None:
+def write(folder: Path, table: "Sequence[Row]", title: str) -> None:
     """Writes `ratings.csv` and `ratings.svg` into a folder, each atomically.
 
     The plot shows rating against samples with two standard deviations. Players without samples are
@@ -87,7 +88,7 @@ def write(folder: Path, table: Sequence[dict[str, Any]], title: str) -> None:
     write_atomically(folder / "ratings.svg", _plot(table, title))
 
 
-def _plot(table, title):
+def _plot(table, title) -> bytes:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -13,6 +14,7 @@ from megastep.agents.evaluation import arena, duels
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import folders
 from megastep.agents.selfplay.bots.random import RandomActions
+from megastep.types import PolicyLike, optional
 
 #: Where random actions are filmed unless geometry= says otherwise.
 HOMES = "megastep.geometries.sources:homes"
@@ -38,21 +40,25 @@ def run(cfg: settings.Record) -> Path:
     env_settings = settings.changed(env_settings, n_envs=1)
     env = factory.make_sample(env_settings, homes, seed=cfg.seed, device=device, films=True)
     random = RandomActions(env.action_space)
-    policy = arena.load_player(loaded, env, loaded).policy if cfg.run else random
+    policy: PolicyLike = random
     if cfg.run:
+        policy = arena.load_player(loaded, env, loaded).policy
         factory.load_wrappers(env, loaded)
     if cfg.against is not None:
         opponent = arena.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
         console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
-        policy = duels.duel_policy(policy, opponent.policy, seat, env.n_agents)
+        policy = duels.duel_policy(policy, opponent.policy, seat, optional(env, "n_agents"))
     with contextlib.ExitStack() as undo:
         path = Path(cfg.file) if cfg.file else take_free_name(folder / "video.mp4")
         if not cfg.file:
             undo.callback(path.unlink, missing_ok=True)
         # a video is the last thing that a run should fail for
         problem = f"The video {path} could not be made: "
-        with env_failures.told(env_settings, folder), user_errors(problem, (Exception,)):
+        with (
+            env_failures.told(cast("settings.Env", env_settings), folder),
+            user_errors(problem, (Exception,)),
+        ):
             recording.film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
         undo.pop_all()
     console.say(f"Filmed {cfg.steps} steps: {path}")
@@ -68,3 +74,4 @@ def take_free_name(path: Path) -> Path:
             with contextlib.suppress(FileExistsError):
                 name.touch(exist_ok=False)
                 return name
+    raise AssertionError("counting never ends")

@@ -2,10 +2,13 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
 
 def interval(
@@ -107,7 +110,7 @@ def worst_homes(
     return numbers[order[:n_worst]], result
 
 
-def _finite_mean(values):
+def _finite_mean(values) -> np.ndarray:
     """Returns the mean over the last axis of what is finite, nan if there is none."""
     is_finite = np.isfinite(values)
     counts = is_finite.sum(-1)
@@ -115,7 +118,7 @@ def _finite_mean(values):
     return np.where(counts > 0, means, np.nan)
 
 
-def _means_by_home(values, homes):
+def _means_by_home(values, homes) -> np.ndarray:
     """Returns the mean of each home's finite values, nan if there is none."""
     is_finite = np.isfinite(values)
     counts = np.bincount(homes[is_finite], minlength=homes.max() + 1)
@@ -123,7 +126,7 @@ def _means_by_home(values, homes):
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
-def worst_summary(episodes: Mapping) -> dict[str, Any]:
+def worst_summary(episodes: Mapping) -> "Row":
     """Returns a table row of the worst homes, `worst_homes`, from the result of `first_episodes`.
 
     A metric without a number in them is left out. Unfinished episodes are not counted.
@@ -150,7 +153,7 @@ def worst_summary(episodes: Mapping) -> dict[str, Any]:
 
 def summaries(
     episodes: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
-) -> list[dict[str, Any]]:
+) -> "list[Row]":
     """Returns table rows for the result of `first_episodes`: one overall, then one per role and one
     per source of homes.
 
@@ -183,7 +186,7 @@ def summaries(
     return rows
 
 
-def _summary(episodes, lanes):
+def _summary(episodes, lanes) -> "Row":
     """Returns a table row for some lanes, (B,) bool.
 
     Intervals are over homes, or over environments if there are no homes or only one.
@@ -208,7 +211,7 @@ def _summary(episodes, lanes):
     }
 
 
-def _metric(values, groups):
+def _metric(values, groups) -> dict[str, float | None]:
     """Returns the mean of finite values with its 95 % interval by name; None for each if there are
     none.
     """

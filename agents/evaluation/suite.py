@@ -8,10 +8,12 @@ DENSE = "dense"
 
 
 def is_suite(geometry: settings.Geometry) -> bool:
+    """Returns whether the homes are evaluated by source."""
     return geometry.name == components.SUITE
 
 
 def each_source(geometry: settings.Geometry) -> str:
+    """Returns what titles say of a suite."""
     return " in each source" if is_suite(geometry) else ""
 
 
@@ -26,6 +28,7 @@ def parts_of(geometry: settings.Geometry, homes: list) -> list[tuple[str | None,
 
 
 def of_source(source: str | None, rows: list[dict]) -> list[dict]:
+    """Returns rows of a table with their source, if it has a name."""
     return [{**row, "source": source} for row in rows] if source else rows
 
 

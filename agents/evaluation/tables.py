@@ -40,6 +40,7 @@ class Labels(NamedTuple):
 
 
 def labels(env: Env, geometry: Geometry, homes: list, split: str) -> Labels:
+    """Returns how tables name an environment and its homes."""
     if not homes:
         return Labels(env_name(env), env_name(env), "")
     path = Path(getattr(geometry, "path", None) or "")
@@ -103,6 +104,7 @@ RATINGS = {
 
 
 def cells(row: dict) -> dict[str, str]:
+    """Returns the cells of an agent's evaluation, by column."""
     cut, metrics = f", {row['unfinished']} cut short" if row["unfinished"] else "", {}
     for name, metric in row["metrics"].items():
         texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 2 * ["none"]
@@ -127,6 +129,7 @@ def part_of(row: dict) -> str:
 
 
 def duel_cells(row: dict) -> dict[str, str]:
+    """Returns the cells of an opponent's duels, by column."""
     against = f"{row['against']}{part_of(row).replace(': ', ', as ')}"
     row = row | {"against": against, "homes": row["homes"] or "none"}
     return {key: form.format_map(row) for key, form in DUELS.items()}

@@ -9,6 +9,7 @@ it.
 """
 
 import importlib
+from typing import Any
 
 _FUNCTIONS = (
     "check_memory",
@@ -35,7 +36,7 @@ _FUNCTIONS = (
 )
 
 
-def __getattr__(name):
+def __getattr__(name) -> Any:
     if name in _FUNCTIONS:
         return getattr(importlib.import_module(f"{__name__}.make"), name)
     raise AttributeError(f"module {__name__} has no attribute {name!r}")

@@ -5,7 +5,7 @@ import dataclasses
 import difflib
 import json
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -14,9 +14,10 @@ from megastep.agents.factory import components, settings
 from megastep.settings import sentence
 
 Tree = dict[str, Any]
+T = TypeVar("T")
 
 
-def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
+def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
     """Returns the settings of dataclass `kind` from nested dicts.
 
     Args:
@@ -41,19 +42,21 @@ def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
             if line["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
                 text = _unknown(path, [*fields, *names])
             else:
-                while ".".join(path) not in fields:  # inside a list, or an option of a union
+                # inside a list, or an option of a union
+                while len(path) > 1 and ".".join(path) not in fields:
                     path.pop()
-                text = sentence(line, fields[".".join(path)], line["input"])
-            errors.setdefault(".".join(path), text)
+                field = fields.get(".".join(path))
+                text = sentence(line, field, line["input"]) if field else line["msg"]
+            errors.setdefault(".".join(path) or "configuration", text)
         raise ConfigErrors(errors.items()) from None
 
 
-def as_tree(chosen: Any) -> Tree:
+def as_tree(chosen: object) -> Tree:
     """The inverse of `check`."""
     return TypeAdapter(type(chosen)).dump_python(chosen, mode="json")
 
 
-def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def fields_of(kind: type, tree: object, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yields (dotted key, pydantic's field) of every setting, and of every group of settings.
 
     `tree` names the members of groups: which keys `env.` has depends on `env.name`.
@@ -61,7 +64,7 @@ def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, An
     for name, field in kind.__pydantic_fields__.items():
         yield prefix + name, field
         value = tree.get(name) if isinstance(tree, dict) else None
-        members = {f"{prefix}{name}": value}
+        members: Tree = {f"{prefix}{name}": value}
         if name == "logger" and isinstance(value, dict):
             members = {f"{prefix}logger.{label}": one for label, one in value.items()}
             yield from ((key, field) for key in members)
@@ -70,7 +73,7 @@ def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, An
             if name in settings.IMPORTED:
                 with contextlib.suppress(KeyError, TypeError, ValueError):
                     below = settings.kind_of(name, str(member["name"]))
-            if dataclasses.is_dataclass(below):
+            if isinstance(below, type) and dataclasses.is_dataclass(below):
                 yield from fields_of(below, member, f"{key}.")
 
 

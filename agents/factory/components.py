@@ -139,11 +139,11 @@ def _files(group: str) -> dict[str, str]:
     return {member: tree["name"] for member, tree in trees.items() if "name" in tree}
 
 
-def _takes_geometries(env):
+def _takes_geometries(env) -> bool:
     return "geometries" in parameters_of(import_object(env))
 
 
-def _sources():
+def _sources() -> str:
     """A hash of whatever decides how arguments are read and stored."""
     folders = Path(megastep.__file__).parent, package.CONFIGS.parent
     files = {path for folder in folders for path in folder.rglob("*.py")}

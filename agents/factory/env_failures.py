@@ -49,12 +49,12 @@ def told(
         raise EnvFailed(". ".join(filter(None, [*text, saved()]))) from error
 
 
-def _failure(error, env):
+def _failure(error, env) -> EnvError | None:
     """Returns the error of an environment as an EnvError, None if another's code raised it."""
     if isinstance(error, EnvError):
         return error
     if isinstance(error, UserError):
-        return error.__cause__ and _failure_below(error.__cause__)
+        return _failure_below(error.__cause__)
     is_told = isinstance(error, engine.EngineError)
     if isinstance(error, (MemoryError, RuntimeError)):
         is_told |= memory_problem(error) is not None
@@ -65,21 +65,23 @@ def _failure(error, env):
     while frames and frames.tb_frame.f_code not in codes:
         frames = frames.tb_next
     trace = "".join(traceback.format_exception(type(error), error, frames))
-    return frames and EnvError(f"{env.name} failed: {one_line(error)}", trace)
+    if not frames:
+        return None
+    return EnvError(f"{env.name} failed: {one_line(error)}", trace)
 
 
-def _failure_below(error):
+def _failure_below(error) -> EnvError | None:
     """Returns an EnvError that others were raised from."""
     while error is not None and not isinstance(error, EnvError):
         error = error.__cause__
     return error
 
 
-def _code(kind, name):
+def _code(kind, name) -> object:
     return getattr(inspect.unwrap(getattr(kind, name, None) or kind), "__code__", None)
 
 
-def _write(folder, name, trace):
+def _write(folder, name, trace) -> object:
     """Writes a traceback into a folder, or a temporary one. Returns the path."""
     for place in (folder, Path(tempfile.gettempdir())):
         with contextlib.suppress(OSError):

@@ -4,13 +4,13 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
-from megastep import contract, engine, scene, spaces
+from megastep import contract, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
-from megastep.agents.errors import ConfigErrors, UserError, user_errors
+from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import check
 from megastep.agents.factory.settings import (
     Agent,
@@ -33,7 +33,12 @@ from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.capture import state_tree
 from megastep.imports import import_object
 from megastep.settings import parameters_of
-from megastep.types import n_lanes, optional
+from megastep.types import PolicyLike, n_lanes, optional
+
+if TYPE_CHECKING:
+    from megastep.agents import types as agent_types
+    from megastep.agents.factory.settings import Member
+    from megastep.agents.storage.collector import Collector
 
 #: Number of environments in which the memory of one is measured.
 PROBE = 65
@@ -58,7 +63,7 @@ KINDS = (
 errors = functools.partial(user_errors, kinds=KINDS)
 
 
-def construct(settings: Any, constructor: Callable | None = None, **arguments: Any) -> Any:
+def construct(settings: "Member", constructor: Callable | None = None, **arguments: Any) -> Any:
     """Calls a class or function with those of the settings and arguments that it takes.
 
     A setting that a class passes on to its base class as one of its `**kwargs` is left out if it
@@ -125,7 +130,7 @@ def spread(homes: list[dict], n_envs: int) -> list[dict]:
     return scene.spread(homes, n_envs) if homes else []
 
 
-def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
+def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> types.Env:
     """Returns a small environment of the same kind, which tells spaces and sizes.
 
     Raises:
@@ -140,7 +145,9 @@ def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
     return sample
 
 
-def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **arguments: Any) -> None:
+def check_memory(
+    env: Env, sample: types.Env, learner: object, geometries: list, **arguments: Any
+) -> None:
     """Raises UserError with the number that fits, if there are too many environments, or too many
     observations in a replay buffer, for the memory.
 
@@ -164,7 +171,7 @@ def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **argume
                 engine.fit(env.n_envs, n_bytes, sample.device)
 
 
-def check_network(agent: Agent, env: Any, n_rows: int, is_learning: bool) -> None:
+def check_network(agent: Agent, env: types.Env, n_rows: int, is_learning: bool) -> None:
     """Raises UserError with the size of the spaces if a network for them does not fit into memory.
 
     Args:
@@ -189,18 +196,23 @@ def check_network(agent: Agent, env: Any, n_rows: int, is_learning: bool) -> Non
         )
 
 
-def sizes_of(env: Any) -> tuple[int, int]:
+def sizes_of(env: types.Env) -> tuple[int, int]:
     """Returns the numbers that a network reads and gives: of integers, one for each value."""
 
-    def size(space):
+    def size(space) -> int:
         return math.prod(space.shape) * getattr(space, "n_actions", 1)
 
     sides = env.obs_space, env.action_space
-    return tuple(sum(map(size, spaces.leaves(side).values())) for side in sides)
+    n_inputs, n_outputs = (sum(map(size, spaces.leaves(side).values())) for side in sides)
+    return n_inputs, n_outputs
 
 
 def make_policy(
-    agent: Agent, env: Any, seed: int = 1, critic: str | None = None, n_rows: int | None = None
+    agent: Agent,
+    env: types.Env,
+    seed: int = 1,
+    critic: str | None = None,
+    n_rows: int | None = None,
 ) -> Policy:
     """Returns a policy on the environment's device; without a `critic` it can only act.
 
@@ -212,7 +224,8 @@ def make_policy(
     check_network(agent, env, n_rows or n_lanes(env), critic is not None)
     with errors():
         spaces = env.obs_space, env.action_space, optional(env, "privileged_space")
-        return Policy(*spaces, seed=seed, **vars(agent) | {"critic": critic}).to(env.device)
+        arguments: dict = vars(agent) | {"critic": critic}
+        return Policy(*spaces, seed=seed, **arguments).to(env.device)
 
 
 def share_threads(width: int) -> None:
@@ -224,7 +237,7 @@ def share_threads(width: int) -> None:
     torch.set_num_threads(max(1, min(n_threads, width // 128)))
 
 
-def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
+def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_types.Learner":
     learner = construct(settings, policy=policy, seed=seed, graph=True)
     with errors(f"{settings.name} is not a learner: "):
         check_learner(learner)
@@ -243,7 +256,7 @@ def make_curriculum(settings: Curriculum, geometries: list[dict]) -> Callable | 
         return None
     sources = sources_of(geometries)
 
-    def make(env, learner, rollout):
+    def make(env, learner, rollout) -> "Collector":
         return construct(settings, env=env, learner=learner, rollout=rollout, sources=sources)
 
     return make
@@ -268,7 +281,7 @@ def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
 
 
 def make_opponents(
-    cfg: Train, env: Any, sample: Any, policy: Policy, seed: int = 1
+    cfg: Train, env: types.Env, sample: types.Env, policy: Policy, seed: int = 1
 ) -> Opponents | None:
     """Returns the environment with opponents in it, None if there are to be none.
 
@@ -293,7 +306,7 @@ def make_opponents(
         return Opponents(env, policy, bot, seed=seed, **options)
 
 
-def make_bot(name: str | None, settings: Env, env: Any) -> Any:
+def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
     """Returns a policy that needs no weights.
 
     It is given the environment's settings that it takes, such as `fov`, and the environment if it
@@ -315,7 +328,7 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
         )
     name = name or f"{where}.bot"
 
-    def check_actions(space, leaf):
+    def check_actions(space, leaf) -> None:
         if len(leaf) != n_lanes(env) or not spaces.are_actions(space, leaf):
             raise ValueError(f"its actions are not those of {space!r}")
 
@@ -327,7 +340,7 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
     return bot
 
 
-def in_env(bot: Any, settings: Env, env: Any) -> Any:
+def in_env(bot: PolicyLike, settings: Env, env: types.Env) -> PolicyLike:
     """Returns the bot for another environment of the same settings: a new one if it takes `env`."""
     takes_env = "env" in inspect.signature(type(bot)).parameters
     return construct(settings, type(bot), env=env) if takes_env else bot
@@ -340,13 +353,13 @@ def config_of(loaded: checkpoint.Checkpoint) -> Train:
         return check.check(Train, loaded.config["train"] | {"logger": {}})
 
 
-def spaces_of(env: Any) -> dict[str, str]:
+def spaces_of(env: types.Env) -> dict[str, str]:
     """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
     tree = {"obs": env.obs_space, "actions": env.action_space}
     return {name: repr(space) for name, space in spaces.leaves(tree).items()}
 
 
-def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Policy:
+def load_weights(policy: Policy, env: types.Env, loaded: checkpoint.Checkpoint) -> Policy:
     """Returns a policy made for `env` with a checkpoint's weights, the critic's too if both have
     one. With the file of an agent, which only acts, the critic keeps the weights that it has.
 
@@ -362,7 +375,10 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Pol
             f"{loaded.path} was trained in another environment{names}: {'; '.join(changes)}. "
             "Choose the env it was trained in"
         )
-    weights, own = loaded.state["policy"], policy.state_dict()
+    assert loaded.state is not None
+    weights, own = cast(dict, loaded.state.get("policy")), policy.state_dict()
+    with errors(f"{loaded.path} cannot be used: "):
+        check_weights(weights, own)
     if policy.critic is None:
         weights = {k: v for k, v in weights.items() if not k.startswith(TRAINING_ONLY)}
     elif agent_file.is_agent_file(loaded.path):
@@ -373,7 +389,7 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Pol
     return policy
 
 
-def load_wrappers(env: Any, loaded: checkpoint.Checkpoint, is_frozen: bool = True) -> None:
+def load_wrappers(env: Env, loaded: checkpoint.Checkpoint, is_frozen: bool = True) -> None:
     """Gives the wrappers of an environment what those of a checkpoint's have learnt.
 
     Args:
@@ -382,7 +398,7 @@ def load_wrappers(env: Any, loaded: checkpoint.Checkpoint, is_frozen: bool = Tru
     Raises:
         UserError: the environment is not in the same wrappers.
     """
-    if state := loaded.state.get("wrappers"):
+    if state := (loaded.state or {}).get("wrappers"):
         load = optional(env, "load_wrapper_state")
         with errors(f"{loaded.path} cannot be used here: "):
             if load is None:
@@ -390,5 +406,21 @@ def load_wrappers(env: Any, loaded: checkpoint.Checkpoint, is_frozen: bool = Tru
             load(state, is_frozen)
 
 
-def _nbytes(env):
+def check_weights(weights: Any, own: Mapping[str, torch.Tensor]) -> None:
+    """Raises ValueError for what are no weights: other numbers than a policy's own are, which would
+    be converted without a word, and NaN and infinity.
+    """
+    if not isinstance(weights, Mapping) or not all(isinstance(name, str) for name in weights):
+        raise ValueError("its weights are no tensors by name")
+    for name, weight in weights.items():
+        if not isinstance(weight, torch.Tensor) or weight.layout != torch.strided:
+            raise ValueError(f"its {shortened(name, 60)} is no dense tensor")
+        dtype = own[name].dtype if name in own else weight.dtype
+        if weight.dtype != dtype and not (weight.is_floating_point() and dtype.is_floating_point):
+            raise ValueError(f"its {name} is {weight.dtype}, and the policy's is {dtype}")
+        if not weight.isfinite().all():
+            raise ValueError(f"its {shortened(name, 60)} has a NaN or an infinity")
+
+
+def _nbytes(env) -> int:
     return sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())

@@ -11,8 +11,8 @@ import json
 import operator
 import os
 import re
-from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
 
@@ -27,6 +27,13 @@ from megastep.settings import (
     settings_class,
     settings_of,
 )
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from megastep.agents.types import Config
+
+T = TypeVar("T")
 
 
 def _device(name: str) -> str:
@@ -95,10 +102,10 @@ def kind_of(group: str, name: str) -> type:
         raise ValueError(f"{name} cannot be used: {error}") from error
 
 
-def _group(group: str) -> Any:
+def _group(group: str) -> object:
     """Returns the type of a field that holds the settings of a group's member."""
 
-    def settings(value):
+    def settings(value) -> object:
         if dataclasses.is_dataclass(value):
             return value
         if not isinstance(value, dict):
@@ -110,19 +117,18 @@ def _group(group: str) -> Any:
     return Annotated[Any, BeforeValidator(settings)]
 
 
-def changed(settings: Any, **changes: Any) -> Any:
+def changed(settings: T, **changes: object) -> T:
     """Returns a copy of settings with those of the changes that it has."""
-    return dataclasses.replace(
-        settings, **{k: v for k, v in changes.items() if hasattr(settings, k)}
-    )
+    known = {k: v for k, v in changes.items() if hasattr(settings, k)}
+    return dataclasses.replace(cast(Any, settings), **known)
 
 
-def takes_geometries(env: Any) -> bool:
+def takes_geometries(env: "Env") -> bool:
     """Returns True if the class of an environment's settings takes floor plans."""
     return components.takes_geometries(env.name)
 
 
-def ignored_geometry(env: Any, typed: list[str]) -> list[tuple[str, str]]:
+def ignored_geometry(env: "Env | None", typed: list[str]) -> list[tuple[str, str]]:
     """Returns [(key, sentence)] of the first typed key that chooses a geometry, if the environment
     takes none. `env` may be None, that of a run.
     """
@@ -137,14 +143,14 @@ def label(name: str) -> str:
     return name.rpartition(":")[2].rpartition(".")[2].lower()
 
 
-def env_name(env: Any) -> str:
+def env_name(env: "Env") -> str:
     """What an environment is called in titles, from its settings: `explorer`, or the id that one of
     other packages has, `CartPole-v1`.
     """
     return getattr(env, "id", None) or label(env.name)
 
 
-def run_name(cfg: Any) -> str:
+def run_name(cfg: "Train") -> str:
     """What the folder of a run is called after the time, from its settings."""
     geometry = [label(cfg.geometry.name)] if takes_geometries(cfg.env) else []
     return "-".join([env_name(cfg.env), *geometry, str(cfg.seed)])
@@ -155,7 +161,7 @@ def loggers() -> dict[str, str]:
     return components.members("logger")
 
 
-def _chosen_loggers(tree):
+def _chosen_loggers(tree) -> dict:
     """Returns nested dicts of loggers by label. Raises for keys of loggers that were not chosen."""
     if not isinstance(tree, dict):
         raise ValueError(f"is a group of keys, got {tree!r}")
@@ -175,24 +181,42 @@ def _chosen_loggers(tree):
     return tree
 
 
-def _own_settings(logger):
+def _own_settings(logger) -> set[str]:
     return kind_of("logger", logger).__pydantic_fields__.keys() - {"name"}
 
 
-Env, Geometry, Learner, Curriculum, Logger = map(_group, IMPORTED)
+if TYPE_CHECKING:
+
+    class Member:
+        """The settings of a group's member: its import path, and what its constructor takes."""
+
+        name: str
+
+        def __getattr__(self, key: str) -> Any: ...
+
+    Env = Geometry = Learner = Curriculum = Logger = Member
+
+    class Agent(Member): ...
+
+    class Opposition(Member): ...
+
+else:
+    Env, Geometry, Learner, Curriculum, Logger = map(_group, IMPORTED)
+    Agent = kind_of("agent", components.POLICY)
+    Opposition = kind_of("opponents", components.OPPONENTS)
 #: {label: settings}, such as {"wandb": ...}
 Loggers = Annotated[dict[str, Logger], BeforeValidator(_chosen_loggers)]
-Agent = kind_of("agent", components.POLICY)
-Opposition = kind_of("opponents", components.OPPONENTS)
 
 
-def missing_sources(tree: dict[str, Any]) -> list[tuple[str, str]]:
+def missing_sources(tree: "Config") -> list[tuple[str, str]]:
     """Returns [(key, sentence)] of files and parts of a mix that are named in nested dicts and do
     not exist.
     """
     match tree.get("geometry"):
         case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
             return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
+        case {"name": components.SUITE, "plans": str(path)} if not os.path.isfile(path):
+            return [("geometry.plans", f"there is no file {path!r}; give an .npz of floor plans")]
         case {"name": components.MIXED | components.SUITE, "parts": dict(parts)}:
             try:
                 import_object(components.CHECK_PARTS)(parts)
@@ -201,7 +225,7 @@ def missing_sources(tree: dict[str, Any]) -> list[tuple[str, str]]:
     return []
 
 
-def too_large(group: Any, tree: Any) -> Iterator[tuple[str, str]]:
+def too_large(group: Any, tree: object) -> Iterator[tuple[str, str]]:
     """Yields (key, sentence) of settings of a group that exceed another setting, see `AtMost`."""
     for name, field in group.__pydantic_fields__.items():
         for limit in (extra for extra in field.metadata if isinstance(extra, AtMost)):
@@ -221,13 +245,13 @@ class Common:
     device: Annotated[str, AfterValidator(_device)]
     trust: bool = False  # import what checkpoints that others made name
 
-    def errors(self) -> dict[str, Any]:
+    def errors(self) -> Mapping[str, object]:
         # {dotted key: sentence} of settings that contradict each other, false for those that do not
         return {}
 
     @model_validator(mode="after")
-    def _agree(self):
-        if errors := [(key, text) for key, text in self.errors().items() if text]:
+    def _agree(self) -> "Self":
+        if errors := [(key, str(text)) for key, text in self.errors().items() if text]:
             raise located(errors)
         return self
 
@@ -248,7 +272,7 @@ class Train(Common):
     geometry: Geometry
     agent: Agent = Agent()
     learner: Learner
-    curriculum: Curriculum = NoCurriculum(name="none")
+    curriculum: Curriculum = cast("Curriculum", NoCurriculum(name="none"))
     opponents: Opposition = Opposition()
     logger: Loggers = dataclasses.field(default_factory=dict)
     finish: Finish
@@ -271,7 +295,7 @@ class Train(Common):
     rerun: str | None = None
     init: str | None
 
-    def errors(self):
+    def errors(self) -> dict[str, object]:
         over = self.learner.anneal
         lag, env = getattr(self.learner, "lag", 0), self.env
         has_curriculum = self.curriculum.name != "none"
@@ -317,7 +341,7 @@ class Played(Common):
     greedy: bool
 
 
-def _given(run):
+def _given(run: T | None) -> T:
     if run is None:
         raise ValueError("is missing; run=latest takes the newest run, run=FOLDER another one")
     return run
@@ -341,7 +365,7 @@ class Record(Played):
     against: str | None = None
     file: str | None
 
-    def errors(self):
+    def errors(self) -> dict[str, object]:
         has_run, has_env = self.run is not None, self.env is not None
         return {
             "run": not (has_run or has_env)

@@ -2,20 +2,22 @@
 another.
 """
 
+import contextlib
 import functools
 import math
 import random
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from megastep.agents import console, factory, package
+from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.distributed import process_group
-from megastep.agents.errors import UserError
+from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, settings
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.runs import (
@@ -23,6 +25,7 @@ from megastep.agents.runs import (
     annealing,
     checkpoint,
     folders,
+    formats,
     provenance,
     repeat,
     saver,
@@ -33,6 +36,9 @@ from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row, RunLogger
 
 
 def make_trainer(
@@ -70,12 +76,18 @@ def make_trainer(
     cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)
     factory.check_memory(cfg.env, sample, learner, **where)
     env = factory.construct(cfg.env, **where)
-    if cfg.resume or cfg.init:
-        path = folders.find(cfg.resume or cfg.init)
+    if start := cfg.resume or cfg.init:
+        path = folders.find(start)
         loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
         if cfg.init:
             factory.load_wrappers(env, loaded, is_frozen=False)
+        if cfg.resume:
+            state = loaded.state or {}
+            with state_errors(loaded.path):
+                formats.check(formats.Counts, {k: state.get(k) for k in formats.COUNTS})
+                if name := nonfinite_leaf(state["learner"]):
+                    raise ValueError(f"learner.{name} has a NaN or an infinity")
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
@@ -83,10 +95,12 @@ def make_trainer(
         checkpoint.set_aside_after(folder / name, loaded.step)
     config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
     made_with = provenance.made_with(device, package.version(), n_ranks)
-    checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
+    checkpoints = folder / "checkpoints"
+    had: dict = (loaded.state or {}) if cfg.resume else Counter()
     with factory.errors():
         limits = budget_of(cfg, folder, loaded if cfg.resume else None)
-        logger, writers = loggers.NoLogger(), {}
+        logger: RunLogger = loggers.NoLogger()
+        writers: dict = {}
         rank_files = RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
             step = had["samples_at_report"]
@@ -121,12 +135,26 @@ def make_trainer(
             **writers,
         )
         if cfg.resume:
-            trainer.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
+            with state_errors(loaded.path):
+                trainer.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
             trainer.lost += differing(loaded.made_with, made_with)
     return trainer
 
 
-def differing(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+@contextlib.contextmanager
+def state_errors(path: Path) -> Iterator[None]:
+    """Turns what the state of a checkpoint raises where it is restored into a UserError."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, RuntimeError) and memory_problem(error):
+            raise
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        problem = f"{kind}{shortened(error, 300)}"
+        raise UserError(f"The state in {path} is not this run's: {problem}") from error
+
+
+def differing(before: "Row", now: "Row") -> list[str]:
     """Returns a clause for each of the things that a run's bits depend on that has changed."""
     before, now = {"ranks": 1, **before}, {"ranks": 1, **now}
     return [
@@ -168,6 +196,7 @@ def budget_of(
         recorded = annealing.read(folder)
         # a clock of another budget would have chosen others
         if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
+            assert loaded.state is not None
             recorded = recorded[: loaded.state["updates"]]
     return budget.Budget(*limits, recorded, is_rerun=cfg.rerun is not None)
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from megastep.agents.errors import UserError, memory_problem
 from megastep.agents.launch import signals
@@ -53,7 +53,7 @@ def ending_of(work: Callable[[], int | None]) -> Ending:
         with signals.interrupting():
             return Ending(work() or 0)
     except SystemExit as end:  # from argparse, Hydra's help, or a rank that exits silently
-        return Ending(end.code or 0)
+        return Ending(cast(int, end.code or 0))
     except UserError as error:
         return Ending(error.code, str(error))
     except (MemoryError, RuntimeError) as error:

@@ -17,6 +17,7 @@ def driver() -> ctypes.CDLL | None:
         library = ctypes.CDLL("libcuda.so.1")
         if library.cuInit(0) == 0:
             return library
+    return None
 
 
 def start_driver() -> None:
@@ -30,12 +31,14 @@ def is_available() -> bool:
     if "torch" in sys.modules:
         return sys.modules["torch"].cuda.is_available()
     package = importlib.util.find_spec("torch")
+    assert package is not None and package.origin is not None
     built_for = runpy.run_path(str(Path(package.origin).with_name("version.py")))["cuda"]
-    if not built_for or driver() is None:
+    library = driver()
+    if not built_for or library is None:
         return False
     version, n_gpus = ctypes.c_int(), ctypes.c_int()
-    driver().cuDriverGetVersion(ctypes.byref(version))
-    driver().cuDeviceGetCount(ctypes.byref(n_gpus))
+    library.cuDriverGetVersion(ctypes.byref(version))
+    library.cuDeviceGetCount(ctypes.byref(n_gpus))
     return n_gpus.value > 0 and version.value // 1000 >= int(built_for.split(".")[0])
 
 
@@ -45,8 +48,9 @@ def count() -> int:
         return 0
     if "torch" in sys.modules:
         return sys.modules["torch"].cuda.device_count()
-    n_gpus = ctypes.c_int()
-    driver().cuDeviceGetCount(ctypes.byref(n_gpus))
+    n_gpus, library = ctypes.c_int(), driver()
+    assert library is not None
+    library.cuDeviceGetCount(ctypes.byref(n_gpus))
     return n_gpus.value
 
 
@@ -62,7 +66,8 @@ def wake(device: str) -> None:
         threading.Thread(target=_create_context, args=(index,)).start()
 
 
-def _create_context(index):
+def _create_context(index) -> None:
     device, context = ctypes.c_int(), ctypes.c_void_p()
-    if driver() and driver().cuDeviceGet(ctypes.byref(device), index) == 0:
-        driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+    library = driver()
+    if library and library.cuDeviceGet(ctypes.byref(device), index) == 0:
+        library.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)

@@ -11,18 +11,23 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
 from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu, launcher
 
+if TYPE_CHECKING:
+    from contextlib import ExitStack
+
+T = TypeVar("T", bound=settings.Common)
+
 #: Environment variable with the GPUs that a process may use.
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
-def check(jobs: Sequence[Any], hydra: Any) -> str | None:
+def check(jobs: Sequence, hydra: Any) -> str | None:
     """Checks that every job has a GPU per rank, before the first job starts.
 
     Args:
@@ -54,7 +59,7 @@ def check(jobs: Sequence[Any], hydra: Any) -> str | None:
     return next(filter(None, hints), None)
 
 
-def _check_on_node(cfg, n_gpus):
+def _check_on_node(cfg, n_gpus) -> str | None:
     # Slurm assigns the GPUs, so those of this machine do not matter
     if not n_gpus or cfg.ranks == "all" or cfg.device == "cpu":
         return None
@@ -86,7 +91,7 @@ def idle(n_ranks: int, n_gpus: int, is_parallel: bool) -> str | None:
 
 
 @contextlib.contextmanager
-def taken(cfg: Any) -> Iterator[Any]:
+def taken(cfg: T) -> Iterator[T]:
     """Takes the slot with the fewest jobs for the duration of the context.
 
     Ranks are separate processes and see only the GPUs of their slot. For a job in this process, the
@@ -113,11 +118,11 @@ def taken(cfg: Any) -> Iterator[Any]:
         yield cfg
 
 
-def _has_ranks(cfg):
+def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
 
 
-def _names(n_gpus):
+def _names(n_gpus) -> list[str]:
     # as in the variable, where GPUs may have other numbers or be UUIDs
     if visible := os.environ.get(VISIBLE):
         return [name.strip() for name in visible.split(",")][:n_gpus]
@@ -141,7 +146,7 @@ def _locked(names: list[str], size: int) -> Iterator[range]:
             return
 
 
-def _lock(names):
+def _lock(names) -> "ExitStack | None":
     # returns all locks, or None if one is taken
     import filelock  # slow to import
 
@@ -153,7 +158,7 @@ def _lock(names):
         return stack.pop_all()
 
 
-def _on_gpu(cfg: Any, number: int, stack: contextlib.ExitStack) -> Any:
+def _on_gpu(cfg: T, number: int, stack: contextlib.ExitStack) -> T:
     """Makes a GPU the current device until the stack closes. Returns settings that use it."""
     import torch
 

@@ -59,13 +59,12 @@ def n_ranks(cfg: settings.Train) -> int:
             text = f"'all' uses every GPU, but {where}; give a number, such as ranks=2"
             raise ConfigErrors([("ranks", text)])
         return n_gpus
-    if n_gpus and cfg.ranks > n_gpus and info is None:
+    wanted = int(cfg.ranks)
+    if n_gpus and wanted > n_gpus and info is None:
         n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
-        text = (
-            f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all uses each GPU once"
-        )
+        text = f"{wanted} is more than the {n_here} of this machine; ranks=all uses each GPU once"
         raise ConfigErrors([("ranks", text)])
-    return cfg.ranks
+    return wanted
 
 
 def is_needed(cfg: settings.Train) -> bool:
@@ -82,7 +81,7 @@ def run(cfg: settings.Train) -> Path:
     cfg = settings.changed(cfg, ranks=n_ranks(cfg))
     with contextlib.ExitStack() as stack:
         job = Job(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="megastep-"))), cfg)
-        stack.enter_context(environment.variables(variables(job.folder, cfg.ranks)))
+        stack.enter_context(environment.variables(variables(job.folder, int(cfg.ranks))))
         agent = threading.Thread(target=job.run_agent, daemon=True)
         with signals.handled(job.stop, job.quit) as numbers:
             agent.start()
@@ -95,6 +94,7 @@ def run(cfg: settings.Train) -> Path:
         name = signal.Signals(numbers[0]).name
         raise signals.Interrupted(numbers[0], ending.text if by_signal else f"stopped by {name}")
     ending.raise_error()
+    assert ending.folder is not None
     return Path(ending.folder)
 
 
@@ -127,7 +127,7 @@ class Job:
     def run_agent(self) -> None:
         """Runs torchrun's agent until all ranks have ended."""
         try:
-            launch_ranks(self.cfg.ranks, self.cfg.restarts)
+            launch_ranks(int(self.cfg.ranks), self.cfg.restarts)
         except BaseException as error:
             self.error = error
 
@@ -213,6 +213,9 @@ def launch_ranks(n_ranks: int, n_restarts: int) -> None:
     from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
+    from megastep.agents.launch import loopback
+
+    loopback.register()
     # its messages repeat the ranks' errors, which are reported in one sentence
     logger = logging.getLogger("torch.distributed")
     logger.handlers, logger.propagate = [logging.NullHandler()], False
@@ -221,9 +224,8 @@ def launch_ranks(n_ranks: int, n_restarts: int) -> None:
         max_nodes=1,
         nproc_per_node=n_ranks,
         run_id=uuid.uuid4().hex,
-        rdzv_backend="c10d",
-        rdzv_endpoint="localhost:0",
-        local_addr="localhost",
+        rdzv_backend=loopback.BACKEND,
+        local_addr=loopback.ADDRESS,
         max_restarts=n_restarts,
         monitor_interval=0.1,
         logs_specs=DefaultLogsSpecs(log_dir=os.devnull),

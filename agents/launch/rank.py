@@ -12,7 +12,7 @@ from typing import NoReturn, TypeVar
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.launch import endings, launcher, signals
+from megastep.agents.launch import endings, launcher, signals, started
 
 #: Seconds that a rank waits for rank 0 to end after an error, and after a signal (it saves).
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
@@ -40,6 +40,7 @@ def report_ending(ending: endings.Ending) -> None:
     """Reports the ranks' ending to the process that launched them, or on stderr under torchrun."""
     info = environment.rank_info()
     if launcher.JOB in os.environ:
+        assert info is not None
         if info.rank > 0 and ending.code != launcher.LOST:
             name = f"rank {info.rank} on {environment.hostname()}: "
             ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
@@ -58,7 +59,7 @@ class Team:
         watch: detects lost ranks.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         from megastep.agents.distributed import process_group
         from megastep.agents.launch import watch
 
@@ -71,14 +72,21 @@ class Team:
         """Publishes the run folder to the launcher and to restarted ranks."""
         self.folder = folder
         if environment.rank() == 0:
-            self.store.set("run", str(folder))
             if launcher.JOB in os.environ:
                 Path(os.environ[launcher.JOB], launcher.RUN).write_text(str(folder))
+            else:
+                started.leave_proof(self.store, folder)
 
     def earlier_folder(self) -> Path | None:
         """Returns the run folder of the previous attempt if torchrun restarted the ranks."""
-        is_again = environment.rank_info().attempt > 0 and self.store.check(["run"])
-        return Path(self.store.get("run").decode()) if is_again else None
+        info = environment.rank_info()
+        assert info is not None
+        if info.attempt == 0:
+            return None
+        if launcher.JOB in os.environ:  # a folder that is this user's alone
+            path = Path(os.environ[launcher.JOB], launcher.RUN)
+            return Path(path.read_text()) if path.exists() else None
+        return started.proven_folder(self.store)
 
     def end(self, problem: str | None) -> NoReturn:
         """Exits at once, because a rank was lost.
@@ -99,6 +107,11 @@ class Team:
             seconds: how long to wait for rank 0 to leave, too.
         """
         self.watch.leave(seconds)
+
+    def finish(self) -> None:
+        """Forgets the run, which is done."""
+        if environment.rank() == 0 and self.folder is not None:
+            started.remove_proof(self.folder)
 
 
 @contextlib.contextmanager
@@ -145,12 +158,13 @@ def joined() -> Iterator[Team | None]:
         raise SystemExit(code) from None
     finally:
         _team = None
+    team.finish()
     team.leave()
     if has_joined:
         process_group.stop()
 
 
-def _cause(error, kind):
+def _cause(error, kind) -> BaseException | None:
     """Returns the error of a kind in the chain of an error's contexts; None if there is none."""
     while error is not None and not isinstance(error, kind):
         error = error.__context__

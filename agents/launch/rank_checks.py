@@ -12,7 +12,6 @@ import shutil
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -56,14 +55,14 @@ def check_world(cfg: settings.Train, trainer: Trainer) -> None:
             raise UserError(f"The ranks start with different weights: {difference}")
 
 
-def _check_equal(facts):
+def _check_equal(facts) -> None:
     if difference := first_differing_fact(facts):
         raise UserError(
             f"The ranks differ: {difference}; start all with the same code, packages and options"
         )
 
 
-def digest(homes: Iterable[dict[str, Any]]) -> str:
+def digest(homes: Iterable[dict]) -> str:
     """Returns a hash of geometries, 16 hexadecimal digits."""
     total = hashlib.sha256()
     for home in homes:
@@ -88,7 +87,7 @@ def check_shared(folder: Path) -> str:
         return name
     token = f".ranks-{name}"
 
-    def wait_for_token():
+    def wait_for_token() -> None:
         deadline = time.monotonic() + SHARED_SECONDS
         while not (folder.is_dir() and token in os.listdir(folder)):
             if time.monotonic() > deadline:
@@ -117,7 +116,7 @@ def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:
     if folder is None:
         return cfg
 
-    def totals():
+    def totals() -> dict[str, float] | None:
         if not any((folder / "checkpoints").glob("*")):
             if not cfg.resume:
                 shutil.rmtree(folder, ignore_errors=True)

@@ -23,6 +23,7 @@ def main() -> int:
         The exit code: 0 if this rank's ending is final, otherwise torchrun may restart the ranks.
     """
     info, job = environment.rank_info(), Path(os.environ[launcher.JOB])
+    assert info is not None
     for number in signals.SIGNALS:  # nothing to save yet
         signal.signal(number, lambda number, frame: os._exit(128 + number))
     (job / f"pid-{info.attempt}-{info.rank}").write_text(str(os.getpid()))
@@ -40,7 +41,7 @@ def main() -> int:
 
     folder = None
 
-    def work():
+    def work() -> None:
         nonlocal folder
         folder = train.run(check.check(settings.Train, facts["settings"]))
 

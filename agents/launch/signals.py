@@ -1,5 +1,6 @@
-"""Ctrl-C, SIGTERM and SIGHUP. The first signal stops a script gracefully, the second at once. The
-exit code is 128 plus the signal's number.
+"""Ctrl-C, SIGTERM and SIGHUP, and SIGUSR1 and SIGUSR2, with which clusters announce a job's end.
+The first signal stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit code is 128
+plus the signal's number.
 """
 
 import contextlib
@@ -14,7 +15,11 @@ from typing import NoReturn, TextIO
 from megastep.agents import package
 from megastep.agents.distributed import environment
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Signals that end a script at once when they are repeated.
+QUITTING = (signal.SIGINT, signal.SIGTERM)
+#: Signals of clusters, which SIGTERM often follows.
+ANNOUNCING = (signal.SIGUSR1, signal.SIGUSR2)
+SIGNALS = (*QUITTING, *ANNOUNCING, signal.SIGHUP)
 #: Seconds within which a second signal counts as the first one: `timeout` and a closing terminal
 #: send two.
 SAME = 0.3
@@ -42,7 +47,7 @@ def exit_on_signals(script: str) -> None:
     interpreter shutdown, when there is nothing to save.
     """
 
-    def exit_at_once(number, frame):
+    def exit_at_once(number, frame) -> NoReturn:
         if environment.rank() == 0:
             name = signal.Signals(number).name
             _write(sys.__stderr__, f"{package.command(script)}: stopped by {name}")
@@ -58,8 +63,8 @@ def handled(
 ) -> Iterator[list[int]]:
     """Handles signals for the duration of the context.
 
-    A second Ctrl-C or SIGTERM ends the process at once. That is safe: checkpoints are written to a
-    temporary folder and renamed.
+    A second Ctrl-C or SIGTERM ends the process at once; one that follows SIGUSR1 or SIGUSR2 is the
+    first. That is safe: checkpoints are written to a temporary folder and renamed.
 
     Args:
         on_first: called with the number of the first signal.
@@ -68,15 +73,17 @@ def handled(
     Yields:
         A list, empty until the first signal's number is appended.
     """
-    numbers, ends_after = [], time.monotonic()
+    numbers, ends_after = [], None
 
-    def handle(number, frame):
+    def handle(number, frame) -> None:
         nonlocal ends_after
+        is_repeated = ends_after is not None and time.monotonic() > ends_after
+        if ends_after is None and number not in ANNOUNCING:
+            ends_after = time.monotonic() + SAME
         if not numbers:
             numbers.append(number)
-            ends_after = time.monotonic() + SAME
             on_first(number)
-        elif number != signal.SIGHUP and time.monotonic() > ends_after:
+        elif number in QUITTING and is_repeated:
             on_second(number)
             os._exit(128 + number)
 
@@ -127,15 +134,16 @@ def stop(process: int) -> None:
         os.kill(process, signal.SIGTERM if is_ignored else signal.SIGHUP)
 
 
-def _install(handler: Callable) -> dict[int, object]:
+def _install(handler: Callable) -> dict[int, Callable | int | None]:
     # returns the previous handlers; does nothing outside the main thread; respects nohup
     if threading.current_thread() is not threading.main_thread():
         return {}
     is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    return {n: signal.signal(n, handler) for n in SIGNALS[: 2 if is_ignored else 3]}
+    return {n: signal.signal(n, handler) for n in SIGNALS[: -1 if is_ignored else None]}
 
 
 def _write(stream: TextIO | None, line: str) -> None:
     # unbuffered: the signal may have interrupted a write to the stream
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        os.write(stream.fileno(), f"{line}\n".encode())
+        if stream is not None:
+            os.write(stream.fileno(), f"{line}\n".encode())

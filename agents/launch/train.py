@@ -3,9 +3,10 @@
 import contextlib
 import functools
 import itertools
+import os
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import yaml
 
@@ -26,19 +27,22 @@ from megastep.agents.errors import (
 from megastep.agents.evaluation import evaluate, record
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
-from megastep.agents.launch import dry_run, launcher, rank, rank_checks, signals
+from megastep.agents.launch import again, dry_run, launcher, rank, rank_checks, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
 from megastep.agents.training.trainer import Trainer
 
+if TYPE_CHECKING:
+    from megastep.agents.types import Config
+
 
 def with_more(cfg: settings.Train) -> settings.Train:
     """Returns `cfg` with more_samples and more_seconds turned into totals of the resumed run."""
     totals = {}
     for name in ("samples", "seconds"):
-        if (more := getattr(cfg, f"more_{name}")) is not None:
+        if (more := getattr(cfg, f"more_{name}")) is not None and cfg.resume:
             had = folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).numbers[name]
             totals |= {name: had + more, f"more_{name}": None}
     return settings.changed(cfg, **totals)
@@ -46,12 +50,13 @@ def with_more(cfg: settings.Train) -> settings.Train:
 
 def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
     """Returns the run folder, locked, and the path to resume from (None for a new run)."""
-    folder = (
-        folders.folder_of(folders.find(cfg.resume))
-        if cfg.resume
-        else folders.new(settings.run_name(cfg), cfg.folder)
-    )
+    if is_new := cfg.resume in (None, again.AUTO):
+        folder = folders.new(settings.run_name(cfg), cfg.folder, cfg.resume == again.AUTO)
+    else:
+        folder = folders.folder_of(folders.find(cfg.resume))
     locks.enter_context(folders.locked(folder))
+    if is_new:
+        return folder, None
     if cfg.resume and process_group.n_ranks() > 1:  # all ranks from the same intact checkpoint
         return folder, str(folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).path)
     return folder, cfg.resume
@@ -81,16 +86,23 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
     progress = console.Progress()
 
-    def show(trainer):
+    def show(trainer) -> None:
         progress.show(*progress_of(trainer))
 
+    if cfg.resume == again.AUTO:
+        start = together(lambda: again.automatic(cfg))
+        if start.is_done:
+            console.say(f"The run in {start.folder} has had its budget.")
+            return start.folder
+        cfg = start.cfg
+    is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(str(cfg.folder)))
     rank_checks.check_start(cfg)
     cfg = rank_checks.started_again(cfg, team)
     with contextlib.ExitStack() as locks:
         with contextlib.ExitStack() as undo:
             with signals.deferred():
                 folder, resume = from_rank_0(lambda: open_folder(cfg, locks))
-                if is_first and not cfg.resume:
+                if is_first and is_new:
                     undo.callback(shutil.rmtree, folder, ignore_errors=True)
             token = rank_checks.check_shared(folder)
             if team:
@@ -156,7 +168,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             raise UserError(unsaved)
         nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
         del trainer, saved  # frees GPU memory for the evaluation
-        common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
+        common: dict = dict(
+            run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device
+        )
         common["trust"] = True  # its modules have just been imported
         if cfg.finish.evaluate:
             with process_group.unhurried():
@@ -180,7 +194,7 @@ def saved_by(trainer: Trainer, resume: str) -> str:
     return f"{text}. {resume}"
 
 
-def write_config(folder: Path, config: dict[str, Any]) -> None:
+def write_config(folder: Path, config: "Config") -> None:
     """Writes a run's configuration into its folder."""
     with user_errors(folders.CANNOT.format(folder)):
         text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")

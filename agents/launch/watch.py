@@ -19,6 +19,8 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+from pydantic import TypeAdapter
+
 from megastep.agents.distributed import environment, process_group
 
 #: Seconds between heartbeats.
@@ -57,13 +59,16 @@ class Heartbeat(NamedTuple):
     host: str
 
 
+HEARTBEAT = TypeAdapter(Heartbeat)
+
+
 class LossDetector:
     """Decides from the heartbeats of two ranks whether the other one is lost.
 
     Time is counted in polls, so that a machine may sleep for an hour without losing a rank.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.last = None
         self.n_silent = self.n_ahead = self.longest = 0
 
@@ -118,8 +123,9 @@ class Watch:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        attempt = environment.rank_info().attempt
-        self.store = process_group.store(f"watch {attempt} {next(NUMBERS)}")
+        info = environment.rank_info()
+        assert info is not None
+        self.store = process_group.store(f"watch {info.attempt} {next(NUMBERS)}")
         self._beat()
         self._thread.start()
 
@@ -154,7 +160,7 @@ class Watch:
                     break
                 time.sleep(0.1)
 
-    def _run(self):
+    def _run(self) -> None:
         detector, other = LossDetector(), (self.rank + 1) % self.n_ranks
         while not self.has_left:
             self._wakes.wait(PERIOD)
@@ -166,8 +172,8 @@ class Watch:
                     return self.on_lost(None)
                 self.is_broken |= self.store.check(["broken"])
                 theirs = self._heartbeat_of(other)
-                problem = theirs and detector.poll(ours, theirs, self.is_broken)
-                if problem and not self.has_left:
+                problem = detector.poll(ours, theirs, self.is_broken) if theirs else None
+                if theirs and problem and not self.has_left:
                     label = f"rank {other} on {theirs.host}"
                     return self.on_lost(f"{label} {problem}" if self.claim() else None)
             except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
@@ -190,4 +196,9 @@ class Watch:
 
     def _heartbeat_of(self, rank) -> Heartbeat | None:
         name = f"heartbeat {rank}"
-        return Heartbeat(*json.loads(self.store.get(name))) if self.store.check([name]) else None
+        if not self.store.check([name]):
+            return None
+        try:
+            return HEARTBEAT.validate_json(self.store.get(name))
+        except ValueError:  # which no rank has written
+            return None

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from megastep import spaces
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.outputs import Output
+from megastep.agents.private_ops import standard_gamma
 
 # Actions closer to a bound count as this far from it: atanh would be infinite.
 _MAX_X = 1 - 2**-20
@@ -31,6 +32,9 @@ class _BoundedOutput(Output):
         n_parameters: outputs of the linear layer per number.
     """
 
+    low: torch.Tensor  # (D,)
+    high: torch.Tensor
+
     def __init__(self, space: spaces.MultiContinuous, width: int, n_parameters: int):
         super().__init__()
         self.shape = space.shape
@@ -41,16 +45,16 @@ class _BoundedOutput(Output):
         nn.init.orthogonal_(self.linear.weight, gain=0.01)
         nn.init.zeros_(self.linear.bias)
 
-    def _linear(self, x):
+    def _linear(self, x) -> torch.Tensor:
         out = linear(x, self.linear).float()
         return out.unflatten(-1, (self.shape[0], -1))
 
-    def _scaled(self, actions):
+    def _scaled(self, actions) -> torch.Tensor:
         """Returns actions as numbers from -1 to 1."""
         x = 2 * (actions.float() - self.low) / (self.high - self.low) - 1
         return x.clamp(-_MAX_X, _MAX_X)
 
-    def _actions(self, x):
+    def _actions(self, x) -> torch.Tensor:
         """Returns numbers from -1 to 1 as actions within the bounds."""
         actions = self.low + (self.high - self.low) * (x + 1) / 2
         return actions.clamp(self.low, self.high)
@@ -72,13 +76,15 @@ class GaussianOutput(_BoundedOutput):
     # tanh(5) is 0.9999, and the gradient of a log-probability is inverse to the standard deviation
     max_mean = 5.0
     min_log_std = -3.0
+    nodes: torch.Tensor  # of the quadrature
+    weights: torch.Tensor
 
     def __init__(self, space: spaces.MultiContinuous, width: int):
         super().__init__(space, width, n_parameters=1)
         self.log_std = nn.Parameter(torch.zeros(self.shape))
-        nodes, weights = np.polynomial.hermite_e.hermegauss(_N_NODES)
+        nodes, areas = np.polynomial.hermite_e.hermegauss(_N_NODES)
         self.register_buffer("nodes", torch.tensor(nodes, dtype=torch.float32), persistent=False)
-        weights = torch.tensor(weights / weights.sum(), dtype=torch.float32)
+        weights = torch.tensor(areas / areas.sum(), dtype=torch.float32)
         self.register_buffer("weights", weights, persistent=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -136,7 +142,7 @@ class BetaOutput(_BoundedOutput):
         self, logits: torch.Tensor, generator: torch.Generator | None = None
     ) -> torch.Tensor:
         """Samples actions."""
-        alpha, beta = torch._standard_gamma(logits, generator=generator).chunk(2, -1)
+        alpha, beta = standard_gamma(logits, generator).chunk(2, -1)
         return self._actions(2 * alpha / (alpha + beta) - 1)
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:
@@ -167,11 +173,11 @@ class BetaOutput(_BoundedOutput):
 CONTINUOUS_OUTPUTS = {"gaussian": GaussianOutput, "beta": BetaOutput}
 
 
-def _log_slope(u):
+def _log_slope(u) -> torch.Tensor:
     """Returns log(1 - tanh(u)^2), the logarithm of the slope of tanh, without cancellation."""
     return 2 * (math.log(2) - u - F.softplus(-2 * u))
 
 
-def _log_beta(alpha, beta):
+def _log_beta(alpha, beta) -> torch.Tensor:
     """Returns the logarithm of the beta function."""
     return alpha.lgamma() + beta.lgamma() - (alpha + beta).lgamma()

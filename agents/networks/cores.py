@@ -11,6 +11,9 @@ A core is a module `Core(width)` with two methods:
 T time, B lanes, W width.
 """
 
+from collections.abc import Iterator
+from typing import Protocol, cast
+
 import torch
 from torch import nn
 
@@ -22,6 +25,18 @@ from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 from megastep.imports import resolve
+
+
+class RecurrentCore(Protocol):
+    """A recurrent core, as the head of this file says."""
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the hidden state of B lanes at the start of an episode."""
+        ...
+
+    def __call__(
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, **options: bool
+    ) -> tuple[torch.Tensor, arrdict]: ...
 
 
 class GRU(nn.Module):
@@ -98,7 +113,7 @@ class Stack(nn.ModuleList):
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the hidden state of B lanes at the start of an episode."""
-        return arrdict({str(i): core.initial(n_lanes, device) for i, core in enumerate(self)})
+        return arrdict({str(i): c.initial(n_lanes, device) for i, c in enumerate(self._cores())})
 
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
@@ -107,18 +122,22 @@ class Stack(nn.ModuleList):
         total, after = None, arrdict()
         # On a GPU each core's kernel adds its input. On a CPU sums keep their order and bits.
         if is_residual and x.is_cuda:
-            for i, core in enumerate(self):
+            for i, core in enumerate(self._cores()):
                 x, after[str(i)] = with_residual(core, x, reset, state[str(i)])
             return x, after
-        for i, core in enumerate(self):
+        for i, core in enumerate(self._cores()):
             core_input = x if total is None else x + total
             outputs, after[str(i)] = core(core_input, reset, state[str(i)])
             total = outputs if total is None else total + outputs
+        assert total is not None
         return x + total if is_residual else total, after
+
+    def _cores(self) -> Iterator[RecurrentCore]:
+        return cast("Iterator[RecurrentCore]", iter(self))
 
 
 def with_residual(
-    core: nn.Module, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    core: RecurrentCore, x: torch.Tensor, reset: torch.Tensor, state: arrdict
 ) -> tuple[torch.Tensor, arrdict]:
     """Returns x plus the outputs of a core, and its state after the last step."""
     if isinstance(core, (LSTM, MinGRU, Stack)):
@@ -127,7 +146,7 @@ def with_residual(
     return x + outputs, state
 
 
-def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") -> nn.Module:
+def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") -> RecurrentCore:
     """Returns a recurrent core.
 
     Args:
@@ -148,7 +167,7 @@ def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") 
 
 
 @torch.no_grad()
-def _check(name, core, width, n_steps=3, n_lanes=2):
+def _check(name, core, width, n_steps=3, n_lanes=2) -> None:
     """Runs a core on two inputs that differ only before a reset."""
     _require(name, hasattr(core, "initial"), "it needs a method initial(B, device)")
     state = core.initial(n_lanes, "cpu")
@@ -172,10 +191,10 @@ def _check(name, core, width, n_steps=3, n_lanes=2):
     _require(name, is_cleared, "a reset must clear the hidden state")
 
 
-def _shapes(state):
+def _shapes(state) -> dict[str, tuple[int, ...]]:
     return {path: tuple(leaf.shape) for path, leaf in spaces.leaves(state).items()}
 
 
-def _require(name, condition, clause):
+def _require(name, condition, clause) -> None:
     if not condition:
         raise ValueError(f"{name} breaks the contract of recurrent cores: {clause}")

@@ -60,6 +60,7 @@ class Critic(nn.Module):
         """Returns the value from features (..., width) and what `encode` returned."""
         if not self.is_asymmetric:
             return self.output(features)
+        assert encoded is not None
         joined = features, self.intake.projected(encoded)
         if self.output.is_fused(features):
             return self.output.of_hidden(linear(joined, self.hidden))

@@ -16,6 +16,7 @@ from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.outputs import Output, gather
 from megastep.agents.networks.precision import cast, compute_dtype, product
+from megastep.agents.private_ops import linear_relu
 
 
 class DuellingOutput(Output):
@@ -76,7 +77,7 @@ class DuellingOutput(Output):
             epsilon = epsilon.float().contiguous()
         return kernels.act(hidden, parameters, self.shape, noise, epsilon, self.epsilon)
 
-    def _is_fused(self, x):
+    def _is_fused(self, x) -> bool:
         return (
             x.is_cuda
             and compute_dtype(self.hidden.weight) == torch.bfloat16
@@ -84,11 +85,11 @@ class DuellingOutput(Output):
             and math.prod(self.shape) <= kernels.MAX_OUTPUTS
         )
 
-    def _values(self):
+    def _values(self) -> tuple[torch.Tensor, ...]:
         return *self.value.parameters(), *self.advantage.parameters()
 
     @staticmethod
-    def _noise(shape, generator, device):
+    def _noise(shape, generator, device) -> torch.Tensor:
         """Returns (2, *shape) from 0 to 1: which random action, and whether to take it."""
         return torch.rand(2, *shape, generator=generator, device=device)
 
@@ -99,11 +100,11 @@ class DuellingOutput(Output):
         epsilon: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Returns the best actions, or random ones with probability epsilon (...,) per lane."""
-        epsilon = self.epsilon if epsilon is None else epsilon[..., None]
+        limit = self.epsilon if epsilon is None else epsilon[..., None]
         best, n = self.greedy(logits), logits.shape[-1]
         which, whether = self._noise(best.shape, generator, logits.device)
         random = (which * n).long().clamp(max=n - 1)  # the product may round up to n
-        return torch.where(whether < epsilon, random, best)
+        return torch.where(whether < limit, random, best)
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:
         """Returns the best actions."""
@@ -125,11 +126,11 @@ class _DuellingValues(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, hidden_weight, hidden_bias, *parameters_and_shape):
+    def forward(ctx, x, hidden_weight, hidden_bias, *parameters_and_shape) -> torch.Tensor:
         *parameters, shape = parameters_and_shape
         lead, x = x.shape[:-1], x.flatten(0, -2)
         weight, bias = (cast(leaf, x.dtype) for leaf in (hidden_weight, hidden_bias))
-        hidden = torch._addmm_activation(bias, x, weight.T)
+        hidden = linear_relu(x, weight, bias)
         parameters = [aligned(p.detach()) for p in parameters]
         values = kernels.values(hidden, parameters, shape)
         value_weight, _, advantage_weight, _ = parameters
@@ -138,9 +139,9 @@ class _DuellingValues(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_values):
+    def backward(ctx, d_values) -> tuple[torch.Tensor | None, ...]:
         x, weight, hidden, *weights = ctx.saved_tensors
         lead, d_values = d_values.shape[:-2], d_values.flatten(0, -3).contiguous()
-        d_hidden, gradients = kernels.backward(hidden, *weights, d_values)
+        d_hidden, gradients = kernels.backward(hidden, *weights, d_values=d_values)
         d_x = (d_hidden @ weight).unflatten(0, lead) if ctx.needs_input_grad[0] else None
         return d_x, product(d_hidden.T, x), *gradients, None

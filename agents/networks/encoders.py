@@ -20,7 +20,13 @@ from megastep.imports import resolve
 from megastep.types import Space
 
 
-class Flat(nn.Module):
+class Encoder(nn.Module):
+    """Base of the encoders of a leaf, which map (..., *shape) to (..., n_features)."""
+
+    n_features: int
+
+
+class Flat(Encoder):
     """Flattens a vector or an image: (..., *shape) -> (..., n_features)."""
 
     def __init__(self, space: Space):
@@ -32,8 +38,10 @@ class Flat(nn.Module):
         return obs.flatten(-self.n_axes)
 
 
-class OneHot(nn.Module):
+class OneHot(Encoder):
     """One-hot encoding of integers: (..., A) -> (..., A n)."""
+
+    values: torch.Tensor  # (n,)
 
     def __init__(self, space: spaces.MultiDiscrete):
         super().__init__()
@@ -41,7 +49,7 @@ class OneHot(nn.Module):
         self.register_buffer("values", torch.arange(space.n_actions), persistent=False)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return (obs[..., None] == self.values).flatten(-2)
+        return obs[..., None].eq(self.values).flatten(-2)
 
 
 class BandedConv1d(nn.Conv1d):
@@ -61,6 +69,8 @@ class BandedConv1d(nn.Conv1d):
     """
 
     MAX_BANDED = 256
+    band: torch.Tensor  # (K, W', W)
+    bias: torch.Tensor  # (C',)
 
     def __init__(
         self,
@@ -108,7 +118,7 @@ class BandedConv1d(nn.Conv1d):
         return outputs.unflatten(1, (-1, self.n_outputs))
 
 
-class Conv(nn.Module):
+class Conv(Encoder):
     """Two convolutions along the rows of an image: (..., A, C, H, W) -> (..., n_features).
 
     The H rows count as channels, since images are one or a few pixels high. Agents share weights.
@@ -158,10 +168,12 @@ class Part(NamedTuple):
 
     def rows(self, columns: torch.Tensor) -> torch.Tensor:
         """Returns the encoder's rows (N, C H, W), a view of (N, n_columns)."""
+        assert self.encoder is not None
         return columns[:, self.source].unflatten(1, self.encoder.row_shape)
 
     def is_supported(self, columns: torch.Tensor) -> bool:
         """Returns whether the kernels take the encoder's rows."""
+        assert self.encoder is not None
         first = self.encoder.first
         is_size_right = (
             first.out_channels == kernels.CHANNELS
@@ -197,7 +209,7 @@ class _Encode(torch.autograd.Function):
     """What `encode` does. Each part's encoder has four parameters, in the order of the parts."""
 
     @staticmethod
-    def forward(ctx, columns, parts, *parameters):
+    def forward(ctx, columns, parts, *parameters) -> torch.Tensor:
         features = columns.new_empty(len(columns), parts[-1].target.stop)
         weights = [cast(leaf, columns.dtype) for leaf in parameters]
         of_encoders = iter(weights)
@@ -206,15 +218,16 @@ class _Encode(torch.autograd.Function):
             if part.encoder is None:
                 target.copy_(columns[:, part.source])
             else:
-                of_part = [next(of_encoders) for _ in range(4)]
-                kernels.conv_forward(part.rows(columns), *of_part, target)
+                first = next(of_encoders), next(of_encoders)
+                second = next(of_encoders), next(of_encoders)
+                kernels.conv_forward(part.rows(columns), *first, *second, target)
         ctx.parts = parts
         ctx.save_for_backward(columns, features, *weights)
         return features
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d):
+    def backward(ctx, d) -> tuple[torch.Tensor | None, ...]:
         columns, features, *weights = ctx.saved_tensors
         of_encoders, gradients = iter(weights), [None, None]
         for part in ctx.parts:
@@ -230,7 +243,7 @@ class _Encode(torch.autograd.Function):
         return tuple(gradients)
 
 
-class Cnn(nn.Module):
+class Cnn(Encoder):
     """Three convolutions of an image in both directions, (..., A, C, H, W) -> (..., n_features):
     those of Mnih et al. 2015 for images of 36 x 36 pixels and more, of 3 x 3 pixels for smaller
     ones. Agents share weights.
@@ -247,6 +260,7 @@ class Cnn(nn.Module):
         for n_out, settings in zip(self.CHANNELS, self.LARGE if is_large else self.SMALL):
             layer = nn.Conv2d(n_channels, n_out, *settings)
             nn.init.orthogonal_(layer.weight, gain=math.sqrt(2))
+            assert layer.bias is not None
             nn.init.zeros_(layer.bias)
             layers += [layer, nn.ReLU()]
             kernel, stride, padding = settings
@@ -256,7 +270,7 @@ class Cnn(nn.Module):
         self.n_features = space.n_agents * n_channels * math.prod(sizes)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        images = obs.flatten(0, -4).to(compute_dtype(self.layers[0].weight))
+        images = obs.flatten(0, -4).to(compute_dtype(next(self.layers.parameters())))
         return self.layers(images).reshape(*obs.shape[:-4], self.n_features)
 
 
@@ -265,7 +279,7 @@ class Cnn(nn.Module):
 ENCODERS = {"linear": Flat, "conv": Conv, "cnn": Cnn}
 
 
-def make_image_encoder(name: str, space: spaces.MultiImage) -> nn.Module:
+def make_image_encoder(name: str, space: spaces.MultiImage) -> Encoder:
     """Returns an encoder of images.
 
     Args:
@@ -282,7 +296,7 @@ def make_image_encoder(name: str, space: spaces.MultiImage) -> nn.Module:
 
 
 @torch.no_grad()
-def _check_encoder(name, encoder, space):
+def _check_encoder(name, encoder, space) -> None:
     for lead in (3,), (3, 2):
         shape = tuple(encoder(torch.zeros(*lead, *space.shape)).shape)
         expected = *lead, getattr(encoder, "n_features", "n_features")
@@ -293,7 +307,7 @@ def _check_encoder(name, encoder, space):
             )
 
 
-def make_encoder(space: Space, image_encoder: str, path: str) -> nn.Module:
+def make_encoder(space: Space, image_encoder: str, path: str) -> Encoder:
     """Returns the encoder of one leaf of an observation space.
 
     Args:

@@ -10,13 +10,11 @@ Nested dicts of spaces give nested dicts of logits and actions. Nothing here syn
 any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane controls.
 """
 
-from torch import nn
-
 from megastep import spaces
 from megastep.agents.networks.continuous_outputs import CONTINUOUS_OUTPUTS
 from megastep.agents.networks.duelling_output import DuellingOutput
 from megastep.agents.networks.intakes import ConcatIntake
-from megastep.agents.networks.outputs import DictOutput, MultiDiscreteOutput
+from megastep.agents.networks.outputs import DictOutput, MultiDiscreteOutput, Output
 from megastep.types import Space
 
 #: Outputs of integers by name: "softmax" samples by probability, "duelling" by action value.
@@ -42,9 +40,7 @@ def intake(
     return ConcatIntake(space, width, encoder, activation)
 
 
-def output(
-    space: Space, width: int, kind: str = "softmax", continuous: str = "gaussian"
-) -> nn.Module:
+def output(space: Space, width: int, kind: str = "softmax", continuous: str = "gaussian") -> Output:
     """Returns a module from vectors (..., width) to logits of an action space.
 
     Its methods are `sample`, `greedy`, `logprob`, and `entropy` ("softmax") or `action_value`

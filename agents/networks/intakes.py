@@ -5,6 +5,7 @@
 
 import itertools
 import math
+from typing import cast
 
 import torch
 from torch import nn
@@ -60,16 +61,15 @@ class ConcatIntake(nn.Module):
             raise ValueError(f"the observation space {space!r} has nothing in it to encode")
         self.activation = ACTIVATIONS[activation]
         self.paths = list(leaves)
-        self.encoders = nn.ModuleList(
-            make_encoder(leaf, encoder, path) for path, leaf in leaves.items()
-        )
+        encoders = [make_encoder(leaf, encoder, path) for path, leaf in leaves.items()]
+        self.encoders = nn.ModuleList(encoders)
         self.norms = nn.ModuleList(
             nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else RunningNorm(leaf)
             for leaf in leaves.values()
         )
         #: whether every leaf is normalised, and encoded by what takes a part of wider rows
         self.is_fused = all(type(encoder) in (Flat, Conv, Cnn) for encoder in self.encoders)
-        sizes = [encoder.n_features for encoder in self.encoders]
+        sizes = [encoder.n_features for encoder in encoders]
         self.n_features = sum(sizes)
         # GPUs multiply matrices whose columns are a multiple of 8 several times faster
         self.n_padding = -self.n_features % 8
@@ -82,7 +82,7 @@ class ConcatIntake(nn.Module):
                 block.normal_(std=math.sqrt(2 / (len(sizes) * size)))
         self._lay_out(list(leaves.values()))
 
-    def _lay_out(self, leaves):
+    def _lay_out(self, leaves) -> None:
         """Decides how `normalised` puts leaves side by side: images first, so that their rows
         start at multiples of 16 bytes. After the leaves come at least `n_padding` zeros.
 
@@ -126,15 +126,16 @@ class ConcatIntake(nn.Module):
         """
         leaves = self._leaves(obs)
         if self.is_fused:
-            ordered = [(leaves[i], self.norms[i]) for i in self.order]
-            columns = normalised(*zip(*ordered, strict=True), self.n_columns, lanes)
+            norms = self.running_norms  # of every leaf
+            ordered = [leaves[i] for i in self.order], [norms[i] for i in self.order]
+            columns = normalised(*ordered, self.n_columns, lanes)
             if columns is not None:
                 return self._encode_columns(columns)
         if lanes is not None:
             leaves = [leaf.index_select(1, lanes) for leaf in leaves]
         dtype = compute_dtype(self.project.weight)
-        if dtype == torch.float32 and intake_cpu.fits(leaves, self.norms, self.encoders):
-            return intake_cpu.normalised(leaves, self.norms, self.n_padding)
+        if dtype == torch.float32 and intake_cpu.fits(leaves, [*self.norms], [*self.encoders]):
+            return intake_cpu.normalised(leaves, self.running_norms, self.n_padding)
         features = [
             encoder(norm(leaf)).to(dtype)
             for leaf, norm, encoder in zip(leaves, self.norms, self.encoders, strict=True)
@@ -143,7 +144,7 @@ class ConcatIntake(nn.Module):
             features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
         return torch.cat(features, dim=-1)
 
-    def _encode_columns(self, columns):
+    def _encode_columns(self, columns) -> torch.Tensor:
         """Returns `encode` of normalised leaves side by side, (..., n_columns)."""
         if all(i is None for i, *_ in self.runs):  # one run, of all columns
             return columns
@@ -161,11 +162,11 @@ class ConcatIntake(nn.Module):
             features.append(encoded)
         return torch.cat(features, -1)
 
-    def _parts(self):
+    def _parts(self) -> list[Part]:
         """Returns `runs` as parts for `encode`, one for each image of each agent."""
         parts, n_features = [], 0
         for i, shape, start, end in self.runs:
-            encoder = None if i is None else self.encoders[i]
+            encoder = None if i is None else cast(Conv, self.encoders[i])
             n_images = 1 if encoder is None else shape[0]
             size = (end - start) // n_images
             for source in range(start, end, size):
@@ -185,6 +186,6 @@ class ConcatIntake(nn.Module):
         pairs = zip(self.norms, self._leaves(obs), strict=True)
         return [leaf for norm, leaf in pairs if isinstance(norm, RunningNorm)]
 
-    def _leaves(self, obs):
+    def _leaves(self, obs) -> list[torch.Tensor]:
         values = spaces.leaves(obs)
         return [values[path] for path in self.paths]

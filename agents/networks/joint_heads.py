@@ -60,7 +60,9 @@ class _JointHeads(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, sizes, value, target, actions, features, privileged, *parameters):
+    def forward(
+        ctx, sizes, value, target, actions, features, privileged, *parameters
+    ) -> tuple[torch.Tensor, ...]:
         lead, dtype, width = features.shape[:-1], features.dtype, sizes.width
         features, privileged, target = (
             aligned(leaf.flatten(0, -2)) for leaf in (features, privileged, target)
@@ -81,7 +83,7 @@ class _JointHeads(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *gradients):
+    def backward(ctx, *gradients) -> tuple[torch.Tensor | None, ...]:
         features, privileged, weight, of_privileged, *saved = ctx.saved_tensors
         columns, target, actions, *value = saved
         sizes, lead = ctx.sizes, gradients[0].shape

@@ -19,6 +19,7 @@ from megastep.agents.networks.kernels import layers as kernels
 from megastep.agents.networks.kernels.library import aligned_rows
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.running_norm import RunningNorm
+from megastep.agents.private_ops import linear_relu
 
 Activation = Callable[[torch.Tensor], torch.Tensor]
 
@@ -51,7 +52,7 @@ def affine(
     is_aligned = not any(part.shape[-1] % 8 for part in parts)
     if parts[0].is_cuda and dtype == torch.bfloat16 and is_known and is_aligned:
         return _Linear.apply(weight, bias, activation is torch.relu, *parts)
-    if is_known and linear_cpu.fits(weight, bias, *parts):
+    if bias is not None and is_known and linear_cpu.fits(weight, bias, *parts):
         return linear_cpu.CpuLinear.apply(weight, bias, activation is torch.relu, *parts)
     y = nn.functional.linear(torch.cat(parts, -1) if len(parts) > 1 else parts[0], weight, bias)
     return y if activation is None else activation(y)
@@ -64,14 +65,14 @@ class _Linear(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, weight, bias, has_relu, *parts):
+    def forward(ctx, weight, bias, has_relu, *parts) -> torch.Tensor:
         ctx.n_outputs, ctx.has_relu, lead = len(weight), has_relu, parts[0].shape[:-1]
         dtype = parts[0].dtype
         weight, bias = (cast(leaf, dtype, multiple=8) for leaf in (weight, bias))
         parts = [part.flatten(0, -2) for part in parts]
         weights = weight.split([part.shape[1] for part in parts], 1)
         if has_relu and len(parts) == 1:
-            y = torch._addmm_activation(bias, parts[0], weight.T)
+            y = linear_relu(parts[0], weight, bias)
         else:
             y = torch.addmm(bias, parts[0], weights[0].T)
             for part, its_weight in zip(parts[1:], weights[1:], strict=True):
@@ -82,7 +83,7 @@ class _Linear(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d):
+    def backward(ctx, d) -> tuple[torch.Tensor | None, ...]:
         weight, *saved = ctx.saved_tensors
         parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
         lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
@@ -139,7 +140,7 @@ class CategoricalTerms(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, logits, actions):
+    def forward(ctx, logits, actions) -> tuple[torch.Tensor, ...]:
         lead = logits.shape[:-2]
         logits = logits.flatten(0, -3).contiguous()
         actions = actions.flatten(0, -2).long().contiguous()
@@ -148,7 +149,7 @@ class CategoricalTerms(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_logprobs, d_entropies):
+    def backward(ctx, d_logprobs, d_entropies) -> tuple[torch.Tensor, None]:
         logits, actions = ctx.saved_tensors
         d = (d_logprobs.contiguous(), d_entropies.contiguous())
         d_logits = kernels.terms_backward(logits, actions, *d)

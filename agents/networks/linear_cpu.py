@@ -66,7 +66,7 @@ class CpuLinear(torch.autograd.Function):
     """A linear layer, with a ReLU: parts (..., in) that count as concatenated -> (..., out)."""
 
     @staticmethod
-    def forward(ctx, weight, bias, has_relu, *parts):
+    def forward(ctx, weight, bias, has_relu, *parts) -> torch.Tensor:
         ctx.has_relu, lead, last = has_relu, parts[0].shape[:-1], len(parts) - 1
         parts = [part.reshape(-1, part.shape[-1]) for part in parts]
         weights = weight.split([part.shape[1] for part in parts], 1)
@@ -79,13 +79,14 @@ class CpuLinear(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d):
+    def backward(ctx, d) -> tuple[torch.Tensor | None, ...]:
         weight, *saved = ctx.saved_tensors
         parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
         lead, d = d.shape[:-1], d.reshape(-1, len(weight))
         if ctx.has_relu:
             d = torch.ops.aten.threshold_backward(d, *activated, 0)
-        d_weight, d_parts = torch.empty_like(weight), [None] * len(parts)
+        d_parts: list[torch.Tensor | None] = [None] * len(parts)
+        d_weight = torch.empty_like(weight)
         sizes = [part.shape[1] for part in parts]
         rows = zip(parts, weight.split(sizes, 1), d_weight.split(sizes, 1), strict=True)
         for i, (part, its_weight, its_gradient) in enumerate(rows):

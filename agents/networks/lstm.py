@@ -13,6 +13,7 @@ and so does a CPU if W is a multiple of 16 (`megastep.agents.networks.lstm_cpu`)
 """
 
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -26,21 +27,24 @@ from megastep.agents.networks.lstm_cpu import CpuSequence, fits
 from megastep.agents.networks.precision import cast, cast_joined, compute_dtype, product
 from megastep.arrdict import arrdict
 
+if TYPE_CHECKING:
+    from types import ModuleType
+
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)
 _tanh_backward = torch.ops.aten.tanh_backward.grad_input  # (d, y): d (1 - y^2)
 
 
-def _split(gates):
+def _split(gates) -> tuple[torch.Tensor, ...]:
     return gates.view(len(gates), 4, -1).unbind(1)
 
 
-def _start(reset, last_output, last_cell, hidden, cell):
+def _start(reset, last_output, last_cell, hidden, cell) -> None:
     reset = reset[:, None]
     hidden.copy_(last_output).masked_fill_(reset, 0.0)
     cell.copy_(last_cell).masked_fill_(reset, 0.0)
 
 
-def _forward(gates, cell, next_reset, output, next_hidden, next_cell):
+def _forward(gates, cell, next_reset, output, next_hidden, next_cell) -> None:
     """Leaves the gates activated for `_backward`; the kernels recompute the activations instead."""
     i, f, g, o = _split(gates)
     gates[:, : 2 * i.shape[1]].sigmoid_()
@@ -54,7 +58,9 @@ def _forward(gates, cell, next_reset, output, next_hidden, next_cell):
         next_cell.masked_fill_(reset, 0.0)
 
 
-def _backward(gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell):
+def _backward(
+    gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell
+) -> None:
     i, f, g, o = _split(gates)
     d_i, d_f, d_g, d_o = _split(d_gates)
     squashed = (f * cell).addcmul_(i, g).tanh_()
@@ -73,11 +79,13 @@ def _backward(gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_g
 _CPU_STEPS = SimpleNamespace(start=_start, forward=_forward, backward=_backward)
 
 
-def _steps(x):
+def _steps(x) -> "ModuleType | SimpleNamespace":
     return kernels if x.is_cuda else _CPU_STEPS
 
 
-def _unroll(x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual):
+def _unroll(
+    x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual
+) -> lstm_sequence.Unrolled:
     """Unrolls the recurrence step by step.
 
     Returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output and cell
@@ -99,7 +107,9 @@ def _unroll(x, input_weight, bias, weight, reset, output, cell, needs_backward, 
     return outputs, hiddens, last, cells[-1], (gates, *cells[:-1])
 
 
-def _unroll_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
+def _unroll_backward(
+    weight, reset, saved, d_outputs, d_cell, needs_state
+) -> lstm_sequence.Gradients:
     """Returns the gradients of the gates (T, B, 4 W), of the bias and, if needed, of the output and
     the cell before the sequence. `d_cell` None: the last cell has no gradient.
     """
@@ -119,21 +129,25 @@ def _unroll_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
     d_bias = d_gates.flatten(0, 1).sum(0)
     if not needs_state:
         return d_gates, d_bias, None, None
+    assert d_hidden is not None
     d_output = d_hidden.float().masked_fill_(reset[0, :, None], 0.0)
     return d_gates, d_bias, d_output, d_cell.masked_fill_(reset[0, :, None], 0.0)
 
 
 def _unroll_on_chip(
     x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual
-):
+) -> lstm_sequence.Unrolled:
     """`_unroll` in one kernel after the inputs' product."""
     gates, residual = F.linear(x, input_weight, bias), x if is_residual else None
     return lstm_sequence.forward(gates, weight, reset, output, cell, needs_backward, residual)
 
 
-def _unroll_on_chip_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
+def _unroll_on_chip_backward(
+    weight, reset, saved, d_outputs, d_cell, needs_state
+) -> lstm_sequence.Gradients:
     """`_unroll_backward` in one kernel."""
-    return lstm_sequence.backward(weight, reset, *saved, d_outputs, d_cell)
+    gates, cells = saved
+    return lstm_sequence.backward(weight, reset, gates, cells, d_outputs, d_cell)
 
 
 class _Sequence(torch.autograd.Function):
@@ -146,7 +160,7 @@ class _Sequence(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx, x, input_weight, bias, weight, reset, output, cell, is_residual=False, has_grad=True
-    ):
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Unrolls the recurrence.
 
         Args:
@@ -179,7 +193,7 @@ class _Sequence(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_outputs, d_cell, d_last_output):
+    def backward(ctx, d_outputs, d_cell, d_last_output) -> tuple[torch.Tensor | None, ...]:
         x, input_weight, weight, reset, hiddens, *saved = ctx.saved_tensors
         d_sum = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
         d_outputs = d_sum
@@ -253,7 +267,7 @@ class LSTM(nn.Module):
                 outputs, cell, last_output = _Sequence.apply(*sequence)
         return outputs, arrdict(output=last_output, cell=cell)
 
-    def _act(self, x, reset, state, is_residual):
+    def _act(self, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
         """Does the same as `forward` for one step on a GPU, without a gradient: with one product of
         inputs and last outputs.
         """

@@ -23,7 +23,9 @@ class CpuSequence(torch.autograd.Function):
     """`lstm._Sequence` in float32: the same arguments, results and gradients."""
 
     @staticmethod
-    def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
+    def forward(
+        ctx, x, input_weight, bias, weight, reset, output, cell
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         inputs = x, input_weight, bias, weight, reset, output, cell
         x, input_weight, bias, weight, reset, output, cell = (one.contiguous() for one in inputs)
         gates = x.new_empty((*x.shape[:2], 4 * x.shape[2]))
@@ -54,7 +56,11 @@ class CpuSequence(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_outputs, d_last_cell):
+    def backward(
+        ctx, d_outputs, d_last_cell
+    ) -> tuple[
+        torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, None, torch.Tensor, torch.Tensor
+    ]:
         x, input_weight, weight, reset, gates, hiddens, cells = ctx.saved_tensors
         d_gates, d_x = torch.empty_like(gates), torch.empty_like(x)
         d_output, d_cell = torch.empty_like(d_last_cell), torch.empty_like(d_last_cell)

@@ -44,7 +44,7 @@ def normalise_masked(x: torch.Tensor, valid: torch.Tensor, moments: Moments) -> 
     return (x - mean).masked_fill(~valid, 0.0) / (variance.sqrt() + _TINY)
 
 
-def _is_fused(valid, *arrays):
+def _is_fused(valid, *arrays) -> bool:
     """Returns whether kernels can read these tensors."""
     are_floats = all(x.dtype == torch.float32 and x.numel() <= _MAX_NUMBERS for x in arrays)
     return are_floats and all(x.is_cuda and x.is_contiguous() for x in (valid, *arrays))

@@ -20,6 +20,7 @@ The recurrence is written here for the CPU. On a GPU it is a kernel with the sam
 """
 
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -33,13 +34,16 @@ from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict
 
+if TYPE_CHECKING:
+    from types import ModuleType
 
-def _split(gates):
+
+def _split(gates) -> tuple[torch.Tensor, torch.Tensor]:
     update, candidate = gates.float().chunk(2, -1)
     return update.sigmoid(), candidate
 
 
-def _forward(gates, reset, start, residual, states, outputs, last):
+def _forward(gates, reset, start, residual, states, outputs, last) -> None:
     (z, candidate), reset = _split(gates), reset[..., None]
     terms, factors = z * candidate, 1 - z
     terms[0].addcmul_(factors[0], start.masked_fill(reset[0], 0.0))
@@ -50,7 +54,9 @@ def _forward(gates, reset, start, residual, states, outputs, last):
         states.copy_(exact)
 
 
-def _backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual):
+def _backward(
+    gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
+) -> torch.Tensor:
     (z, candidate), reset = _split(gates), reset[..., None]
     factors, before = 1 - z, torch.cat([start[None], states[:-1]]).masked_fill(reset, 0.0)
     terms = d_outputs
@@ -71,7 +77,7 @@ def _backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, 
 _CPU_RECURRENCE = SimpleNamespace(forward=_forward, backward=_backward)
 
 
-def _recurrence(x):
+def _recurrence(x) -> "ModuleType | SimpleNamespace":
     return kernels if x.is_cuda else _CPU_RECURRENCE
 
 
@@ -83,7 +89,9 @@ class _Sequence(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, weight, bias, reset, start, is_residual, has_grad):
+    def forward(
+        ctx, x, weight, bias, reset, start, is_residual, has_grad
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Unrolls the recurrence.
 
         Args:
@@ -116,7 +124,7 @@ class _Sequence(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_outputs, d_last):
+    def backward(ctx, d_outputs, d_last) -> tuple[torch.Tensor | None, ...]:
         x, weight, gates, reset, start, states = ctx.saved_tensors
         d_outputs = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
         d_last = None if d_last is None else aligned(d_last)

@@ -5,6 +5,8 @@ controls, n choices of each.
 """
 
 import math
+import typing
+from collections.abc import Callable, Iterable, Mapping
 
 import torch
 from torch import nn
@@ -24,8 +26,15 @@ _TINY = 1e-20
 class Output(nn.Module):
     """Base of the outputs of actions by probability: what acting and learning take at once.
 
-    A subclass has `forward(x)`, which returns logits, `sample`, `greedy`, `logprob` and `entropy`.
+    A subclass has `forward(x)`, which returns logits, `sample`, `greedy`, `logprob`, and `entropy`
+    or `action_value`.
     """
+
+    sample: Callable[..., Tree]
+    greedy: Callable[..., Tree]
+    logprob: Callable[..., torch.Tensor]
+    entropy: Callable[..., torch.Tensor]
+    action_value: Callable[..., torch.Tensor]
 
     def act(
         self,
@@ -129,7 +138,7 @@ class DictOutput(Output):
         ValueError: if a key is the name of an attribute that every ``nn.ModuleDict`` has.
     """
 
-    def __init__(self, outputs: dict[str, nn.Module]):
+    def __init__(self, outputs: Mapping[str, nn.Module]):
         super().__init__()
         for key in outputs:
             if hasattr(nn.ModuleDict(), key):
@@ -151,15 +160,15 @@ class DictOutput(Output):
     ) -> tuple[arrdict, arrdict, torch.Tensor]:
         """Acts key by key."""
         parts = {
-            key: output.act(x, sample, generator, **options) for key, output in self.outputs.items()
+            key: output.act(x, sample, generator, **options) for key, output in self._outputs()
         }
         logits, actions, logprobs = zip(*parts.values())
-        return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), sum(logprobs)
+        return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), _total(logprobs)
 
     def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """Sums the outputs' terms."""
         logprobs, entropies = zip(*self._map("terms", logits, actions).values())
-        return sum(logprobs), sum(entropies)
+        return _total(logprobs), _total(entropies)
 
     def sample(
         self, logits: Tree, generator: torch.Generator | None = None, **options: torch.Tensor
@@ -173,17 +182,17 @@ class DictOutput(Output):
 
     def logprob(self, logits: Tree, actions: Tree) -> torch.Tensor:
         """Returns the log-probability (...,) of actions."""
-        return sum(self._map("logprob", logits, actions).values())
+        return _total(self._map("logprob", logits, actions).values())
 
     def entropy(self, logits: Tree) -> torch.Tensor:
         """Returns the entropy (...,) in nats."""
-        return sum(self._map("entropy", logits).values())
+        return _total(self._map("entropy", logits).values())
 
     def action_value(self, logits: Tree, actions: Tree) -> torch.Tensor:
         """Returns the value (...,) of actions."""
-        return sum(self._map("action_value", logits, actions).values())
+        return _total(self._map("action_value", logits, actions).values())
 
-    def _map(self, method, *trees, **options):
+    def _map(self, method, *trees, **options) -> arrdict:
         """Calls a method of each output with its part of the trees."""
         return arrdict(
             {
@@ -191,6 +200,13 @@ class DictOutput(Output):
                 for key, output in self.outputs.items()
             }
         )
+
+    def _outputs(self) -> Iterable[tuple[str, Output]]:
+        return typing.cast("Iterable[tuple[str, Output]]", self.outputs.items())
+
+
+def _total(parts: Iterable[torch.Tensor]) -> torch.Tensor:
+    return typing.cast(torch.Tensor, sum(parts))  # there is at least one
 
 
 def gather(values: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:

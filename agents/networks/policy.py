@@ -7,7 +7,7 @@ T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, 
 import copy
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, cast
 
 import torch
 from pydantic import AfterValidator, Field
@@ -18,6 +18,7 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, encoders, heads, joint_heads, running_norm
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.layers import linear
+from megastep.agents.networks.outputs import MultiDiscreteOutput
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.agents.types import Moments
 from megastep.arrdict import arrdict
@@ -30,7 +31,7 @@ from megastep.types import Space, Tree
 TRAINING_ONLY = ("critic.", "prediction.")
 
 
-def _name_in(table: Mapping[str, Any]) -> AfterValidator:
+def _name_in(table: Mapping[str, object]) -> AfterValidator:
     """Returns a validator of names: a name in the table, or an import path."""
     return AfterValidator(functools.partial(known_name, names=tuple(table)))
 
@@ -99,12 +100,17 @@ class Policy(nn.Module):
             self.output = heads.output(action_space, width, output, continuous)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:
-                self.prediction = nn.Linear(width, self.critic.intake.n_features)
+                self.prediction = nn.Linear(width, self._critic.intake.n_features)
 
     @property
     def device(self) -> torch.device:
         """Device of the weights."""
         return self.intake.project.weight.device  # `parameters` walks through all modules
+
+    @property
+    def _critic(self) -> Critic:
+        assert self.critic is not None
+        return self.critic
 
     @property
     def activation_bytes(self) -> int:
@@ -199,7 +205,7 @@ class Policy(nn.Module):
         torch.clear_autocast_cache()
         return state
 
-    def _features(self, obs, reset, state, lanes=None):
+    def _features(self, obs, reset, state, lanes=None) -> tuple[torch.Tensor, arrdict]:
         return cores.with_residual(self.core, self.intake(obs, lanes), reset, state)
 
     def value(
@@ -216,7 +222,7 @@ class Policy(nn.Module):
             lanes: (M,) int64, the lanes of `privileged` that `features` belong to. None: all.
         """
         with self.compute_dtype():
-            return self.critic(features, privileged, lanes)
+            return self._critic(features, privileged, lanes)
 
     def prediction_error(
         self, features: torch.Tensor, privileged: Tree, lanes: torch.Tensor | None = None
@@ -233,7 +239,7 @@ class Policy(nn.Module):
             lanes: as for `value`.
         """
         with self.compute_dtype():
-            encoded = self.critic.encode(privileged, lanes)
+            encoded = self._critic.encode(privileged, lanes)
             return self._prediction_error(features, encoded)
 
     def terms(
@@ -259,18 +265,19 @@ class Policy(nn.Module):
             features, _ = self._features(obs, reset, state, lanes)
             encoded = errors = None
             if self.privileged_space:
-                encoded = self.critic.encode(privileged, lanes)
-                if joint_heads.fit(self.output, self.critic, features, encoded):
-                    heads_of = self.output, self.critic, self.prediction
+                encoded = self._critic.encode(privileged, lanes)
+                if joint_heads.fit(self.output, self._critic, features, encoded):
+                    output = cast(MultiDiscreteOutput, self.output)
+                    heads_of = output, self._critic, self.prediction
                     terms = joint_heads.joint_terms(*heads_of, features, encoded, actions)
                     return arrdict(zip(names, terms, strict=True))
                 errors = self._prediction_error(features, encoded)
             logprobs, entropies = self.output.terms(self.output(features), actions)
-            values = self.critic.from_encoded(features, encoded)
+            values = self._critic.from_encoded(features, encoded)
         return arrdict(zip(names, (logprobs, entropies, errors, values), strict=True))
 
-    def _prediction_error(self, features, encoded):
-        target = encoded[..., : self.critic.intake.n_features].detach()
+    def _prediction_error(self, features, encoded) -> torch.Tensor:
+        target = encoded[..., : self._critic.intake.n_features].detach()
         predicted = linear(features, self.prediction).float()
         return (predicted - target).square().mean(-1)
 
@@ -316,7 +323,7 @@ class Policy(nn.Module):
         """
         observations = self.intake.normalised_leaves(obs)
         if self.privileged_space:
-            observations += self.critic.intake.normalised_leaves(privileged)
+            observations += self._critic.intake.normalised_leaves(privileged)
         return running_norm.moments_of(self._norms(), observations, is_counted)
 
     def add_moments(
@@ -340,6 +347,6 @@ class Policy(nn.Module):
         if self.critic is not None:
             self.critic.output.clear()
 
-    def _norms(self):
+    def _norms(self) -> list[running_norm.RunningNorm]:
         norms = self.intake.running_norms
-        return norms + self.critic.intake.running_norms if self.privileged_space else norms
+        return norms + self._critic.intake.running_norms if self.privileged_space else norms

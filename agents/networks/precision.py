@@ -2,11 +2,14 @@
 
 import threading
 from collections.abc import Callable, Hashable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from megastep.agents.networks.kernels import casts as kernels
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 class _Casts(threading.local):
@@ -14,9 +17,9 @@ class _Casts(threading.local):
 
     depth = 0
 
-    def __init__(self):
+    def __init__(self) -> None:
         # with the weights themselves, so that no other gets their id
-        self.by_weight: dict[tuple, tuple[Any, torch.Tensor]] = {}
+        self.by_weight: dict[tuple, tuple[object, torch.Tensor]] = {}
         self.weights: Callable[[], Iterable[torch.Tensor]] = tuple
 
 
@@ -29,29 +32,33 @@ class ComputeDtype(torch.autocast):
     ends, each weight is cast only once. Weights must not change inside it.
 
     Args:
-        args: autocast's arguments.
+        device_type, dtype, enabled: autocast's arguments.
         weights: returns weights that are cast together, on a GPU, once one of them is needed. In
             contexts inside each other, those of the innermost.
-        options: autocast's arguments.
     """
 
     def __init__(
-        self, *args: Any, weights: Callable[[], Iterable[torch.Tensor]] = tuple, **options: Any
+        self,
+        device_type: str,
+        dtype: torch.dtype,
+        enabled: bool = True,
+        weights: Callable[[], Iterable[torch.Tensor]] = tuple,
     ):
-        super().__init__(*args, **options)
+        super().__init__(device_type, dtype, enabled)
         self._weights = weights
 
-    def __enter__(self) -> Any:
+    def __enter__(self) -> "Self":
         self._outer_weights, _CASTS.weights = _CASTS.weights, self._weights
         _CASTS.depth += 1
-        return super().__enter__()
+        super().__enter__()
+        return self
 
-    def __exit__(self, *args: Any) -> Any:
+    def __exit__(self, *args: object) -> None:
         _CASTS.weights = self._outer_weights
         _CASTS.depth -= 1
         if not _CASTS.depth:
             _CASTS.by_weight.clear()
-        return super().__exit__(*args)
+        super().__exit__(*args)
 
 
 def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.Tensor:
@@ -81,7 +88,7 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
 def cast_joined(weights: tuple[torch.Tensor, ...], dtype: torch.dtype) -> torch.Tensor:
     """Returns weights (N, n) each, cast as by `cast` and joined along columns: (N, sum of n)."""
 
-    def join():
+    def join() -> torch.Tensor:
         return torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
 
     return once(weights, dtype, join)
@@ -107,7 +114,7 @@ def once(
 
 
 @torch.no_grad()
-def _cast_together(weight):
+def _cast_together(weight) -> None:
     """Rounds all weights of the context to bfloat16, if this is one of them: in one kernel instead
     of one or two for each.
     """
@@ -119,7 +126,7 @@ def _cast_together(weight):
         _CASTS.by_weight[id(w), torch.bfloat16, _MULTIPLE] = w, padded
 
 
-def _is_float32_on_gpu(weight):
+def _is_float32_on_gpu(weight) -> bool:
     return weight.is_cuda and weight.dtype == torch.float32 and weight.is_contiguous()
 
 

@@ -5,6 +5,7 @@ B lanes; `...` any further axes.
 """
 
 from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 import torch
 from torch import nn
@@ -23,6 +24,12 @@ UNKNOWN_SCALE = LIBRARY.constants["UNKNOWN_SCALE"]
 RESOLUTION = LIBRARY.constants["RESOLUTION"]
 
 
+class _Statistics(Protocol):
+    mean: torch.Tensor
+    scale: torch.Tensor
+    min_scale: float
+
+
 class RunningNorm(nn.Module):
     """Subtracts a running mean and divides by a running standard deviation: per channel for images,
     per number for vectors. A number that has not varied yet becomes 0: nothing tells by how much
@@ -36,6 +43,10 @@ class RunningNorm(nn.Module):
     Args:
         space: leaf space of an image or a vector.
     """
+
+    mean: torch.Tensor
+    scale: torch.Tensor
+    count: torch.Tensor  # ()
 
     def __init__(self, space: Space):
         super().__init__()
@@ -134,17 +145,17 @@ def add_moments(
         norm.add(n_lanes if is_counted is None else n_lanes * is_counted, mean, variance)
 
 
-def _is_fused(norm):
+def _is_fused(norm) -> bool:
     return norm.mean.is_cuda and norm.mean.dtype == torch.float32
 
 
-def _is_readable(leaf):
+def _is_readable(leaf) -> bool:
     is_float = leaf.dtype in (torch.float16, torch.float32)
     return leaf.is_cuda and is_float and leaf.is_contiguous()
 
 
 def mix_moments(
-    norm: nn.Module, mean: torch.Tensor, variance: torch.Tensor, rate: torch.Tensor
+    norm: _Statistics, mean: torch.Tensor, variance: torch.Tensor, rate: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns mean and standard deviation of a mixture: the norm's moments with weight 1 - rate,
     `mean` and `variance` with weight rate.

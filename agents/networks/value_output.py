@@ -29,6 +29,10 @@ class ValueOutput(nn.Module):
         min_scale: smallest standard deviation, far below that of returns in any units, and not 0.
     """
 
+    mean: torch.Tensor  # ()
+    scale: torch.Tensor
+    count: torch.Tensor
+
     def __init__(self, width: int, min_scale: float = 1e-15):
         super().__init__()
         self.linear = nn.Linear(width, 1)

@@ -8,34 +8,41 @@ maps names to strings:
     facts     how the agent was trained, such as samples, seconds, command and commit; JSON
     tables    its evaluations: a list of {title, command, rows}; JSON
     wrappers  what wrappers around its environment have learnt, if anything; JSON
-    sha256    hash of all bytes after the header, those of the tensors
+    sha256    hash of the whole file, with zeros in place of these 64 digits
 
-Weights are float16, statistics float32. Without a device, reading does not import PyTorch.
+Weights are float16, statistics float32. Without a device, reading does not import PyTorch. In files
+of format 1, `sha256` is the hash of all bytes after the header, those of the tensors.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import safetensors
 
 from megastep.agents.errors import shortened
-from megastep.agents.runs import trust
+from megastep.agents.runs import formats, strange_files, trust
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
+    from megastep.agents.types import Config, Row
+
 SUFFIX = ".safetensors"
-FORMAT = "1"
+FORMAT, FIRST_FORMAT = "2", "1"
 #: NumPy's name of each dtype by safetensors' name.
 DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I64": "int64"}
-_MAX_HEADER = 2**24  # bytes
+_MAX_HEADER, _MAX_BYTES = 2**24, 2**31
+#: The digest in a header. Texts in the header have their quotes escaped.
+_SEAL = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 
 
 def is_agent_file(path: Path) -> bool:
@@ -46,10 +53,10 @@ def is_agent_file(path: Path) -> bool:
 def write(
     path: Path,
     tensors: Mapping[str, torch.Tensor],
-    config: dict[str, Any],
-    facts: Mapping[str, Any],
-    tables: Sequence[dict[str, Any]] = (),
-    wrappers: Mapping[str, Any] | None = None,
+    config: Config,
+    facts: Mapping[str, object],
+    tables: Sequence[Row] = (),
+    wrappers: Mapping[str, object] | None = None,
 ) -> None:
     """Writes an agent file atomically.
 
@@ -72,8 +79,7 @@ def write(
         if array.dtype.name not in DTYPES.values():
             allowed = ", ".join(DTYPES.values())
             raise ValueError(f"{name} is {array.dtype}, but agent files hold {allowed}")
-    _, data = _split(save(arrays))
-    metadata = {"format": FORMAT, "sha256": hashlib.sha256(data).hexdigest()}
+    metadata = {"format": FORMAT, "sha256": "0" * 64}
     texts = dict(config=config, facts=dict(facts), tables=[*tables])
     if wrappers:
         texts["wrappers"] = {
@@ -81,10 +87,19 @@ def write(
             for path, value in wrappers.items()
         }
     metadata |= {name: json.dumps(value) for name, value in texts.items()}
-    write_atomically(path, save(arrays, metadata))
+    write_atomically(path, sealed(save(arrays, metadata)))
 
 
-def _split(content):
+def sealed(content: bytes) -> bytes:
+    """Returns the bytes of a file with its SHA-256 in place of the one in its header."""
+    match = _SEAL.search(content)
+    assert match is not None
+    start, end = match.span(1)
+    digest = hashlib.sha256(content[:start] + b"0" * 64 + content[end:]).hexdigest()
+    return content[:start] + digest.encode() + content[end:]
+
+
+def _split(content) -> tuple[bytes, bytes]:
     """Returns the header of a file and the bytes of its tensors."""
     end = 8 + int.from_bytes(content[:8], "little")
     return content[8:end], content[end:]
@@ -115,7 +130,7 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
     )
 
 
-def read_metadata(path: Path) -> dict[str, Any]:
+def read_metadata(path: Path) -> Row:
     """Returns `config`, `facts`, `tables` and `wrappers` of an agent file, and `untrusted`: the
     import paths outside megastep in its configuration.
 
@@ -125,12 +140,15 @@ def read_metadata(path: Path) -> dict[str, Any]:
     return _read(path)[0]
 
 
-def _read(path):
+def _read(path) -> tuple[Row, Row]:
     """Returns the result of `read_metadata`, and dtype, shape and bytes of each tensor by name."""
     try:
-        content = path.read_bytes()
+        # a typed path may be a link, as in caches of downloaded files
+        content = strange_files.read_bytes(path.resolve(), _MAX_BYTES)
     except OSError as error:
         raise DamagedCheckpoint(f"{path} cannot be read ({error.strerror})") from None
+    import numpy as np  # not where commands only look for a run
+
     header, data = _split(content)
     try:
         if len(header) > _MAX_HEADER:
@@ -138,17 +156,20 @@ def _read(path):
         entries = dict(sorted(safetensors.deserialize(content)))
         texts = json.loads(header)["__metadata__"]
         version = texts["format"]
-        if version == FORMAT:
-            if hashlib.sha256(data).hexdigest() != texts["sha256"]:
-                raise ValueError("its tensors do not match their SHA-256")
+        if version in (FORMAT, FIRST_FORMAT):
+            if not _is_intact(content, data, texts):
+                raise ValueError("its bytes do not match their SHA-256")
             if any(entry["dtype"] not in DTYPES for entry in entries.values()):
                 raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
             metadata = {name: json.loads(texts[name]) for name in ("config", "facts", "tables")}
             metadata["wrappers"] = json.loads(texts.get("wrappers", "{}"))
-            if type(metadata["facts"]["samples"]) is not int:
-                raise ValueError("invalid number of samples")
+            formats.check(formats.Facts, metadata["facts"])
+            formats.check(formats.Tables, metadata["tables"])
             if not {"train", "spaces"} <= metadata["config"].keys():
                 raise ValueError("incomplete configuration")
+            for name, array in _arrays(entries):
+                if array.dtype.kind == "f" and not np.isfinite(array).all():
+                    raise ValueError(f"{shortened(name, 60)} has a NaN or an infinity")
             metadata["untrusted"] = tuple(trust.foreign_names(texts["config"].encode()))
             return metadata, entries
     except safetensors.SafetensorError as error:
@@ -163,12 +184,21 @@ def _read(path):
     raise DamagedCheckpoint(f"{path} is damaged or not an agent file of megastep: {problem}")
 
 
-def _tensors(entries, device):
+def _is_intact(content, data, texts) -> object:
+    if texts["format"] == FIRST_FORMAT:
+        return hashlib.sha256(data).hexdigest() == texts["sha256"]
+    return _SEAL.search(content, 0, len(content) - len(data)) and sealed(content) == content
+
+
+def _arrays(entries) -> Iterator[tuple[str, np.ndarray]]:
+    """Yields (name, array) of tensors."""
     import numpy as np
+
+    for name, entry in entries.items():
+        yield name, np.frombuffer(entry["data"], DTYPES[entry["dtype"]]).reshape(entry["shape"])
+
+
+def _tensors(entries, device) -> dict:
     import torch
 
-    tensors = {}
-    for name, entry in entries.items():
-        array = np.frombuffer(entry["data"], DTYPES[entry["dtype"]]).reshape(entry["shape"])
-        tensors[name] = torch.tensor(array, device=device)
-    return tensors
+    return {name: torch.tensor(array, device=device) for name, array in _arrays(entries)}

@@ -8,19 +8,27 @@ import math
 from array import array
 from pathlib import Path
 
+from megastep.agents.runs import strange_files
 from megastep.agents.runs.atomic_files import AppendedFile
 
-FILE = "annealing.f64"
+FILE, MAX_BYTES = "annealing.f64", 2**32
+#: Updates of earlier versions, at most, that are not recorded.
+MAX_MISSING = 10**7
 
 
 def read(folder: Path | str) -> array:
     """Returns the factor of each update of a run; empty without a record. NaN marks updates by
     versions that recorded none.
+
+    Raises:
+        ValueError: there is another number than NaN and those from 0 to 1.
     """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
-        data = path.read_bytes()
+        data = strange_files.read_bytes(path, MAX_BYTES)
         factors.frombytes(data[: len(data) // factors.itemsize * factors.itemsize])
+    if not all(0 <= factor <= 1 or math.isnan(factor) for factor in factors):
+        raise ValueError(f"{path} is damaged: factors of the learning rate are from 0 to 1")
     return factors
 
 
@@ -34,11 +42,14 @@ class AnnealingRecord:
 
     Raises:
         OSError: the file cannot be written.
+        ValueError: there is another record, or a forged number of updates.
     """
 
     def __init__(self, folder: Path | str, n_updates: int = 0):
         n_kept = min(n_updates, len(read(folder)))
         self.file = AppendedFile(Path(folder) / FILE, n_kept * array("d").itemsize)
+        if n_updates - n_kept > MAX_MISSING:
+            raise ValueError(f"{folder} has had no {n_updates:,} updates, as its checkpoint says")
         for _ in range(n_kept, n_updates):
             self.append(math.nan)
 

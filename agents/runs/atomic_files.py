@@ -10,6 +10,8 @@ import socket
 import time
 from pathlib import Path
 
+from megastep.agents.runs import strange_files
+
 #: Age in seconds at which temporary files of other machines are deleted, whose processes cannot be
 #: checked from here.
 ABANDONED = 24 * 3600
@@ -67,13 +69,13 @@ def delete_leftovers(folder: Path | str) -> None:
                 path.unlink()
 
 
-def _is_in_use(path, machine, pid, token):
+def _is_in_use(path, machine, pid, token) -> bool:
     if machine != _machine():
         return time.time() - path.stat().st_mtime < ABANDONED
     return token == _TOKEN if pid == os.getpid() else _is_alive(pid)
 
 
-def _is_alive(pid):
+def _is_alive(pid) -> bool:
     try:
         os.kill(pid, 0)  # sends no signal; not all systems have /proc
     except PermissionError:  # it is another user's
@@ -83,7 +85,7 @@ def _is_alive(pid):
     return True
 
 
-def _machine():
+def _machine() -> str:
     """Returns a name for the host or container, within which process ids are unique."""
     name = re.sub(r"[^\w.]", "_", socket.gethostname())[:32]
     with contextlib.suppress(OSError):  # not all systems have namespaces
@@ -112,7 +114,7 @@ class AppendedFile:
         n_bytes: length to truncate it to first; None keeps all.
 
     Raises:
-        OSError: the file cannot be opened or cut.
+        OSError: the file cannot be opened or cut, or is a link.
 
     Attributes:
         unwritten: bytes still to write.
@@ -120,7 +122,7 @@ class AppendedFile:
 
     def __init__(self, path: Path, n_bytes: int | None = None):
         self.path, self.unwritten = path, bytearray()
-        self.file = open(path, "ab", buffering=0)
+        self.file = open(path, "ab", buffering=0, opener=strange_files.opener)
         if n_bytes is not None:
             self.file.truncate(n_bytes)
 

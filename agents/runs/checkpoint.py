@@ -13,7 +13,7 @@ import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs import checkpoint_format
 from megastep.agents.runs.atomic_files import delete_leftovers, sync_folder, temporary_path
@@ -21,6 +21,8 @@ from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, 
 
 if TYPE_CHECKING:
     import torch
+
+    from megastep.agents.types import Config, Row, StateDict
 
 __all__ = [
     "Checkpoint",
@@ -37,13 +39,13 @@ __all__ = [
 def save(
     folder: Path | str,
     step: int,
-    state: dict[str, Any],
-    config: dict[str, Any],
+    state: StateDict,
+    config: Config,
     keep_checkpoints: int = 2,
     score: float | None = None,
-    made_with: dict[str, Any] | None = None,
+    made_with: Row | None = None,
     replay_seconds: float | None = None,
-    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
+    add_files: Callable[[Path], Row] = lambda path: {},
 ) -> Path:
     """Writes a checkpoint and deletes old ones. Returns its folder.
 
@@ -107,12 +109,15 @@ def load_latest(
     folder = Path(folder)
     if (folder / "manifest.json").exists():
         return checkpoint_format.read(folder, device, is_whole, rank)
-    messages = []
-    for path in reversed(list_checkpoints(folder)):
+    messages, tried = [], set()
+    # a run that is being trained replaces its checkpoints meanwhile
+    while paths := [path for path in list_checkpoints(folder) if path not in tried]:
+        tried.add(path := paths[-1])
         try:
             checkpoint = checkpoint_format.read(path, device, is_whole, rank)
         except DamagedCheckpoint as error:
-            messages.append(str(error))
+            if path.exists():
+                messages.append(str(error))
             continue
         for message in messages:
             warnings.warn(f"{message}; using {path.name} instead", stacklevel=2)
@@ -148,7 +153,9 @@ def step_of(path: Path) -> int:
 
 def _step_and_number(path: Path) -> tuple[int, int]:
     """Returns a checkpoint's step, and its number among those of that step, from 1."""
-    step, number = re.match(r"step_(\d+)(?:-(\d+))?", path.name).groups()
+    match = re.match(r"step_(\d+)(?:-(\d+))?", path.name)
+    assert match is not None
+    step, number = match.groups()
     return int(step), int(number or 1)
 
 
@@ -167,9 +174,9 @@ def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
     """
     checkpoints = list_checkpoints(folder)
     last_of_each_step = list({step_of(path): path for path in checkpoints}.values())
-    scores = {path: _score(path) for path in last_of_each_step}
-    scored = [path for path in last_of_each_step if scores[path] is not None]
-    best = max(scored, key=scores.get, default=None)
+    scored = [(path, _score(path)) for path in last_of_each_step]
+    scores = {path: score for path, score in scored if score is not None}
+    best = max(scores, key=scores.__getitem__, default=None)
     with_replay = [path for path in last_of_each_step if (path / "replay.pt").exists()]
     kept = {*last_of_each_step[-keep_checkpoints:], best, *with_replay[-1:]}
     aside = [path for path in folder.glob("step_*.aside") if step_of(path) <= step]

@@ -23,15 +23,19 @@ import os
 import pickle
 import re
 import time
+import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from megastep.agents.runs import trust
+from megastep.agents.errors import memory_problem, shortened
+from megastep.agents.runs import formats, strange_files, trust
 from megastep.agents.runs.atomic_files import sync_folder
 
 if TYPE_CHECKING:
     import torch
+
+    from megastep.agents.types import Config, Row, StateDict
 
 #: The format number. Increase it if older readers would misread a checkpoint, or this version an
 #: older one, and add the last commit of the replaced format to `READERS`.
@@ -43,7 +47,7 @@ MIGRATED = 6
 PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
 _RANK_FILE = re.compile(r"rank[1-9]\d*\.pt")
 _LOGGERS = "megastep.agents.training.loggers"
-_CHUNK = 2**24  # bytes
+_CHUNK = _MAX_JSON = 2**24  # bytes
 
 
 class CheckpointError(RuntimeError):
@@ -72,9 +76,9 @@ class Checkpoint:
     path: Path
     step: int
     numbers: dict[str, float]
-    config: dict[str, Any]
-    made_with: dict[str, Any]
-    state: dict[str, Any] | None = None
+    config: Config
+    made_with: Row
+    state: StateDict | None = None
     untrusted: tuple[str, ...] = ()
     n_ranks: int = 1
 
@@ -90,12 +94,12 @@ def rank_file(rank: int) -> str:
 def write(
     path: Path,
     step: int,
-    state: dict[str, Any],
-    config: dict[str, Any],
+    state: StateDict,
+    config: Config,
     score: float | None,
-    made_with: dict[str, Any] | None = None,
+    made_with: Row | None = None,
     replay_seconds: float | None = None,
-    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
+    add_files: Callable[[Path], Row] = lambda path: {},
 ) -> None:
     """Writes a checkpoint into a new folder and flushes it to disk.
 
@@ -126,7 +130,7 @@ def write(
     files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
     files |= add_files(path)
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
-    manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
+    manifest: dict = dict(format=FORMAT, step=step, score=score, numbers=numbers)
     manifest |= dict(torch=torch.__version__, made_with=made_with or {}, files=files)
     manifest["signature"] = trust.sign(text)
     text = sealed(manifest)
@@ -134,9 +138,7 @@ def write(
     sync_folder(path)
 
 
-def write_state(
-    path: Path, state: dict[str, Any], replay_seconds: float | None = None
-) -> dict[str, Any]:
+def write_state(path: Path, state: StateDict, replay_seconds: float | None = None) -> Row:
     """Writes a rank's state into one file and flushes it to disk. Returns its manifest entry.
 
     Args:
@@ -154,7 +156,7 @@ def write_state(
         return _write_file(path, functools.partial(torch.save, state))
 
 
-def check_plain(tree: Any, name: str) -> None:
+def check_plain(tree: object, name: str) -> None:
     """Checks that a tree can be loaded without running code: it may hold tensors, numbers, strings,
     None, and lists, tuples and dicts of these.
 
@@ -213,9 +215,7 @@ class _HashedFile:
         pass
 
 
-def _write_file(
-    path: Path, write: Callable[[Any], Any], deadline: float | None = None
-) -> dict[str, Any]:
+def _write_file(path: Path, write: Callable[[Any], object], deadline: float | None = None) -> Row:
     """Writes a file and flushes it to disk. Returns its manifest entry."""
     with open(path, "wb") as file:
         hashed = _HashedFile(file, deadline)
@@ -227,7 +227,7 @@ def _write_file(
     return {"sha256": hashed.sha256.hexdigest(), "bytes": hashed.n_bytes}
 
 
-def sealed(manifest: dict[str, Any]) -> bytes:
+def sealed(manifest: Row) -> bytes:
     """Returns a manifest as JSON, with its own SHA-256 added."""
     digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
     return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
@@ -261,10 +261,10 @@ def read(
         verify(path, manifest)
     else:
         verify(path, manifest, [*parts, "config.json"])
-    text = (path / "config.json").read_bytes()
     try:
+        text = strange_files.read_bytes(path / "config.json", _MAX_JSON)
         config = json.loads(text)
-    except (ValueError, RecursionError):
+    except (OSError, ValueError, RecursionError):
         raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is not JSON") from None
     checkpoint = Checkpoint(
         path,
@@ -283,25 +283,41 @@ def read(
     return dataclasses.replace(checkpoint, state=_migrated(state, manifest))
 
 
-def _load(path, device):
+def _load(path, device) -> Any:
     """Returns the state in a file. Raises DamagedCheckpoint."""
     import torch
 
     try:
-        return torch.load(path, map_location=device, weights_only=True)
+        with open(path, "rb", opener=strange_files.opener) as file:
+            _check_zip(file)
+        state = torch.load(path, map_location=device, weights_only=True)
+        if not isinstance(state, dict):
+            raise ValueError("it is no dict")
+        return state
     except pickle.UnpicklingError:
         raise DamagedCheckpoint(
             f"Checkpoint {path.parent} is refused: {path.name} holds more than tensors and "
             "numbers, so loading it could run code"
         ) from None
-    except (RuntimeError, EOFError, ValueError) as error:
+    except Exception as error:  # of a planted file, there is no end to what unpickling raises
+        if memory_problem(error):
+            raise
         raise DamagedCheckpoint(
-            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read "
-            f"({str(error).splitlines()[0]})"
+            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read ({shortened(error)})"
         ) from None
 
 
-def _migrated(state, manifest):
+def _check_zip(file) -> None:
+    """Raises ValueError for a zip file whose parts are compressed, which `torch.save` never does: a
+    small one may unpack to more than there is memory.
+    """
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            if any(entry.compress_size != entry.file_size for entry in archive.infolist()):
+                raise ValueError("its parts are compressed")
+
+
+def _migrated(state, manifest) -> dict:
     """Returns a state of format `MIGRATED` or `FORMAT` in `FORMAT`."""
     import torch
     from torch.nn.functional import pad
@@ -319,7 +335,7 @@ def _migrated(state, manifest):
     return state | {"samples_at_report": state.get("samples", 0)}
 
 
-def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
+def with_loggers(config: Config) -> Config:
     """Returns a configuration with loggers by label. In older ones, `train.logger` is W&B or none,
     and TensorBoard is implied.
     """
@@ -332,7 +348,7 @@ def with_loggers(config: dict[str, Any]) -> dict[str, Any]:
     return config
 
 
-def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = None) -> None:
+def verify(path: Path, manifest: Row, names: Iterable[str] | None = None) -> None:
     """Compares files of a checkpoint, by default all, with the SHA-256 in its manifest.
 
     Raises:
@@ -351,15 +367,15 @@ def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = N
             )
 
 
-def _digest(path):
+def _digest(path) -> str:
     digest = hashlib.sha256()
-    with open(path, "rb") as file:
+    with open(path, "rb", opener=strange_files.opener) as file:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
     return digest.hexdigest()
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path) -> Row:
     """Returns a checkpoint's manifest.
 
     Raises:
@@ -367,16 +383,23 @@ def read_manifest(path: Path) -> dict[str, Any]:
         CheckpointError: it has an unknown format.
     """
     try:
-        data = (path / "manifest.json").read_bytes()
+        data = strange_files.read_bytes(path / "manifest.json", _MAX_JSON)
         manifest = json.loads(data)
         version = manifest["format"]
         body = {key: value for key, value in manifest.items() if key != "sha256"}
-        is_intact = data == sealed(body)
+        is_intact = data == sealed(body) and isinstance(version, (int, str))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         version, is_intact = None, False
-    if is_intact:
+    if is_intact and version in (FORMAT, MIGRATED):
+        try:
+            formats.check(formats.Manifest, manifest)
+        except ValueError as error:
+            raise DamagedCheckpoint(
+                f"Checkpoint {path} is damaged: manifest.json: {error}"
+            ) from None
         others = {*manifest["files"]} - {"config.json", "state.pt", *PARTS}
         is_intact = all(map(_RANK_FILE.fullmatch, others))  # a forged manifest may name any path
+        is_intact &= {"config.json", "state.pt"} <= {*manifest["files"]}
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest):
         raise DamagedCheckpoint(

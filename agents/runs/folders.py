@@ -11,11 +11,20 @@ import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
+from megastep.agents.runs import (
+    agent_file,
+    checkpoint,
+    checkpoint_format,
+    formats,
+    strange_files,
+)
+
+if TYPE_CHECKING:
+    import torch
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: The folder of each start of a run, one per line.
@@ -43,31 +52,41 @@ def make(path: Path) -> Path:
             with contextlib.suppress(FileExistsError):  # taken, perhaps by another process just now
                 folder.mkdir()
                 return folder
+    raise AssertionError("counting never ends")
 
 
-def new(name: str, folder: str | None = None) -> Path:
+def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
     """Returns the folder of a new run.
 
     Args:
         name: end of the default folder's name, which starts with the time.
         folder: a folder that is empty or does not exist; None for the default in `RUNS`.
+        is_again: as for `check_free`.
 
     Raises:
         UserError: the folder is not empty or cannot be written.
     """
     if folder is None:
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
-    check_free(folder)
+    check_free(folder, is_again)
     return Path(folder) if os.path.exists(folder) else make(Path(folder))
 
 
-def check_free(name: str | None) -> None:
-    """Raises UserError if the folder of a new run is not empty or cannot be read."""
+def check_free(name: str | None, is_again: bool = False) -> None:
+    """Raises UserError if the folder of a new run is not empty or cannot be read.
+
+    Args:
+        is_again: it may be that of a run which ended before it saved anything.
+    """
     folder = Path(name or "")
     with user_errors(CANNOT.format(shortened(folder))):
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
     # Hydra writes .hydra/ and a log before the job of a sweep starts
-    if [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]:
+    used = [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]
+    if is_again and used:
+        strange_files.check_folder(folder)
+        used = used if not {"lock", "config.yaml"} & {path.name for path in used} else []
+    if used:
         raise UserError(
             f"The run folder {folder} is not empty; choose another with folder=, or continue "
             f"its run: {resume_command(folder)}"
@@ -89,7 +108,8 @@ def locked(folder: Path) -> Iterator[None]:
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
         lock.acquire()
-        path.write_text(str(os.getpid()))
+        with open(path, "w", opener=strange_files.opener) as file:
+            file.write(str(os.getpid()))
     except filelock.Timeout:
         with user_errors(f"The run folder {folder} is in use, or was just now: "):
             pid = path.read_text()  # fails if the last owner has just deleted it
@@ -146,12 +166,15 @@ def find(name: str) -> Path:
         name: a path, `latest`, or the name of a pretrained agent; an existing path has priority.
 
     Raises:
-        UserError: nothing is found. Names the most similar run and pretrained agent.
+        UserError: nothing is found. Names the most similar run and pretrained agent. Or a link in a
+            run leaves its folder, or something in it is no file.
     """
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
-        return folders[-1]
+        path = folders[-1]
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
+        is_in_run = path.parent.name in ("checkpoints", "snapshots")
+        strange_files.check_folder(folder_of(path) if is_in_run else path)
         return path
     if agent_file.is_agent_file(path) and os.path.isfile(path):
         return path
@@ -173,7 +196,11 @@ def find(name: str) -> Path:
 
 
 def load_checkpoint(
-    path: Path, trust: bool, device: Any = None, is_whole: bool = False, rank: int = 0
+    path: Path,
+    trust: bool,
+    device: "torch.device | str | None" = None,
+    is_whole: bool = False,
+    rank: int = 0,
 ) -> checkpoint.Checkpoint:
     """Loads the latest intact checkpoint of a run, or an agent file. Warns of damaged checkpoints.
 
@@ -192,16 +219,18 @@ def load_checkpoint(
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
-    with contextlib.suppress(AttributeError, KeyError, TypeError):  # a forged one may hold anything
-        for key in REMOVED:
-            loaded.config["train"].pop(key, None)
+    config = loaded.config
+    with user_errors(f"The configuration in {loaded.path} is no run's: "):
+        formats.check(formats.Config, config)
+    for key in REMOVED:
+        config["train"].pop(key, None)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "
             f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
             "trust it, add trust=true"
         )
-    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(loaded.config))
+    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(config))
 
 
 def resume_command(folder: Path, key: str = "resume") -> str:

@@ -7,9 +7,15 @@ import json
 import math
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
+from megastep.agents.runs import formats, strange_files
 from megastep.agents.runs.atomic_files import AppendedFile, write_atomically
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
+
+MAX_BYTES = 2**32
 
 
 class JsonLines:
@@ -33,7 +39,7 @@ class JsonLines:
         self.file.close()
 
 
-def read(path: Path | str) -> list[dict[str, Any]]:
+def read(path: Path | str) -> "list[Row]":
     """Returns the objects in a file.
 
     Skips damaged lines with a warning, and silently a last line that a crash cut short.
@@ -53,13 +59,13 @@ def truncate_after(path: Path | str, step: int) -> None:
         return
     lines = (line + b"\n" for row, line in _intact_lines(path) if row["samples"] <= step)
     data = b"".join(lines)
-    if data != path.read_bytes():
+    if data != strange_files.read_bytes(path, MAX_BYTES):
         write_atomically(path, data)
 
 
-def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
+def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
     """Returns (object, bytes) of each intact line."""
-    *lines, last = path.read_bytes().split(b"\n")
+    *lines, last = strange_files.read_bytes(path, MAX_BYTES).split(b"\n")
     rows = [(_parsed(line), line) for line in [*lines, last]]
     damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]
     if damaged:
@@ -68,11 +74,10 @@ def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
     return [(row, line) for row, line in rows if row is not None]
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
+def _parsed(line: bytes) -> "Row | None":
     """Returns a line's object, or None if it is damaged."""
     try:
-        row = json.loads(line)
-    except ValueError:
+        formats.check(formats.Row, row := json.loads(line))
+    except (ValueError, RecursionError):
         return None
-    is_intact = isinstance(row, dict) and isinstance(row.get("samples"), int)
-    return row if is_intact else None
+    return row

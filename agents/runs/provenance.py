@@ -77,13 +77,14 @@ def commit(folder: Path) -> str | None:
     changed; None without a checkout or git.
     """
 
-    def git(*words):
+    def git(*words) -> str:
         command = ["git", "-C", str(folder), *words]
         # ignore the variables of a git hook that starts this; take no lock in the user's checkout
         env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
         env["GIT_OPTIONAL_LOCKS"] = "0"
-        options = dict(capture_output=True, check=True, timeout=GIT_TIMEOUT, env=env, text=True)
-        return subprocess.run(command, stdin=subprocess.DEVNULL, **options).stdout.strip()
+        options: dict = dict(stdin=subprocess.DEVNULL, timeout=GIT_TIMEOUT, env=env)
+        result = subprocess.run(command, capture_output=True, check=True, text=True, **options)
+        return result.stdout.strip()
 
     try:
         # megastep may be installed inside another project's checkout

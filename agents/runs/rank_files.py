@@ -10,10 +10,13 @@ import os
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs import checkpoint_format
 from megastep.agents.runs.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row, StateDict
 
 #: Seconds that rank 0 waits for the other ranks' files.
 SECONDS = 60.0
@@ -35,19 +38,17 @@ class RankFiles:
         if rank == 0:
             self._delete_leftovers()
 
-    def _delete_leftovers(self):
+    def _delete_leftovers(self) -> None:
         for path in self.folder.glob(".rank*"):
             with contextlib.suppress(OSError):
                 path.unlink()
 
-    def _paths(self, rank, number):
+    def _paths(self, rank, number) -> tuple[Path, Path]:
         """Returns the paths of a rank's state and of its manifest entry, which is written last."""
         name = f".rank{rank}-{self.launch}-{number}"
         return self.folder / f"{name}.pt", self.folder / f"{name}.json"
 
-    def hand_in(
-        self, number: int, state: dict[str, Any], replay_seconds: float | None = None
-    ) -> None:
+    def hand_in(self, number: int, state: StateDict, replay_seconds: float | None = None) -> None:
         """Writes this rank's file: its state without the policy's weights, which rank 0 saves.
 
         Args:
@@ -67,7 +68,7 @@ class RankFiles:
             path.unlink(missing_ok=True)
             raise
 
-    def collect(self, number: int, folder: Path) -> dict[str, Any]:
+    def collect(self, number: int, folder: Path) -> Row:
         """Waits for the other ranks' files and moves them into a checkpoint, as `rank1.pt` and so
         on. Returns their manifest entries by name.
 

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.errors import UserError
 from megastep.agents.runs import annealing, checkpoint, folders
@@ -15,6 +15,7 @@ from megastep.agents.runs import annealing, checkpoint, folders
 if TYPE_CHECKING:
     from megastep.agents.algorithms.nonfinite import NonFiniteValue
     from megastep.agents.training.trainer import Trainer
+    from megastep.agents.types import Config
 
 #: Folder inside the run folder that keeps the checkpoint, itself a run folder.
 FOLDER = "nonfinite"
@@ -60,19 +61,19 @@ def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
     return f"{why}. {how}, once this run has ended: {folders.resume_command(run, 'rerun')}"
 
 
-def _is_whole(path, trainer):
+def _is_whole(path, trainer) -> bool:
     """Returns True if a checkpoint has environments, and the replay buffer if there is one."""
     has_replay = trainer.run_state.replay_buffer is None or (path / "replay.pt").exists()
     return has_replay and (path / "world.pt").exists()
 
 
-def _changed(path: Path, config: dict[str, Any]) -> dict[str, Any]:
+def _changed(path: Path, config: Config) -> Config:
     """Returns the settings in `CHANGEABLE` whose values differ from the checkpoint's."""
     before = json.loads((path / "config.json").read_bytes())["train"]
     return {key: config[key] for key in CHANGEABLE if config[key] != before.get(key)}
 
 
-def _keep(path, run, trainer):
+def _keep(path, run, trainer) -> Path:
     """Creates a run folder with the checkpoint and the annealing record. Returns the folder."""
     kept = folders.make(run / FOLDER)
     try:
@@ -86,7 +87,7 @@ def _keep(path, run, trainer):
     return kept
 
 
-def _link(source, target):
+def _link(source, target) -> str:
     """Hard-links a file, since checkpoints never change; copies it where links fail."""
     with contextlib.suppress(OSError):
         os.link(source, target)

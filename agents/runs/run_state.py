@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
 from megastep.env_state import EnvState
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.training.episode_stats import EpisodeStats
-    from megastep.agents.types import CollectorLike, Learner
+    from megastep.agents.types import CollectorLike, Learner, StateDict
 
 
 class RunState:
@@ -61,7 +61,7 @@ class RunState:
         names = self.env_state.unreachable()
         return f"they cannot hold {', '.join(names)} of the environment" if names else None
 
-    def state_dict(self, has_episodes: bool = True) -> dict[str, Any]:
+    def state_dict(self, has_episodes: bool = True) -> StateDict:
         """Returns the state as dicts of tensors and plain values.
 
         Most tensors are not copies, so copy them before the environment or the learner steps.
@@ -87,7 +87,7 @@ class RunState:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
 
-    def load_state_dict(self, state: dict[str, Any], is_new_rank: bool = False) -> list[str]:
+    def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> list[str]:
         """Restores a `state_dict`.
 
         Args:
@@ -117,7 +117,7 @@ class RunState:
                 lost.append("the replay buffer was not saved and starts empty")
         return ["added ranks start new episodes"] if is_new_rank else lost
 
-    def _of_new_rank(self, state):
+    def _of_new_rank(self, state) -> StateDict:
         """Returns rank 0's state with this rank's generators, and with no episodes counted since
         the last report.
         """
@@ -126,7 +126,7 @@ class RunState:
         parts = {name: _with_generators(saved, own[name]) for name, saved in pairs}
         return {**state, **parts, "episode_stats": stats | {"sums": 0 * stats["sums"]}}
 
-    def _load_episodes(self, state):
+    def _load_episodes(self, state) -> list[str]:
         """Restores environment, actor state and episode statistics. Returns clauses."""
         lost = []
         if "env" not in state:
@@ -162,7 +162,7 @@ class RunState:
             )
 
 
-def _with_generators(saved, own):
+def _with_generators(saved, own) -> object:
     """Returns a saved state whose `SeededGenerator` states are replaced by those of `own`."""
     if not isinstance(saved, dict) or not isinstance(own, dict):
         return saved

@@ -10,7 +10,7 @@ import threading
 import time
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch.utils._pytree import tree_leaves
@@ -21,6 +21,7 @@ from megastep.agents.runs.rank_files import RankFiles
 
 if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
+    from megastep.agents.types import Config, Row, StateDict
 
 #: Bytes up to which a replay buffer is in every checkpoint.
 SMALL_REPLAY = 2**28
@@ -54,21 +55,24 @@ class Saver:
     def __init__(
         self,
         folder: Path,
-        config: dict[str, Any],
+        config: Config,
         keep_checkpoints: int = 2,
-        made_with: dict[str, Any] | None = None,
+        made_with: Row | None = None,
         replay_every: int = 20,
         rank_files: RankFiles | None = None,
     ):
         self.folder, self.config, self.keep_checkpoints = folder, config, keep_checkpoints
         self.made_with, self.replay_every = made_with, replay_every
         self.rank_files = rank_files or RankFiles(folder)
-        self.error, self.lacks_replay, self.has_warned_of_memory = None, False, False
+        self.error: str | None = None
+        self.lacks_replay = self.has_warned_of_memory = False
         self.seconds, self._n_since_replay, self._number = 0.0, 0, 0
-        self._host_copy, self._thread, self._failure = _HostCopy(), None, None
+        self._host_copy = _HostCopy()
+        self._thread: threading.Thread | None = None
+        self._failure: tuple[int, int, Exception] | None = None
 
     def __call__(
-        self, step: int, state: dict[str, Any], score: float | None = None, is_last: bool = False
+        self, step: int, state: StateDict, score: float | None = None, is_last: bool = False
     ) -> None:
         """Copies `state` to the CPU and starts to write a checkpoint of it.
 
@@ -94,7 +98,7 @@ class Saver:
         self._thread = threading.Thread(target=self._write, args=(step, state, score, seconds))
         self._thread.start()
 
-    def _with_replay(self, state, is_last):
+    def _with_replay(self, state, is_last) -> tuple[StateDict, float | None]:
         """Returns the state, without the replay buffer if that is not due, and the time limit in
         seconds for the buffer (None for no limit).
         """
@@ -111,7 +115,7 @@ class Saver:
         self.lacks_replay = True
         return {name: part for name, part in state.items() if name != "replay"}, None
 
-    def _warn_of_memory(self):
+    def _warn_of_memory(self) -> None:
         if not self.has_warned_of_memory:
             self.has_warned_of_memory = True
             warnings.warn(
@@ -125,7 +129,7 @@ class Saver:
         """True while the thread writes."""
         return self._thread is not None and self._thread.is_alive()
 
-    def _write(self, step, state, score, replay_seconds):
+    def _write(self, step, state, score, replay_seconds) -> None:
         began = time.monotonic()
         try:
             if self.rank_files.rank > 0:
@@ -174,7 +178,7 @@ class Saver:
                 f"{self.error}. Training goes on; the next checkpoint tries again", stacklevel=2
             )
 
-    def _message(self, step, n_bytes, error):
+    def _message(self, step, n_bytes, error) -> str:
         reason = getattr(error, "strerror", None) or str(error)
         sentence = (
             f"The checkpoint at {step:,} samples could not be saved ({reason}): it needs about "
@@ -190,18 +194,18 @@ class Saver:
 class _HostCopy:
     """Copies a state to the CPU, from a GPU into pinned memory that is reused."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.pinned = {}
 
-    def __call__(self, state: dict[str, Any]) -> dict[str, Any]:
+    def __call__(self, state: StateDict) -> StateDict:
         """Returns the copy as plain dicts, lists and tuples. Synchronises."""
         self.devices = set()
-        copy = self._copied(state, ())
+        copy = {key: self._copied(part, (key,)) for key, part in state.items()}
         for device in self.devices:
             torch.cuda.synchronize(device)
         return copy
 
-    def _copied(self, node, path):
+    def _copied(self, node, path) -> object:
         if isinstance(node, torch.Tensor):
             return self._copied_tensor(node.detach(), path)
         if isinstance(node, dict):
@@ -211,7 +215,7 @@ class _HostCopy:
         checkpoint_format.check_plain(node, ".".join(map(str, path)))
         return node
 
-    def _copied_tensor(self, tensor, path):
+    def _copied_tensor(self, tensor, path) -> torch.Tensor:
         if tensor.device.type != "cuda":
             return tensor.clone()
         if path[0] == "replay" or "rollouts" in path:  # possibly too large to pin
@@ -224,7 +228,7 @@ class _HostCopy:
         return kept.copy_(tensor, non_blocking=True)
 
 
-def _free_memory():
+def _free_memory() -> float:
     """Returns free memory in bytes, infinity if unknown."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -232,7 +236,7 @@ def _free_memory():
         return math.inf
 
 
-def _nbytes(state):
+def _nbytes(state) -> int:
     return sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
 
 

@@ -3,12 +3,15 @@
 import contextlib
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs import json_lines
 
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
-def mean_return(rows: list[dict[str, Any]], n_reports: int = 10) -> float | None:
+
+def mean_return(rows: "list[Row]", n_reports: int = 10) -> float | None:
     """Returns the score of a training run: the mean return of the episodes that ended in its last
     reports. None if no episode finished.
 

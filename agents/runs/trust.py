@@ -67,16 +67,16 @@ def foreign_names(config: bytes) -> list[str]:
     return sorted({*names})
 
 
-def _digest(key, config):
+def _digest(key, config) -> str:
     return hmac.new(key, config, "sha256").hexdigest()
 
 
-def _path():
+def _path() -> Path:
     base = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(base) / "megastep" / "key"
 
 
-def _read_key():
+def _read_key() -> bytes:
     """Returns the key. Raises OSError if it does not exist or is not private."""
     with open(_path(), "rb") as file:
         status, key = os.fstat(file.fileno()), file.read()
@@ -86,7 +86,7 @@ def _read_key():
     return key
 
 
-def _make_key():
+def _make_key() -> bytes:
     """Returns the key. Creates it if missing; among several processes, the first one does."""
     with contextlib.suppress(FileNotFoundError):
         return _read_key()

@@ -34,7 +34,7 @@ class MixedPolicy:
 
     def __init__(self, policies: Sequence[PolicyLike], lanes: Sequence[torch.Tensor]):
         self.policies = [
-            policy.in_lanes(own) if hasattr(policy, "in_lanes") else policy
+            policy if (in_lanes := getattr(policy, "in_lanes", None)) is None else in_lanes(own)
             for policy, own in zip(policies, lanes, strict=True)
         ]
         self.sizes = [len(policy_lanes) for policy_lanes in lanes]
@@ -79,9 +79,8 @@ class MixedPolicy:
 
         Until then nothing may use the results, and `world` and `state` must not change.
         """
-        main = torch.cuda.current_stream(self.lanes.device) if self.streams else None
         for stream in self.streams:
-            stream.wait_stream(main)
+            stream.wait_stream(torch.cuda.current_stream(self.lanes.device))
         started, start = [], 0
         for i, (policy, size) in enumerate(zip(self.policies, self.sizes, strict=True)):
             policy_world, start = world[start : start + size], start + size

@@ -3,7 +3,7 @@
 Axes: N environments of A agents, B = N A lanes; M of the environments have opponents.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +15,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.agents.storage.rollout import copy_tree
+from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
@@ -74,6 +75,7 @@ class Opponents:
         seed: int = 1,
     ):
         self.env, self.every, device = env, every, env.device
+        self.n_agents = optional(env, "n_agents")
         self.scripted = scripted if bot else None
         n_per_snapshot, n_bot = count_environments(env, env.n_envs, past, bot, snapshots)
         if bot and scripted is None:
@@ -87,25 +89,25 @@ class Opponents:
         n_by_opponent = [n_per_snapshot] * n_snapshots + [n_bot] * (n_bot > 0)
         self.n_past, self.n_opposed = n_per_snapshot * n_snapshots, sum(n_by_opponent)
 
-        slots = [rotating_slots(n, env.n_agents, device) for n in n_by_opponent]
+        slots = [rotating_slots(n, self.n_agents, device) for n in n_by_opponent]
         self.slots = torch.cat(slots)  # (M, 1)
-        learners = torch.ones(env.n_envs, env.n_agents, dtype=torch.bool, device=device)
+        learners = torch.ones(env.n_envs, self.n_agents, dtype=torch.bool, device=device)
         learners[-self.n_opposed :] = torch.zeros_like(self.slots, dtype=torch.bool)
         learners[-self.n_opposed :].scatter_(1, self.slots, True)
         self.learners = learners.flatten()
         opponent_lanes = (~self.learners).nonzero()[:, 0]
-        n_lanes_by_opponent = [n * (env.n_agents - 1) for n in n_by_opponent]
+        n_lanes_by_opponent = [n * (self.n_agents - 1) for n in n_by_opponent]
         opponents = [*self.snapshots, scripted][: len(n_by_opponent)]
         self.mixed_policy = MixedPolicy(opponents, opponent_lanes.split(n_lanes_by_opponent))
         self.matchups = self._matchups({"past": self.n_past, "bot": n_bot})
         # (2, M): pairs of a learning agent and an opponent that were won and decided since `pop`
         self.pairs = torch.zeros(2, self.n_opposed, device=device)
-        self.returns = torch.zeros(self.n_opposed, env.n_agents, device=device)
+        self.returns = torch.zeros(self.n_opposed, self.n_agents, device=device)
 
-    def _matchups(self, n_by_kind):
+    def _matchups(self, n_by_kind) -> dict[str, torch.Tensor]:
         """Returns {name: (B,) bool} from the number of environments per kind of opponent."""
         n_by_kind = {"now": self.env.n_envs - self.n_opposed, **n_by_kind}
-        n_lanes = torch.tensor(list(n_by_kind.values())) * self.env.n_agents
+        n_lanes = torch.tensor(list(n_by_kind.values())) * self.n_agents
         kind = torch.arange(len(n_by_kind)).repeat_interleave(n_lanes).to(self.env.device)
         return {name: kind == i for i, name in enumerate(n_by_kind) if n_by_kind[name]}
 
@@ -137,13 +139,14 @@ class Opponents:
         )
 
     @torch.no_grad()
-    def step(self, decision: arrdict) -> World:
+    def step(self, decision: Mapping) -> World:
         """Steps the environment.
 
         Uses `decision.actions`, (B, ...), in the lanes that learn; the opponents act in the others.
         """
         if self.acting is None:
             self.begin_step()
+        assert self.acting is not None
         opponent_actions, self.hidden_state = self.mixed_policy.finish(self.acting)
         self.acting = None
         lanes = self.mixed_policy.lanes
@@ -153,16 +156,16 @@ class Opponents:
         self._count_pairs(world)
         return self._observed(world)
 
-    def _observed(self, world):
+    def _observed(self, world) -> arrdict:
         """Stores what the opponents see of a world. Returns the world with `learns`."""
         self.opponent_world = self.mixed_policy.select_lanes(world)
         learns = self.learners if "learns" not in world else self.learners & world["learns"]
         return arrdict(world, learns=learns)
 
-    def _count_pairs(self, world):
+    def _count_pairs(self, world) -> None:
         """Adds the pairs that this step decided to `pairs`. On a GPU in one kernel."""
         reward, terminal, truncated = (
-            world[key].contiguous().view(-1, self.env.n_agents)[-self.n_opposed :]
+            world[key].contiguous().view(-1, self.n_agents)[-self.n_opposed :]
             for key in ("reward", "terminal", "truncated")
         )
         if reward.is_cuda and reward.dtype == torch.float32:
@@ -170,7 +173,7 @@ class Opponents:
                 *(LIBRARY, "count_pairs", reward.device, self.n_opposed),
                 **dict(reward=reward, terminal=terminal, truncated=truncated, slots=self.slots),
                 **dict(returns=self.returns, pairs=self.pairs),
-                **dict(n_envs=self.n_opposed, n_agents=self.env.n_agents),
+                **dict(n_envs=self.n_opposed, n_agents=self.n_agents),
             )
             return
         self.returns += reward
@@ -195,7 +198,11 @@ class Opponents:
     ) -> dict[str, float]:
         """Returns the fraction of decided pairs that were won since the last call. Synchronises.
 
-        Keys are metric names. A kind of opponent without a decided pair is absent.
+        A kind of opponent without a decided pair is absent.
+
+        Metrics:
+            episode/won/KIND: fraction of pairs won against past snapshots (past) or the bot (bot)
+                since the last report, of those that were decided.
 
         Args:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.
@@ -208,12 +215,12 @@ class Opponents:
         self.pairs.zero_()
         return win_rates
 
-    def _pairs_by_kind(self):
+    def _pairs_by_kind(self) -> dict[str, torch.Tensor]:
         """Returns the parts of `pairs`, (2, m) by kind of opponent. They are views."""
         past, bot = self.pairs.tensor_split([self.n_past], 1)
         return {"past": past, "bot": bot}
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns the snapshots, the generator's state, and by lane what opponents see and remember
         and the scores of the episodes in progress. The environment has a state of its own.
         """
@@ -223,7 +230,7 @@ class Opponents:
             lanes=dict(self._lanes(), pairs=self.pairs.clone()),  # a report clears the pairs
         )
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Restores a `state_dict`. Without `lanes`, the opponents begin new episodes.
 
         Raises:
@@ -240,7 +247,7 @@ class Opponents:
         if "lanes" in state:
             copy_tree(self._lanes(), state["lanes"])
 
-    def _lanes(self):
+    def _lanes(self) -> dict[str, torch.Tensor]:
         names = "hidden_state", "opponent_world", "pairs", "returns"
         return {name: getattr(self, name) for name in names}
 

@@ -9,13 +9,14 @@ in the same order, but not at the same time; the numbers are equal.
 
 import copy
 from collections.abc import Callable
-from typing import Any
 
 import torch
 
 from megastep.agents.networks.policy import Policy
+from megastep.agents.private_ops import copy_all_
 from megastep.agents.storage.collector import Collector, initial_actor_state
 from megastep.agents.storage.rollout import Rollout, copy_tree
+from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
 from megastep.capture import Graph
 from megastep.types import Env
@@ -37,8 +38,8 @@ class _Slot:
         self.collect = Collector(env, self.actor, self.rollout, actor_state)
         self.end = None
 
-    def copy_weights(self):
-        torch._foreach_copy_(list(self.weights.values()), self.sources)
+    def copy_weights(self) -> None:
+        copy_all_([*self.weights.values()], self.sources)
 
 
 class AsyncCollector:
@@ -95,10 +96,10 @@ class AsyncCollector:
         for rollout in (self.rollout, *(slot.rollout for slot in self.slots)):
             rollout.allocate_layouts()
 
-    def _launch(self, slot):
+    def _launch(self, slot) -> None:
         """Starts collecting a rollout with the policy's current weights."""
         slot.copy_weights()
-        if not self.on_gpu:
+        if self.stream is None:
             slot.collect()
             return
         current = torch.cuda.current_stream(self.stream.device)
@@ -113,15 +114,15 @@ class AsyncCollector:
 
     def wait(self) -> None:
         """Blocks until no rollout is being collected. Call it before using the environment."""
-        if self.on_gpu:
+        if self.stream is not None:
             self.stream.synchronize()
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns the actor state and the rollouts collected in advance. Call `wait` first."""
         rollouts = [slot.rollout.state_dict() for slot in self.slots] if self.is_ahead else []
         return dict(actor_state=self.actor_state, rollouts=rollouts, n_returned=self.n_returned)
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Restores a `state_dict` of a collector with the same lag."""
         copy_tree(self.actor_state, state["actor_state"])
         self.n_returned, self.is_ahead = state["n_returned"], bool(state["rollouts"])

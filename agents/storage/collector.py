@@ -4,7 +4,7 @@ T time, B lanes.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import torch
 
@@ -15,6 +15,9 @@ from megastep.capture import capture
 from megastep.dotdict import leaves
 from megastep.env_state import EnvState
 from megastep.types import Env, Tree, optional
+
+if TYPE_CHECKING:
+    from megastep.agents.networks.policy import Policy
 
 _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
 
@@ -60,12 +63,13 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
             with torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
-            layout = None if rollout.layouts is None else env.layout
+            layout = None if rollout.layouts is None else optional(env, "layout")
             seen = rollout.store_outcome(t, world, layout)
 
         if rollout.values is not None:
             features.append(policy(seen, state, sample=False)[0]["features"])
-            rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
+            values = cast("Policy", policy).value(torch.stack(features), rollout.privileged)
+            rollout.values[:] = values
     # A non-finite hidden state would otherwise last until the lane's episode ends.
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=_stored(world), state=state)
@@ -76,7 +80,7 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
 
 def capture_with(
     env: Env,
-    policies: Any,
+    policies: object,
     function: Callable,
     args: tuple = (),
     roots: tuple = (),
@@ -156,5 +160,5 @@ class Collector:
         self.n_collected, self.graph = 0, None
 
 
-def _stored(world):
+def _stored(world) -> arrdict:
     return arrdict({key: world[key] for key in _STORED if key in world})

@@ -64,7 +64,7 @@ def copy_all(
         )
 
 
-def _is_plain_copy(target, source):
+def _is_plain_copy(target, source) -> bool:
     return (
         source.device == target.device
         and source.dtype == target.dtype
@@ -128,7 +128,7 @@ def select_tree(tree: Tree, lanes: torch.Tensor) -> Tree:
     return tree_unflatten([leaf[0] for leaf in selected], spec)
 
 
-def _can_select(tensor, n_selected):
+def _can_select(tensor, n_selected) -> bool:
     n_bytes = tensor[:, :1].numel() * tensor.element_size()  # of one lane
     is_small = 0 < n_bytes * max(n_selected, tensor.shape[1]) < _MAX_BYTES
     return tensor.is_cuda and tensor.is_contiguous() and is_small

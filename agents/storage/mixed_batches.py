@@ -38,7 +38,7 @@ def add_replayed(
     return arrdict(joined, index=replayed.index)
 
 
-def _burn_in(batch, policy, n_steps):
+def _burn_in(batch, policy, n_steps) -> arrdict:
     """Returns a batch without its first steps, with the hidden state after them."""
     if not n_steps:
         return batch

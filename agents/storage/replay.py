@@ -61,13 +61,13 @@ class ReplayBuffer:
         device = rollout.reward.device
         n_rows = self.n_rollouts * self.n_steps
 
-        def column(leaf, stored=None):  # for a leaf (T, B, ...) of the rollout
+        def column(leaf, stored=None) -> Column:  # for a leaf (T, B, ...) of the rollout
             return Column(n_rows, leaf.shape[1:], leaf.dtype, stored, device)
 
-        def column_of_space(space, leaf):
+        def column_of_space(space, leaf) -> Column:
             return column(leaf, stored_dtype(space, settings.images))
 
-        def column_of_state(leaf):
+        def column_of_state(leaf) -> Column:
             return Column(self.n_rollouts, leaf.shape, leaf.dtype, torch.float16, device)
 
         self.columns = arrdict(
@@ -139,7 +139,7 @@ class ReplayBuffer:
                 *(columns, getattr(rollout, name)),
             )
         bits = [getattr(rollout, name)[: self.n_steps].byte() << i for i, name in enumerate(_FLAGS)]
-        self.flags.write(rows, sum(bits))
+        self.flags.write(rows, torch.as_tensor(sum(bits)))
         spaces.map(lambda column, leaf: column.write(slot, leaf[None]), self.state, rollout.state)
         self.is_finite.index_copy_(0, slot, is_finite)
         self.n_added += 1
@@ -174,7 +174,7 @@ class ReplayBuffer:
         batch["index"], batch["probability"] = index, probability
         return batch
 
-    def _read(self, index, probability):
+    def _read(self, index, probability) -> arrdict:
         """Returns the sequences with their weights and ages."""
         slot, lane = index // self.n_lanes, index % self.n_lanes
         window = torch.arange(self.length + 1, device=index.device)[:, None]
@@ -193,7 +193,7 @@ class ReplayBuffer:
         batch["age"] = (self.n_added - 1 - slot) % self.n_rollouts
         return batch
 
-    def _read_on_gpu(self, index, probability):
+    def _read_on_gpu(self, index, probability) -> arrdict | None:
         """Does the same in one kernel; None where that is not possible."""
         tree = arrdict(self.columns, state=self.state)
         columns, spec = tree_flatten(tree)
@@ -259,7 +259,7 @@ class ReplayBuffer:
         self.n_added.copy_(state["n_added"])
         copy_tree(self.state_dict(), state)
 
-    def _rows(self, n_rollouts):
+    def _rows(self, n_rollouts) -> dict[str, object]:
         """Returns the first rollouts of every column, as views."""
         rows = mapping(lambda column: column.rows[: n_rollouts * self.n_steps])
         state = mapping(lambda column: column.rows[:n_rollouts])(self.state)

@@ -205,6 +205,6 @@ def read_sequences(
     return results, bools, weight, age
 
 
-def _packed(levels):
+def _packed(levels) -> bytes:
     rows = [LIBRARY.params.TreeLevelParams(sums=level) for level in levels]
     return LIBRARY.params.SumTreeParams(levels=b"".join(rows), n_levels=len(levels))

@@ -83,5 +83,5 @@ def defaults_from(settings: ReplaySettings) -> BeforeValidator:
     return BeforeValidator(functools.partial(_complete, settings))
 
 
-def _complete(settings, value):
+def _complete(settings, value) -> object:
     return {**dataclasses.asdict(settings), **value} if isinstance(value, dict) else value

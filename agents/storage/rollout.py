@@ -93,7 +93,8 @@ class Rollout:
         self.values = torch.zeros(rows_and_last, device=device) if values else None
         self.logprobs = torch.zeros(rows, device=device)
         self.reward = torch.zeros(rows, device=device)
-        self.metrics, self.layouts = arrdict(), None
+        self.metrics = arrdict()
+        self.layouts: torch.Tensor | None = None
         self.state = clone(state)
 
     # ---- Writing ----
@@ -117,7 +118,7 @@ class Rollout:
         """Stores reward, episode end and metrics of the world after the action of time t."""
         copy_all(self._of_transition(t, world))
 
-    def store_decision(self, t: int, decision: arrdict) -> None:
+    def store_decision(self, t: int, decision: Mapping) -> None:
         """Stores the actions of time t, and log-probabilities if the decision has them. Call it
         before the environment steps, which may change actions in place.
         """
@@ -137,11 +138,12 @@ class Rollout:
         if layout is not None:
             n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
             by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
+            assert self.layouts is not None
             pairs.append((self.layouts[t], self.select_lanes(by_lane)))
         copy_all(pairs)
         return self.world(t + 1)
 
-    def _of_world(self, t, world):
+    def _of_world(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Returns (target, source) pairs for the observation of time t."""
         pairs = [*_pairs(self.obs, t, world["obs"]), (self.starts[t], world["reset"])]
         if "learns" in world:
@@ -150,7 +152,7 @@ class Rollout:
             pairs += _pairs(self.privileged, t, world["privileged"])
         return pairs
 
-    def _of_transition(self, t, world):
+    def _of_transition(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Returns (target, source) pairs for row t, from the world after its action."""
         names = "reward", "terminal", "truncated"
         metrics = [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
@@ -178,12 +180,12 @@ class Rollout:
 
     def scatter_actions(self, actions: Tree) -> Tree:
         """Returns actions for every lane of the environment: 0 for lanes that are not stored."""
-        if self.lane_indices is None:
+        if self.lane_indices is None or self.learners is None:
             return actions
         n_env_lanes = len(self.learners)
 
         @mapping
-        def scatter(leaf):
+        def scatter(leaf) -> torch.Tensor:
             zeros = leaf.new_zeros(n_env_lanes, *leaf.shape[1:])
             return zeros.index_copy(0, self.lane_indices, leaf)
 
@@ -216,6 +218,7 @@ class Rollout:
 
     def transitions(self) -> dict[str, torch.Tensor]:
         """Returns the arguments of `returns.gae`: (T, B) each, and the last value (B,)."""
+        assert self.values is not None
         return dict(
             value=self.values[:-1],
             last_value=self.values[-1],
@@ -291,23 +294,23 @@ def copy_tree(target: Tree, source: Tree) -> None:
         copy_tree(part, source[key])
 
 
-def without_last(tree: Tree | None) -> Tree | None:
+def without_last(tree: Tree) -> Tree:
     """Returns the first T of T+1 rows, those with actions, of a tree of tensors or of None."""
     return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
 
 
-def _pairs(rows, t, tree):
+def _pairs(rows, t, tree) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Returns (target, source) pairs of the leaves of row t and of a tree."""
     targets, sources = spaces.leaves(rows), spaces.leaves(tree)
     return [(target[t], sources[path]) for path, target in targets.items()]
 
 
-def _zeros(space, lead, device, dtype=torch.float32):
+def _zeros(space, lead, device, dtype=torch.float32) -> Tree:
     """Returns zeros (*lead, ...) for a space: int64 for integers, else the dtype that the space
     names, else `dtype`.
     """
 
-    def zeros(leaf):
+    def zeros(leaf) -> torch.Tensor:
         is_integer = isinstance(leaf, spaces.MultiDiscrete)
         leaf_dtype = torch.int64 if is_integer else getattr(leaf, "dtype", None) or dtype
         return torch.zeros(*lead, *leaf.shape, dtype=leaf_dtype, device=device)
@@ -315,7 +318,7 @@ def _zeros(space, lead, device, dtype=torch.float32):
     return spaces.map(zeros, space)
 
 
-def _bytes(space, default_itemsize):
+def _bytes(space, default_itemsize) -> int:
     """Returns the bytes of one value of a space, whose leaves may name a dtype."""
     n_bytes = 0
     for leaf in spaces.leaves(space).values():

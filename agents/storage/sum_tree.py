@@ -128,7 +128,7 @@ class SumTree:
         tiny = torch.finfo(torch.float64).tiny
         return self.priorities.index_select(0, index) / self.total.clamp(min=tiny)
 
-    def _fractions(self, n, generator):
+    def _fractions(self, n, generator) -> torch.Tensor:
         """Returns where in its part of the total each sample is, (n,) float64 from 0 to 1."""
         if n < 1:
             raise ValueError(f"n must be at least 1 index to draw, but {n} was given")

@@ -56,7 +56,7 @@ class Budget:
         return max(0.0, _fraction_left(seconds, self.seconds))
 
 
-def _fraction_left(spent, limit):
+def _fraction_left(spent, limit) -> float:
     return 1.0 if limit is None else 1 - spent / limit
 
 
@@ -68,9 +68,9 @@ class Stopwatch:
         started: time of `start` on the monotonic clock, or None.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.seconds_before = 0.0
-        self.started = None
+        self.started: float | None = None
 
     def start(self) -> None:
         """Starts counting. Called after the first update, so compilation does not count."""
@@ -78,10 +78,11 @@ class Stopwatch:
 
     @property
     def is_running(self) -> bool:
+        """Whether the time counts."""
         return self.started is not None
 
     @property
     def seconds(self) -> float:
         """Seconds of training so far, those before a resume included."""
-        since_start = time.monotonic() - self.started if self.is_running else 0.0
+        since_start = 0.0 if self.started is None else time.monotonic() - self.started
         return self.seconds_before + since_start

@@ -5,6 +5,7 @@ import signal
 import threading
 import warnings
 from collections.abc import Iterator
+from typing import NoReturn
 
 from megastep.types import Env, optional
 
@@ -32,7 +33,7 @@ def _limited(seconds: float) -> Iterator[None]:
         yield
         return
 
-    def interrupt(number, frame):
+    def interrupt(number, frame) -> NoReturn:
         raise TimeoutError(f"it took more than {seconds:g} s")
 
     signal.signal(signal.SIGALRM, interrupt)

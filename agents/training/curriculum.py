@@ -7,14 +7,14 @@ repeat bit for bit. With several ranks, each has scores of its own episodes and 
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field, SkipValidation
 
 from megastep.agents.algorithms import returns
 from megastep.agents.storage.rollout import Rollout
-from megastep.agents.types import Learner, LearnerOptions, with_defaults
+from megastep.agents.types import Learner, LearnerOptions, StateDict, with_defaults
 from megastep.settings import checked
 from megastep.types import Env, optional
 
@@ -77,17 +77,17 @@ class Curriculum:
         )
         self.means, self.squares, self.scores = (torch.zeros(n, device=device) for _ in range(3))
         self.lanes = torch.zeros(2, rollout.n_lanes, dtype=torch.int64, device=device)
-        names = dict.fromkeys(sources or ())
+        sources = sources or ()
         self.sources = {
             name: torch.tensor([name == source for source in sources], device=device)
-            for name in names
+            for name in dict.fromkeys(sources)
         }
 
     def probabilities(self) -> torch.Tensor:
         """Returns how likely each home is to be drawn, (D,) float32 of sum 1."""
         raise NotImplementedError
 
-    def _rescore(self, rollout, n, homes, ended):
+    def _rescore(self, rollout, n, homes, ended) -> None:
         """Updates `scores`, after the other statistics.
 
         Args:
@@ -101,6 +101,7 @@ class Curriculum:
     def update(self, rollout: Rollout) -> None:
         """Learns from the episodes that ended in a rollout, and changes the probabilities."""
         ended = (rollout.terminal | rollout.truncated) & rollout.learns[:-1]
+        assert rollout.layouts is not None
         homes = rollout.layouts.flatten().long()
         n = self._sums(homes, ended)
         self.n_episodes += n
@@ -115,12 +116,12 @@ class Curriculum:
             weights = (self.probabilities() * _TOTAL).long()
             self.cumulative.copy_(weights.cumsum(0).clamp_(max=2**31 - 1))
 
-    def _sums(self, homes, values):
+    def _sums(self, homes, values) -> torch.Tensor:
         """Returns the sums of values (T, B) by home, (D,) int64."""
         sums = torch.zeros_like(self.n_episodes)
         return sums.index_add_(0, homes, values.flatten().long())
 
-    def _average(self, running, n, sums):
+    def _average(self, running, n, sums) -> None:
         """Moves a running mean by n episodes of these sums, (D,) each; to their mean at first."""
         is_known = self.n_episodes > n
         rates = torch.where(is_known, 1 - (1 - self.lr) ** n, (n > 0).float())
@@ -129,14 +130,17 @@ class Curriculum:
     def stats(self) -> dict[str, float]:
         """Returns numbers for a report. Synchronises.
 
-        - `curriculum/effective_homes`: exponential of the entropy of the draws: D if all are alike
-        - `curriculum/unseen`: fraction of homes in which no episode has ended yet
-        - `curriculum/fewest_episodes`: of all homes, since training began
-        - `curriculum/score`: mean score
-        - `curriculum/outcome`, `curriculum/worst`: running outcome, the mean over all homes alike
-          and over the worst 5 % of them; 0 in an unseen home
-        - `curriculum/outcome/SOURCE`, `curriculum/drawn/SOURCE`: the mean over the homes of a
-          source, and the fraction of draws in them
+        Metrics:
+            curriculum/effective_homes: exponential of the entropy of the draws: the number of homes
+                if draws are uniform, 1 if one home is always drawn.
+            curriculum/unseen: fraction of homes in which no episode has ended yet.
+            curriculum/fewest_episodes: episodes that ended in the home with the fewest.
+            curriculum/score: mean score; with `sfl`, mean learnability.
+            curriculum/outcome: mean running outcome, all homes weighted alike; 0 in an unseen home.
+            curriculum/worst: the same over the worst 5 % of homes.
+            curriculum/outcome/SOURCE: with `geometry=mixed`, mean running outcome in the homes of a
+                source.
+            curriculum/drawn/SOURCE: with `geometry=mixed`, fraction of draws in those homes.
         """
         weights = self.cumulative.double().diff(prepend=self.cumulative.new_zeros(1).double())
         drawn = weights / weights.sum()
@@ -155,12 +159,12 @@ class Curriculum:
         values = torch.stack([*numbers.values()]).tolist()
         return {f"curriculum/{name}": value for name, value in zip(numbers, values)}
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns everything that changes; tensors are copies."""
         state = {name: getattr(self, name).clone() for name in _SAVED}
         return state | {"lanes": self.lanes.clone(), "n_updates": self.n_updates}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`. Its `lanes` are None if new episodes begin."""
         for name in _SAVED:
             getattr(self, name).copy_(state[name])
@@ -214,7 +218,7 @@ class SFL(Curriculum):
         powers = self.scores ** (1 / self.temperature)
         return self.uniform / len(powers) + (1 - self.uniform) * proportions(powers)
 
-    def _rescore(self, rollout, n, homes, ended):
+    def _rescore(self, rollout, n, homes, ended) -> None:
         variance = (self.squares - self.means.square()).clamp(min=0.0)
         self.scores.copy_(torch.where(self.n_episodes > 0, variance, 0.25))
 
@@ -253,12 +257,12 @@ class PLR(Curriculum):
         super().__init__(env, rollout, sources, lr, every)
         self.score, self.temperature, self.mix = score, temperature, staleness
         options = with_defaults(learner, LearnerOptions)
-        if rollout.values is None or options.lambda_ is None:
+        if rollout.values is None or options.gamma is None or options.lambda_ is None:
             raise ValueError(
                 "curriculum=plr needs values at the time of acting, which learner=ppo stores; use "
                 "curriculum=sfl"
             )
-        self.discounts = dict(gamma=options.gamma, lambda_=options.lambda_)
+        self.gamma, self.lambda_ = options.gamma, options.lambda_
 
     def probabilities(self) -> torch.Tensor:
         scores = torch.where(self.n_episodes > 0, self.scores, torch.inf)
@@ -267,8 +271,9 @@ class PLR(Curriculum):
         powers = torch.empty_like(ranks).scatter_(0, order, ranks ** (-1 / self.temperature))
         return (1 - self.mix) * proportions(powers) + self.mix * proportions(self.staleness.float())
 
-    def _rescore(self, rollout, n, homes, ended):
-        advantages = returns.gae(**rollout.transitions(), **self.discounts).advantages
+    def _rescore(self, rollout, n, homes, ended) -> None:
+        steps = rollout.transitions()
+        advantages = returns.gae(**steps, gamma=self.gamma, lambda_=self.lambda_).advantages
         is_absolute = self.score == "absolute"
         magnitudes = advantages.abs() if is_absolute else advantages.clamp(min=0.0)
         # of the episode so far: cumulative sums, minus those at the last episode's end
@@ -287,7 +292,7 @@ def outcomes_of(rollout: Rollout) -> torch.Tensor | None:
     """Returns the outcome of the episodes that end, (T, B) from 0 to 1; None if no metric tells."""
     for names in OUTCOMES:
         if all(name in rollout.metrics for name in names):
-            total = sum(rollout.metrics[name] for name in names)
+            total = torch.as_tensor(sum(rollout.metrics[name] for name in names))
             return total.nan_to_num(0.0).clamp(0.0, 1.0)
     return None
 

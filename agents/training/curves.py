@@ -1,11 +1,16 @@
 """Learning curves of a run, drawn from its JSON lines."""
 
+import io
 import warnings
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs import json_lines
+from megastep.agents.runs.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
 MAX_COLUMNS = 4
 #: Statistics of episodes that are no curves of their own: how many they are of, and their spread.
@@ -55,12 +60,13 @@ def plot_curves(folder: Path | str) -> None:
         for axes in grid.flat[len(panels) :]:
             axes.set_axis_off()
         figure.supxlabel("samples", fontsize="medium")
-        figure.savefig(folder / "curves.png", dpi=80)
+        figure.savefig(image := io.BytesIO(), dpi=80)
+        write_atomically(folder / "curves.png", image.getvalue())
     except OSError as error:
         warnings.warn(f"curves.png cannot be drawn ({error.strerror})", stacklevel=2)
 
 
-def panels_of(metrics: list[dict[str, Any]], perf: list[dict[str, Any]]) -> dict[str, Lines]:
+def panels_of(metrics: "list[Row]", perf: "list[Row]") -> dict[str, Lines]:
     """Returns the lines of each panel by its title, from the rows of a run's two files.
 
     Panels are in the order return, length, other episode statistics, losses, speed.

@@ -7,11 +7,11 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from megastep.agents.algorithms.nonfinite import LIMIT
+from megastep.agents.types import StateDict
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Env, optional
@@ -121,7 +121,7 @@ class EpisodeStats:
         self.lengths = _sum_since(lengths, last_end, slice(-1, None))[0]
         self.is_whole |= done.any(0)
 
-    def _is_fused(self, reward, learns, metrics):
+    def _is_fused(self, reward, learns, metrics) -> bool:
         values = [metrics[name] for name in self.metrics]
         return (
             reward.is_cuda
@@ -130,7 +130,7 @@ class EpisodeStats:
             and all(value.dtype == torch.float32 for value in (reward, *values))
         )
 
-    def _add_on_gpu(self, reward, reset, done, learns, metrics, layouts):
+    def _add_on_gpu(self, reward, reset, done, learns, metrics, layouts) -> None:
         """Does the same as `add` in two kernels."""
         n_steps, n_lanes = reward.shape
         values = [metrics[name].contiguous() for name in self.metrics]
@@ -174,23 +174,23 @@ class EpisodeStats:
             n_lanes=n_lanes,
         )
 
-    def _add_sums(self, sums, source_sums):
+    def _add_sums(self, sums, source_sums) -> None:
         """Adds sums (4 + 2 M, B), and those by source (4 + 2 M, S, B) if there are sources."""
         columns = sums @ self.members
         self.sums += columns if source_sums is None else torch.cat([columns, source_sums.sum(2)], 1)
 
-    def _sources_of(self, layouts):
+    def _sources_of(self, layouts) -> torch.Tensor:
         """Returns the number of each layout's source, -1 for one that is out of range."""
         last = len(self.source_of_layout) - 1
         sources = self.source_of_layout[layouts.clamp(0, last).long()]
         return torch.where((layouts >= 0) & (layouts <= last), sources, -1)
 
-    def _sum(self, counts, values, metrics):
+    def _sum(self, counts, values, metrics) -> torch.Tensor:
         """Returns the sums over time of the episodes that count, (4 + 2 M, B)."""
         sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
         return torch.cat([sums, *self._sum_metrics(counts, metrics)]) if self.metrics else sums
 
-    def _sum_metrics(self, counts, metrics):
+    def _sum_metrics(self, counts, metrics) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the sums of the metrics and the number of episodes left out of each, (M, B)."""
         values = torch.stack([metrics[name] for name in self.metrics])  # (M, T, B)
         is_good = values.abs() <= LIMIT
@@ -220,15 +220,18 @@ class EpisodeStats:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.
 
         Means are over the episodes that ended since the last call and, if those are fewer than
-        `MIN_EPISODES`, those of earlier calls, a call at a time. A dict of
+        `MIN_EPISODES`, those of earlier calls, a call at a time. They are absent if there are none.
 
-        - `episode/count`: episodes that ended since the last call
-        - `episode/window`: episodes that the means are over; absent, like the means, if it is 0
-        - `episode/return`, `episode/length` and `episode/NAME` for each metric: the means; a metric
-          is absent if every episode was left out of it
-        - `episode/return_std`: standard deviation of the return
-        - all but the last for each group and each source, such as `episode/return/leader` and
-          `episode/success/maze`
+        Metrics:
+            episode/count: episodes that ended since the last report.
+            episode/window: episodes that the means are over.
+            episode/return: mean return.
+            episode/return_std: standard deviation of the return.
+            episode/length: mean number of steps.
+            episode/NAME: mean of a metric of the environment, over the episodes in which it is
+                finite.
+            episode/NAME/GROUP: the same, but for `return_std`, in the lanes of a role (leader) or
+                of a kind of opponent (now, past, bot), or in the floor plans of a source (maze).
         """
         reports = sum_over_ranks(self.sums.T).tolist()
         self.sums.zero_()
@@ -247,10 +250,10 @@ class EpisodeStats:
             stats |= {name: n for name, n in by_name.items() if name not in stats}
         return stats
 
-    def _means(self, report, totals):
+    def _means(self, report, totals) -> dict[str, float]:
         """Returns counts and means by name from the sums of a report and those of a window."""
         n, returns, _, lengths, *metrics = totals
-        stats = {"episode/count": int(report[0])}
+        stats: dict[str, float] = {"episode/count": int(report[0])}
         if n:
             stats |= {"episode/window": int(n), "episode/return": returns / n}
             stats["episode/length"] = lengths / n
@@ -261,14 +264,14 @@ class EpisodeStats:
                     stats[f"episode/{name}"] = total / (n - n_left_out)
         return stats
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> StateDict:
         """Returns a copy of the episodes in progress, the sums since the last report and those of
         earlier ones.
         """
         windows = [torch.tensor(window, dtype=torch.float64) for window in self.windows]
         return {name: getattr(self, name).clone() for name in _SAVED} | {"windows": windows}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: StateDict) -> None:
         """Restores a `state_dict`. Ignores one with other metrics or groups."""
         if state["sums"].shape != self.sums.shape:
             return
@@ -297,7 +300,7 @@ def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch
     return groups if stored is None else {name: lanes[stored] for name, lanes in groups.items()}
 
 
-def _sum_since(cumulative, ends, rows=slice(None)):
+def _sum_since(cumulative, ends, rows=slice(None)) -> torch.Tensor:
     """Returns cumulative sums (T, B) at some rows, minus those at the row of the last episode end.
 
     Args:
@@ -308,7 +311,7 @@ def _sum_since(cumulative, ends, rows=slice(None)):
     return cumulative[rows] - at_end
 
 
-def _add_report(window, report):
+def _add_report(window, report) -> list[float]:
     """Adds the sums of a report to a window, in place. Returns the sums over the window."""
     if report[0]:
         window.append(report)
@@ -319,6 +322,6 @@ def _add_report(window, report):
     return [math.fsum(column) for column in zip(*window, strict=True)] or [0.0] * len(report)
 
 
-def _without_nonfinite(values):
+def _without_nonfinite(values) -> torch.Tensor:
     """Returns numbers with 0 in place of NaN, infinity and those beyond `nonfinite.LIMIT`."""
     return torch.where(values.abs() <= LIMIT, values, 0.0)

@@ -6,7 +6,7 @@ The learner skips such updates, see `nonfinite.NonFiniteCheck`.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
@@ -78,7 +78,7 @@ class NonFiniteGuard:
             return n_skipped == 0
         advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
         is_from_env = value is not None and value.is_from_env
-        if is_from_env:
+        if value is not None and is_from_env:
             advice = f"It came from the environment: check how it computes {value.name}"
         raise NonFiniteError(
             f"The last {n_skipped} updates were skipped because of numbers that were not finite or "
@@ -105,7 +105,7 @@ class NonFiniteGuard:
             )
 
 
-def _env_lanes(rollout):
+def _env_lanes(rollout) -> Sequence[int]:
     """Returns the environment's lane of each lane of the rollout."""
     learners = rollout.learners
     return range(rollout.n_lanes) if learners is None else learners.nonzero()[:, 0].tolist()

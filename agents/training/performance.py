@@ -2,6 +2,7 @@
 
 import time
 from collections import deque
+from typing import Any
 
 import torch
 
@@ -62,7 +63,7 @@ class PhaseTimer:
         seconds, self._seconds = self._seconds, {}
         return seconds
 
-    def _now(self):
+    def _now(self) -> Any:
         """Returns this moment: seconds, on a GPU an event."""
         if self.device.type != "cuda":
             return time.perf_counter()
@@ -70,7 +71,7 @@ class PhaseTimer:
         event.record(torch.cuda.current_stream(self.device))
         return event
 
-    def _add_finished(self):
+    def _add_finished(self) -> None:
         """Adds the phases that have ended, so that no more events are kept than the GPU is behind.
 
         Does not wait for a GPU.

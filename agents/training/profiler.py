@@ -69,7 +69,7 @@ class Profiler:
             write_atomically(path, self._tables(profile, seconds).encode())
             self.path = path
 
-    def _begin(self):
+    def _begin(self) -> None:
         activities, is_gpu = [torch.profiler.ProfilerActivity.CPU], self.device.type == "cuda"
         if is_gpu:
             activities.append(torch.profiler.ProfilerActivity.CUDA)
@@ -79,7 +79,7 @@ class Profiler:
         profile.start()  # takes seconds on a GPU
         self._profile = profile
 
-    def _close_range(self):
+    def _close_range(self) -> None:
         if self._range is not None:
             self._range.__exit__(None, None, None)
             self._range = None
@@ -95,10 +95,11 @@ class Profiler:
             reason = str(error).partition("\n")[0]
             warnings.warn(f"The profile could not be made: {reason}", stacklevel=3)
 
-    def _tables(self, profile, seconds):
+    def _tables(self, profile, seconds) -> str:
         """Returns Markdown: milliseconds of an update by phase and by operation."""
         n, is_gpu = self.n_begun - N_SKIPPED, self.device.type == "cuda"
-        of_device = torch.autograd.DeviceType.CUDA if is_gpu else torch.autograd.DeviceType.CPU
+        device_types = torch.autograd.DeviceType  # pyright: ignore[reportPrivateImportUsage]
+        of_device = device_types.CUDA if is_gpu else device_types.CPU
         times = {}  # name -> calls, microseconds without those of what it calls
         for event in profile.key_averages():
             if event.device_type == of_device and not (is_gpu and event.key in PHASES):
@@ -109,7 +110,7 @@ class Profiler:
             raise RuntimeError("PyTorch's profiler saw no kernels")
         update = 1000 * sum(seconds.values()) / n
 
-        def cells(milliseconds):
+        def cells(milliseconds) -> tuple[str, str]:
             return f"{milliseconds:.3g}", f"{100 * milliseconds / update:.1f} %"
 
         phases = [(phase, *cells(1000 * seconds.get(phase, 0.0) / n)) for phase in PHASES]

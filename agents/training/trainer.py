@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, cast
 
 import torch
 
@@ -26,9 +26,10 @@ from megastep.types import Env, optional
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.runs.annealing import AnnealingRecord
+    from megastep.agents.storage.rollout import Rollout
     from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.training.profiler import Profiler
-    from megastep.agents.types import Learner, RolloutLike, RunLogger, SaverLike
+    from megastep.agents.types import Learner, RolloutLike, RunLogger, SaverLike, StateDict
 
 
 #: Updates that the host may be ahead of a GPU. The learning rate of an update follows the clock at
@@ -116,7 +117,8 @@ class Trainer:
         self.on_log, self.evaluator, self.snapshot_saver = on_log, evaluator, snapshot_saver
         self.opponents = optional(env, "opponent_pool")
         self.annealing_record, self.profiler = annealing_record, profiler
-        if budget.anneal != "never" and not with_defaults(learner, LearnerOptions).set_lr:
+        self.set_lr = with_defaults(learner, LearnerOptions).set_lr
+        if budget.anneal != "never" and not self.set_lr:
             raise ValueError(
                 f"{type(learner).__name__} has no set_lr(lr), so its learning rate cannot fall "
                 f"with {budget.anneal}: use learner.anneal=never, or add the method"
@@ -125,13 +127,14 @@ class Trainer:
         self.collector_options = with_defaults(self.collect, CollectorOptions)
         self.rollout = self.collect.rollout
         self.curriculum = make_curriculum and make_curriculum(env, learner, self.rollout)
-        if optional(env, "layout") is None or not self.collector_options.allocate_layouts:
+        allocate_layouts = self.collector_options.allocate_layouts
+        if optional(env, "layout") is None or not allocate_layouts:
             layout_sources = None
-        if layout_sources:
-            self.collector_options.allocate_layouts()
+        elif layout_sources:
+            allocate_layouts()
         desync = desync and optional(env, "desync") is not None
-        if desync:
-            env.desync()  # the collector has reset the environment, and has not stepped it yet
+        if desync:  # the collector has reset the environment, and has not stepped it yet
+            optional(env, "desync")()
         self.episode_stats = EpisodeStats(
             self.rollout.n_lanes,
             env.device,
@@ -253,12 +256,12 @@ class Trainer:
         Args:
             lr_fraction: factor of the learning rate.
         """
-        rollout = self.rollout
+        rollout = cast("Rollout", self.rollout)
         if self.annealing_record is not None:
             self.annealing_record.append(lr_fraction)
-        if self.budget.anneal != "never":
+        if self.set_lr and self.budget.anneal != "never":
             self.lr = self.learner.lr * lr_fraction
-            self.learner.set_lr(self.lr)
+            self.set_lr(self.lr)
         losses = self.learner.update(rollout)
         self.start("rest")
         self.episode_stats.add(
@@ -287,7 +290,24 @@ class Trainer:
     def log(self, losses: dict[str, torch.Tensor]) -> None:
         """Writes the metrics of all ranks since the last report. Synchronises.
 
-        A loss that is NaN has no value, as no gradient step was taken; it is left out.
+        A loss that is NaN has no value, as no gradient step was taken; it is left out. Rates and
+        times leave out the first update, which compiles.
+
+        Metrics:
+            samples: environment steps so far, over all lanes that learn.
+            updates: updates so far.
+            lr: learning rate.
+            anneal: what the learning rate falls with.
+            eval/NAME: what an evaluation in training measured.
+            perf/rate: samples per second since the last report.
+            perf/seconds: seconds of training so far.
+            perf/collect: seconds of collecting since the last report, on a GPU of the GPU; with
+                `learner.lag`, as far as the learner waits for it.
+            perf/update: seconds of updates, in the same way.
+            perf/rest: seconds of everything else: statistics, logging, checkpoints.
+            perf/memory_allocated: on a GPU, bytes of tensors.
+            perf/memory_reserved: on a GPU, bytes that PyTorch has reserved.
+            perf/memory_peak: on a GPU, the most bytes of tensors so far.
 
         Raises the errors that `env.check()` does, and DriftError if the ranks' weights differ.
         """
@@ -337,7 +357,7 @@ class Trainer:
             self.score = stats["episode/return"]
         self.on_log(self)
 
-    def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
+    def save_checkpoint(self, state: StateDict | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update. All ranks call it.
 
         Args:
@@ -365,7 +385,7 @@ class Trainer:
         self.saver.wait()
 
     @unhurried()
-    def _sync_files(self):
+    def _sync_files(self) -> bool:
         """Returns whether the files of metrics are on disk, where this rank writes them."""
         try:
             self.logger.sync()
@@ -381,7 +401,7 @@ class Trainer:
         """
         self.save_checkpoint(self.state_dict(has_episodes=False), is_last=True)
 
-    def state_dict(self, has_episodes: bool = True) -> dict[str, Any]:
+    def state_dict(self, has_episodes: bool = True) -> StateDict:
         """Returns all that a resumed run needs, as dicts of tensors and plain values, most of which
         share their memory with what trains.
 
@@ -397,7 +417,7 @@ class Trainer:
         )
         return counts | self.run_state.state_dict(has_episodes)
 
-    def load_state_dict(self, state: dict[str, Any], is_new_rank: bool = False) -> None:
+    def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> None:
         """Restores a `state_dict`. `lost` names what cannot be restored.
 
         Args:

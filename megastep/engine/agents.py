@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -12,14 +12,17 @@ from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
 
+if TYPE_CHECKING:
+    from megastep.engine.objects import Objects
+
 __all__ = [
     *("AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents"),
     *("check", "check_flag", "check_on_cpu", "check_flag_on_cpu"),
 ]
 
-AGENT_WIDTH = 0.15  # metres
-AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # of the disc around a square of that width
-MAX_RES = ENGINE.constants["MAX_RES"]
+AGENT_WIDTH = 0.15  # metres, of the square that an agent is drawn as
+AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # metres, of the disc around a square of that width
+MAX_RES = ENGINE.constants["MAX_RES"]  # rays per camera
 
 
 class Agents(SetOnce):
@@ -56,7 +59,7 @@ class Agents(SetOnce):
         fps: float = 10.0,
         cameras: Sequence[float] | None = None,
         radius: float = AGENT_RADIUS,
-        device: Any = "cpu",
+        device: torch.device | str = "cpu",
     ):
         device = checks.device("device", device)
         n_envs = checks.integer("n_envs", n_envs, 1)
@@ -132,7 +135,7 @@ def check_on_cpu(agents: Agents) -> None:
         check_objects(objects)
 
 
-def _objects_of(agents):
+def _objects_of(agents) -> "Objects | None":
     """Returns the objects in the scenery that the agents were last in, or None."""
     checked = vars(agents).get("_checked")
     return checked and checked.scenery.objects

@@ -4,7 +4,7 @@ import math
 import numbers
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -30,11 +30,13 @@ __all__ = [
     "word",
 ]
 
+T = TypeVar("T")
+
 _INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fits into float32
 
 
-def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
+def integer(name: str, value: object, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
     number = value if type(value) is int else _index(value)
     if number is None or not min <= number <= max:
@@ -43,7 +45,7 @@ def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
     return number
 
 
-def _index(value):
+def _index(value) -> int | None:
     """Returns a value as an int, or None if it is none."""
     if isinstance(value, bool) or isinstance(value, torch.Tensor) and not _is_stored(value):
         return None
@@ -57,7 +59,7 @@ def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: 
     """Returns ``value`` as a float. ValueError unless ``min < value < max``."""
     plain = type(value) is float or type(value) is int
     real = plain or isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not real or not min < value < max:
+    if not real or not min < value < max:  # pyright: ignore[reportOperatorIssue]
         kind = f"a number of {unit}" if unit else "a number"
         range_ = f"between {min:g} and {max:g}" if max < math.inf else f"above {min:g}"
         range_ = range_ if min > -math.inf else "that is finite"
@@ -65,28 +67,28 @@ def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: 
     return float(value)
 
 
-def flag(name: str, value: Any) -> bool:
+def flag(name: str, value: object) -> bool:
     """Returns ``value``. TypeError unless it is True or False."""
     if value is not True and value is not False:
         raise TypeError(f"{name} must be True or False, but {_described(value)} was given")
     return value
 
 
-def word(name: str, value: Any, words: Sequence[str]) -> str:
+def word(name: str, value: object, words: Sequence[str]) -> str:
     """Returns ``value``. ValueError unless it is one of ``words``."""
     if not isinstance(value, str) or value not in words:
         raise ValueError(f"{name} must be {' or '.join(words)}, but {_described(value)} was given")
     return value
 
 
-def instance(name: str, value: Any, kind: type) -> Any:
+def instance(name: str, value: object, kind: type[T]) -> T:
     """Returns ``value``. TypeError unless it is a ``kind``."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be a {kind.__name__}, but {_described(value)} was given")
     return value
 
 
-def items(name: str, value: Any) -> list:
+def items(name: str, value: object) -> list:
     """Returns ``value`` as a list. TypeError or ValueError unless it is a list and not empty."""
     if isinstance(value, (str, dict)) or not isinstance(value, Iterable):
         raise TypeError(f"{name} must be a list, but {_described(value)} was given")
@@ -106,7 +108,7 @@ def device(name: str, value: Any) -> torch.device:
         ) from None
 
 
-def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
+def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) -> torch.Tensor:
     """Returns ``value`` as a contiguous float32 tensor on ``device``.
 
     Args:
@@ -135,7 +137,7 @@ def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
 
 
 def integers(
-    name: str, value: Any, size: int | str, min: int, max: int, device: Any
+    name: str, value: Any, size: int | str, min: int, max: int, device: torch.device
 ) -> torch.Tensor:
     """Returns a copy of ``value`` as an int64 tensor of shape (size,) on ``device``.
 
@@ -165,13 +167,13 @@ def integers(
     return tensor
 
 
-def _fits(tensor, shape):
+def _fits(tensor, shape) -> bool:
     return tensor.ndim == len(shape) and all(
         isinstance(size, str) or size == n for size, n in zip(shape, tensor.shape)
     )
 
 
-def ragged(name: str, value: Any, shape: Sequence, device: Any) -> RaggedTorch:
+def ragged(name: str, value: Any, shape: Sequence, device: torch.device | None) -> RaggedTorch:
     """Returns ``value`` as a Ragged of contiguous float32 tensors on ``device``.
 
     Raises:
@@ -181,10 +183,10 @@ def ragged(name: str, value: Any, shape: Sequence, device: Any) -> RaggedTorch:
     if not isinstance(value, Ragged) and not hasattr(value, "torchify"):
         raise TypeError(f"{name} must be a Ragged, but {_described(value)} was given")
     value = value.torchify()
-    return Ragged(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
+    return RaggedTorch(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
 
 
-def length(name: str, value: Any, axis: int = 0) -> int:
+def length(name: str, value: object, axis: int = 0) -> int:
     """Returns the size of a tensor's ``axis``. TypeError or ValueError unless it has that axis."""
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{name} must be a tensor, but {_described(value)} was given")
@@ -282,11 +284,11 @@ def vectors(name: str, value: Any, n_lanes: int, dim: int, device: torch.device)
     return value
 
 
-def _sizes(shape):
+def _sizes(shape) -> str:
     return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
 
 
-def _is_stored(tensor):
+def _is_stored(tensor) -> bool:
     """Returns True if a tensor has memory and lies inside its storage."""
     if tensor.layout is not torch.strided:
         return False
@@ -298,7 +300,7 @@ def _is_stored(tensor):
     return n_bytes <= tensor.untyped_storage().nbytes() or not tensor.numel()
 
 
-def _described(value):
+def _described(value) -> str:
     """Describes a value in a few words."""
     if isinstance(value, torch.Tensor):
         if value.layout is not torch.strided:

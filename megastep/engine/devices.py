@@ -2,7 +2,6 @@
 
 import functools
 import os
-from typing import Any
 
 import torch
 
@@ -45,7 +44,7 @@ def device(name: str | torch.device = "auto") -> torch.device:
     return requested
 
 
-def _missing(count):
+def _missing(count) -> str:
     if count:
         return f"there are {count} GPUs"
     built = "" if torch.version.cuda else " and this PyTorch is built for the CPU only"
@@ -67,7 +66,7 @@ def set_threads(n: int | None) -> None:
     _n_threads = None if n is None else checks.integer("n", n, 1, MAX_THREADS)
 
 
-def fit(n: int, bytes_each: float, device: Any, what: str = "environments") -> None:
+def fit(n: int, bytes_each: float, device: torch.device | str, what: str = "environments") -> None:
     """Checks that ``n`` things of ``bytes_each`` bytes fit into the free memory of ``device``.
 
     Raises:
@@ -81,7 +80,7 @@ def fit(n: int, bytes_each: float, device: Any, what: str = "environments") -> N
         )
 
 
-def free_memory(device: Any) -> int:
+def free_memory(device: torch.device | str) -> int:
     """Returns the number of bytes that can still be allocated on ``device``."""
     device = torch.device(device)
     if device.type == "cuda":

@@ -16,7 +16,8 @@ __all__ = [
     "texel_bits",
 ]
 
-_address, _n_bytes = torch.Tensor.data_ptr, torch.Tensor.nbytes.__get__
+_address = torch.Tensor.data_ptr
+_n_bytes = torch.Tensor.nbytes.__get__  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class _Packed:
@@ -28,9 +29,10 @@ class _Packed:
 
     __slots__ = ("tensors", "inputs", "params")
 
-    def __init__(self, scenery):
+    def __init__(self, scenery) -> None:
         layouts = scenery.layouts
-        self.inputs = self.params = None
+        self.inputs: list | None = None
+        self.params = b""
         self.tensors = (
             layouts.lines.vals,
             layouts.lights.vals,
@@ -64,11 +66,11 @@ def scenery_params(scenery: Scenery, radius: float) -> bytes:
     return packed.params
 
 
-def _pack(scenery, radius, n_threads):
+def _pack(scenery, radius, n_threads) -> bytes:
     layouts, n, k = scenery.layouts, scenery.n_envs, scenery.n_agent_texels
     n_model = len(scenery.model)
 
-    def address(name, tensor, *shape, dtype=torch.float32):
+    def address(name, tensor, *shape, dtype=torch.float32) -> int:
         return checks.address(name, tensor, shape, dtype, scenery.device)
 
     texels = address("scenery.layouts.texels", layouts.texels, layouts.n_texels, 4)
@@ -125,7 +127,7 @@ class _Checked:
 
     __slots__ = ("scenery", "tensors")
 
-    def __init__(self, scenery):
+    def __init__(self, scenery) -> None:
         self.scenery, self.tensors = scenery, {}
 
 
@@ -153,7 +155,7 @@ def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int
     return addresses
 
 
-def _memory(tensor):
+def _memory(tensor) -> tuple[int, int, int]:
     return tensor.data_ptr(), tensor.nbytes, tensor.untyped_storage().nbytes()
 
 

@@ -31,7 +31,7 @@ def bake(scenery: Scenery) -> None:
     )
 
 
-def _owners(widths, total):
+def _owners(widths, total) -> torch.Tensor:
     """Returns (total,) int32, the subarray that each element belongs to."""
     subarrays = torch.arange(len(widths), dtype=torch.int32, device=widths.device)
     return torch.repeat_interleave(subarrays, widths, output_size=total)

@@ -84,14 +84,14 @@ def physics(
     return Physics(progress)
 
 
-def _addresses(actions, lanes, n_moves, device):
+def _addresses(actions, lanes, n_moves, device) -> tuple[int, int]:
     """Returns the addresses of discrete and of continuous actions: one of them is 0."""
     if isinstance(actions, torch.Tensor) and actions.is_floating_point():
         return 0, checks.address("actions", actions, (*lanes, n_moves), torch.float32, device)
     return checks.address("actions", actions, lanes, torch.int64, device), 0
 
 
-def _kernel(n_envs, device):
+def _kernel(n_envs, device) -> str:
     """Returns the kernel that moves agents: with more registers per thread until environments are
     many, by what is faster on an H200.
     """
@@ -99,6 +99,6 @@ def _kernel(n_envs, device):
     return "physics_unspilled" if n_threads <= n_resident_threads(device) else "physics"
 
 
-def _threads_per_env(n_envs, device):
+def _threads_per_env(n_envs, device) -> int:
     room = n_resident_threads(device, UNSPILLED_BLOCKS)
     return next((size for size in GROUPS if size * n_envs <= room), GROUPS[-1])

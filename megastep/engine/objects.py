@@ -79,7 +79,7 @@ class Objects(SetOnce):
         palette: Any,
         lit: bool = False,
         names: Sequence[str] | None = None,
-        device: Any = "cpu",
+        device: torch.device | str = "cpu",
     ):
         device = checks.device("device", device)
         n = checks.integer("n_envs", n_envs, 1)
@@ -186,10 +186,10 @@ def object_params(scenery: "Scenery") -> bytes:
     return packed.params
 
 
-def _pack(scenery, o):
+def _pack(scenery, o) -> bytes:
     shape, n_lines = (o.n_envs, o.n_objects), len(o.line_object)
 
-    def address(name, tensor, *shape):
+    def address(name, tensor, *shape) -> int:
         return checks.address(f"objects.{name}", tensor, shape, torch.float32, scenery.device)
 
     return ENGINE.params.ObjectsParams(
@@ -220,6 +220,6 @@ def check_objects(objects: Objects) -> None:
     flag = checks.stored("objects.error_flag", objects.error_flag).item()
     if flag:
         objects.error_flag.zero_()
-        index, kind = divmod(flag, _KINDS)
+        index, kind = divmod(int(flag), _KINDS)
         env, k = divmod(index, objects.n_objects)
         raise EngineError(f"In environment {env}, {objects.names[k]} {_ERRORS[kind]}.")

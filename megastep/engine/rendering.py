@@ -139,11 +139,11 @@ def observe(
     return out
 
 
-def _per_camera(lanes, agents):
+def _per_camera(lanes, agents) -> tuple[int, ...]:
     return lanes if agents.n_cameras == 1 else (*lanes, agents.n_cameras)
 
 
-def _seen_fields(scenery, seen, clear_mask):
+def _seen_fields(scenery, seen, clear_mask) -> dict[str, int]:
     """Returns the fields of RenderParams about the texels seen."""
     lanes, mask = (scenery.n_envs, scenery.n_agents), 0
     if seen is None:
@@ -154,7 +154,7 @@ def _seen_fields(scenery, seen, clear_mask):
     return dict(seen=address, clear_mask=mask, n_words=n_words)
 
 
-def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
+def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
     res, device = agents.res, scenery.device
     half_width = math.tan(math.radians(agents.fov / 2))
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
@@ -191,7 +191,7 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     check_on_cpu(agents)
 
 
-def _kernel(scenery, res, subsample):
+def _kernel(scenery, res, subsample) -> str:
     """Returns the kernel that renders observations: with two warps per agent if agents are few,
     with more registers for each warp until they are many. Two warps share whole tiles of the
     screen, which must hold whole pixels.

@@ -9,7 +9,7 @@ environment's agents, W walls and T texels of all layouts.
 """
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -17,8 +17,12 @@ from megastep.engine import checks, views
 from megastep.engine.objects import Objects
 from megastep.engine.views import JoinedRagged
 from megastep.kernels.build.launch import ENGINE
-from megastep.ragged import Ragged
+from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor, SetOnce
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from typing_extensions import Self
 
 __all__ = ["Layouts", "Scenery"]
 
@@ -47,7 +51,12 @@ class Layouts(SetOnce):
     """
 
     def __init__(
-        self, lines: Ragged, textures: Ragged, lights: Ragged, agent_textures: Any, device: Any
+        self,
+        lines: Ragged,
+        textures: Ragged,
+        lights: Ragged,
+        agent_textures: "ArrayLike",
+        device: torch.device,
     ):
         device = checks.device("device", device)
         lines = checks.ragged("lines", lines, ("W", 2, 2), device)
@@ -79,7 +88,7 @@ class Layouts(SetOnce):
         self._boxes = torch.empty((int(self.box_starts[-1]), 4), device=device)
         self.update_bounding_boxes()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.n_layouts
 
     @property
@@ -153,8 +162,8 @@ class Scenery(SetOnce):
         lights: Ragged,
         lines: Ragged,
         textures: Ragged,
-        model: Any,
-        device: Any = None,
+        model: "ArrayLike",
+        device: torch.device | str | None = None,
     ):
         n_agents = checks.integer("n_agents", n_agents, 0)
         device = None if device is None else checks.device("device", device)
@@ -190,7 +199,12 @@ class Scenery(SetOnce):
 
     @classmethod
     def of_layouts(
-        cls, n_agents: int, layouts: Layouts, model: Any, model_widths: Any, layout: Any
+        cls,
+        n_agents: int,
+        layouts: Layouts,
+        model: "ArrayLike",
+        model_widths: "ArrayLike",
+        layout: "ArrayLike",
     ) -> "Scenery":
         """Returns scenery whose environments share layouts.
 
@@ -207,7 +221,7 @@ class Scenery(SetOnce):
         self._set(n_agents, layouts, model, model_widths, layout)
         return self
 
-    def _set(self, n_agents, layouts, model, model_widths, layout):
+    def _set(self, n_agents, layouts, model, model_widths, layout) -> None:
         device = layouts.texels.device
         model = checks.floats("model", model, ("M", 2, 2), device)
         n_lines, n_texels = n_agents * len(model), layouts.agent_textures.shape[1]
@@ -225,7 +239,7 @@ class Scenery(SetOnce):
         self.agent_light = torch.ones((self.n_envs, n_texels), device=device)
         self.reach = float(model.norm(dim=-1).max()) if len(model) else 0.0
 
-    def _stored(self):
+    def _stored(self) -> "Self":
         """Returns self. ValueError if the storage of a tensor that may be written was resized."""
         for name in ("layout", "agent_lines", "agent_light"):
             checks.stored(f"scenery.{name}", getattr(self, name))
@@ -286,7 +300,7 @@ class Scenery(SetOnce):
             layouts.lights[d].clone(),
         )
 
-    def _moving_lines(self, e):
+    def _moving_lines(self, e) -> list[torch.Tensor]:
         # the lines of an environment's agents and objects
         return (
             [self.agent_lines[e]]
@@ -294,7 +308,7 @@ class Scenery(SetOnce):
             else [self.agent_lines[e], self.objects.lines[e]]
         )
 
-    def _of_objects(self, e):
+    def _of_objects(self, e) -> tuple[torch.Tensor, ...]:
         # the lit texel (1, 3) of each line of an environment's objects
         if self.objects is None:
             return ()
@@ -302,26 +316,26 @@ class Scenery(SetOnce):
         return (texels[:, :3] * texels[:, 3:]).split(1)
 
 
-def _same(name, what, expected, actual):
+def _same(name, what, expected, actual) -> None:
     if expected != actual:
         raise ValueError(f"{name} must have {what}, so {expected}, but {actual} were given")
 
 
-def _widths(bounds):
+def _widths(bounds) -> list[int]:
     return [last - first for first, last in zip(bounds, bounds[1:])]
 
 
-def _fixed(name, tensor):
+def _fixed(name, tensor) -> torch.Tensor:
     return ReadOnlyTensor(
         tensor, f"{name} is read-only, because other tensors depend on it: make another Scenery"
     )
 
 
-def _of_fixed_widths(name, vals, widths):
-    return Ragged(vals, _fixed(f"{name}.widths", widths.clone()))
+def _of_fixed_widths(name, vals, widths) -> RaggedTorch:
+    return RaggedTorch(vals, _fixed(f"{name}.widths", widths.clone()))
 
 
-def _starts(name, widths):
+def _starts(name, widths) -> torch.Tensor:
     """Returns (n + 1,) int32, the start of each subarray and the end of the last one."""
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:

@@ -40,7 +40,7 @@ OPAQUE = (  # types whose attributes hold no state of an environment
 )
 
 
-def children(node, only_state=True):
+def children(node: object, only_state: bool = True) -> list[tuple[str, Any]]:
     """Returns [(step of the path, child)] of a node.
 
     With ``only_state``, an object with ``__slots__`` in place of a ``__dict__``, or of a class with
@@ -65,7 +65,7 @@ def children(node, only_state=True):
 
 
 def walk(
-    root: Any, types: tuple[type, ...], only_state: bool = True
+    root: object, types: type | tuple[type, ...], only_state: bool = True
 ) -> dict[str, tuple[Any, str, Any]]:
     """Returns {path: (parent, step, leaf)} of the leaves reachable from ``root`` that are of one of
     these types.
@@ -90,7 +90,7 @@ def walk(
     return leaves
 
 
-def node_at(root: Any, path: str) -> Any:
+def node_at(root: object, path: str) -> Any:
     """Returns the node at a path of :func:`walk`, None if there is none."""
     node = root
     while path and node is not None:
@@ -116,7 +116,7 @@ def rebind(parent: Any, step: str, leaf: Any) -> None:
         setattr(parent, step[1:], leaf)
 
 
-def state_tree(env: Any) -> dict[str, torch.Tensor | torch.Generator]:
+def state_tree(env: object) -> dict[str, torch.Tensor | torch.Generator]:
     """Returns {path: tensor or generator} of everything in ``env`` that can change.
 
     Read-only tensors are left out.
@@ -128,7 +128,7 @@ def state_tree(env: Any) -> dict[str, torch.Tensor | torch.Generator]:
     }
 
 
-def snapshot(env: Any) -> State:
+def snapshot(env: object) -> State:
     """Returns a copy of the state, for :func:`restore`, without tensors that repeat an element
     (``expand``), which nothing changes in place.
     """
@@ -139,7 +139,7 @@ def snapshot(env: Any) -> State:
     }
 
 
-def is_expanded(leaf: Any) -> bool:
+def is_expanded(leaf: object) -> bool:
     """Returns whether a leaf is a tensor of which several elements are one number in memory."""
     return isinstance(leaf, torch.Tensor) and any(
         n > 1 and not stride for n, stride in zip(leaf.shape, leaf.stride())
@@ -147,7 +147,7 @@ def is_expanded(leaf: Any) -> bool:
 
 
 @torch.no_grad()
-def restore(env: Any, saved: State) -> None:
+def restore(env: object, saved: State) -> None:
     """Writes a :func:`snapshot` back, in place.
 
     Raises:

@@ -44,7 +44,7 @@ class JoinedRagged(RaggedTorch):
         self._message, self._parts = refusal, parts
         self.widths = self._guarded(sum(widths for _, _, widths in parts))
 
-    def _guarded(self, tensor):
+    def _guarded(self, tensor) -> torch.Tensor:
         return ReadOnlyTensor(tensor, self._message)
 
     @cached_property
@@ -72,25 +72,28 @@ class JoinedRagged(RaggedTorch):
 
     @property
     def device(self) -> torch.device:
+        """The device of the tensors."""
         return self._parts[0][0].device
 
     def __getitem__(self, index: int | slice) -> torch.Tensor | Ragged:
         if isinstance(index, slice):
             indices = range(len(self))[index]
-            pieces = [self[i] for i in indices] or [self._parts[0][0][:0]]
+            pieces = [self._subarray(i) for i in indices] or [self._parts[0][0][:0]]
             return Ragged(
                 self._guarded(torch.cat(pieces)), self._guarded(self.widths[list(indices)])
             )
-        i = self._index(index)
+        return self._guarded(self._subarray(self._index(index)))
+
+    def _subarray(self, i: int) -> torch.Tensor:
         pieces = [vals[int(s[i]) : int(s[i]) + int(w[i])] for vals, s, w in self._parts]
-        return self._guarded(torch.cat(pieces))
+        return torch.cat(pieces)
 
     def numpyify(self) -> RaggedNumpy:
         """Returns a writable copy with numpy arrays."""
         return self.clone().numpyify()
 
 
-def _ranges(starts, widths):
+def _ranges(starts, widths) -> torch.Tensor:
     """Returns the indices of the ranges [start, start + width), concatenated."""
     offsets = widths.cumsum(0) - widths
     return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(
@@ -133,7 +136,7 @@ def baked(scenery) -> JoinedRagged:
     return _by_line(scenery, BAKED, agents.flatten(), starts, scenery.layouts.baked.vals, 3)
 
 
-def _by_line(scenery, refusal, agents, agent_starts, texels, channels):
+def _by_line(scenery, refusal, agents, agent_starts, texels, channels) -> JoinedRagged:
     """Returns texels by line. In ``agents``, those of environment e start at ``agent_starts[e]``;
     an object's are ``channels`` of its texel.
 
@@ -165,6 +168,6 @@ def _by_line(scenery, refusal, agents, agent_starts, texels, channels):
     )
 
 
-def _with_zero(table):
+def _with_zero(table) -> torch.Tensor:
     """Returns a table with a zero appended."""
     return torch.cat([table, table.new_zeros(1)])

@@ -1,7 +1,7 @@
 """Members that the environments share."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -9,6 +9,9 @@ from megastep import engine
 from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
 from megastep.modules import RandomSpawns
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["DisplayedEnv", "SceneryEnv", "images"]
 
@@ -18,6 +21,7 @@ def images(view: engine.Observation) -> arrdict:
     tensors: an image has a row per camera.
     """
     rgb, d = view.rgb, view.depth
+    assert rgb is not None and d is not None
     if rgb.ndim == 4:  # one camera
         rgb, d = rgb.unsqueeze(2), d.unsqueeze(2)
     return arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2))
@@ -26,10 +30,10 @@ def images(view: engine.Observation) -> arrdict:
 class DisplayedEnv:
     """An environment that is drawn by its own ``state(e)`` and ``plot_state(state)``."""
 
-    plot_state: Callable[..., Any]
+    plot_state: Callable[..., "Figure"]
     state: Callable[..., arrdict]
 
-    def display(self, e: int = 0) -> Any:
+    def display(self, e: int = 0) -> "Figure":
         """Draws environment ``e`` as it is now. Returns a matplotlib figure."""
         return self.plot_state(numpyify(self.state(e)))
 

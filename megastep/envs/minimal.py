@@ -1,7 +1,7 @@
 """Minimal: an agent that moves and sees. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -12,6 +12,9 @@ from megastep.core import Core
 from megastep.envs.common import SceneryEnv
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Minimal"]
 
@@ -89,12 +92,13 @@ class Minimal(SceneryEnv):
         self.movement(decision)
         return self._world(self.lifecycle.start_ended())
 
-    def _world(self, reset):
+    def _world(self, reset) -> arrdict:
         self.spawner(reset)
         return arrdict(obs=self._rgb(), reward=self._reward.clone(), **self.lifecycle(reset))
 
-    def _rgb(self):
+    def _rgb(self) -> torch.Tensor:
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)
+        assert view.rgb is not None
         return view.rgb.view(self.n_envs, *self.obs_space.shape)
 
     def state(self, e: int = 0) -> arrdict:
@@ -104,7 +108,7 @@ class Minimal(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state`: the floor plan above the agent's image. Returns a
         matplotlib figure.
         """

@@ -6,7 +6,7 @@ They step on the CPU, one after the other, even if the learner is on a GPU. B = 
 import copy
 import inspect
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from megastep.envs.on_host.env import VectorizedEnv
 from megastep.imports import import_object
 from megastep.settings import checked
 from megastep.sync_envs import CHECKED_STEPS, BadValue, close_all
+
+if TYPE_CHECKING:
+    import gymnasium
 
 __all__ = ["PettingZoo"]
 
@@ -48,7 +51,7 @@ class PettingZoo(VectorizedEnv):
         n_envs: number of environments, N.
         id: import path of the function that makes one, such as
             ``pettingzoo.sisl.multiwalker_v9:parallel_env``.
-        kwargs: its arguments.
+        kwargs: arguments of that function.
         seed: each environment is reset with a seed of its own, which derives from this one.
         check: as for Gymnasium.
         device: where worlds and actions are. Default: a GPU if there is one.
@@ -103,7 +106,7 @@ class ParallelEnvs:
         ValueError: it is turn-based, or the spaces of two agents differ.
     """
 
-    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, Any], check: bool = True):
+    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, object], check: bool = True):
         from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 
         parameters = inspect.signature(make).parameters
@@ -125,7 +128,7 @@ class ParallelEnvs:
         self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
         self.checks, self.n_checked = check, np.zeros(n_envs, np.int64)
 
-    def _common(self, space_of):
+    def _common(self, space_of) -> "gymnasium.Space":
         first, *others = self.agents
         for agent in others:
             if space_of(agent) != space_of(first):
@@ -161,7 +164,7 @@ class ParallelEnvs:
     def close(self) -> None:
         close_all(self.envs)
 
-    def _begin(self, e, seed=None):
+    def _begin(self, e, seed=None) -> None:
         observed = self._checked(e, "reset", self.envs[e].reset(seed=seed))[0]
         self._observe(e, observed)
         for flags in (self.reward, self.terminated, self.truncated):
@@ -169,7 +172,7 @@ class ParallelEnvs:
         agents = self.envs[e].agents
         self.present[e] = [agent in agents and agent in observed for agent in self.agents]
 
-    def _step(self, e, actions):
+    def _step(self, e, actions) -> None:
         env = self.envs[e]
         observed, rewards, terminated, truncated, _ = self._checked(e, "step", env.step(actions))
         self._observe(e, observed)
@@ -185,7 +188,7 @@ class ParallelEnvs:
             self.truncated[e, a] = was_present and not ends and not is_here
             self.present[e, a] = is_here
 
-    def _checked(self, e, method, result):
+    def _checked(self, e, method, result) -> tuple:
         """Returns the result of `reset` or `step`. Raises BadValue if its form is wrong."""
         if not self.checks or self.n_checked[e] >= CHECKED_STEPS:
             return result
@@ -195,18 +198,18 @@ class ParallelEnvs:
             raise BadValue.of(problem, f"environment {e}")
         return result
 
-    def _observe(self, e, observed):
+    def _observe(self, e, observed) -> None:
         for a, agent in enumerate(self.agents):
             if agent in observed:
                 self.latest[e * len(self.agents) + a] = observed[agent]
 
-    def _observations(self):
+    def _observations(self) -> np.ndarray | dict | tuple:
         from gymnasium.vector.utils import concatenate
 
         return concatenate(self.single_observation_space, self.latest, self.batch)
 
 
-def _parallel(env):
+def _parallel(env) -> Any:
     """Returns an environment in which agents act together."""
     if not hasattr(env, "agent_iter"):
         return env

@@ -8,7 +8,6 @@ in the same order (the same objects, not copies).
 
 import difflib
 import inspect
-from typing import Any
 
 import numpy as np
 
@@ -21,11 +20,12 @@ from megastep.geometry import centers, indices, masks
 
 __all__ = ["SOURCES", "SPLITS", "centers", "indices", "masks", "sample"]
 
-SPLITS = ("training", "test", "all")
+SPLITS = ("training", "test", "all")  # parts of a source
+#: The sources by name.
 SOURCES = {name: getattr(sources, name) for name in sources.__all__}
 
 
-def _require_known(kind, name, allowed):
+def _require_known(kind, name, allowed) -> None:
     """Raises ValueError, with the nearest allowed name, unless `name` is one of `allowed`."""
     if name not in allowed:
         nearest = difflib.get_close_matches(str(name), allowed, 1, 0)
@@ -36,7 +36,7 @@ def _require_known(kind, name, allowed):
 
 
 def sample(
-    name: str, n: int, split: str = "training", seed: int = 1, **options: Any
+    name: str, n: int, split: str = "training", seed: int = 1, **options: object
 ) -> list[dotdict]:
     """Returns n geometries from a source. Equal arguments give equal geometries.
 

@@ -17,11 +17,15 @@ import zlib
 from collections.abc import Sequence
 from math import prod
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from megastep import geometry
 from megastep.dotdict import dotdict
+
+if TYPE_CHECKING:
+    from zipfile import ZipFile
 
 KEYS = ("walls", "lights", "masks", "res", "id")
 MAX_GEOMETRIES = 16_384
@@ -48,7 +52,7 @@ UNREADABLE = (
 NAME = re.compile(r"(0|[1-9][0-9]{0,5})/([A-Za-z_][A-Za-z0-9_]{0,63})\.npy")
 
 
-def _open(path):
+def _open(path) -> "ZipFile":
     """Opens a zip file. Raises ValueError if its table of contents exceeds MAX_DIRECTORY."""
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -65,7 +69,7 @@ def _open(path):
     return zipfile.ZipFile(path)
 
 
-def _contents(archive):
+def _contents(archive) -> dict:
     """Returns {geometry index: {key: zip entry}}.
 
     Raises ValueError unless the archive holds the indices from 0 up, nothing else, and respects the
@@ -102,7 +106,7 @@ def _contents(archive):
 
 
 @functools.lru_cache(maxsize=1024)  # a file has few different headers
-def _read_header(start):
+def _read_header(start) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Returns (shape, fortran order, dtype) from the first bytes of an array's file."""
     file = io.BytesIO(start)
     version = np.lib.format.read_magic(file)
@@ -115,7 +119,7 @@ def _read_header(start):
     return reader(file, max_header_size=MAX_HEADER)
 
 
-def _read_array(archive, entry):
+def read_array(archive, entry) -> np.ndarray:
     """Returns the array of a zip entry. Raises ValueError if its header contradicts its size."""
     if entry.flag_bits & 1:
         raise ValueError("is encrypted")
@@ -134,17 +138,17 @@ def _read_array(archive, entry):
     return values.reshape(shape, order="F" if fortran else "C")
 
 
-def _read_geometry(archive, entries):
+def _read_geometry(archive, entries) -> dict:
     g = dotdict()
     for key, entry in sorted(entries.items()):
         try:
-            g[key] = _read_array(archive, entry)
+            g[key] = read_array(archive, entry)
         except UNREADABLE as error:
             raise ValueError(f"{key!r} cannot be read: {_clause(error)}") from error
     return geometry.validate_geometry(g)
 
 
-def _clause(error):
+def _clause(error) -> str:
     """The first line of an error's message, to be put into a sentence."""
     return str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
 

@@ -65,7 +65,7 @@ def bytes_each(size: int, corridor: float, thickness: float) -> float:
 
 
 @functools.lru_cache(maxsize=8)
-def _neighbours(size):
+def _neighbours(size) -> list[list[int]]:
     """Returns the neighbours of each cell, whether or not a wall is between."""
     return [
         [
@@ -85,7 +85,7 @@ def passages(size: int, braid: float, generator: PortableGenerator) -> list[list
     neighbours = _neighbours(size)
     opened = [[] for _ in neighbours]
 
-    def join(a, b):
+    def join(a, b) -> None:
         opened[a].append(b)
         opened[b].append(a)
 
@@ -141,7 +141,7 @@ def lit_cells(opened: list[list[int]], reach: int) -> list[int]:
     return sorted(lit)
 
 
-def _paint(size, opened):
+def _paint(size, opened) -> np.ndarray:
     """Returns a grid of the states WALL and INDOORS, (2 size + 1, 2 size + 1), in which wall and
     corridor lines alternate. Row 0 is at the bottom.
     """

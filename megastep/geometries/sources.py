@@ -36,7 +36,7 @@ SUITE = {  # the parts of `suite`
 }
 
 
-def _split_range(count, split):
+def _split_range(count, split) -> range:
     """Returns the indices of a split, as a range into a database of `count` geometries. A single
     geometry is in every split.
     """
@@ -48,7 +48,7 @@ def _split_range(count, split):
     }[split]
 
 
-def _draw_indices(count, n, split, seed):
+def _draw_indices(count, n, split, seed) -> list[int]:
     """Returns n indices into a database of `count`: a random permutation of the split, repeated."""
     members = _split_range(count, split)
     random = np.random.RandomState(seed % 2**32)  # numpy never changes what it draws
@@ -57,26 +57,48 @@ def _draw_indices(count, n, split, seed):
 
 
 def box(n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.0) -> list[dotdict]:
-    """Returns one empty square room, `width` metres wide, n times."""
+    """Returns one empty square room, n times.
+
+    Args:
+        n: number of geometries, all the same one.
+        split: any; the room is in every split.
+        seed: not used.
+        width: width of the room, in metres.
+    """
     return [toys.box(width)] * n
 
 
 def column(
     n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.0, pillar: float = 1.0
 ) -> list[dotdict]:
-    """Returns one square room with a pillar, `pillar` metres wide, in its middle, n times."""
+    """Returns one square room with a pillar in its middle, n times.
+
+    Args:
+        n: number of geometries, all the same one.
+        split: any; the room is in every split.
+        seed: not used.
+        width: width of the room, in metres.
+        pillar: width of the pillar, in metres.
+    """
     return [toys.column(width, pillar)] * n
 
 
 @functools.lru_cache(maxsize=2)
-def _load(path, modified):
+def _load(path, modified) -> list[dotdict]:
     return npz.load(path)
 
 
 def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str) -> list[dotdict]:
-    """Returns geometries from the `.npz` file at `path`. The last tenth of it is the test split."""
-    path = Path(path)
-    database = _load(path, path.stat().st_mtime_ns if path.exists() else 0)
+    """Returns geometries from an `.npz` file. The last tenth of it is the test split.
+
+    Args:
+        n: number of geometries; a split with fewer repeats them.
+        split: training, test or all.
+        seed: which geometries of the split are drawn, and in which order.
+        path: the file.
+    """
+    file = Path(path)
+    database = _load(file, file.stat().st_mtime_ns if file.exists() else 0)
     return [database[i] for i in _draw_indices(len(database), n, split, seed)]
 
 
@@ -89,12 +111,18 @@ def homes(
     density: Annotated[float, Field(ge=1, le=plan.DENSEST)] = 1.0,
     clutter: Annotated[float, Field(ge=0, le=1)] = 0.0,
 ) -> list[dotdict]:
-    """Returns homes from the 5,000 of the package. With `outer=False` they lack the outer faces of
-    outer walls, which cannot be seen from inside.
+    """Returns homes from the 5,000 generated ones of the package.
 
-    Of more `density`, up to 3, they are generated anew from as many seeds: with more rooms,
-    narrower doors and corridors, and furniture, they reach three times as many walls. With
-    `clutter`, up to 1, furniture leaves narrow gaps to walls, to other furniture and in doorways.
+    Homes of another density or clutter are generated from as many seeds at their first use.
+
+    Args:
+        n: number of geometries; a split with fewer repeats them.
+        split: training, test or all.
+        seed: which geometries of the split are drawn, and in which order.
+        outer: if False, outer walls have no outer faces, which cannot be seen from inside.
+        density: 3: more rooms, narrower doors and corridors, and furniture: three times as many
+            walls.
+        clutter: 1: furniture leaves narrow gaps to walls, to other furniture and in doorways.
     """
     indices = _draw_indices(database.COUNT, n, split, seed)
     if density == 1 and clutter == 0:
@@ -104,8 +132,14 @@ def homes(
 
 
 def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
-    """Returns homes from the 512 dense ones on which the benchmarks run."""
-    return files(n, split, seed, path=BENCH)
+    """Returns homes from the 512 dense ones on which the benchmarks run.
+
+    Args:
+        n: number of geometries; a split with fewer repeats them.
+        split: training, test or all.
+        seed: which geometries of the split are drawn, and in which order.
+    """
+    return files(n, split, seed, path=str(BENCH))
 
 
 @checked
@@ -118,10 +152,16 @@ def maze(
     thickness: Annotated[float, Field(ge=0.02, le=100)] = 0.2,
     braid: Annotated[float, Field(ge=0, le=1)] = 0.0,
 ) -> list[dotdict]:
-    """Returns mazes of `size` x `size` cells from 5,000 of them.
+    """Returns square mazes from 5,000 of them.
 
-    Corridors are `corridor` metres wide between walls of `thickness` metres. The fraction `braid`
-    of the dead ends is opened.
+    Args:
+        n: number of geometries; a split with fewer repeats them.
+        split: training, test or all.
+        seed: which geometries of the split are drawn, and in which order.
+        size: cells per side.
+        corridor: width of the corridors, in metres, at least 0.32, so that agents fit.
+        thickness: thickness of the walls, in metres.
+        braid: fraction of the dead ends that is opened: 0 leaves a perfect maze.
     """
     from megastep.engine.devices import fit  # imports PyTorch, which reading settings must not
 
@@ -143,7 +183,7 @@ class _Part(NamedTuple):
     mirror: bool
 
 
-def _part(name: str, part: Any) -> _Part:
+def _part(name: str, part: object) -> _Part:
     """Returns a part of `mixed`.
 
     Raises:
@@ -176,6 +216,8 @@ def _part(name: str, part: Any) -> _Part:
         raise ValueError(f"{name}: weight={weight!r} is not an integer from 1 to 1,000")
     if not isinstance(mirror, bool):
         raise ValueError(f"{name}: mirror={mirror!r} is neither true nor false")
+    if function is files and not Path(str(options["path"])).is_file():  # before others are made
+        raise ValueError(f"{name}: there is no file {str(options['path'])!r}")
     return _Part(function, options, weight, mirror)
 
 
@@ -199,6 +241,8 @@ def mixed(
     Args:
         n: number of geometries, evenly spaced over the parts, or repeated; None: as many as the
             parts have.
+        split: training, test or all, of each part.
+        seed: which geometries are drawn, of each part without a seed of its own.
         parts: name -> number of geometries from the source of that name; or {source, n, options}
             with the name or import path of a source. Every part is of the same split, and of the
             same seed unless its options have one; it has at most as many geometries as that split
@@ -236,6 +280,10 @@ def suite(
     """Returns the homes of the fixed suite that agents are evaluated in, a `mixed` of all kinds.
 
     Args:
+        n: number of geometries, as of `mixed`.
+        split: training, test or all, of each part.
+        seed: which geometries are drawn.
+        parts: the parts, as of `mixed`.
         plans: an `.npz` file of imported floor plans, which are a further part, `plans`.
     """
     if plans is not None:

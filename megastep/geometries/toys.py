@@ -10,19 +10,19 @@ from megastep.dotdict import dotdict
 CORNER = 1.0  # metres; x and y of the lower-left corner of every toy
 
 
-def _square(left, width):
+def _square(left, width) -> np.ndarray:
     """Returns the corners, (4, 2) anticlockwise, of a square with its lower-left corner at
     (left, left).
     """
     return left + width * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
-def _loop(corners):
+def _loop(corners) -> np.ndarray:
     """Returns the walls (P, 2, 2) of a closed loop of corners (P, 2)."""
     return np.stack([corners, np.roll(corners, -1, 0)], 1)
 
 
-def _toy(rings, lights):
+def _toy(rings, lights) -> dotdict:
     walls = np.concatenate([_loop(ring) for ring in rings])
     return dotdict(
         id=0,
@@ -33,7 +33,7 @@ def _toy(rings, lights):
     )
 
 
-def _validate_width(width, minimum):
+def _validate_width(width, minimum) -> None:
     maximum = geometry.MAX_EXTENT - CORNER
     if not isinstance(width, Real) or not minimum <= width <= maximum:
         raise ValueError(f"width={width!r} must be from {minimum:g} to {maximum:g} m")

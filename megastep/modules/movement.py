@@ -16,7 +16,7 @@ from megastep.modules.lanes import to_agents
 # The direction in the agent's frame (forward, left) and the turn of each action:
 # 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
 MOVES = [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0), (0, 0), (0, 0)]
-TURNS = [0, 0, 0, 0, 0, 1, -1]
+TURNS = [0, 0, 0, 0, 0, 1, -1]  # turn of each action: 1 left, -1 right
 CONTROLS = [3, 1, 5]  # the actions that a continuous action weights: forward, left, turn left
 
 

@@ -16,7 +16,7 @@ from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.engine.objects import MAX_OBJECTS, NUMBERS
 from megastep.modules.spawning import MAX_SPAWNS, cached_points
-from megastep.ragged import Ragged, RaggedNumpy
+from megastep.ragged import RaggedNumpy
 
 __all__ = ["COLOURS", "Crate", "Disc", "Door", "Kind", "Objects", "doorways"]
 
@@ -83,7 +83,7 @@ def doorways(geometries: Sequence[dotdict]) -> RaggedNumpy:
     without the key `doors`.
     """
     segments = [np.reshape(g.get("doors", ()), (-1, 2, 2)).astype(np.float32) for g in geometries]
-    return Ragged(np.concatenate(segments), np.array([len(s) for s in segments]))
+    return RaggedNumpy(np.concatenate(segments), np.array([len(s) for s in segments]))
 
 
 class Objects:
@@ -269,10 +269,10 @@ class Kind:
         mask = mask if mask.ndim == 3 else mask[..., None]
         self.carriers.masked_fill_((self.carried() & mask).any(1), -1)
 
-    def _loose(self):
+    def _loose(self) -> torch.Tensor:
         return self.visible & ~self.open & (self.carriers < 0)
 
-    def _broadcast(self, mask):
+    def _broadcast(self, mask) -> torch.Tensor:
         n, k = self.visible.shape
         if (
             not isinstance(mask, torch.Tensor)
@@ -285,7 +285,7 @@ class Kind:
             )
         return mask.view(n, -1).expand(n, k)
 
-    def _paint(self, mask, colours):
+    def _paint(self, mask, colours) -> None:
         if isinstance(colours, int):
             self.colours.masked_fill_(mask, colours)
         elif colours is not None:
@@ -304,7 +304,7 @@ class Doors(Kind):
         shape, device = (len(openings), len(self)), self.positions.device
         poses = np.zeros((*shape, 4), np.float32)
         for d in range(len(openings)):
-            a, b = openings[d][: len(self)].astype(float).swapaxes(0, 1)
+            a, b = np.asarray(openings[d], float)[: len(self)].swapaxes(0, 1)
             along = b - a
             poses[d, : len(a), :2] = (a + b) / 2
             poses[d, : len(a), 2] = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
@@ -335,7 +335,7 @@ class Doors(Kind):
         self.open.logical_and_(~mask)
 
 
-def _count(name, kind, openings):
+def _count(name, kind, openings) -> int:
     if not isinstance(kind, (Disc, Crate, Door)):
         raise ValueError(f"{name} must be a number, Disc, Crate or Door, but is {kind!r}")
     if not isinstance(kind, Door):
@@ -349,9 +349,10 @@ def _count(name, kind, openings):
     return most if kind.count is None else checks.integer(f"the number of {name}", kind.count, 1)
 
 
-def _palette(colours):
+def _palette(colours) -> np.ndarray:
     try:
-        hexadecimal = [COLOURS.get(colour, colour) for colour in checks.items("colours", colours)]
+        names = checks.items("colours", colours)
+        hexadecimal = [COLOURS.get(name) or name for name in names]
         return gamma_decode(
             np.array(
                 [[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in hexadecimal]

@@ -4,7 +4,8 @@ Each has a ``space``, the ``state`` of one environment, and ``plot_state``, whic
 state. Axes: N environments, A agents, C cameras per agent, R rays per camera.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,6 +14,9 @@ from megastep import engine, plotting, spaces
 from megastep.core import Core
 from megastep.engine import checks
 from megastep.modules.movement import to_local
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def render(core: Core) -> engine.Render:
@@ -34,7 +38,7 @@ def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 
 
-def _plot_strips(name, state, axes, yaws):
+def _plot_strips(name, state, axes, yaws) -> np.ndarray:
     """Draws images (A, channels, C, R) as strips, one per agent, with a row per camera."""
     aspect = plotting.STRIP * np.shape(state)[-2]
     return plotting.plot_images({name: state}, aspect=aspect, axes=axes, yaws=yaws)
@@ -66,7 +70,11 @@ class RGB:
         return self()[e]
 
     @staticmethod
-    def plot_state(state: np.ndarray, axes: Any = None, yaws: Any = None) -> np.ndarray:
+    def plot_state(
+        state: np.ndarray,
+        axes: "Sequence[Axes] | np.ndarray | None" = None,
+        yaws: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera.
 
         Args:
@@ -111,7 +119,11 @@ class Depth:
         return self()[e]
 
     @staticmethod
-    def plot_state(state: np.ndarray, axes: Any = None, yaws: Any = None) -> np.ndarray:
+    def plot_state(
+        state: np.ndarray,
+        axes: "Sequence[Axes] | np.ndarray | None" = None,
+        yaws: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Draws a numpyified :meth:`state` in grey, bright where near. Arguments and result are
         those of :meth:`RGB.plot_state`.
         """
@@ -143,7 +155,7 @@ class IMU:
         return self()[e]
 
     @staticmethod
-    def plot_state(state: np.ndarray, ax: Any = None) -> Any:
+    def plot_state(state: np.ndarray, ax: "Axes | None" = None) -> "Axes":
         """Draws a numpyified :meth:`state` as three bars per agent on ``ax``, by default on a new
         figure. Returns the axes.
         """

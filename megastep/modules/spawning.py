@@ -3,7 +3,7 @@
 Axes: N environments, A agents, D layouts, P points, M walls.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ MAX_SPAWNS = 1_000_000  # points per layout; four times as many are drawn at onc
 BATCHES = 20  # of candidate points; then the search ends
 
 
-def distances(points, walls):
+def distances(points, walls) -> np.ndarray:
     """Returns the metres, (P,) float64, from points (P, 2) to the nearest of walls (M, 2, 2);
     infinite without walls.
     """
@@ -37,7 +37,7 @@ def distances(points, walls):
     return np.sqrt((dx * dx + dy * dy).min(1, initial=np.inf))
 
 
-def candidates(g, n, random):
+def candidates(g, n, random) -> Iterator[np.ndarray]:
     """Yields batches (n, 2) of points, drawn uniformly from the rooms of a geometry."""
     i, j = (g.masks > 0).nonzero()
     if not len(i):
@@ -48,7 +48,7 @@ def candidates(g, n, random):
         yield from np.split(cells + random.uniform(-0.5, 0.5, (4 * n, 2)) * g.res, 4)
 
 
-def _assign(points, owners, candidates, n_agents, size, gap):
+def _assign(points, owners, candidates, n_agents, size, gap) -> tuple[np.ndarray, np.ndarray]:
     """Gives candidate points (F, 2) to agents in turn, at most ``size`` each, none nearer than
     ``gap`` to a point of another agent.
 
@@ -147,9 +147,8 @@ class RandomSpawns:
         self.seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         if points is None:
             geometries = geometries[: len(core.scenery.layouts)]
-            points = cached_points(
-                geometries, n_spawns, core.n_agents, core.agents.radius, self.seed
-            )
+            size = n_spawns, core.n_agents, core.agents.radius
+            points = torch.from_numpy(cached_points(geometries, *size, self.seed))
         self.points = torch.as_tensor(points, device=core.device)
         self.counts, self.point_index = (
             torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
@@ -185,7 +184,7 @@ class RandomSpawns:
         if self._weights is None:
             n, device = self._n_layouts, self.core.device
             self._weights = torch.arange(1, n + 1, dtype=torch.int32, device=device)
-        return self.cumulative
+        return self._weights
 
     @property
     def cumulative(self) -> torch.Tensor | None:
@@ -195,7 +194,7 @@ class RandomSpawns:
         return self._weights
 
 
-def _all_points(geometries, n, n_agents, radius, seed):
+def _all_points(geometries, n, n_agents, radius, seed) -> np.ndarray:
     points = [
         spawn_points(g, n, n_agents, radius, np.random.Generator(np.random.Philox([seed, d])))
         for d, g in enumerate(geometries)
@@ -216,7 +215,7 @@ def cached_points(
     key = content_hash(geometries)
     key.update(Path(__file__).read_bytes() + repr((np.__version__, arguments)).encode())
 
-    def build():
+    def build() -> bytes:
         cache.prune(PREFIX, MAX_FILES - 1)
         return _all_points(geometries, *arguments).tobytes()
 

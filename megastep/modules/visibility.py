@@ -51,7 +51,7 @@ def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
     for tensor in (layouts.lines.vals, layouts.wall_starts, layouts.texel_starts, points):
         key.update(repr((tensor.shape, tensor.dtype)).encode() + tensor.numpy().tobytes())
 
-    def build():
+    def build() -> bytes:
         cache.prune(PREFIX, MAX_FILES - 1)
         return _visible_from(scenery, points).numpy().tobytes()
 
@@ -59,7 +59,7 @@ def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(np.frombuffer(body, np.int32).reshape(len(layouts), -1).copy())
 
 
-def _visible_from(scenery, points):
+def _visible_from(scenery, points) -> torch.Tensor:
     layouts, device = scenery.layouts, scenery.device
     env_per_layout = Scenery.of_layouts(
         scenery.n_agents,

@@ -36,7 +36,7 @@ def panels(
     height = 2 * margin + inner_width + n_strips * (strip_height + gap)
     figure = Figure(figsize=(width, height), dpi=100)
 
-    def axes(bottom, axes_height):
+    def axes(bottom, axes_height) -> Axes:
         sizes = margin / width, bottom / height, inner_width / width, axes_height / height
         return figure.add_axes(sizes)
 
@@ -69,11 +69,11 @@ def panels_beside(
     strip_height = (row_height - head) / n_strips - gap
     figure = Figure(figsize=(width, height), dpi=100)
 
-    def axes(left, bottom, axes_height):
+    def axes(left, bottom, axes_height) -> Axes:
         sizes = left / width, bottom / height, plan_width / width, axes_height / height
         return figure.add_axes(sizes)
 
-    def strip(row, i):
+    def strip(row, i) -> Axes:
         top = height - margin - row * row_height - head - i * (strip_height + gap)
         return axes(width / 2 + margin / 2, top - strip_height, strip_height)
 
@@ -87,7 +87,7 @@ def plot_level(ax: Axes, level: float) -> None:
     """Draws a level in [0, 1], such as health, as a bar above ``ax``, from red (0) to green (1)."""
     from matplotlib.patches import Rectangle
 
-    bar = dict(transform=ax.transAxes, clip_on=False, linewidth=0)
+    bar: dict = dict(transform=ax.transAxes, clip_on=False, linewidth=0)
     ax.add_patch(Rectangle((0, 1.02), 1, 0.12, facecolor="0.8", **bar))
     ax.add_patch(Rectangle((0, 1.02), level, 0.12, facecolor=(1 - level, 0.7 * level, 0), **bar))
 

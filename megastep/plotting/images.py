@@ -57,7 +57,7 @@ def plot_images(
     return axes
 
 
-def _stack(name, image, transpose):
+def _stack(name, image, transpose) -> np.ndarray:
     """Returns (n, H, W, C) floats in [0, 1], ready to show."""
     image, shape = np.asarray(image, np.float32), np.shape(image)
     if image.ndim >= 3 and not transpose:
@@ -72,7 +72,7 @@ def _stack(name, image, transpose):
     return gamma_encode(image) if image.shape[-1] == 3 else image
 
 
-def _plot_image(ax, image, title, aspect, yaws):
+def _plot_image(ax, image, title, aspect, yaws) -> None:
     options = dict(cmap="gray", vmin=0, vmax=1) if image.shape[-1] == 1 else {}
     ax.imshow(
         image.squeeze(-1) if image.shape[-1] == 1 else image,

@@ -42,10 +42,11 @@ def plot_scenery(
         ax = pyplot.subplots(figsize=(6, 6))[1]
     ax.set_facecolor(str(BACKGROUND))
     plot_lines(ax, lines, colours, seen)
-    if lights is not None and len(lights):
+    points = np.asarray([] if lights is None else lights)
+    if len(points):
         ax.scatter(
-            np.asarray(lights)[:, 0],
-            np.asarray(lights)[:, 1],
+            points[:, 0],
+            points[:, 1],
             s=14,
             c="gold",
             marker="*",
@@ -84,7 +85,7 @@ def plot_lines(
     from matplotlib.collections import LineCollection
 
     lines = np.asarray(lines, np.float32).reshape(-1, 2, 2)
-    widths = np.array([len(texels) for texels in colours], int)
+    widths = np.array([len(np.asarray(texels)) for texels in colours], int)
     if len(widths) != len(lines):
         raise ValueError(
             f"plot_lines needs one array of colours per line, but {len(lines)} lines and "
@@ -107,9 +108,11 @@ def plot_lines(
         faint = BACKGROUND + UNSEEN * (texel_colours - BACKGROUND)
         texel_colours = np.where(is_seen[:, None], texel_colours, faint)
     # projecting caps overlap the neighbours; otherwise the background shows between texels
-    return ax.add_collection(
-        LineCollection(segments, colors=texel_colours, linewidths=width, capstyle="projecting")
+    collection = LineCollection(
+        [*segments], colors=texel_colours, linewidths=width, capstyle="projecting"
     )
+    ax.add_collection(collection)
+    return collection
 
 
 def plot_view(
@@ -142,9 +145,10 @@ def plot_view(
     angles = np.radians(angle) + np.arctan(tangents)
     rim = position + distances[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
     ax.plot(*position, marker="o", markersize=4, color=colour)
-    return ax.add_patch(
-        Polygon(np.concatenate([position[None], rim]), facecolor=colour, alpha=0.15, linewidth=0)
-    )
+    corners = np.concatenate([position[None], rim])
+    polygon = Polygon(corners, facecolor=colour, alpha=0.15, linewidth=0)
+    ax.add_patch(polygon)
+    return polygon
 
 
 def plot_goal(ax: Axes, position: ArrayLike, radius: float) -> Circle:
@@ -156,5 +160,7 @@ def plot_goal(ax: Axes, position: ArrayLike, radius: float) -> Circle:
     """
     from matplotlib.patches import Circle
 
-    disc = Circle(position, radius, facecolor="C2", edgecolor="w", linewidth=0.8, zorder=3)
-    return ax.add_patch(disc)
+    x, y = np.asarray(position, float)
+    disc = Circle((x, y), radius, facecolor="C2", edgecolor="w", linewidth=0.8, zorder=3)
+    ax.add_patch(disc)
+    return disc

@@ -6,6 +6,7 @@ import copy
 import io
 
 import pytest
+import reference
 import torch
 
 from megastep import spaces
@@ -45,6 +46,7 @@ def test_keeps_contract_and_metrics_are_finite(name):
     for _ in range(6):
         losses = learner.update(collect())
     assert all(key.startswith("loss/") for key in losses) and "loss/skipped_steps" in losses
+    assert [key for key in losses if not reference.has_metric(key)] == []
     assert all(value.shape == () and value.isfinite() for value in losses.values())
     assert learner.check.read(collect.rollout.floats()) == (None, 0)
 

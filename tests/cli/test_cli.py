@@ -116,20 +116,37 @@ def test_ascii_output(tmp_path):
     assert list((tmp_path / "ü" / "evaluations").iterdir())
 
 
+ACROSS_ZONES = """
+import os, sys, time
+from megastep.agents.cli import train
+
+for zone, *words in map(str.split, sys.argv[1:]):
+    os.environ["TZ"] = zone
+    time.tzset()
+    assert train.main(words) == 0, words
+"""
+
+
 @pytest.mark.slow
 def test_folder_that_the_locale_cannot_spell(tmp_path, monkeypatch):
     """And a clock that is put back by a day, as the time zone changes."""
     folder = tmp_path / "r n ü"
     folder.mkdir()
     ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TERM": "dumb"}
-    finish = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=2"]
-    for words, zone in (
-        ([*TINY, "samples=32"], "Pacific/Kiritimati"),
-        (["resume=latest", "more_samples=32"], "Pacific/Midway"),
-        ([*TINY, "samples=1", *finish], "Pacific/Midway"),
-    ):
-        code, _, err = finished("train", *words, cwd=folder, TZ=zone, **ascii_only)
-        assert (code, err) == (0, "")
+    commands = (
+        ["Pacific/Kiritimati", *TINY, "samples=32"],
+        ["Pacific/Midway", "resume=latest", "more_samples=32"],
+        ["Pacific/Midway", *TINY, "samples=1", "finish.evaluate=true", "finish.episodes=4"],
+    )
+    commands[-1].extend(["finish.record=true", "finish.steps=2"])
+    process = subprocess.run(
+        [sys.executable, "-c", ACROSS_ZONES, *map(" ".join, commands)],
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        timeout=HUNG,
+        env={**os.environ, **ascii_only, "PYTHONPATH": str(ROOT)},
+    )
+    assert (process.returncode, process.stderr) == (0, b"")
     monkeypatch.chdir(folder)
     latest, first = sorted(folder.glob("runs/*/checkpoints"))  # by name, which has the local time
     assert folders.find("latest").resolve() == latest.parent

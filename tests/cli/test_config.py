@@ -413,12 +413,21 @@ def test_value_with_equals_sign():
     assert runs == ["a/0_seed=1", "a/1_seed=2"]
 
 
+#: Calls that resolve to an environment variable, with blanks and inside others.
+SECRETS = ["${ oc.env:SECRET}", "${\toc.env:SECRET}", "${oc.env :SECRET}", "${oc.env: SECRET }"]
+SECRETS += ["${oc.select:nothing,${ oc.env:SECRET}}", r"${oc.decode:'\${oc.env:SECRET}'}"]
+SECRETS += [r"${oc.create:{a:'\${oc.env:SECRET}'}}", "${${seed}:SECRET}", "${hydra:job.name}"]
+
+
 def test_environment_variables_are_refused(monkeypatch, capsys):
     monkeypatch.setenv("SECRET", "hush")
     messages = errors(
         "logger=wandb", "logger.wandb.project=${oc.env:SECRET}", "folder=x/${oc.env:SECRET}"
     )
     assert set(messages) == {"logger.wandb.project", "folder"} and "hush" not in str(messages)
+    for call in SECRETS:
+        message = errors(f"+folder='x{call}'" if "'" not in call else f'folder="x{call}"')
+        assert "folder" in message and "hush" not in str(message), call
     assert train.main(["--cfg", "hydra", "hydra.sweep.dir=${oc.env:SECRET}/x"]) == 0
     shown = capsys.readouterr().out
     assert "dir: ${oc.env:SECRET}/x" in shown and "hush" not in shown

@@ -25,8 +25,8 @@ ENVIRONMENT = {key: value for key, value in os.environ.items() if key != "PYTHON
 #: Source folders with files that the wheel must contain, and where it has them.
 PACKAGE_DATA = {
     "configs": ("megastep/agents/configs", {".yaml"}),
-    "agents": ("megastep/agents", {".py", ".h", ".cu", ".cpp", ".safetensors", ".md"}),
-    "megastep": ("megastep", {".py", ".h", ".cu", ".cpp", ".npz", ".json", ".sha256"}),
+    "agents": ("megastep/agents", {".py", ".typed", ".h", ".cu", ".cpp", ".safetensors", ".md"}),
+    "megastep": ("megastep", {".py", ".typed", ".h", ".cu", ".cpp", ".npz", ".json", ".sha256"}),
 }
 
 

@@ -36,7 +36,7 @@ def env_id(name):
 
 @pytest.mark.parametrize("vectorization", ["sync", "async"])
 def test_failed_environment_ends_the_run_with_all_saved(here, vectorization, capsys):
-    words = [*WORDS, env_id("Crash"), "samples=9600", "folder=run", "seed=2"]
+    words = [*WORDS, env_id("Crash"), "samples=9600", "folder=run", "seed=2", "learner.n_steps=32"]
     assert train.main([*words, f"env.vectorization={vectorization}"]) == 4
     (line,) = capsys.readouterr().err.splitlines()
     text = "OddCrash-v0: environment {} failed: OSError: simulator does not answer. Its traceback "

@@ -1,5 +1,6 @@
 """Agents in one file: exported from a run, and then used by their names. Those of the package."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import export_agent
 import pytest
+import safetensors.torch
 import torch
 
 from megastep import geometries
@@ -274,20 +276,23 @@ def changed(content, entries=(), **texts):
     n = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + n]) | dict(entries)
     header["__metadata__"] |= texts
-    text = json.dumps(header).encode()
-    return len(text).to_bytes(8, "little") + text + content[8 + n :]
+    text = json.dumps(header, separators=(",", ":")).encode()
+    return agent_file.sealed(len(text).to_bytes(8, "little") + text + content[8 + n :])
 
 
 DAMAGES = {
     "empty": (lambda content: b"", "header too small"),
     "cut off": (lambda content: content[:-7], "file not fully covered"),
     "a bit": (lambda content: content[:-3] + b"!" + content[-2:], "do not match their SHA-256"),
+    "a fact": (lambda content: content.replace(b'samples\\": 512', b'samples\\": 513'), "SHA-256"),
     "header": (lambda content: content[:30] + b"!" + content[31:], "not an agent file of megastep"),
     "no text": (lambda content: content[:30] + b"\xff" + content[31:], "invalid UTF-8 in header"),
     "long header": (lambda content: b"\xff" * 8 + content, "header too large"),
     "spaces": (lambda content: (2**25).to_bytes(8, "little") + b" " * 2**25, "too long"),
     "of others": (lambda content: b"\x02" + b"\0" * 7 + b"{}", "unexpected header"),
     "no samples": (lambda content: changed(content, facts='{"samples": null}'), "samples"),
+    "true samples": (lambda content: changed(content, facts='{"samples": true}'), "samples"),
+    "tables": (lambda content: changed(content, tables='[{"rows": 3}]'), "0.title"),
     "no config": (lambda content: changed(content, config="{}"), "incomplete configuration"),
     "deep": (lambda content: changed(content, tables="[" * 100_000), "unexpected header"),
     "newer": (lambda content: changed(content, format="99"), "Update megastep"),
@@ -325,6 +330,49 @@ def test_tensors_that_do_not_fill_the_file_are_refused(entry, tmp_path):
     ) as info:
         agent_file.read(path, "cpu")
     assert "\n" not in str(info.value)
+
+
+def test_every_flipped_bit_of_a_header_is_found(tmp_path):
+    path = tmp_path / "a.safetensors"
+    agent_file.write(path, {"w": torch.ones(2)}, {"train": {}, "spaces": {}}, {"samples": 1})
+    content = path.read_bytes()
+    for bit in range(8 * len(content)):
+        flipped = bytearray(content)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        with pytest.raises(CheckpointError):
+            agent_file.read(path, None)
+
+
+def test_format_1_has_a_digest_of_its_tensors(tmp_path):
+    path, tensors = tmp_path / "a.safetensors", {"w": torch.ones(2)}
+    agent_file.write(path, tensors, {"train": {}, "spaces": {}}, {"samples": 1})
+    content = path.read_bytes()
+    metadata = json.loads(content[8:-8])["__metadata__"]
+    metadata |= {"format": "1", "sha256": hashlib.sha256(content[-8:]).hexdigest()}
+    path.write_bytes(first := safetensors.torch.save(tensors, metadata))
+    assert torch.equal(agent_file.read(path, "cpu").state["policy"]["w"], torch.ones(2))
+    path.write_bytes(first[:-1] + b"!")
+    with pytest.raises(DamagedCheckpoint, match="SHA-256"):
+        agent_file.read(path, None)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, True, 1])
+def test_weights_that_are_none_are_refused(value, file, exported, capsys):
+    read, about = agent_file.read(file, "cpu"), agent_file.read_metadata(file)
+    weights = read.state["policy"]
+    name = next(name for name, weight in weights.items() if weight.dtype == torch.float16)
+    weight = torch.full_like(weights[name], value, dtype=torch.tensor(value).dtype)
+    weights[name] = weight.half() if weight.is_floating_point() else weight.long()
+    agent_file.write(file, weights, read.config, about["facts"], about["tables"])
+    loaded = checkpoint.load_latest(exported / "run/checkpoints")
+    loaded.state["policy"][name] = weight
+    checkpoint.save("run/checkpoints", 512, loaded.state, loaded.config)
+    for words in ([f"run={NAME}"], ["run=run"]):
+        assert evaluate.main(words) == 2
+        err = capsys.readouterr().err
+        assert name in err and ("NaN" in err or "int64" in err or "bool" in err), err
+        assert err.count("\n") == 1
 
 
 def test_modules_of_others_need_trust(file, capsys):

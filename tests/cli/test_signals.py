@@ -44,7 +44,7 @@ def pairs(moments):
 def here(tmp_path, monkeypatch):
     """Changes to an empty folder, with default signal handlers."""
     monkeypatch.chdir(tmp_path)
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS}
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in signals.SIGNALS}
     yield tmp_path
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -126,6 +126,22 @@ def reporting(monkeypatch, number):
 def saving(monkeypatch, number):
     # in the second checkpoint, which is written while training goes on
     signalled(monkeypatch, checkpoint_format, "_write_file", number, call=6)
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        [signal.SIGUSR1],
+        [signal.SIGUSR2, signal.SIGTERM],
+        [signal.SIGUSR2, signal.SIGUSR2],
+        [signal.SIGTERM, signal.SIGUSR1],
+    ],
+)
+def test_signals_of_a_cluster_save_and_do_not_quit(here, monkeypatch, numbers):
+    monkeypatch.setattr(signals, "SAME", -1)  # any signal that repeats another does so at once
+    signalled(monkeypatch, Collector, "__call__", *numbers)
+    assert train.main([*TINY, "samples=1e9", "folder=run"]) == 128 + numbers[0]
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
 
 
 @pytest.mark.parametrize("moment, number", pairs([collecting, reporting, saving]))

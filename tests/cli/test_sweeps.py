@@ -285,6 +285,27 @@ def test_submitit_job_of_two_ranks(here):
 
 
 @pytest.mark.slow
+def test_preempted_submitit_job_continues_its_checkpoint(here):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    total = f"samples={400 * UPDATE}"
+    job = here / "mine/job"
+    words = [*SMALL, "-m", "seed=1", total, "hydra/launcher=submitit_local", "hydra.sweep.dir=mine"]
+    words += ["hydra.sweep.subdir=job"]
+    process = start("train", *words, "checkpoint_seconds=0.2", cwd=here)
+    wait_until(lambda: [*job.glob("checkpoints/step_*")], process)
+    (row,) = (here / "mine/.jobs").glob("*/0.json")
+    os.kill(json.loads(row.read_text())["process"], signal.SIGUSR2)
+    _, err = process.communicate(timeout=HUNG)
+    assert process.returncode == 0, err
+    (row,) = rows("mine")
+    assert row["state"] == "done"
+    assert len((job / "provenance.jsonl").read_text().splitlines()) == 2, "it was started twice"
+    assert train.main([*SMALL, "seed=1", total, "folder=whole"]) == 0
+    metrics = (here / "whole/metrics.jsonl").read_bytes()
+    assert metrics == (job / "metrics.jsonl").read_bytes()
+
+
+@pytest.mark.slow
 def test_job_that_ends_its_process_leaves_the_others(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     code, _, err = finished("train", *SHORT, "-m", "env.mood=dead,fine", *JOBLIB)

@@ -4,6 +4,7 @@ import hashlib
 import math
 import shutil
 import time
+import tracemalloc
 
 import matplotlib
 import numpy as np
@@ -593,6 +594,20 @@ def test_a_damaged_database_is_named(tmp_path):
     path.with_suffix(".sha256").unlink()
     with pytest.raises(ValueError, match="homes.npz' cannot be read"):
         database.home(5, path=path)
+
+
+def test_a_planted_database_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    path = tmp_path / "homes.npz"
+    arrays = {name: np.zeros(1, np.int8) for name in database.NAMES}
+    np.savez_compressed(path, **arrays | {"masks": np.zeros(2**26, np.int8)})
+    path.with_suffix(".sha256").write_text(hashlib.sha256(path.read_bytes()).hexdigest())
+    database._arrays.cache_clear()
+    monkeypatch.setattr(database, "MAX_EACH", 1 << 12)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="unpacks to more than 5,000 homes can have"):
+        database.home(4, path=path)
+    assert tracemalloc.get_traced_memory()[1] < 2**23
+    tracemalloc.stop()
 
 
 def test_a_written_database_can_be_read(tmp_path, generated):

@@ -3,8 +3,6 @@
 import contextlib
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -17,7 +15,7 @@ from megastep.agents.launch.endings import Ending
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from tests.helpers import tiny
-from tests.helpers.processes import forked, is_running, wait_until
+from tests.helpers.processes import Forked, forked, is_running, wait_until
 from tests.helpers.ranks import HUNG, ROOT
 
 pytestmark = pytest.mark.usefixtures("here")
@@ -291,17 +289,29 @@ def test_stopped_rank(here):
     assert err.startswith("train.py: rank 1 on ") and not any(map(is_running, pids))
 
 
+PACED = """
+import time
+from megastep.envs import Minimal
+
+class Paced(Minimal):
+    def step(self, decision):
+        time.sleep(0.005)  # so that few updates outlast the first checkpoint
+        return super().step(decision)
+"""
+
+
 @pytest.mark.slow
 def test_restart(here):
-    total = f"samples={400 * UPDATE}"
-    with started(here, "checkpoint_seconds=1", "restarts=1", total) as run:
+    (here / "paced.py").write_text(PACED)
+    words = "env=paced:Paced", "checkpoint_seconds=1", "restarts=1", f"samples={100 * UPDATE}"
+    with started(here, *words) as run:
         wait_for_checkpoint(here, run)
         os.kill(pid_of(here, 1), signal.SIGKILL)
         code, out, err, _ = wait_for_end(run)
     assert code == 0 and out.count("Training on 2 x cpu in run") == 2
     assert err.startswith("warning: rank 1 on ") and "Restarting, 1 of restarts=1" in err
     rows = json_lines.read(here / "run" / "metrics.jsonl")
-    assert [row["updates"] for row in rows] == [*range(1, 401)]
+    assert [row["updates"] for row in rows] == [*range(1, 101)]
 
 
 @pytest.mark.slow
@@ -375,21 +385,48 @@ def test_learner_that_does_not_average(here):
 # ---- torchrun ----
 
 
-def torchrun(*words, **options):
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    return subprocess.run(
-        [*command, *words], capture_output=True, text=True, timeout=HUNG, **options
-    )
+def torchrun(here, *words):
+    """Returns the exit code, stdout and stderr of torchrun with two ranks."""
+    command = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", *words]
+    process = Forked(command, here, os.environ | {"PYTHONPATH": str(ROOT)})
+    out, err = process.communicate(timeout=HUNG)
+    return process.returncode, out, err
 
 
 @pytest.mark.slow
 def test_torchrun(here):
     script = str(ROOT / "train.py")
-    result = torchrun(script, *TINY, f"samples={3 * UPDATE}")
-    assert result.returncode == 0 and result.stdout.startswith("Training on 2 x cpu in run\n")
-    refused = torchrun(script, *TINY, "ranks=3", "folder=other")
-    assert refused.returncode != 0 and not (here / "other").exists()
-    assert refused.stderr.count("ranks: 3 is not") == 1
+    code, out, _ = torchrun(here, script, *TINY, f"samples={3 * UPDATE}")
+    assert code == 0 and out.startswith("Training on 2 x cpu in run\n")
+    code, _, err = torchrun(here, script, *TINY, "ranks=3", "folder=other")
+    assert code != 0 and not (here / "other").exists()
+    assert err.count("ranks: 3 is not") == 1
+
+
+KILLED = """
+import os
+from pathlib import Path
+from megastep.envs import Minimal
+
+class Killed(Minimal):
+    def step(self, decision):
+        first = os.environ.get("TORCHELASTIC_RESTART_COUNT") == "0"
+        if first and os.environ["RANK"] == "1" and [*Path("run/checkpoints").glob("step_*[0-9]")]:
+            os.kill(os.getpid(), 9)
+        return super().step(decision)
+"""
+
+
+@pytest.mark.nightly
+def test_torchrun_goes_on_in_the_folder_that_proves_itself(here):
+    (here / "killed.py").write_text(KILLED)
+    words = ["env=killed:Killed", *TINY[1:], "checkpoint_seconds=0.2", f"samples={100 * UPDATE}"]
+    script = str(ROOT / "train.py")
+    code, out, err = torchrun(here, "--max-restarts=1", script, *words)
+    assert code == 0 and out.count("Training on 2 x cpu in run\n") == 2, (out, err)
+    rows = json_lines.read(here / "run" / "metrics.jsonl")
+    assert [row["updates"] for row in rows] == [*range(1, 101)]
+    assert not (here / "run" / ".started").exists()
 
 
 DIFFERING = """
@@ -402,7 +439,7 @@ sys.exit(train.main([*sys.argv[1:], "learner.lr=0.00" + str(1 + int(os.environ["
 @pytest.mark.slow
 def test_ranks_with_different_words(here):
     (here / "differing.py").write_text(DIFFERING)
-    result = torchrun("differing.py", *TINY, env=os.environ | {"PYTHONPATH": str(ROOT)})
-    assert result.returncode != 0 and not (here / "run").exists()
+    code, _, err = torchrun(here, "differing.py", *TINY)
+    assert code != 0 and not (here / "run").exists()
     line = "The ranks differ: learner.lr is 0.001 on rank 0, and 0.002 on rank 1"
-    assert result.stderr.count(line) == 1
+    assert err.count(line) == 1

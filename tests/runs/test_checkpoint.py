@@ -105,6 +105,22 @@ def test_every_flipped_bit_is_detected(folder, file, every):
     assert checkpoint.load_latest(folder).step == 30
 
 
+@pytest.mark.filterwarnings("error")
+def test_run_that_is_trained_meanwhile_replaces_its_checkpoints(folder, monkeypatch):
+    real, tried = checkpoint_format.read, []
+
+    def read(path, *arguments):
+        tried.append(path.name)
+        if len(tried) == 1:
+            checkpoint.save(folder, 40, state(40), CONFIG, keep_checkpoints=2)
+            for old in ("step_20", "step_30"):
+                shutil.rmtree(folder / old, ignore_errors=True)
+        return real(path, *arguments)
+
+    monkeypatch.setattr(checkpoint_format, "read", read)
+    assert checkpoint.load_latest(folder).step == 40 and tried == ["step_30", "step_40"]
+
+
 def test_error_if_every_checkpoint_is_damaged(folder):
     for n in (30, 20):
         os.truncate(folder / f"step_{n}" / "state.pt", 100)
@@ -156,6 +172,27 @@ def seal_file(path):
     files = json.loads((path.parent / "manifest.json").read_text())["files"]
     files[path.name]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
     seal(path.parent, files=files)
+
+
+@pytest.mark.parametrize(
+    "name", ["../../secret", "rank0.pt", "xrank1.pt", "rank1.pt.x", "/etc/hosts"]
+)
+def test_manifest_names_no_other_files(folder, name):
+    (folder.parent / "secret").write_bytes(b"")
+    entry = {"sha256": hashlib.sha256(b"").hexdigest(), "bytes": 0}
+    files = json.loads((folder / "step_30/manifest.json").read_text())["files"]
+    seal(folder / "step_30", files=files | {name: entry})
+    with pytest.warns(UserWarning, match="manifest.json cannot be read.*using step_20"):
+        assert checkpoint.load_latest(folder).step == 20
+
+
+@pytest.mark.parametrize("name", ["config.json", "state.pt"])
+def test_manifest_names_what_is_read(folder, name):
+    files = json.loads((folder / "step_30/manifest.json").read_text())["files"]
+    del files[name]
+    seal(folder / "step_30", files=files)
+    with pytest.warns(UserWarning, match="manifest.json cannot be read.*using step_20"):
+        assert checkpoint.load_latest(folder).step == 20
 
 
 @pytest.mark.parametrize("version, commit", [(4, "e9908db"), (1, "e17fabe")])

@@ -74,6 +74,21 @@ def test_large_replay_buffer_is_in_some_checkpoints_and_the_last(writes, tmp_pat
     assert "replay" not in checkpoint.load_latest(tmp_path / "step_7").state
 
 
+def test_checkpoint_after_one_that_failed_has_the_replay_buffer(writes, tmp_path, monkeypatch):
+    monkeypatch.setattr(saver, "SMALL_REPLAY", 100)
+    with monkeypatch.context() as patch, pytest.warns(UserWarning, match="tries again") as warned:
+        patch.setattr(checkpoint, "save", lambda *_: open(tmp_path / "no folder" / "file"))
+        for step in (1, 2):
+            writes(step, state())
+            writes.wait()
+            assert writes.error.startswith(f"The checkpoint at {step} samples could not be saved")
+    assert len(warned) == 1
+    for step in (3, 4):
+        writes(step, state())
+    writes.wait()
+    assert with_replay(tmp_path) == [3] and writes.error is None
+
+
 def test_checkpoint_with_a_large_replay_buffer_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(saver, "SMALL_REPLAY", 100)
     writes = saver.Saver(tmp_path, {}, keep_checkpoints=2, replay_every=4)

@@ -63,6 +63,16 @@ def test_lock_is_split_by_package():
     assert sorted(together.splitlines()) == sorted(compiled.splitlines())
 
 
+def test_make_builds_sources_with_locked_packages_only():
+    """A build in isolation would fetch its requirements without hashes."""
+    makefile = (ROOT / "Makefile").read_text()
+    commands = [one for one in re.findall(r"pip install ([^&;\n]+)", makefile) if "-r " in one]
+    assert [re.findall(r"requirements/(\w+)", one) for one in commands] == [["build"], ["packages"]]
+    assert all("--require-hashes --no-build-isolation" in one for one in commands[1:])
+    (own,) = re.findall(r"pip install (.* -e .*)", makefile)
+    assert "--no-build-isolation" in own
+
+
 # ---- The Dockerfile ----
 
 

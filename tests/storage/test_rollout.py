@@ -298,6 +298,17 @@ def test_all_lanes_learn_by_default():
     assert rollout.learns.all() and not rollout.metrics
 
 
+def test_lanes_that_are_not_stored_act_with_0():
+    learners = torch.tensor([True, False, True, False])
+    args = LabelledEnv.obs_space, LabelledEnv.action_space, arrdict()
+    rollout = Rollout(1, 2, *args, learners=learners)
+    assert rollout.lane_indices.tolist() == [0, 2]
+    flat, nested = torch.tensor([5, 7]), torch.tensor([[1.5, 2.5], [3.5, 4.5]])
+    actions = rollout.scatter_actions(arrdict(flat=flat, nested=nested))
+    assert actions.flat.tolist() == [5, 0, 7, 0] and actions.flat.dtype == torch.int64
+    assert actions.nested.tolist() == [[1.5, 2.5], [0, 0], [3.5, 4.5], [0, 0]]
+
+
 def test_empty_rollout_raises():
     with pytest.raises(ValueError, match="not 0 and 6"):
         Rollout(0, B, LabelledEnv.obs_space, LabelledEnv.action_space, arrdict())

@@ -114,7 +114,7 @@ def forward_kernel(
     return f"conv_forward_{4 if n_channels <= 4 else 8}", blocks, sizes
 
 
-def _forward_sizes(n_channels, n_columns):
+def _forward_sizes(n_channels, n_columns) -> dict[str, int]:
     """Returns sizes in shared memory, in numbers.
 
     Threads of eight channels and rows read 16 bytes at once, from different banks: a channel takes
@@ -129,7 +129,7 @@ def _forward_sizes(n_channels, n_columns):
     return {name: ALIGNMENT * size for name, size in sizes.items()}
 
 
-def _forward_bytes(channel_size, row_size, feature_size):
+def _forward_bytes(channel_size, row_size, feature_size) -> int:
     return 2 * _ROWS * (2 * row_size + feature_size)
 
 
@@ -199,14 +199,14 @@ def backward_kernel(
     return f"conv_backward_{-(-n_channels // 2) * 2}", blocks, sizes
 
 
-def _backward_blocks(n_rows, n_channels, n_columns, gpu):
+def _backward_blocks(n_rows, n_channels, n_columns, gpu) -> int:
     """Returns how many blocks run at once, at most one for each tile of rows."""
     _, n_bytes = _backward_sizes(n_channels, n_columns)
     n_at_once = min(_BLOCKS, gpu.shared_memory_per_multiprocessor // (n_bytes + _RESERVED))
     return max(min(-(-n_rows // _ROWS), n_at_once * gpu.multi_processor_count), 1)
 
 
-def _backward_sizes(n_channels, n_columns):
+def _backward_sizes(n_channels, n_columns) -> tuple[dict[str, int], int]:
     """Returns sizes in shared memory, in numbers, and its bytes.
 
     Rows start in other banks than those that a warp reads with them: those of features an odd

@@ -56,12 +56,12 @@ def act(
     n_lanes, device = len(hidden), hidden.device
     actions = torch.empty(n_lanes, shape[0], dtype=torch.int64, device=device)
     logprobs = torch.empty(n_lanes, device=device)
-    results = dict(actions=actions, logprobs=logprobs)
-    options = dict(noise=noise, epsilon=epsilon, usual_epsilon=usual_epsilon)
-    return _forward("act", hidden, parameters, shape, **results, **options), actions, logprobs
+    tensors = dict(noise=noise, epsilon=epsilon, actions=actions, logprobs=logprobs)
+    values = _forward("act", hidden, parameters, shape, usual_epsilon, **tensors)
+    return values, actions, logprobs
 
 
-def _forward(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors):
+def _forward(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors) -> torch.Tensor:
     n_rows, n_features = hidden.shape
     values = torch.empty(n_rows, *shape, device=hidden.device)
     names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"

@@ -73,7 +73,7 @@ def values(hidden: torch.Tensor, value: Value) -> torch.Tensor:
     return results
 
 
-def _forward(columns, outputs, value, sizes):
+def _forward(columns, outputs, value, sizes) -> None:
     product = columns["product"]
     blocks = Blocks(_n_strips(product), threads=_STRIP_THREADS)
     launch(
@@ -124,9 +124,9 @@ def backward(
     return d_product, d_bias, d_weight[None], d_value_bias[:1]
 
 
-def _padded(n):
+def _padded(n) -> int:
     return n + -n % MULTIPLE
 
 
-def _n_strips(product):
+def _n_strips(product) -> int:
     return -(-len(product) // _STRIP)

@@ -182,7 +182,7 @@ def terms_backward(
     return d_logits
 
 
-def _rows(logits, actions):
+def _rows(logits, actions) -> dict[str, object]:
     n_rows, n_agents, n_choices = logits.shape
     return dict(
         logits=logits, actions=actions, n_rows=n_rows, n_agents=n_agents, n_choices=n_choices

@@ -10,7 +10,7 @@ from megastep.agents.networks.kernels.library import LIBRARY, kernel, n_threads,
 from megastep.kernels.build.launch import launch
 
 
-def start(reset, last_output, last_cell, hidden, cell):
+def start(reset, last_output, last_cell, hidden, cell) -> None:
     """Computes the first step's input state: the last output and cell, zeroed where `reset`.
 
     Args:
@@ -31,7 +31,7 @@ def start(reset, last_output, last_cell, hidden, cell):
     )
 
 
-def join(reset, x, last_output, joined):
+def join(reset, x, last_output, joined) -> None:
     """Joins what the gates are computed from: x and the last output, zeroed where `reset`.
 
     Args:
@@ -50,7 +50,7 @@ def join(reset, x, last_output, joined):
     )
 
 
-def act(gates, reset, last_cell, residual, output, next_output, next_cell):
+def act(gates, reset, last_cell, residual, output, next_output, next_cell) -> None:
     """Computes one step without a gradient, from gates of what `join` joined.
 
     Args:
@@ -75,7 +75,7 @@ def act(gates, reset, last_cell, residual, output, next_output, next_cell):
     )
 
 
-def forward(gates, cell, next_reset, output, next_hidden, next_cell):
+def forward(gates, cell, next_reset, output, next_hidden, next_cell) -> None:
     """Computes a step's output, and the input state of the next step.
 
     Args:
@@ -99,7 +99,9 @@ def forward(gates, cell, next_reset, output, next_hidden, next_cell):
     )
 
 
-def backward(gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell):
+def backward(
+    gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell
+) -> None:
     """Computes the gradients of `forward`'s gates and cell from those of its outputs."""
     launch(
         *(LIBRARY, kernel("lstm_backward", gates.dtype), cell.device, n_threads(cell)),

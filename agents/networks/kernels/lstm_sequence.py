@@ -22,6 +22,10 @@ MIN_STEPS = 2  # for one step, loading the weights takes longer than the product
 MAX_STEPS = LIBRARY.constants["MAX_STEPS"]
 _THREADS = LIBRARY.constants["SEQUENCE_THREADS"]
 _LANES = LIBRARY.constants["SEQUENCE_LANES"]
+#: Outputs, recurrent inputs, the last output and cell, and what the backward pass needs.
+Unrolled = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, tuple]
+#: Those of the gates, of the bias, and of the output and the cell before the sequence, if needed.
+Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]
 _RANKS = WIDTH // LIBRARY.constants["BLOCK_UNITS"]  # blocks of a cluster
 _MEMORY = max(LIBRARY.constants[f"{name}_MEMORY"] for name in ("FORWARD", "BACKWARD"))
 
@@ -41,7 +45,7 @@ def is_supported(x: torch.Tensor) -> bool:
     return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= _MEMORY
 
 
-def forward(gates, weight, reset, output, cell, needs_backward, residual=None):
+def forward(gates, weight, reset, output, cell, needs_backward, residual=None) -> Unrolled:
     """Unrolls the recurrence.
 
     Args:
@@ -92,7 +96,7 @@ def forward(gates, weight, reset, output, cell, needs_backward, residual=None):
     return outputs, hiddens, after, last_cell, saved
 
 
-def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
+def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell) -> Gradients:
     """Computes the gradients of `forward`'s gates, output and cell.
 
     Args:
@@ -132,7 +136,7 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
     return d_gates, sum_rows(d_bias), d_last_output, d_last_cell
 
 
-def _where(direction, device, n_clusters):
+def _where(direction, device, n_clusters) -> tuple[KernelLibrary, str, torch.device, Blocks]:
     """Returns the arguments of a launch but its fields."""
     shared = LIBRARY.constants[f"{direction.upper()}_MEMORY"]
     blocks = Blocks(_RANKS * n_clusters, threads=_THREADS, shared=shared)

@@ -6,6 +6,8 @@ their gradients are in the compute dtype, `start` and `last` (B, W) are float32,
 bool.
 """
 
+from typing import TYPE_CHECKING
+
 from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.library import (
     LIBRARY,
@@ -16,11 +18,14 @@ from megastep.agents.networks.kernels.library import (
 )
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
+if TYPE_CHECKING:
+    import torch
+
 _LARGEST_BLOCK = 256  # threads, of `backward`
 _MANY_BLOCKS = 128  # about one per multiprocessor
 
 
-def forward(gates, reset, start, residual, states, outputs, last):
+def forward(gates, reset, start, residual, states, outputs, last) -> None:
     """Computes the last three from the gates and the first state.
 
     Args:
@@ -42,7 +47,9 @@ def forward(gates, reset, start, residual, states, outputs, last):
     )
 
 
-def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual):
+def backward(
+    gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
+) -> "torch.Tensor":
     """Computes the gradients of `forward`'s gates and first state from those of its outputs.
 
     Args:

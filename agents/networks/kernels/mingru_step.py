@@ -75,7 +75,7 @@ def blocks(n_lanes: int, width: int, n_policies: int = 1) -> Blocks:
     return Blocks(n_blocks, n_policies, _THREADS, _shared(width))
 
 
-def _shared(width):
+def _shared(width) -> int:
     """Returns the bytes of shared memory of a block."""
     n_bytes = LIBRARY.constants
     of_parts = width // _UNITS * n_bytes["PART_BYTES"]

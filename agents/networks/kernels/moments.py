@@ -54,7 +54,9 @@ def moments(
     return n_counted, list(means), list(variances)
 
 
-def add_moments(norms: list, all_moments: list, is_counted: torch.Tensor | None = None) -> None:
+def add_moments(
+    norms: Sequence, all_moments: Sequence[tuple], is_counted: torch.Tensor | None = None
+) -> None:
     """Adds moments to the statistics of norms, at most `MAX_LEAVES`.
 
     Args:

@@ -93,14 +93,14 @@ class Plans:
         self.lengths = torch.cat(
             [pad(part, (0, width - part.shape[1]), value=torch.inf) for part in lengths]
         )
-        on = dict(dtype=torch.float32, device=device)
+        on: dict = dict(dtype=torch.float32, device=device)
         self._corners = torch.tensor([(0, 0), (0, 1), (1, 0), (1, 1)], **on)
         offsets = CELL * SQUARE * torch.tensor(EXITS, **on)
         self.beside = offsets[[max(map(abs, pair)) < 2 for pair in EXITS]]
         exits = [self._exits(plan, part, offsets) for plan, part in enumerate(nodes)]
         self.exits, self.metres = map(torch.cat, zip(*exits))
 
-    def _exits(self, plan, nodes, offsets):
+    def _exits(self, plan, nodes, offsets) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the nodes (m, K) int32 near the nodes of a plan (m, 2), and the lengths (m, K)
         float16 of the straight ways there.
         """
@@ -142,7 +142,7 @@ class Plans:
         """Returns the nodes (n, ...) in the squares of points (n, ..., 2), -1 if there is none."""
         return self._at(self._squares, plan, points, CELL * SQUARE)
 
-    def _at(self, grids, plan, points, size):
+    def _at(self, grids, plan, points, size) -> torch.Tensor:
         shape = len(plan), *[1] * (points.ndim - 2)
         cells = (points - self._origins[plan].view(*shape, 2)) / size
         column, row = cells.long().unbind(-1)
@@ -151,18 +151,18 @@ class Plans:
         return grids.view(-1)[(plan.view(shape) * height + row) * width + column]
 
 
-def _area(walls):
+def _area(walls) -> float:
     return np.prod(np.ptp(walls, (0, 1)))
 
 
-def _stack(tensors, value=0):
+def _stack(tensors, value=0) -> torch.Tensor:
     """Returns tensors (h, w) of different sizes, padded at their ends by a value, as one."""
     height, width = np.max([tensor.shape for tensor in tensors], 0).tolist()
     ends = [(0, width - tensor.shape[1], 0, height - len(tensor)) for tensor in tensors]
     return torch.stack([pad(tensor, end, value=value) for tensor, end in zip(tensors, ends)])
 
 
-def _surveys(graph, spawns, targets):
+def _surveys(graph, spawns, targets) -> list[tuple]:
     """Returns for each home of a graph origin (2,), clearances (H, W) uint8, squares (h, w) int64,
     nodes (m, 2), targets (l, 2) and lengths (m, l). Nodes are numbered from 0.
 
@@ -184,7 +184,7 @@ def _surveys(graph, spawns, targets):
     return [*zip(origins, clearances, all_squares, nodes, targets, lengths)]
 
 
-def _grid(graph, d):
+def _grid(graph, d) -> tuple[torch.Tensor, ...]:
     """Returns origin and clearances of a home's plan, and of its squares the spot furthest from
     walls: its clearance (h, w), whether an agent fits there (h, w), and where it is (h, w, 2).
     """
@@ -201,7 +201,7 @@ def _grid(graph, d):
     return graph.tensor(low, np.float32), levels, room, room > graph.radius + CLEAR, points[spot]
 
 
-def _best(values, side):
+def _best(values, side) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the highest of the values (H, W) in each square of `side` x `side`, (h, w), and its
     flat index.
     """
@@ -213,12 +213,12 @@ def _best(values, side):
     return highest, row * values.shape[1] + column
 
 
-def _lengths(graph, goals, points):
+def _lengths(graph, goals, points) -> list[torch.Tensor]:
     """Returns the lengths of the shortest paths, (k, g) for each home, from points (k, 2) to goals
     (g, 2). A graph takes equally many of each home, so the last ones are repeated.
     """
 
-    def of_all(parts):
+    def of_all(parts) -> np.ndarray:
         most = max(map(len, parts))
         parts = [part.cpu()[torch.arange(most).clamp(max=len(part) - 1)] for part in parts]
         return torch.stack(parts).numpy() - graph.origins[:, None]

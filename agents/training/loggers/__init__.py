@@ -59,7 +59,7 @@ class Loggers:
                 warnings.warn(f"logger={name} skipped: {first_line(error)}", stacklevel=2)
 
     def write(
-        self, step: int, metrics: dict[str, float | str] | None, perf: dict[str, float]
+        self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]
     ) -> None:
         """Writes one report after `step` environment steps.
 
@@ -77,11 +77,12 @@ class Loggers:
         self.metrics.file.sync()
 
     def close(self) -> None:
+        """Closes the files and every logger."""
         for lines in self.metrics, self.perf:
             self._call_lines(lines, "close")
         self._call_others("close")
 
-    def _call_lines(self, lines, method, *args):
+    def _call_lines(self, lines, method, *args) -> None:
         try:
             getattr(lines, method)(*args)
         except Exception as error:
@@ -90,7 +91,7 @@ class Loggers:
                 text = f"{lines.path} cannot be written ({first_line(error)}); the run goes on"
                 warnings.warn(text, stacklevel=3)
 
-    def _call_others(self, method, *args):
+    def _call_others(self, method, *args) -> None:
         for name, logger in list(self.others.items()):
             try:
                 getattr(logger, method)(*args)
@@ -104,15 +105,15 @@ class NoLogger:
     """Writes nothing, as on ranks other than 0."""
 
     def write(
-        self, step: int, metrics: dict[str, float | str] | None, perf: dict[str, float]
+        self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]
     ) -> None:
-        pass
+        """Does nothing."""
 
     def sync(self) -> None:
-        pass
+        """Does nothing."""
 
     def close(self) -> None:
-        pass
+        """Does nothing."""
 
 
 def first_line(error: Exception) -> str:

@@ -26,6 +26,7 @@ class CSV:
             self._replace([row for row in rows if int(row["samples"]) <= step])
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
+        """Appends a row. A metric that no row had before rewrites the file."""
         row = {"samples": step, **values}
         if not row.keys() <= {*self.columns}:
             self.columns = list(dict.fromkeys([*self.columns, *row]))
@@ -35,19 +36,19 @@ class CSV:
                 self._table(file).writerow(row)
 
     def close(self) -> None:
-        pass
+        """Does nothing: every row is in the file."""
 
-    def _table(self, file):
+    def _table(self, file) -> csv.DictWriter:
         return csv.DictWriter(file, self.columns, lineterminator="\n")
 
-    def _read(self):
+    def _read(self) -> list[dict[str, str]]:
         """Returns the rows of the file, without a last one that a kill cut short."""
         if not self.path.exists():
             return []
         lines = self.path.read_text().splitlines(keepends=True)
         return list(csv.DictReader(line for line in lines if line.endswith("\n")))
 
-    def _replace(self, rows):
+    def _replace(self, rows) -> None:
         """Writes the file as a whole."""
         text = io.StringIO()
         self._table(text).writeheader()

@@ -23,7 +23,7 @@ class TensorBoard:
             queue.SimpleQueue(),
         )
 
-    def _write_reports(self):
+    def _write_reports(self) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
 
@@ -37,6 +37,7 @@ class TensorBoard:
             self.error = error
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
+        """Hands one report to the thread that writes. Raises what ended that thread."""
         if self.error:
             raise self.error
         if not self.thread.ident:
@@ -44,6 +45,7 @@ class TensorBoard:
         self.reports.put((step, values))
 
     def close(self) -> None:
+        """Waits until everything is written. Raises what ended the thread."""
         self.reports.put(None)
         if self.thread.ident:
             self.thread.join()

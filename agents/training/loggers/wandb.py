@@ -20,9 +20,11 @@ class Wandb:
 
     Args:
         folder: the run folder.
-        run_name, config, project, group: as `wandb.init` takes them. A sweep sets the group to
-            the name of its folder, unless one is given.
-        mode: `offline` keeps the run in its folder; `wandb sync` uploads it later.
+        run_name: name of the run on Weights & Biases.
+        config: settings of the run.
+        project: project on Weights & Biases.
+        mode: `offline` needs no key and keeps the run in its folder until `wandb sync`.
+        group: group of the run; a sweep sets it to the name of its folder, unless one is given.
 
     Raises:
         RuntimeError: wandb is not installed, has no key, or did not start.
@@ -73,7 +75,9 @@ class Wandb:
             return bool(wandb.api.api_key)
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
+        """Logs one report."""
         self.run.log({"samples": step, **values}, step=step)
 
     def close(self) -> None:
+        """Ends the run on Weights & Biases."""
         self.run.finish()

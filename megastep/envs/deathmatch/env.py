@@ -4,7 +4,7 @@ N environments of A agents. Each agent is a lane: B = N A.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -20,6 +20,9 @@ from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import MAX_AGENTS, TALLY_ROWS, deathmatch_step, privileged_size
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Deathmatch"]
 
@@ -62,8 +65,10 @@ class Deathmatch(SceneryEnv):
         Terminal at health 0, for that agent alone. Truncated after ``limit`` steps.
 
     Metrics:
-        ``kills``: shared among the agents that hit the target in its last step. ``deaths``.
-        ``damage``: health taken from others. ``accuracy``: the fraction of steps with a hit.
+        ``kills``: kills, each shared among the agents that hit the target in its last step.
+        ``deaths``: 1 if the episode ended by death, else 0.
+        ``damage``: health taken from others.
+        ``accuracy``: fraction of steps with a hit.
 
     Args:
         n_envs: number of environments.
@@ -76,16 +81,17 @@ class Deathmatch(SceneryEnv):
         drain: health lost per second.
         health_per_hit: health gained by an agent that hits.
         limit: steps after which an episode is truncated.
-        hit_reward: per hit.
-        wound_cost: per hit received.
-        kill_reward: per kill.
-        death_cost: per death.
-        aim_reward: for bringing another agent from the edge of the view to its centre. What an
-            agent gains as its target nears the centre, it loses as it leaves, so that watching a
+        hit_reward: reward per hit, a step with another agent at the middle ray of the view.
+        wound_cost: cost per wound, a hit received.
+        kill_reward: reward per kill.
+        death_cost: cost of a death, also of one by drain.
+        aim_reward: reward for bringing another agent from the edge of the view to its centre. What
+            an agent gains as its target nears the centre, it loses as it leaves, so that watching a
             target without killing it pays nothing (after Ng, Harada and Russell 1999, "Policy
             invariance under reward transformations", but without discount).
-        search_reward: per 64 wall texels seen for the first time in the episode, as in Explorer.
-        hearing: metres at which sounds of other agents fade. 0: agents are deaf.
+        search_reward: reward per 64 wall texels seen for the first time in the episode, as in
+            Explorer.
+        hearing: metres at which the sound of another agent fades. 0: agents are deaf.
         res: rays of an agent's camera.
         subsample: rays per pixel.
         fov: field of view in degrees.
@@ -152,7 +158,7 @@ class Deathmatch(SceneryEnv):
             self.obs_space["sound"] = spaces.MultiVector(1, 3)
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
         self.privileged_space = spaces.MultiVector(1, n_privileged) if privileged else None
-        self.rules = dict(
+        self.rules: dict = dict(
             damage=damage,
             recovery=recovery / fps,
             drain=drain / fps,
@@ -170,9 +176,10 @@ class Deathmatch(SceneryEnv):
         engine.fit(n_envs, n_agents * bytes_per_lane, self.device)
         self.search_reward, self.seen = search_reward, None
         if search_reward:
-            on = dict(dtype=torch.int32, device=self.device)
-            self.seen = torch.zeros((n_envs, n_agents, words), **on)
-        n_lanes, on = n_envs * n_agents, dict(device=self.device)
+            shape = n_envs, n_agents, words
+            self.seen = torch.zeros(shape, dtype=torch.int32, device=self.device)
+        on: dict = dict(device=self.device)
+        n_lanes = n_envs * n_agents
         self.health = torch.ones(n_lanes, **on)
         self.tally = torch.zeros((TALLY_ROWS, n_lanes), **on)
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, **on)
@@ -202,7 +209,7 @@ class Deathmatch(SceneryEnv):
         self.movement(dict(actions=actions))
         return self._world()
 
-    def _world(self):
+    def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, renders, and lets the agents hit each other."""
         self.spawner(self.ended)
         view = self._view(**self._search_arguments())
@@ -219,6 +226,7 @@ class Deathmatch(SceneryEnv):
         )
         reward = step.reward
         if self.seen is not None:
+            assert view.newly_seen is not None
             search = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
             reward = reward + search.masked_fill_(step.reset, 0.0)
         truncated, metrics = step.truncated, step.metrics
@@ -238,11 +246,12 @@ class Deathmatch(SceneryEnv):
             world["privileged"] = step.privileged
         return world
 
-    def _end_rounds(self, step):
+    def _end_rounds(self, step) -> tuple[torch.Tensor, torch.Tensor]:
         """Ends every episode of the environments whose round is over, but not while one begins.
 
         Returns `truncated` and the metrics with those episodes in them.
         """
+        assert self.round_ages is not None
         shape = self.n_envs, self.n_agents
         over = self.round_ages.add_(1) >= self.rules["limit"]
         over &= ~step.reset.view(shape).any(1)
@@ -254,14 +263,14 @@ class Deathmatch(SceneryEnv):
         self.ended |= over
         return step.truncated | (over & ~step.terminal), metrics
 
-    def _search_arguments(self):
+    def _search_arguments(self) -> dict[str, torch.Tensor]:
         """The arguments of observe that count newly seen texels, if search_reward is not 0."""
         if self.seen is None:
             return {}
         starts = self.ended.view(self.n_envs, self.n_agents)
         return dict(seen=self.seen, clear_mask=starts)
 
-    def _view(self, **search):
+    def _view(self, **search) -> engine.Observation:
         return engine.observe(
             self.core.scenery,
             self.core.agents,
@@ -272,7 +281,7 @@ class Deathmatch(SceneryEnv):
             **search,
         )
 
-    def _images(self, view):
+    def _images(self, view) -> arrdict:
         """The images and the IMU of a view, by lane: (B, 1, ...)."""
         lanes = self.n_envs * self.n_agents
         return arrdict(
@@ -289,6 +298,7 @@ class Deathmatch(SceneryEnv):
         """
         lanes = slice(e * self.n_agents, (e + 1) * self.n_agents)
         view, n_model = self._view(), len(self.core.scenery.model)
+        assert view.centre_line is not None
         line = view.centre_line[e]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
         images = self._images(view)
@@ -303,7 +313,7 @@ class Deathmatch(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
         each agent to its target, and each agent's health, RGB and depth.
         """

@@ -1,7 +1,7 @@
 """Explorer: see as much of a home as possible. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -16,6 +16,9 @@ from megastep.envs.explorer.step import N_BINS, N_EPISODE, explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Explorer"]
 
@@ -133,11 +136,12 @@ class Explorer(SceneryEnv):
         self.movement(decision)
         return self._world()
 
-    def _world(self):
+    def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, renders, and computes rewards and flags."""
         ages, limits, ended = self.lifecycle.ages, self.lifecycle.limits, self.lifecycle.ended
         self.spawner(ended)
         obs, newly_seen = self._observation(seen=self.seen, clear_mask=ended[:, None])
+        assert newly_seen is not None
         step = explorer_step(
             self.core.scenery,
             self.core.agents,
@@ -169,7 +173,7 @@ class Explorer(SceneryEnv):
         """(B,) int32: texels seen this episode."""
         return self.lifecycle.limits - self.patience
 
-    def _observation(self, **bitmaps):
+    def _observation(self, **bitmaps) -> tuple[arrdict, torch.Tensor | None]:
         """Returns the observation and the number of newly seen texels, (N, 1) int32.
 
         Without ``bitmaps`` (arguments ``seen`` and ``clear_mask`` of ``engine.observe``) the number
@@ -190,7 +194,7 @@ class Explorer(SceneryEnv):
             lifecycle=self.lifecycle.state(e),
         )
 
-    def _seen_texels(self, e):
+    def _seen_texels(self, e) -> torch.Tensor:
         """(T,) bool: the wall texels of environment ``e`` that were seen this episode."""
         bits = (
             self.seen[e, 0, :, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1
@@ -200,7 +204,7 @@ class Explorer(SceneryEnv):
         return bits.flatten()[: last - first].bool()
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state`: the floor plan, bright where it was seen, above the
         agent's images. Returns a matplotlib figure.
         """

@@ -85,7 +85,8 @@ def explorer_step(
     if checks.flag("privileged", privileged):
         episode = torch.empty((n_lanes, 1, N_EPISODE), device=device)
         unseen = torch.empty((n_lanes, 1, N_BINS), device=device)
-    out = ExplorerStep(torch.empty(n_lanes, device=device), *flags, coverage_out, episode, unseen)
+    reward, (reset, terminal, truncated) = torch.empty(n_lanes, device=device), flags
+    out = ExplorerStep(reward, reset, terminal, truncated, coverage_out, episode, unseen)
     seen_at, n_words = texel_bits(scenery, "seen", seen, lanes)
     tables = dict(runs=0, run_starts=0, n_visible=0)
     if coverage or privileged:

@@ -57,7 +57,8 @@ class TexelRuns:
         table = torch.cat([places, indices.view(torch.float32)], 1)[bits != 0]
         n_runs = layout[bits != 0].bincount(minlength=len(layouts))
         n_visible = torch.zeros(len(layouts), dtype=torch.int64)
-        n_visible.index_add_(0, layout, sum(bits >> i & 1 for i in range(WORD)))
+        n_bits = torch.as_tensor(sum(bits >> i & 1 for i in range(WORD)))
+        n_visible.index_add_(0, layout, n_bits)
         self.table = table.contiguous().to(device)
         self.starts = torch.cat([n_runs.new_zeros(1), n_runs.cumsum(0)]).int().to(device)
         self.n_visible = n_visible.int().to(device)
@@ -86,6 +87,6 @@ class TexelRuns:
         )
 
 
-def _as_signed(bits):
+def _as_signed(bits) -> torch.Tensor:
     """Returns numbers below 2**32 as the int32 numbers of the same bits."""
     return bits - (bits >> 31 << 32)

@@ -53,7 +53,9 @@ class Gymnasium(VectorizedEnv):
         kwargs: arguments of the environment's constructor.
         wrappers: import paths of Gymnasium's wrappers, ``package.module:Wrapper``, put around every
             environment in this order.
-        vectorization: sync, async or own.
+        vectorization: how environments are stepped: sync, one after the other in this process;
+            async, divided among processes, one per core; own, the environment's own vector
+            environment.
         restart_failed: how often each environment is made anew after an error of its own. The
             episode is then truncated. Not with own.
         seed: each environment is reset with a seed of its own, which derives from this one.

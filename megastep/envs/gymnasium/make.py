@@ -5,13 +5,17 @@ import difflib
 import functools
 import importlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 from megastep import global_generators
 from megastep.env_probe import probe
 from megastep.imports import import_object, search_current_folder
 from megastep.sync_envs import SyncEnvs, make_env
 from megastep.vector_processes import VectorProcesses
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+    from gymnasium.vector import VectorEnv
 
 __all__ = ["vector_env"]
 
@@ -21,14 +25,14 @@ INSTALL = "pip install 'megastep-flatland[gymnasium]'"
 def vector_env(
     id: str | None,
     n_envs: int,
-    kwargs: Mapping[str, Any],
+    kwargs: Mapping[str, object],
     wrappers: Sequence[str],
     vectorization: str,
     restart_failed: int = 0,
     films: bool = False,
     seed: int = 1,
     check: bool = True,
-) -> Any:
+) -> "VectorEnv | SyncEnvs | VectorProcesses":
     """Returns a vector environment. The step after an episode's end resets it.
 
     Args are those of :class:`~megastep.envs.gymnasium.env.Gymnasium`.
@@ -42,7 +46,7 @@ def vector_env(
         raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
     spec = _spec(id)
     try:
-        wrappers = [import_object(name) for name in wrappers]
+        functions = [import_object(name) for name in wrappers]
     except ValueError as error:
         raise ValueError(f"env.wrappers: {error}") from None
     try:
@@ -53,15 +57,15 @@ def vector_env(
                     "environment has not; use env.vectorization=sync or async"
                 )
             make_vec = functools.partial(gymnasium.make_vec, spec)
-            return _checked(id, _own(make_vec, spec, wrappers, n_envs, kwargs))
+            return _checked(id, _own(make_vec, spec, functions, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
         settings = {"disable_env_checker": True, **kwargs}
         with global_generators.kept():
-            example = make_env(spec, wrappers, settings)
+            example = make_env(spec, functions, settings)
         max_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
         if films and "rgb_array" in (example.metadata.get("render_modes") or ()):
             settings = {"render_mode": "rgb_array", **settings}
-        make_one = functools.partial(make_env, spec, wrappers, settings)
+        make_one = functools.partial(make_env, spec, functions, settings)
         with contextlib.suppress(Exception):
             example.close()
         make = functools.partial(
@@ -85,7 +89,7 @@ def vector_env(
         ) from error
 
 
-def _spec(id):
+def _spec(id) -> "EnvSpec":
     """Returns the specification of an environment, whose package is imported if it names one."""
     import gymnasium
 
@@ -111,7 +115,7 @@ def _spec(id):
     return gymnasium.registry[name]
 
 
-def _own(make, spec, wrappers, n_envs, kwargs):
+def _own(make, spec, wrappers, n_envs, kwargs) -> "VectorEnv":
     if wrappers:
         raise ValueError(
             "env.wrappers go around single environments, which its own vector environment has "
@@ -122,7 +126,7 @@ def _own(make, spec, wrappers, n_envs, kwargs):
     return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs)
 
 
-def _checked(id, env):
+def _checked(id: str | None, env: "VectorEnv") -> "VectorEnv":
     from gymnasium.vector import AutoresetMode
 
     mode = env.metadata.get("autoreset_mode")
@@ -135,7 +139,7 @@ def _checked(id, env):
     return env
 
 
-def _line(error):
+def _line(error) -> str:
     """Returns the first line of an error, without what Gymnasium adds to it."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return line.partition(" was raised from the environment creator")[0]

@@ -39,10 +39,10 @@ class HostBuffers:
     ):
         self.device, self.on_gpu = device, device.type == "cuda"
 
-        def empty(dtype, *shape):
+        def empty(dtype, *shape) -> torch.Tensor:
             return torch.empty((n_lanes, *shape), dtype=dtype, pin_memory=self.on_gpu)
 
-        def of_space(space):
+        def of_space(space) -> torch.Tensor:
             dtypes = {spaces.MultiDiscrete: torch.int64, spaces.MultiContinuous: torch.float32}
             return empty(dtypes.get(type(space)) or space.dtype, *space.shape)
 
@@ -60,7 +60,7 @@ class HostBuffers:
     def send(self, world: arrdict) -> arrdict:
         """Returns a world of arrays as one of new tensors on the device."""
         pairs = zip(self.arrays, leaves(world), strict=True)
-        if not self.on_gpu:
+        if self.copied is None:
             tensors = (torch.from_numpy(np.array(array, to.dtype)) for to, array in pairs)
             return _tree(world, tensors)
         self.copied.synchronize()  # the last world may still be on its way
@@ -74,7 +74,7 @@ class HostBuffers:
         """Returns actions as arrays, once the device has chosen them. They are valid until the next
         call.
         """
-        if not self.on_gpu:
+        if self.copied is None:
             return spaces.map(lambda _, leaf: leaf.numpy(), self.actions, actions)
         spaces.map(lambda to, leaf: to.copy_(leaf, non_blocking=True), self.actions, actions)
         self.copied.record()
@@ -82,7 +82,7 @@ class HostBuffers:
         return spaces.map(lambda leaf: leaf.numpy(), self.actions)
 
 
-def _tree(like, values):
+def _tree(like, values) -> arrdict:
     """Returns the next values of an iterator as a tree with the keys of another."""
     return arrdict(
         {

@@ -57,7 +57,7 @@ class VectorizedEnv:
 
     def __init__(
         self,
-        id: str,
+        id: str | None,
         vector: Any,
         n_envs: int,
         n_agents: int,
@@ -67,7 +67,8 @@ class VectorizedEnv:
     ):
         self._checks = check
         self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
-        self.device, self._seeds = engine.device(device), seeds
+        self.device = engine.device("auto" if device is None else device)
+        self._seeds = seeds
         self.fps = float(vector.metadata.get("render_fps") or 10)
         self.max_episode_steps = getattr(vector, "max_episode_steps", None) or MAX_EPISODE_STEPS
         try:
@@ -124,7 +125,7 @@ class VectorizedEnv:
         self._read_news(news, terminated | truncated)
         return self._world(obs, reward, terminated, truncated, news)
 
-    def _check_actions(self, actions):
+    def _check_actions(self, actions) -> None:
         """Raises BadValue for a NaN or an infinity."""
         for path, leaf in spaces.leaves(actions, "the action").items():
             if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
@@ -170,7 +171,7 @@ class VectorizedEnv:
         self._n_restarts[:] = 0
         return n_restarts
 
-    def _call(self, function, *arguments, **more):
+    def _call(self, function, *arguments, **more) -> Any:
         """Calls a method of the environments. Raises EnvError for their errors."""
         try:
             return function(*arguments, **more)
@@ -181,7 +182,7 @@ class VectorizedEnv:
         except Exception as error:
             raise EnvError.of(error, f"{self.id}: an environment") from error
 
-    def _read_news(self, news, ended):
+    def _read_news(self, news, ended) -> None:
         """Keeps the numbers of episodes that ended, and counts environments that were made anew."""
         if not news or not hasattr(self.vector, "names"):
             return
@@ -238,7 +239,7 @@ class VectorizedEnv:
         """Returns the frame of a numpyified :meth:`state`."""
         return state.frame
 
-    def _world(self, obs, reward, terminated, truncated, news):
+    def _world(self, obs, reward, terminated, truncated, news) -> arrdict:
         """Returns the world after a step, in which lanes that had ended before it began again."""
         reset = self._ended.copy()
         terminal = terminated > reset
@@ -259,7 +260,7 @@ class VectorizedEnv:
         return self._buffers.send(world)
 
 
-def _plain(value):
+def _plain(value) -> object:
     """Returns a value of a wrapper in a form that checkpoints hold."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(np.array(value, order="C"))

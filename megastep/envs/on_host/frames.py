@@ -1,7 +1,5 @@
 """Frames that environments of other packages render, as images."""
 
-from typing import Any
-
 import numpy as np
 
 __all__ = ["as_frame"]
@@ -10,7 +8,7 @@ __all__ = ["as_frame"]
 MAX_FRACTION = 1.5
 
 
-def as_frame(rendered: Any) -> np.ndarray:
+def as_frame(rendered: object) -> np.ndarray:
     """Returns a rendered frame as (H, W, 3) uint8.
 
     Args:
@@ -40,7 +38,7 @@ def as_frame(rendered: Any) -> np.ndarray:
     return np.array(np.broadcast_to(frame, (*frame.shape[:2], 3)))
 
 
-def _described(rendered, frame):
+def _described(rendered, frame) -> str:
     if frame.dtype == object:
         return "None" if rendered is None else f"a {type(rendered).__name__}"
     return f"{frame.dtype} of shape {frame.shape}"

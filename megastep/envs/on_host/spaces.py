@@ -129,11 +129,11 @@ def actions(space: Any, path: str = "action") -> Conversion:
     )
 
 
-def _reshaped(shape, dtype, array):
+def _reshaped(shape, dtype, array) -> np.ndarray:
     return array.reshape(shape).astype(dtype)
 
 
-def _image(space):
+def _image(space) -> Conversion | None:
     """Returns the conversion of a Box that is an image or a stack of images, None if it is not.
 
     What has other axes than rows, columns and a few channels must be uint8 or have the same bounds
@@ -161,7 +161,7 @@ def _image(space):
     return spaces.MultiImage(1, channels, *rows, dtype=dtype), convert
 
 
-def _has_channels_last(shape, is_uniform):
+def _has_channels_last(shape, is_uniform) -> bool | None:
     """Returns which axis of an image has its channels: False for the first, None if it is none.
 
     Few channels tell it, then two sides of one length, then the shorter axis.
@@ -180,19 +180,19 @@ def _has_channels_last(shape, is_uniform):
     return can_be_last
 
 
-def _grey(x):
+def _grey(x) -> np.ndarray:
     return x[:, None, None]
 
 
-def _channels_first(x):
+def _channels_first(x) -> np.ndarray:
     return x.reshape(len(x), 1, -1, *x.shape[-2:])
 
 
-def _channels_last(x):
+def _channels_last(x) -> np.ndarray:
     return _channels_first(np.moveaxis(x, -1, -3))
 
 
-def _parts(space, conversion, path):
+def _parts(space, conversion, path) -> list[tuple[str, object, Space, Callable]]:
     """Returns [(name of ours, Gymnasium's key, space, function)] of a Dict or Tuple."""
     children = space.spaces if isinstance(space.spaces, Mapping) else dict(enumerate(space.spaces))
     return [
@@ -201,11 +201,11 @@ def _parts(space, conversion, path):
     ]
 
 
-def _tree(parts):
+def _tree(parts) -> dotdict:
     return dotdict({name: space for name, _, space, _ in parts})
 
 
-def _choices(names, sizes):
+def _choices(names, sizes) -> dotdict:
     return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)})
 
 
@@ -221,7 +221,7 @@ def identifiers(keys: Iterable[Any], reserved: Collection[str] = RESERVED) -> li
     return names
 
 
-def _described(space):
+def _described(space) -> str:
     text = " ".join(str(space).split())
     is_short = type(space).__name__ == "Box" and len(text) <= 80
     return text if is_short else f"a {type(space).__name__}"

@@ -4,7 +4,7 @@ N environments of one agent, so B = N lanes.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -19,6 +19,9 @@ from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["PointGoal"]
 
@@ -53,10 +56,12 @@ class PointGoal(SceneryEnv):
         Terminal within 0.2 m of the goal (success). Truncated after ``limit`` steps.
 
     Metrics:
-        ``success``: 1 if the goal was reached. ``spl``: success weighted by path length (Anderson
-        et al. 2018): 0 without success, else the length of the shortest path divided by the length
-        walked, at most 1. ``soft_spl``: the same with the fraction of the distance covered in place
-        of success (Datta et al. 2020). ``collisions``: steps that a wall cut short.
+        ``success``: 1 if the goal was reached.
+        ``spl``: success weighted by path length (Anderson et al. 2018): 0 without success, else the
+            length of the shortest path divided by the length walked, at most 1.
+        ``soft_spl``: the same with the fraction of the distance covered in place of success (Datta
+            et al. 2020).
+        ``collisions``: steps that a wall cut short.
 
     Args:
         n_envs: number of environments.
@@ -113,7 +118,9 @@ class PointGoal(SceneryEnv):
         self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
-        self.rules = dict(bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH)
+        self.rules: dict = dict(
+            bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH
+        )
         self.goals = goal_fields(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns
@@ -150,7 +157,7 @@ class PointGoal(SceneryEnv):
         """Takes one step with ``decision.actions``. Returns a world."""
         return self._world(self.movement(decision).progress)
 
-    def _world(self, free=None):
+    def _world(self, free=None) -> arrdict:
         """Respawns agents whose episode has ended, renders, and computes rewards and flags."""
         self.spawner(self.ended)
         obs = self._view()
@@ -181,7 +188,7 @@ class PointGoal(SceneryEnv):
             world["privileged"] = arrdict(way=step.privileged)
         return world
 
-    def _view(self):
+    def _view(self) -> arrdict:
         """Returns the observation without the goal."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
         return arrdict(images(view), imu=view.imu)
@@ -201,7 +208,7 @@ class PointGoal(SceneryEnv):
         )
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan with the goal,
         and the agent's RGB and depth.
         """

@@ -11,11 +11,12 @@ points, H x W cells.
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from megastep.dotdict import dotdict
 from megastep.engine.devices import threads
 from megastep.envs.pointgoal.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
@@ -42,7 +43,7 @@ class Geodesics(NamedTuple):
 
 
 def geodesics(
-    geometries: Sequence[Any],
+    geometries: Sequence[dotdict],
     n_spawns: int,
     n_goals: int,
     radius: float,
@@ -81,7 +82,7 @@ def geodesics(
 # ---- Goals and spawn points ----
 
 
-def n_cells(g: Any) -> int:
+def n_cells(g: dotdict) -> int:
     """Returns the number of cells in the grid of a geometry.
 
     Raises:
@@ -99,7 +100,7 @@ def n_cells(g: Any) -> int:
     return n
 
 
-def _chunks(geometries, most):
+def _chunks(geometries, most) -> Iterator[slice]:
     """Yields slices of geometries whose grids have about `most` cells in all, at least one each."""
     first = total = 0
     for d, g in enumerate(geometries):

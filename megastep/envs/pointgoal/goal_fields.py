@@ -75,14 +75,14 @@ class GoalFields:
                 raise ValueError(f"{name} must have one array {shape} for each of the {d} fields")
         if any(np.asarray(mask).dtype != bool for mask in allowed):
             raise ValueError("allowed must hold True and False")
-        allowed = np.stack(allowed)
-        counts = allowed.sum(2, dtype=np.int32)
+        is_allowed = np.stack(allowed)
+        counts = is_allowed.sum(2, dtype=np.int32)
         if not counts.all():
             raise ValueError("allowed must have at least one goal for each spawn point")
         numbers = dict(
             points=np.stack(points),
             origins=np.stack(origins),
-            lengths=np.where(allowed, np.stack(lengths), 0.0),  # of others it may be infinite
+            lengths=np.where(is_allowed, np.stack(lengths), 0.0),  # of others it may be infinite
             spawns=np.stack(spawns),
         )
         tensors = {
@@ -95,14 +95,14 @@ class GoalFields:
             fields=np.concatenate([field.reshape(-1) for field in distinct.values()]),
             starts=np.array([starts[id(field)] for field in fields], np.int64),
             shapes=np.array([field.shape[1:] for field in fields], np.int32),
-            in_range=np.argsort(~allowed, axis=2, kind="stable").astype(np.int32),
+            in_range=np.argsort(~is_allowed, axis=2, kind="stable").astype(np.int32),
             n_in_range=counts,
         )
         tensors |= {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
         self.points, self.spawns = tensors["points"], tensors.pop("spawns")
         self._tensors, self.device = tensors, self.points.device
 
-    def __setattr__(self, name, value):
+    def __setattr__(self, name, value) -> None:
         if hasattr(self, name):
             raise AttributeError(f"{name} of GoalFields cannot be changed: make another GoalFields")
         super().__setattr__(name, value)

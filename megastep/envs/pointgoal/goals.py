@@ -4,19 +4,23 @@ D layouts, S spawn points and G goals per layout.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from megastep import cache, engine
+from megastep.core import Core
+from megastep.dotdict import dotdict
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics, n_cells
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.geometry import content_hash
 from megastep.kernels.build.kernel_library import KERNELS
 from megastep.modules import spawning
+
+T = TypeVar("T")
 
 PREFIX = "geodesics-"  # of the cached files
 MAX_FILES, MAX_BYTES = 64, 10**9  # of all cached files together
@@ -42,8 +46,8 @@ REST = {
 
 
 def goal_fields(
-    geometries: Sequence[Any],
-    core: Any,
+    geometries: Sequence[dotdict],
+    core: Core,
     nearest: float = 1.0,
     furthest: float = 15.0,
     seed: int | None = None,
@@ -66,10 +70,11 @@ def goal_fields(
             f"goals need 0 <= nearest < furthest metres, but {nearest:g} and {furthest:g} were "
             f"given"
         )
-    seed, device = core.seed if seed is None else seed, core.device
+    seed = core.seed if seed is None else seed
+    device = core.device
     geometries = geometries[: len(core.scenery.layouts)]
-    mean_bytes = np.mean([2 * N_GOALS * n_cells(g) for g in geometries])  # of fields in fp16
-    engine.fit(len(geometries), mean_bytes, device, "layouts")
+    n_bytes = [2 * N_GOALS * n_cells(g) for g in geometries]  # of fields in fp16
+    engine.fit(len(geometries), float(np.mean(n_bytes)), device, "layouts")
     layouts = all_geodesics(geometries, core.agents.radius, seed, device)
     spawns, lengths, allowed = zip(
         *[_in_range(*pair, nearest, furthest) for pair in zip(layouts, geometries, strict=True)]
@@ -80,7 +85,7 @@ def goal_fields(
     return GoalFields(points, fields, origins, spawns, lengths, allowed, CELL, device)
 
 
-def _in_range(layout, g, nearest, furthest):
+def _in_range(layout, g, nearest, furthest) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns spawn points (S, 2) with a goal in range, the lengths (S, G) of their shortest paths,
     and (S, G) bool, true where a length is in range.
     """
@@ -100,7 +105,7 @@ def _in_range(layout, g, nearest, furthest):
 
 
 def all_geodesics(
-    geometries: Sequence[Any], radius: float, seed: int, device: torch.device | str = "cpu"
+    geometries: Sequence[dotdict], radius: float, seed: int, device: torch.device | str = "cpu"
 ) -> list[Geodesics]:
     """Returns the geodesics of each geometry.
 
@@ -122,25 +127,25 @@ def all_geodesics(
     return [by_id[id(g)] for g in geometries]
 
 
-def _cached(found, geometries, radius, seed):
+def _cached(found, geometries, radius, seed) -> list[Geodesics]:
     """Returns the list of what the iterator `found` yields, from the cache if it holds it."""
     key = content_hash(geometries)
     for path in SOURCES:
         key.update(path.read_bytes())
     key.update(repr((np.__version__, radius, seed)).encode())
 
-    def build():
+    def build() -> bytes:
         layouts = list(_with_progress(found, len(geometries)))
         shapes = np.array([layout.fields.shape for layout in layouts], np.int64)
         parts = [np.stack([getattr(layout, name) for layout in layouts]) for name in REST]
         parts = [shapes, *parts, *(layout.fields for layout in layouts)]
         cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - sum(part.nbytes for part in parts))
-        return b"".join(map(np.ascontiguousarray, parts))
+        return b"".join(np.ascontiguousarray(part).data for part in parts)
 
     body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
     n, start = len(geometries), 0
 
-    def read(shape, dtype):
+    def read(shape, dtype) -> np.ndarray:
         nonlocal start
         array = np.frombuffer(body, dtype, math.prod(shape), start).reshape(shape)
         start += array.nbytes
@@ -155,7 +160,7 @@ def _cached(found, geometries, radius, seed):
     ]
 
 
-def _with_progress(items, total):
+def _with_progress(items: Iterable[T], total: int) -> Iterable[T]:
     """Returns an iterator over `items` that shows a progress bar on stderr, if they are many."""
     if total < MIN_PROGRESS:
         return items

@@ -4,11 +4,11 @@ D homes, W walls of all homes, V corners of all homes, G goals per home, P point
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 
+from megastep.dotdict import dotdict
 from megastep.engine.devices import threads
 from megastep.envs.pointgoal.library import LIBRARY
 from megastep.kernels.build.launch import BLOCK, launch
@@ -39,7 +39,7 @@ class PathGraph:
         origins: (D, 2) float32. All points are relative to these.
     """
 
-    def __init__(self, geometries: Sequence[Any], radius: float, device: torch.device):
+    def __init__(self, geometries: Sequence[dotdict], radius: float, device: torch.device):
         self.geometries, self.device, self.radius = geometries, device, radius
         n_walls = np.array([len(g.walls) for g in geometries])
         firsts, home = self._starts(n_walls)[:-1], np.repeat(np.arange(len(n_walls)), n_walls)
@@ -58,7 +58,7 @@ class PathGraph:
         self.tensors["corner_starts"] = starts.int()
         self.links = self._link()
 
-    def _group(self, walls, home, n_walls):
+    def _group(self, walls, home, n_walls) -> None:
         """Sets walls (W, 2, 2), neighbours together, in groups with bounding boxes."""
         cells = (walls.mean(1) / GROUP_SIDE).astype(int)
         walls = walls[np.lexsort((cells[:, 0], cells[:, 1], home))].astype(np.float32)
@@ -79,14 +79,14 @@ class PathGraph:
             group_starts=self.tensor(self._starts(n_groups), np.int32),
         )
 
-    def _starts(self, counts):
+    def _starts(self, counts) -> np.ndarray:
         return np.concatenate([[0], np.cumsum(counts)])
 
-    def tensor(self, array, dtype):
+    def tensor(self, array, dtype) -> torch.Tensor:
         """Returns an array on the device."""
         return torch.from_numpy(np.ascontiguousarray(array, dtype)).to(self.device)
 
-    def _params(self):
+    def _params(self) -> bytes:
         inradius = INFLATION * self.radius + 2 * SLACK
         circumradius = inradius / np.cos(np.pi / SIDES)
         return LIBRARY.params.HomesParams(
@@ -101,7 +101,7 @@ class PathGraph:
 
     # ---- The visibility graph ----
 
-    def _find_corners(self, walls, home):
+    def _find_corners(self, walls, home) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the corners where a disc fits and a path may turn around the end of a wall:
         columns (6, V) as in HomesParams, and the home of each, (V,) int32, ascending.
         """
@@ -129,7 +129,7 @@ class PathGraph:
         corners = (ends[:, None] + self.tensor(corner, np.float64)).view(-1, 2)[fits]
         return torch.cat([corners.float(), sides], 1).T.contiguous(), owner[fits // SIDES]
 
-    def clearances(self, points, home, most):
+    def clearances(self, points, home, most) -> torch.Tensor:
         """Returns the metres (P,) float32 from points (P, 2) to the nearest wall of their home, by
         its number (P,) int32; at most `most`.
         """
@@ -145,7 +145,7 @@ class PathGraph:
         )
         return clearances
 
-    def _link(self):
+    def _link(self) -> dict[str, torch.Tensor]:
         """Returns the links between corners that see each other: starts (V + 1,) int32, targets
         int32, metres float32.
         """
@@ -169,7 +169,7 @@ class PathGraph:
 
     # ---- Shortest paths ----
 
-    def lengths(self, goals, points):
+    def lengths(self, goals, points) -> torch.Tensor:
         """Returns the lengths of the shortest paths from points (D, K, 2) to goals (D, G, 2), as
         (D, G, K) float32. Infinite where there is no path.
         """
@@ -177,7 +177,7 @@ class PathGraph:
         lengths = self._all_lengths(goals, counts, self.tensor(points, np.float32))
         return lengths.view(len(points), -1, points.shape[1])
 
-    def fields(self, goals):
+    def fields(self, goals) -> list[np.ndarray]:
         """Returns the lengths of the shortest paths from all cells to goals (D, G, 2), as float16
         (G, H, W) of each home.
         """
@@ -186,7 +186,7 @@ class PathGraph:
         ends = np.prod(shapes, 1).cumsum()[:-1]
         return [field.reshape(s) for field, s in zip(np.split(lengths, ends), shapes)]
 
-    def _all_lengths(self, goals, counts, points=None):
+    def _all_lengths(self, goals, counts, points=None) -> torch.Tensor:
         """Returns lengths (P * G,): for each home G rows, one after the other.
 
         Args:
@@ -232,5 +232,5 @@ class PathGraph:
         return lengths
 
 
-def _directions(angles):
+def _directions(angles) -> np.ndarray:
     return np.stack([np.cos(angles), np.sin(angles)], 1)

@@ -62,7 +62,7 @@ class Tracker:
         return arrdict(actions=actions[:, None]), arrdict(saved=saved - moves.float())
 
 
-def _cells_below(obs):
+def _cells_below(obs) -> torch.Tensor:
     """Returns (B,): how many cells the ball is below the centre of a lane's paddle."""
     shape = getattr(obs, "shape", None)
     if shape is not None and shape[1:] == (1, FEATURES):

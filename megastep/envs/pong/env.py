@@ -5,7 +5,7 @@ one operation, :func:`~megastep.envs.pong.step.pong_step`.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from megastep.envs.common import DisplayedEnv
 from megastep.envs.pong.bot import Tracker
 from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, LIBRARY, PIXELS, pong_step
 from megastep.settings import MAX_ENVS, checked
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Pong"]
 
@@ -93,7 +96,7 @@ class Pong(DisplayedEnv):
         self.obs_space = spaces.MultiVector(1, FEATURES)
         n_lanes = n_envs * self.n_agents
         engine.fit(n_envs, 64 + self.n_agents * (64 + pixels * ROWS * COLUMNS), self.device)
-        on = dict(device=self.device)
+        on: dict = dict(device=self.device)
         self.games = torch.zeros((GAME_FIELDS, n_envs), dtype=torch.int32, **on)
         self.error_flag = torch.zeros(1, dtype=torch.int32, **on)
         self.no_actions = torch.zeros((n_lanes, 1), dtype=torch.int64, **on)
@@ -111,7 +114,7 @@ class Pong(DisplayedEnv):
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         return self._world(checks.alike("actions", decision["actions"], self.no_actions))
 
-    def _world(self, actions, restart=False):
+    def _world(self, actions, restart=False) -> arrdict:
         step = pong_step(
             self.games,
             actions,
@@ -174,7 +177,7 @@ class Pong(DisplayedEnv):
         return "\n".join([score, edge, *(line.rstrip() for line in lines), edge])
 
     @classmethod
-    def plot_state(cls, state: arrdict) -> Any:
+    def plot_state(cls, state: arrdict) -> "Figure":
         """Draws the court and the score of a numpyified :meth:`state` as a matplotlib figure."""
         from matplotlib.figure import Figure
 

@@ -105,4 +105,5 @@ def pong_step(
         n_threads=threads(),
     )
     check_flag_on_cpu(error_flag)
-    return PongStep(reward, *flags, points_won, features)
+    reset, terminal, truncated = flags
+    return PongStep(reward, reset, terminal, truncated, points_won, features)

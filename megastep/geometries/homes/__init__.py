@@ -21,7 +21,7 @@ SLANTED = 0.08  # fraction of homes with a corner cut off at 45 degrees
 START = 100  # cm; the minimum coordinate of a home
 
 
-def _attempt(count, generator, style):
+def _attempt(count, generator, style) -> list[tuple]:
     """Tries to plan `count` rooms. Returns [(cost, footprint, rooms, contacts, depth, gaps)], or []
     if it fails.
     """
@@ -45,7 +45,7 @@ def _attempt(count, generator, style):
     return [(cost, footprint, rooms, meetings, depth, gaps)]
 
 
-def _best_plan(generator, style):
+def _best_plan(generator, style) -> tuple:
     """Returns the best of a few plans: (cost, footprint, rooms, contacts, depth, gaps).
 
     The number of rooms is drawn once. Plans of few rooms succeed more often, so drawing it again
@@ -63,7 +63,7 @@ def _best_plan(generator, style):
         count -= 1
 
 
-def _doorways(gaps, depth, half_blocked, generator):
+def _doorways(gaps, depth, half_blocked, generator) -> tuple[list, list]:
     """Returns the rectangles in front of doors and openings that stay clear, and the parts of
     their gaps that clutter blocks, in the fraction `half_blocked` of them.
     """
@@ -82,7 +82,9 @@ def _doorways(gaps, depth, half_blocked, generator):
     return clear, blocked
 
 
-def _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator):
+def _furnish(
+    rooms, solids, gaps, depth, lights, triangle, style, generator
+) -> list[tuple[int, int, int, int]]:
     """Returns the furniture of a home: rectangles, none in a room with a slanted corner."""
     clear, blocked = _doorways(gaps, depth, style.half_blocked, generator)
     reach = furniture.BESIDE_LIGHT
@@ -97,7 +99,7 @@ def _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator):
     ]
 
 
-def _metres(segments, shift):
+def _metres(segments, shift) -> np.ndarray:
     return ((np.reshape(segments, (-1, 2, 2)) + shift) / 100).astype(np.float32)
 
 

@@ -21,9 +21,12 @@ import numpy as np
 
 from megastep import cache, geometry, workers
 from megastep.dotdict import dotdict
-from megastep.geometries import homes
+from megastep.geometries import files, homes
 
 COUNT = 5_000
+NAMES = ("walls", "lights", "doors", "masks", "widths")
+#: Bytes of a home and of the headers of arrays, at most; the homes of the package have 3.8 kB.
+MAX_EACH, MAX_HEADERS = 1 << 16, 1 << 12
 PATH = Path(__file__).parents[1] / "data" / "homes.npz"
 PREFIX, MAX_FILES = "homes-", 16  # of files in the cache: of their names, and their number
 SEEDS_EACH = 50  # homes per process at least; to start one takes as long as about ten homes
@@ -31,7 +34,7 @@ REMEDY = "install megastep again, or run scripts/make_homes.py"
 
 
 @functools.lru_cache(maxsize=1)
-def _arrays(path):
+def _arrays(path) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Returns the arrays of a database and the index at which each home's begin.
 
     Raises ValueError unless the file's sha256 is the one in the file beside it.
@@ -45,7 +48,7 @@ def _arrays(path):
         ) from error
     if hashlib.sha256(content).hexdigest() != expected:
         raise ValueError(f"The homes in {str(path)!r} are damaged (wrong sha256); {REMEDY}.")
-    return _unpack(content)
+    return _unpack(content, COUNT)
 
 
 def pack(plans: Sequence[dotdict]) -> bytes:
@@ -70,10 +73,20 @@ def pack(plans: Sequence[dotdict]) -> bytes:
     return buffer.getvalue()
 
 
-def _unpack(content):
-    """Returns the arrays of a database and the index at which each home's begin."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
+def _unpack(content, n_homes) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Returns the arrays of a database and the index at which each home's begin.
+
+    Raises ValueError for one that is larger than so many homes can be, before it is unpacked.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = {entry.filename: entry for entry in archive.infolist()}
+            n_bytes = sum(entry.file_size for entry in entries.values())
+            if n_bytes > n_homes * MAX_EACH + MAX_HEADERS:
+                raise ValueError(f"it unpacks to more than {n_homes:,} homes can have")
+            arrays = {name: files.read_array(archive, entries[f"{name}.npy"]) for name in NAMES}
+    except (*files.UNREADABLE, KeyError) as error:
+        raise ValueError(f"The database of homes cannot be read ({error}); {REMEDY}.") from error
     widths = arrays["widths"]
     sizes = np.stack([widths[:, 0], widths[:, 2], widths[:, 3] * widths[:, 4], widths[:, 5]], 1)
     return arrays, np.concatenate([np.zeros((1, 4), int), sizes.cumsum(0)])
@@ -85,7 +98,7 @@ def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
     return _home(*_arrays(path), index, index, outer)
 
 
-def _home(arrays, starts, index, seed, outer):
+def _home(arrays, starts, index, seed, outer) -> dotdict:
     _, n_outer, _, height, width, _ = arrays["widths"][index]
     parts = ("walls", "lights", "masks", "doors")
     walls, lights, cells, doors = (
@@ -113,11 +126,11 @@ def generated(
     name = f"{PREFIX}{key.hexdigest()[:20]}"
     content, _ = cache.fetch(name, lambda: _generate(seeds, density, clutter))
     cache.prune(PREFIX, MAX_FILES)
-    database = _unpack(content)
+    database = _unpack(content, len(seeds))
     return {seed: _home(*database, index, seed, outer) for index, seed in enumerate(seeds)}
 
 
-def _generate(seeds, density, clutter):
+def _generate(seeds, density, clutter) -> bytes:
     """Returns the bytes of a database of generated homes."""
     import loky
 

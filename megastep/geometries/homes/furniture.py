@@ -7,12 +7,14 @@ around clutter `TIGHT[0]`.
 """
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 from megastep.geometries.homes import regions
 from megastep.geometries.homes.portable_generator import PortableGenerator
+from megastep.geometries.homes.regions import Rectangle
 from megastep.geometries.homes.walls import CLEAR
 
-Rectangle = tuple[int, int, int, int]
+T = TypeVar("T")
 
 PASSAGE = 65  # cm; 5 more than the narrowest door
 SLIT = 20  # cm; nearer than this to a wall, a piece stands at it
@@ -27,7 +29,7 @@ DEEP, LONG = (30, 90), (30, 130)  # cm; sides of a piece of clutter
 OFF_WALL = 0.5  # fraction of clutter that leaves a gap behind it
 
 
-def overlap(a: Rectangle, b: Rectangle, apart: int = 0) -> bool:
+def overlap(a: Sequence[int], b: Sequence[int], apart: int = 0) -> bool:
     """Returns True if two rectangles overlap, or are less than `apart` cm apart in x and in y."""
     return min(a[2], b[2]) + apart > max(a[0], b[0]) and min(a[3], b[3]) + apart > max(a[1], b[1])
 
@@ -41,7 +43,8 @@ def clear(rectangle: Rectangle, solids: regions.Region) -> Rectangle:
             touched = [side for side in range(4) if part[side] == rectangle[side]]
             side = min(touched, key=lambda side: part[side % 2 + 2] - part[side % 2])
             sides[side] = (max if side < 2 else min)(sides[side], part[(side + 2) % 4])
-    return tuple(sides)
+    x0, y0, x1, y1 = sides
+    return x0, y0, x1, y1
 
 
 def place_light(
@@ -60,7 +63,7 @@ def walled(region: regions.Region, rectangle: Rectangle) -> list[bool]:
     for side in range(4):
         beyond, axis, at = [*rectangle], side % 2, rectangle[side]
         beyond[axis], beyond[axis + 2] = (at - 1, at) if side < 2 else (at, at + 1)
-        closed.append(not any(overlap(tuple(beyond), other) for other in region))
+        closed.append(not any(overlap(beyond, other) for other in region))
     return closed
 
 
@@ -69,7 +72,15 @@ def tight(generator: PortableGenerator) -> int:
     return max(generator.between(*TIGHT), generator.between(*TIGHT))
 
 
-def _place(low, high, size, is_walled, generator, passage=PASSAGE, off_wall=0.0):
+def _place(
+    low: int,
+    high: int,
+    size: int,
+    is_walled: Sequence[bool],
+    generator: PortableGenerator,
+    passage: int = PASSAGE,
+    off_wall: float = 0.0,
+) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """Places a piece along an axis of a room, from `low` to `high`. With the probability `off_wall`
     no wall is nearer than a passage.
 
@@ -93,7 +104,7 @@ def _place(low, high, size, is_walled, generator, passage=PASSAGE, off_wall=0.0)
     return (at, at + size), (low if fills[0] else at, high if fills[1] else at + size)
 
 
-def _roomy(floor, is_walled, generator):
+def _roomy(floor, is_walled, generator) -> tuple[Rectangle, Rectangle] | None:
     """Places a piece with a passage around it on a rectangle of floor.
 
     Returns the rectangles of the piece and of what it fills with the walls that it stands by, or
@@ -109,12 +120,14 @@ def _roomy(floor, is_walled, generator):
     return (a, b, c, d), (fill_a, fill_b, fill_c, fill_d)
 
 
-def _turned(sides):
+def _turned(sides: tuple[T, T, T, T]) -> tuple[T, T, T, T]:
     """Exchanges x and y of a rectangle, or of something else in the order of its sides."""
     return sides[1], sides[0], sides[3], sides[2]
 
 
-def _cluttered(floor, is_walled, filled, keep_clear, doorway, gap, generator):
+def _cluttered(
+    floor, is_walled, filled, keep_clear, doorway, gap, generator
+) -> tuple[Rectangle, Rectangle] | None:
     """Places a piece that leaves narrow gaps. Returns the same as `_roomy`.
 
     It stands in front of `doorway`, the part of one that clutter blocks, if given.
@@ -134,10 +147,12 @@ def _cluttered(floor, is_walled, filled, keep_clear, doorway, gap, generator):
         gap,
         generator,
     )
-    return rectangles and tuple(map(_turned, rectangles))
+    return rectangles and (_turned(rectangles[0]), _turned(rectangles[1]))
 
 
-def _in_row(floor, is_walled, filled, keep_clear, doorway, gap, generator):
+def _in_row(
+    floor, is_walled, filled, keep_clear, doorway, gap, generator
+) -> tuple[Rectangle, Rectangle] | None:
     """Places a piece so that along x it takes a free interval between walls, other pieces and what
     is kept clear, less narrow gaps. At a wall at one of its ends may be none.
     """
@@ -227,7 +242,7 @@ def furnish(
     return pieces
 
 
-def _shape(box, right, up, generator):
+def _shape(box, right, up, generator) -> list[Rectangle]:
     """Returns the rectangles of a piece with this bounding box: all of it, or an L-shape that lacks
     the corner on these sides.
     """

@@ -2,10 +2,13 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from megastep.geometries.homes.plan import NORMAL, Style
 from megastep.geometries.homes.portable_generator import PortableGenerator
+
+if TYPE_CHECKING:
+    from megastep.geometries.homes.partition import Room
 
 # Probability of each width of a door.
 DOORS = {60: 0.06, 65: 0.12, 70: 0.16, 75: 0.18, 80: 0.24, 85: 0.14, 90: 0.10}
@@ -77,7 +80,7 @@ class Opening(NamedTuple):
     door: bool
 
 
-def contacts(rooms: Sequence[Any]) -> list[Contact]:
+def contacts(rooms: Sequence["Room"]) -> list[Contact]:
     """Returns every Contact between two of the rooms. Collinear pieces are merged."""
     pieces = []
     for (i, room), (j, other) in combinations(enumerate(rooms), 2):
@@ -112,7 +115,7 @@ def clear(contact: Contact, others: Iterable[Contact], depth: Callable) -> tuple
     return low, high
 
 
-def _cost(a, b):
+def _cost(a, b) -> float:
     """Returns the cost of a connection between rooms of kinds a and b."""
     pair = frozenset((a, b))
     return COSTS.get(
@@ -121,7 +124,7 @@ def _cost(a, b):
 
 
 def connections(
-    rooms: Sequence[Any], spans: dict[Contact, tuple[int, int]], generator: PortableGenerator
+    rooms: Sequence["Room"], spans: dict[Contact, tuple[int, int]], generator: PortableGenerator
 ) -> tuple[float, list[Contact]] | None:
     """Chooses the contacts to open: a cheapest spanning tree of the rooms, and some loops.
 

@@ -79,7 +79,7 @@ def partition(
     return result
 
 
-def _divide(region, rooms, generator, corridor, steps_left):
+def _divide(region, rooms, generator, corridor, steps_left) -> tuple[list[Room], dict] | None:
     """Returns the result of `partition` for rooms in this order, or None if it fails. `steps_left`
     counts down over the whole recursion.
     """
@@ -105,7 +105,7 @@ def _divide(region, rooms, generator, corridor, steps_left):
     return None
 
 
-def _cuts(region, rooms, generator, corridor):
+def _cuts(region, rooms, generator, corridor) -> list:
     """Returns all cuts of a region in two that suit its rooms, and cuts with a corridor."""
     widths = [KINDS[kind].width + ALLOWANCE for kind, _ in rooms]
     firsts, lasts = list(accumulate(widths, max)), list(accumulate(widths[::-1], max))[::-1]
@@ -133,7 +133,7 @@ def _cuts(region, rooms, generator, corridor):
     return [cut for cut in cuts if cut]
 
 
-def _corridor(region, rooms, axis, slices, generator, widths):
+def _corridor(region, rooms, axis, slices, generator, widths) -> Cut | None:
     """Returns a cut of a region into two rows of rooms with the entry as a corridor between, or
     None.
     """
@@ -161,7 +161,7 @@ def _corridor(region, rooms, axis, slices, generator, widths):
     return cut and cut._replace(parts=[*cut.parts, (strip, entries)], favour=CORRIDORS)
 
 
-def _suitable_cut(pairs, lines):
+def _suitable_cut(pairs, lines) -> Cut | None:
     """Returns the Cut of these (region, rooms), or None if a part does not suit its rooms."""
     worst = 1.0
     for part, rooms in pairs:
@@ -172,7 +172,7 @@ def _suitable_cut(pairs, lines):
     return Cut(pairs, lines, worst)
 
 
-def _aspect(region, rooms):
+def _aspect(region, rooms) -> float | None:
     """Returns long side / short side of a region for several rooms, or None if it is too narrow for
     one of them.
     """
@@ -185,7 +185,7 @@ def _aspect(region, rooms):
     return long / short
 
 
-def _leaf_aspect(region, kind):
+def _leaf_aspect(region, kind) -> float | None:
     """Returns long side / short side of a region for one room, or None if it does not suit it."""
     if not region or len(region) > 2 or not regions.connected(region, 90):
         return None

@@ -106,7 +106,7 @@ def room_count(generator: PortableGenerator, style: Style = NORMAL) -> int:
 
 def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]:
     """Draws `count` rooms: a list of (kind, area in cm2)."""
-    kinds = list(CORE[:count])
+    kinds: list[str] = [*CORE[:count]]
     maximum = {"bedroom": 1 + count // 4, "bath": 1 + count // 6, "lobby": 1, "utility": 1}
     while len(kinds) < count:
         allowed = [kind for kind in KINDS if kinds.count(kind) < maximum.get(kind, count)]
@@ -121,7 +121,7 @@ def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]
     ]
 
 
-def _notch(width, height, fraction, at_corner, generator):
+def _notch(width, height, fraction, at_corner, generator) -> regions.Rectangle | None:
     """Draws a notch: a rectangle of about `fraction` of the bounding box, at a corner or in the
     middle of a side. Returns None if it does not fit.
     """
@@ -139,7 +139,7 @@ def _notch(width, height, fraction, at_corner, generator):
     return left, low, left + across, low + down
 
 
-def _apart(a, b):
+def _apart(a, b) -> int:
     """Returns the larger of the gaps along x and y between two rectangles, in cm."""
     return max(max(a[0], b[0]) - min(a[2], b[2]), max(a[1], b[1]) - min(a[3], b[3]))
 
@@ -173,7 +173,7 @@ def footprint(total: int, generator: PortableGenerator) -> regions.Region:
     )
 
 
-def _without(width, height, notches):
+def _without(width, height, notches) -> list:
     """Returns the box from (0, 0) less the notches, as a region."""
     lines = sorted({0, width, *(x for notch in notches for x in (notch[0], notch[2]))})
     region = []

@@ -4,7 +4,8 @@ The rectangles of a region lie side by side: each is as tall as the region is th
 makes such regions, and cuts preserve this. Axis 0 is x, axis 1 is y.
 """
 
-Region = list[tuple[int, int, int, int]]
+Rectangle = tuple[int, int, int, int]
+Region = list[Rectangle]
 
 LATTICE = 5  # centimetres; cuts are at multiples
 
@@ -128,6 +129,6 @@ def widest(region: Region) -> tuple[int, int, int, int]:
     return best
 
 
-def _breadth(rectangle):
+def _breadth(rectangle) -> tuple[int, int]:
     x0, y0, x1, y1 = rectangle
     return min(x1 - x0, y1 - y0), (x1 - x0) * (y1 - y0)

@@ -32,7 +32,7 @@ def depths(sides: dict, thickness: int) -> Callable:
     return lambda contact: around[sides.get((contact.axis, contact.at), 0)]
 
 
-def _rectangle(axis, across, along):
+def _rectangle(axis, across, along) -> regions.Rectangle:
     """Returns a rectangle from its extents along `axis` and along the other axis."""
     (a, b), (c, d) = across, along
     return (a, c, b, d) if axis == 0 else (c, a, d, b)
@@ -68,7 +68,7 @@ def across(opening: Opening) -> list[tuple[int, int]]:
     """Returns the ends of the segment across an opening, in the middle of its wall."""
     contact = opening.contact
     ends = [(contact.at, opening.low), (contact.at, opening.high)]
-    return [end[::-1] for end in ends] if contact.axis else ends
+    return [(y, x) for x, y in ends] if contact.axis else ends
 
 
 def paint(
@@ -76,7 +76,7 @@ def paint(
     walls: regions.Region,
     gaps: regions.Region,
     envelope: int,
-    furniture: regions.Region = (),
+    furniture: Sequence[regions.Rectangle] = (),
 ) -> Grid:
     """Paints the grid of a home from rectangles of floor, inner walls, gaps and furniture, which is
     wall too, with an envelope of so many cm.
@@ -101,7 +101,7 @@ def paint(
     return np.array(xs), np.array(ys), cells
 
 
-def _faces(lines, along, cells, beside):
+def _faces(lines, along, cells, beside) -> np.ndarray:
     """Returns the longest segments between rows with a wall on one side and the state `beside` on
     the other: (n, 2, 2) of (along, line).
 
@@ -207,7 +207,7 @@ def slanted(
     )
 
 
-def _reach(lines, corner):
+def _reach(lines, corner) -> np.ndarray:
     """Returns the lengths along x and y of the segments that end in a corner."""
     return np.abs(lines[(lines == corner).all(-1).any(-1)] - corner).max((0, 1))
 
@@ -218,7 +218,7 @@ def cut_off(lines: np.ndarray, triangle: list) -> np.ndarray:
     return _chamfered(lines, corner, x - corner[0], y - corner[1])
 
 
-def _chamfered(lines, corner, dx, dy):
+def _chamfered(lines, corner, dx, dy) -> np.ndarray:
     """Cuts back the two segments that end in a corner by (dx, dy), and adds one between their new
     ends.
     """

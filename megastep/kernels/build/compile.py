@@ -17,13 +17,16 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from megastep import cache
 from megastep.kernels.build.forks import end_threads_at_forks
 from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
+
+if TYPE_CHECKING:
+    from ctypes import CDLL
 
 __all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
 
@@ -34,7 +37,7 @@ class EngineError(RuntimeError):
     """
 
 
-def _key(*parts):
+def _key(*parts) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
 
@@ -74,7 +77,7 @@ def compiler() -> tuple[str, str]:
     )
 
 
-def _run(command, **env):
+def _run(command, **env) -> subprocess.CompletedProcess[str]:
     """Runs a compiler in a new session, so that Ctrl-C reaches Python's handlers only.
 
     Raises:
@@ -93,7 +96,7 @@ def _run(command, **env):
     return process
 
 
-def _processor():
+def _processor() -> str:
     """Returns the CPU's features, which -march=native depends on."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -104,7 +107,7 @@ def _processor():
         return platform.machine() + platform.processor()
 
 
-def _build_cpu(library, command):
+def _build_cpu(library, command) -> bytes:
     """Returns a shared library of all ``.cpp`` files."""
     files = [str(library.folder / name) for name in library.sources(".cpp")]
     try:
@@ -127,7 +130,7 @@ def _build_cpu(library, command):
     )
 
 
-def _load(name, body, path):
+def _load(name, body, path) -> "CDLL":
     """Loads a shared library from its cached file or, without a cache, from a temporary copy."""
     if path is not None:
         try:
@@ -151,7 +154,7 @@ def _load(name, body, path):
 
 
 @functools.cache
-def cuda(library: KernelLibrary, index: int) -> dict[str, Any]:
+def cuda(library: KernelLibrary, index: int) -> dict[str, object]:
     """Returns a library's operations on GPU ``index``: {name: CUfunction}."""
     if not library.cuda_operations:
         return {}
@@ -193,7 +196,7 @@ def build_cuda(library: KernelLibrary, architecture: str) -> bytes:
 def bindings() -> tuple[Any, Any]:
     """Returns the modules ``driver`` and ``nvrtc`` of cuda.bindings."""
     try:
-        from cuda.bindings import driver, nvrtc
+        from cuda.bindings import driver, nvrtc  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise EngineError(
             "Kernels on a GPU need the package cuda-bindings, which comes with PyTorch for CUDA "
@@ -217,7 +220,7 @@ def check_status(result: tuple, action: str) -> Any:
     return values[0] if len(values) == 1 else values
 
 
-def _build_cuda(files, flags):
+def _build_cuda(files, flags) -> bytes:
     """Returns a cubin of all ``.cu`` files.
 
     NVRTC gets every file under its own name, so its errors, ncu and compute-sanitizer name file and

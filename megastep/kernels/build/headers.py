@@ -11,7 +11,7 @@ Three kinds of declarations are recognised:
 
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 __all__ = ["constants", "early_operations", "operations", "packer", "struct_fields"]
@@ -59,11 +59,11 @@ def struct_fields(sources: Mapping[str, str]) -> dict[str, Fields]:
     return structs
 
 
-def _field(line, formats, header):
+def _field(line, formats, header) -> tuple[str, str]:
     match = FIELD.fullmatch(line.strip())
-    kind = match and match[1].replace("const", "").strip()
+    kind = match[1].replace("const", "").strip() if match else ""
     is_array = match and match[4]
-    if is_array and not match[2] and formats.get(kind, "").endswith("s"):
+    if match and is_array and not match[2] and formats.get(kind, "").endswith("s"):
         size = int(formats[kind][2:-1])
         return match[3], f"{formats[kind][:2]}{size * int(match[4])}s"
     if not match or is_array or not (match[2] or kind in formats):
@@ -82,11 +82,11 @@ def packer(fields: Fields) -> struct.Struct:
     return struct.Struct("".join(kind for _, kind in fields) + end)
 
 
-def _holds_pointer(fields):
+def _holds_pointer(fields) -> bool:
     return any("P" in kind for _, kind in fields)
 
 
-def builder(name: str, fields: Fields) -> Callable[[Mapping[str, Any]], bytes]:
+def builder(name: str, fields: Fields) -> Callable[[Mapping[str, object]], bytes]:
     """Returns a function of {field: value} that packs the struct ``name``.
 
     A pointer is a tensor, an address, or None for null. An array is the joined bytes of its
@@ -98,12 +98,12 @@ def builder(name: str, fields: Fields) -> Callable[[Mapping[str, Any]], bytes]:
     items = [
         address.format(field) if kind == "P" else f"values[{field!r}]" for field, kind in fields
     ]
-    scope = dict(name=name, names=dict(fields).keys(), pack=packer(fields).pack)
+    scope: dict = dict(name=name, names=dict(fields).keys(), pack=packer(fields).pack)
     exec(PACKED.format(", ".join(items)), scope)  # a loop over the fields would slow launches down
     return scope["packed"]
 
 
-def constants(sources: Mapping[str, str]) -> dict[str, int | float]:
+def constants(sources: Mapping[str, str]) -> dict[str, Any]:
     """Returns the constants of all files called ``constants.h``.
 
     Raises:
@@ -148,7 +148,7 @@ def early_operations(sources: Mapping[str, str]) -> frozenset[str]:
     return frozenset(name for name, _ in waits) - {name for name, does in waits if not does}
 
 
-def _kernels(sources):
+def _kernels(sources) -> Iterator[re.Match[str]]:
     """Yields a match of OPERATION, in a text without comments, for every line with KERNEL."""
     for source, text in sources.items():
         text = _without_comments(text)
@@ -164,6 +164,6 @@ def _kernels(sources):
             yield match
 
 
-def _without_comments(text):
+def _without_comments(text) -> str:
     """Returns C++ without comments. Every line keeps its number."""
     return re.sub(r"//.*|/\*[\s\S]*?\*/", lambda comment: "\n" * comment[0].count("\n"), text)

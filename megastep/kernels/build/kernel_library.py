@@ -73,15 +73,15 @@ class KernelLibrary:
     ):
         self.folder, self.cuda_flags, self.cpu_flags = Path(folder), cuda_flags, cpu_flags
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         return f"KernelLibrary({str(self.folder)!r})"
 
     @cached_property
-    def constants(self) -> dict[str, int | float]:
+    def constants(self) -> dict[str, Any]:
         return headers.constants(self.sources(".h"))
 
     @cached_property
-    def packers(self) -> dict[str, Callable[[Mapping[str, Any]], bytes]]:
+    def packers(self) -> dict[str, Callable[[Mapping[str, object]], bytes]]:
         structs = headers.struct_fields(self.sources(".h"))
         return {name: headers.builder(name, fields) for name, fields in structs.items()}
 
@@ -113,5 +113,5 @@ class KernelLibrary:
         return {name: path.read_text() for name, path in files.items() if path.suffix in suffixes}
 
 
-def _pack(packer, /, **fields):
+def _pack(packer, /, **fields) -> bytes:
     return packer(fields)

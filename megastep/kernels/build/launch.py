@@ -2,7 +2,7 @@
 
 import ctypes
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -18,7 +18,8 @@ WARP = ENGINE.constants["WARP"]
 INVALID_CONTEXT = 201  # CUDA_ERROR_INVALID_CONTEXT
 MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
 USUAL_SHARED = 48 * 1024  # bytes of dynamic shared memory that any kernel may have
-_ALLOWED_SHARED: dict[tuple[Any, int], int] = {}  # {(kernel, GPU): bytes} of those that have more
+#: {(kernel, GPU): bytes} of those that have more.
+_ALLOWED_SHARED: dict[tuple[object, int], int] = {}
 
 
 class Blocks(NamedTuple):
@@ -42,7 +43,7 @@ def launch(
     device: torch.device,
     shape: int | Blocks,
     /,
-    **fields: Any,
+    **fields: object,
 ) -> None:
     """Runs an operation of a kernel library: on a CPU before this returns, on a GPU on the
     current stream.
@@ -96,7 +97,7 @@ def launch(
     check_status(status, f"Launching {operation}")
 
 
-def _missing(library, operation, suffix, other):
+def _missing(library, operation, suffix, other) -> EngineError:
     return EngineError(
         f"No {suffix} file in {library.folder} defines the operation {operation}: add one, or run "
         f"on {other}."
@@ -110,7 +111,7 @@ def _can_start_early(index: int) -> bool:
 
 
 @functools.lru_cache(maxsize=1024)  # making one takes as long as a third of a launch
-def _config(blocks: tuple[int, int, int, int], stream: int, is_early: bool) -> Any:
+def _config(blocks: tuple[int, int, int, int], stream: int, is_early: bool) -> object:
     """Returns what a launch needs beside its kernel and struct.
 
     Args:
@@ -133,7 +134,7 @@ def _config(blocks: tuple[int, int, int, int], stream: int, is_early: bool) -> A
     return config
 
 
-def _allow_shared(function: Any, shared: int, index: int) -> None:
+def _allow_shared(function: object, shared: int, index: int) -> None:
     """Lets a kernel have more than the usual shared memory. Never less than it had before."""
     if shared <= _ALLOWED_SHARED.get((function, index), 0):
         return

@@ -1,0 +1,115 @@
+"""One command that starts a run or, when it is given again, continues it: `resume=auto`.
+
+Clusters start a job again with the words that it had: after a preemption, a time limit or the loss
+of a machine.
+"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from megastep.agents.errors import ConfigErrors, shortened
+from megastep.agents.factory import check, settings
+from megastep.agents.runs import checkpoint, folders
+
+#: The value of `resume` that continues the run in `folder`, if there is one.
+AUTO = "auto"
+#: The variable with the number that a job of Slurm's keeps when it is started again.
+SLURM_JOB = "SLURM_JOB_ID"
+#: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
+#: what it learns.
+RESUMABLE = (
+    "resume",
+    "samples",
+    "seconds",
+    "more_samples",
+    "more_seconds",
+    "device",
+    "trust",
+    "log_every",
+    "checkpoint_seconds",
+    "keep_checkpoints",
+    "replay_every",
+    "desync",
+    "profile",
+    "snapshots",
+    "ranks",
+    "restarts",
+    "dry_run",
+    "logger",
+    "finish",
+    "env.restart_failed",
+)
+
+
+class Start(NamedTuple):
+    """How a run goes on.
+
+    Attributes:
+        cfg: the settings; `resume` is still `AUTO` if the run has saved nothing yet.
+        folder: the run's.
+        is_done: it has had its budget.
+    """
+
+    cfg: settings.Train
+    folder: Path
+    is_done: bool = False
+
+
+def folder_of(cfg: settings.Train) -> Path:
+    """Returns the folder of the run to start or continue.
+
+    Raises:
+        ConfigErrors: none is given, and this is no job of Slurm's.
+    """
+    if cfg.folder is not None:
+        return Path(cfg.folder)
+    if number := os.environ.get(SLURM_JOB):
+        return folders.RUNS / folders.for_file(f"slurm-{number}")
+    text = f"is needed with resume=auto, outside jobs of Slurm: folder={folders.RUNS}/NAME"
+    raise ConfigErrors([("folder", text)])
+
+
+def automatic(cfg: settings.Train) -> Start:
+    """Returns how a run with `resume=auto` goes on.
+
+    Raises:
+        ConfigErrors: settings differ from those of the run, or add to its budget.
+        UserError: its folder holds something else, or no checkpoint that can be used.
+    """
+    for key in ("more_samples", "more_seconds"):
+        if getattr(cfg, key) is not None:
+            text = f"would be added each time; with resume=auto give the total, {key[5:]}="
+            raise ConfigErrors([(key, text)])
+    folder = folder_of(cfg)
+    cfg = settings.changed(cfg, folder=str(folder))
+    if not has_checkpoint(folder):
+        folders.check_free(cfg.folder, is_again=True)
+        return Start(cfg, folder)
+    loaded = folders.load_checkpoint(folders.find(str(cfg.folder)), cfg.trust)
+    if errors := [*_differences(loaded.config["train"], check.as_tree(cfg))]:
+        raise ConfigErrors(errors)
+    numbers = loaded.numbers
+    budgets = {name: getattr(cfg, name) for name in ("samples", "seconds")}
+    is_done = any(limit is not None and numbers[name] >= limit for name, limit in budgets.items())
+    cfg = settings.changed(cfg, resume=str(folder), folder=None, init=None)
+    return Start(cfg, folder, is_done)
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Returns whether a run in a folder has saved anything, whole or damaged."""
+    return bool(checkpoint.list_checkpoints(folder / "checkpoints"))
+
+
+def _differences(saved, typed) -> Iterator[tuple[str, str]]:
+    """Yields (key, sentence) of settings that are others than a run's and may not change."""
+    free = {*RESUMABLE, "folder", "init"}
+    if typed["learner"].get("anneal") == "auto":  # which a run decides when it begins
+        free.add("learner.anneal")
+    before = dict(check.leaves(saved))
+    for key, value in check.leaves(typed):
+        is_free = {key, key.partition(".")[0]} & free
+        if not is_free and key in before and before[key] != value:
+            was, cure = shortened(before[key], 60), "choose another folder, or init=RUN"
+            yield key, f"was {was} when the run began; {cure}"

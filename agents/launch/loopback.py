@@ -1,0 +1,74 @@
+"""The meeting place of ranks on one machine: a key-value store that no other machine can reach.
+
+torchrun's own listens on all addresses, and whoever can write into it has the ranks do things.
+"""
+
+import datetime
+import socket
+
+from torch import distributed
+from torch.distributed.elastic.rendezvous import RendezvousHandler, rendezvous_handler_registry
+from torch.distributed.elastic.rendezvous.api import RendezvousInfo, RendezvousStoreInfo
+
+#: The name under which torchrun's library finds it, and the only address that it listens on.
+BACKEND, ADDRESS = "megastep-loopback", "127.0.0.1"
+#: Seconds that a reader of the store waits for a key.
+SECONDS = 300.0
+
+
+class Loopback(RendezvousHandler):
+    """One machine's meeting place.
+
+    Args:
+        run_id: the start's token, which begins the names of all keys.
+    """
+
+    def __init__(self, run_id: str):
+        self.run_id, self.n_meetings, self.has_closed = run_id, 0, False
+        listener = socket.create_server((ADDRESS, 0))
+        self.port = listener.getsockname()[1]
+        self.store = distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
+            ADDRESS,
+            self.port,
+            is_master=True,
+            timeout=datetime.timedelta(seconds=SECONDS),
+            wait_for_workers=False,
+            master_listen_fd=listener.detach(),
+        )
+
+    @property
+    def use_agent_store(self) -> bool:
+        return True
+
+    def next_rendezvous(self) -> RendezvousInfo:
+        self.n_meetings += 1
+        name = f"{self.run_id} {self.n_meetings}"
+        keys = distributed.PrefixStore(name, self.store)  # pyright: ignore[reportPrivateImportUsage]
+        return RendezvousInfo(keys, 0, 1, RendezvousStoreInfo(ADDRESS, self.port))
+
+    def get_backend(self) -> str:
+        return BACKEND
+
+    def get_run_id(self) -> str:
+        return self.run_id
+
+    def is_closed(self) -> bool:
+        return self.has_closed
+
+    def set_closed(self) -> None:
+        self.has_closed = True
+
+    def num_nodes_waiting(self) -> int:
+        return 0
+
+    def shutdown(self) -> bool:
+        return True
+
+
+def register() -> None:
+    """Makes it known to torchrun's library."""
+    rendezvous_handler_registry.register(BACKEND, _make)
+
+
+def _make(parameters) -> Loopback:
+    return Loopback(parameters.run_id)

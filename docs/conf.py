@@ -1,0 +1,78 @@
+"""Builds the site with Sphinx: `make docs` writes it to docs/_build."""
+
+import os
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
+
+import reference  # noqa: E402
+
+from megastep.agents import package  # noqa: E402
+
+# The repository of edit links and of links to files outside docs/, such as
+# https://github.com/NAME/megastep. Without one, such files are named and not linked.
+REPOSITORY = next(
+    (
+        re.sub(r"\.git$", "", os.environ[name])
+        for name in ("MEGASTEP_REPOSITORY", "READTHEDOCS_GIT_CLONE_URL")
+        if os.environ.get(name, "").startswith("https://")
+    ),
+    "",
+)
+
+project = "megastep"
+author = copyright = "the megastep authors"
+release = version = package.version().split()[-1]
+
+extensions = ["myst_parser", "sphinx.ext.linkcode"]
+exclude_patterns = ["_build"]
+myst_heading_anchors = 4
+myst_enable_extensions = ["colon_fence"]
+suppress_warnings = ["misc.highlighting_failure"]
+html_theme = "furo"
+html_title = "megastep"
+html_static_path = []
+html_theme_options = {"source_repository": f"{REPOSITORY}/", "source_branch": "main"}
+html_theme_options |= {"source_directory": "docs/"}
+html_theme_options = html_theme_options if REPOSITORY else {}
+html_copy_source = False
+toc_object_entries = False  # hundreds, which every page's sidebar would be searched for
+
+
+def linkcode_resolve(domain, info):
+    """Returns where the source of a name is, on its line."""
+    path, line = reference.source_of(info["module"], info["fullname"])
+    return f"{REPOSITORY}/blob/main/{path}#L{line}" if REPOSITORY and path else None
+
+
+def prepare(app, name, source):
+    """Puts generated blocks into a page, and the repository before files outside docs/."""
+    folder = (ROOT / "docs" / name).parent
+
+    def linked(match):
+        path, _, anchor = match[2].partition("#")
+        target = (folder / path).resolve()
+        if target.is_relative_to(ROOT / "docs") or not path:
+            return match[0]
+        kind = "tree" if target.is_dir() else "blob"
+        url = f"{REPOSITORY}/{kind}/main/{target.relative_to(ROOT)}{anchor and '#' + anchor}"
+        return f"[{match[1]}]({url})" if REPOSITORY else match[1]
+
+    text = reference.expand(source[0])
+    if name == "decisions/README":  # a page for each, which its own links lead to
+        text += "\n```{toctree}\n:hidden:\n:glob:\n\n*\n```\n"
+    source[0] = re.sub(r"\[([^\]]*)\]\((?!\w+:|#)([^)\s]+)\)", linked, text)
+
+
+def write_llms(app, error):
+    """Writes llms.txt, a list of the pages with their first sentences."""
+    if not error and app.builder.name == "html":
+        (Path(app.outdir) / "llms.txt").write_text(reference.llms(Path(app.srcdir)))
+
+
+def setup(app):
+    app.connect("source-read", prepare)
+    app.connect("build-finished", write_llms)
