@@ -64,7 +64,7 @@ def probe(make: Callable[[], Any], seed: int = 0) -> Probe:
             last = wrapper_state(env)
         with contextlib.suppress(Exception):
             env.close()
-    learnt = (path for path in last if not np.array_equal(last[path], first.get(path)))
+    learnt = (p for p in last if p not in first or not np.array_equal(last[p], first[p]))
     names = [name for name in names if name != TRUE_RETURN]
     names = [TRUE_RETURN, *names] if is_changed else names
     return Probe(tuple(names), generators, tuple(learnt))

@@ -81,12 +81,12 @@ def problem_of_observation(space: Any, value: Any, path: str = "it") -> str | No
         is_dict = isinstance(space, spaces.Dict)
         if not isinstance(value, Mapping if is_dict else (tuple, list)):
             return f"{path} must be a {'dict' if is_dict else 'tuple'}, not {_shown(value)}"
-        keys = space.spaces.keys() if is_dict else range(len(space.spaces))
-        present = value.keys() if is_dict else range(len(value))
-        if {*keys} != {*present}:
-            return f"{path} must have {[*keys]}, not {[*present]}"
-        parts = (problem_of_observation(space[k], value[k], f"its part {k!r}") for k in keys)
-        return next(filter(None, parts), None)
+        trees: tuple[Any, Any] = space.spaces, value
+        parts, values = (tree if is_dict else dict(enumerate(tree)) for tree in trees)
+        if parts.keys() != values.keys():
+            return f"{path} must have {[*parts]}, not {[*values]}"
+        problems = (problem_of_observation(parts[k], values[k], f"its part {k!r}") for k in parts)
+        return next(filter(None, problems), None)
     if not isinstance(
         space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
     ):
@@ -101,9 +101,9 @@ def problem_of_observation(space: Any, value: Any, path: str = "it") -> str | No
         return f"{path} must be {kind} of shape {shape}, not {_shown(value)}"
     if isinstance(space, spaces.Box):
         return None
-    start = getattr(space, "start", 0)
-    n = 2 if isinstance(space, spaces.MultiBinary) else getattr(space, "nvec", None)
-    n = space.n if n is None else n
+    start, n = getattr(space, "start", 0), 2  # of MultiBinary
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        n = space.n if isinstance(space, spaces.Discrete) else space.nvec
     if not ((array >= start) & (array < start + n) & (array % 1 == 0)).all():
         return f"{path} is {_shown(value)}, and the space is {space}"
     return None

@@ -8,12 +8,14 @@ import contextlib
 import random
 import sys
 from collections.abc import Collection, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 __all__ = ["KINDS", "GlobalGenerators", "changed_kinds", "kept", "seed_all", "states"]
 
 KINDS = "numpy", "python", "torch"
+_NUMPY: Any = np.random  # whose types leave out the functions that exchange its bit generator
 
 
 class GlobalGenerators:
@@ -42,18 +44,18 @@ class GlobalGenerators:
         torch = sys.modules.get("torch") if "torch" in kinds else None
         with contextlib.ExitStack() as undo:
             if "numpy" in kinds:
-                undo.callback(np.random.set_bit_generator, np.random.get_bit_generator())
-                np.random.set_bit_generator(self.numpy.bit_generator)
+                undo.callback(_NUMPY.set_bit_generator, _NUMPY.get_bit_generator())
+                _NUMPY.set_bit_generator(self.numpy.bit_generator)
             if "python" in kinds:
                 undo.callback(random.setstate, random.getstate())
                 random.setstate(self.python.getstate())
                 undo.callback(lambda: self.python.setstate(random.getstate()))
             if torch is not None:
-                if self.torch is None:
-                    self.torch = torch.Generator().manual_seed(self.torch_seed)
+                own = self.torch or torch.Generator().manual_seed(self.torch_seed)
+                self.torch = own
                 undo.callback(torch.set_rng_state, torch.get_rng_state())
-                torch.set_rng_state(self.torch.get_state())
-                undo.callback(lambda: self.torch.set_state(torch.get_rng_state()))
+                torch.set_rng_state(own.get_state())
+                undo.callback(lambda: own.set_state(torch.get_rng_state()))
             yield
 
 

@@ -68,7 +68,9 @@ def load_wrapper_state(env: Any, state: Mapping[str, Any]) -> None:
 
 
 def _is_safe(path, value) -> bool:
-    """Returns whether a part of a state from a file may be set: numbers, in no special attribute."""
+    """Returns whether a part of a state, which may be a stranger's, is numbers for an attribute
+    that is not special.
+    """
     _, *names = str(path).split(".")
     is_named = len(names) > 1 and all(name.isidentifier() for name in names)
     is_special = any(name.startswith("__") or name in SKIPPED for name in names)

@@ -10,8 +10,8 @@ import torch
 from pydantic import Field
 
 from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
-from megastep.agents.algorithms.masked_stats import pooled_mean
 from megastep.agents.algorithms.td_loss import Result, Settings, td_loss
+from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
@@ -186,10 +186,10 @@ class R2D2(GradientLearner):
     def _update(self, rollout) -> dict[str, torch.Tensor]:
         replay = self.replay_buffer
         assert replay is not None
-        is_finite, _ = self.steps.begin(rollout.floats())
+        own = masked_moments(~rollout.reset & rollout.learns[:-1], rollout.reward)
+        is_finite, ((_, mean, variance),) = self.steps.begin(rollout.floats(), *own)
         replay.add(rollout, is_finite)
-        valid = ~rollout.reset & rollout.learns[:-1]
-        size = pooled_mean(rollout.reward.square(), valid).sqrt()
+        size = (variance + mean.square()).sqrt()
         is_first = is_finite & (self.reward_scale == 0) & (size > 0)
         size = size.masked_fill((size > _USUAL[0]) & (size < _USUAL[1]), 1.0)
         self.reward_scale.copy_(torch.where(is_first, size, self.reward_scale))

@@ -182,11 +182,13 @@ class VTrace(GradientLearner):
         return settings.capacity, bytes_per_observation(env, self.policy, self.n_steps, settings)
 
     def _update(self, rollout) -> dict[str, torch.Tensor]:
-        is_finite, _ = self.steps.begin(rollout.floats())
+        of_own_rewards = masked_moments(~rollout.reset, rollout.reward)
+        is_finite, (of_rewards,) = self.steps.begin(rollout.floats(), *of_own_rewards)
         if self.replay_buffer is not None:
             self.replay_buffer.add(rollout, is_finite)
         # The first rollout with rewards tells only their size. It counts as skipped if not finite.
-        is_unknown = self.policy.critic.output.is_clear & rollout.reward.any()
+        _, mean, variance = of_rewards
+        is_unknown = self.critic.output.is_clear & ((mean != 0) | (variance > 0))
         is_enabled = ~(is_unknown & is_finite)
         all_estimates = []
         for _ in range(self.n_epochs):

@@ -27,7 +27,6 @@ RESOLUTION = LIBRARY.constants["RESOLUTION"]
 class _Statistics(Protocol):
     mean: torch.Tensor
     scale: torch.Tensor
-    min_scale: float
 
 
 class RunningNorm(nn.Module):

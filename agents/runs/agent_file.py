@@ -83,7 +83,7 @@ def write(
     texts = dict(config=config, facts=dict(facts), tables=[*tables])
     if wrappers:
         texts["wrappers"] = {
-            path: value.tolist() if hasattr(value, "tolist") else value
+            path: getattr(value, "tolist", lambda value=value: value)()
             for path, value in wrappers.items()
         }
     metadata |= {name: json.dumps(value) for name, value in texts.items()}

@@ -4,6 +4,7 @@ They step on the CPU, one after the other, even if the learner is on a GPU. B = 
 """
 
 import copy
+import importlib
 import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
@@ -214,9 +215,8 @@ def _parallel(env) -> Any:
     if not hasattr(env, "agent_iter"):
         return env
     if getattr(env, "metadata", {}).get("is_parallelizable"):
-        from pettingzoo.utils.conversions import aec_to_parallel
-
-        return aec_to_parallel(env)
+        conversions = importlib.import_module("pettingzoo.utils.conversions")
+        return conversions.aec_to_parallel(env)
     raise ValueError(
         "it is turn-based, and agents have to act together; name the function that makes its "
         "parallel form, such as env.id=package.module:parallel_env, or one whose metadata has "

@@ -133,7 +133,7 @@ class VectorizedEnv:
                 raise BadValue.of(
                     f"{path} for lane {lane} is not finite, so the policy's weights or "
                     "observations are not",
-                    self.id,
+                    str(self.id),
                 )
 
     def wrapper_state(self) -> dict[str, Any]:
