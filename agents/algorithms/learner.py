@@ -188,9 +188,8 @@ class GradientLearner:
             )
         if state.get("normalisation") != VERSION:
             raise ValueError(
-                "an earlier version of megastep began this run and normalised observations and "
-                "returns otherwise: continue it with commit cb5506d, or begin a run with its "
-                "weights (init=RUN)"
+                "a version of megastep that normalised observations and returns otherwise began "
+                "this run: continue it with commit cb5506d, or start from its weights (init=RUN)"
             )
         self.steps.load_state_dict(state)
         self.generator.load_state_dict(state["generator"], self.device)

@@ -32,7 +32,21 @@ class Draws(Odd):
         return self.numbers(), *super().step(action)[1:]
 
 
+class Seven(Odd):
+    """Observes 7 in its third step, where there are 4 observations."""
+
+    observation_space = spaces.Discrete(4)
+
+    def reset(self, seed=None, options=None):
+        return 0, super().reset(seed=seed)[1]
+
+    def step(self, action):
+        _, *more = super().step(action)
+        return 7 if self.count == 3 else 1, *more
+
+
 gymnasium.register("Draws-v0", Draws)
+gymnasium.register("Seven-v0", Seven)
 
 
 class Level(gymnasium.Wrapper):
@@ -65,3 +79,18 @@ class Memory:
 class Small(gymnasium.RewardWrapper):
     def reward(self, reward):
         return reward / 10
+
+
+class TinyObservations(gymnasium.ObservationWrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        shape = env.observation_space.shape
+        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+    def observation(self, observation):
+        return (observation * 1e-4).astype(np.float32)
+
+
+class TinyRewards(gymnasium.RewardWrapper):
+    def reward(self, reward):
+        return reward * 1e-5
