@@ -83,8 +83,14 @@ def check_environment(env: Env) -> None:
     is_list = isinstance(roles, (tuple, list)) and len(roles) == n_agents
     _require(
         env,
-        roles is None or (is_list and _are_names(roles)),
+        roles is None or is_list,
         f"roles must hold one name per agent, {n_agents} in all, not {roles!r}",
+    )
+    _require(
+        env,
+        roles is None or _are_names(roles),
+        f"roles must be identifiers, such as red_team, as metrics have them in their names, not "
+        f"{roles!r}",
     )
 
 

@@ -315,6 +315,7 @@ def film(
 
     Raises:
         ValueError: for another kind of file, or an environment that cannot be drawn.
+        OSError: the file cannot be written.
         RuntimeError: naming the first frame that failed.
     """
     plot_state = getattr(env, "plot_state", None)
@@ -323,12 +324,18 @@ def film(
             f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
             "plot_state(state), which docs/new-environment.md shows"
         )
-    path, states = pathlib.Path(path), _states(env, policy, steps, greedy, seed)
+    path = pathlib.Path(path)
+    if path.suffix not in (".mp4", ".png"):
+        raise ValueError(f"'{path}' is neither a video, .mp4, nor its last frame, .png")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
+    states = _states(env, policy, steps, greedy, seed)
     if path.suffix == ".png":
         from matplotlib.image import imsave  # a third of a second, which train.py needs not wait
 
         (last,) = collections.deque(states, maxlen=1)
-        path.parent.mkdir(parents=True, exist_ok=True)
         imsave(path, draw(plot_state, numpyify(last)))
         return path
     with ParallelEncoder(plot_state, fps=optional(env, "fps")) as encoder:

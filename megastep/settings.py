@@ -6,7 +6,7 @@
     def __init__(self, n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128): ...
 
 The command line makes a dataclass of the same arguments with `settings_of`. Types are strict: true
-is not an integer, "3" is not a number, and numbers are finite.
+is not an integer, "3" is not a number, and numbers are finite, but for those of users' classes.
 """
 
 import dataclasses
@@ -58,6 +58,12 @@ class AtMost:
     key: str
 
 
+def _frozen(**config) -> Callable[[type], type]:
+    return pydantic.dataclasses.dataclass(
+        frozen=True, kw_only=True, config=pydantic.ConfigDict(**{**CONFIG, **config})
+    )
+
+
 if TYPE_CHECKING:
 
     @dataclass_transform(kw_only_default=True, frozen_default=True)
@@ -65,7 +71,7 @@ if TYPE_CHECKING:
 
 else:
     #: Class decorator: a frozen dataclass whose fields are checked against their annotations.
-    frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
+    frozen = _frozen()
 
 
 # the expected type, by the first part of pydantic's name of the error
@@ -92,18 +98,19 @@ def settings_of(
     constructor: Callable,
     reserved: Sequence[str] = (),
     missing: Mapping[str, Any] | None = None,
+    is_finite: bool = True,
     **more: Any,
 ) -> type:
     """Returns a frozen dataclass of the arguments of a class or function: types, bounds, defaults.
 
-    Takes the arguments of `arguments_of`.
+    Takes the arguments of `arguments_of`, and `is_finite`: whether infinity and NaN are refused.
 
     Raises:
         ValueError: if an annotation cannot be read, or an argument has the name of a field of
             `more`.
     """
     try:
-        return settings_class(*arguments_of(constructor, reserved, missing, **more))
+        return settings_class(*arguments_of(constructor, reserved, missing, **more), is_finite)
     except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
         raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
 
@@ -169,9 +176,9 @@ def _signatures(constructor) -> Iterator[tuple[Callable, dict[str, inspect.Param
             return
 
 
-def settings_class(name: str, fields: Mapping[str, tuple]) -> type:
+def settings_class(name: str, fields: Mapping[str, tuple], is_finite: bool = True) -> type:
     """Returns a frozen dataclass of what `arguments_of` returned."""
-    return frozen(_class(name, fields))
+    return (frozen if is_finite else _frozen(allow_inf_nan=True))(_class(name, fields))
 
 
 def _field(hint, default) -> tuple:

@@ -10,7 +10,17 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-__all__ = ["DEFAULTS", "Env", "PolicyLike", "Space", "Tree", "World", "n_lanes", "optional"]
+__all__ = [
+    "DEFAULTS",
+    "Env",
+    "PolicyLike",
+    "Space",
+    "Tree",
+    "World",
+    "is_stored",
+    "n_lanes",
+    "optional",
+]
 
 #: A space of :mod:`megastep.spaces`, or a (nested) dict of spaces.
 Space = Any
@@ -167,3 +177,15 @@ class PolicyLike(Protocol):
             generator: random number generator of the draws.
         """
         ...
+
+
+def is_stored(tensor: torch.Tensor) -> bool:
+    """Returns whether a tensor has memory and lies inside its storage; PyTorch crashes else."""
+    if tensor.layout is not torch.strided:
+        return False
+    if tensor.is_contiguous():
+        n = tensor.numel()
+    else:
+        n = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride()))
+    n_bytes = (tensor.storage_offset() + n) * tensor.itemsize
+    return n_bytes <= tensor.untyped_storage().nbytes() or not tensor.numel()

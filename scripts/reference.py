@@ -58,7 +58,7 @@ REPORTERS = {
 #: Megastep's own machinery, which nobody needs to import; and `cuda`, another name of `engine`.
 INTERNAL = re.compile(
     r"megastep\.(__main__|cache|cuda|colour|imports|kernels|agents\.(cli|console|distributed\.(?!pooling)"
-    r"\w+|factory|launch|package|pretrained|runs|networks\.(kernels|\w+_cpu)|storage\.\w*kernels"
+    r"\w+|factory|launch|package|pretrained|private_ops|runs|networks\.(kernels|\w+_cpu)|storage\.\w*kernels"
     r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.\w+\.(?!(env|bot)\b)\w+)\b"
 )
 
@@ -247,7 +247,7 @@ def comment_on(module: str, name: str) -> str:
     own = Path(importlib.import_module(module).__file__)
     definition = re.compile(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", re.M)
     for path in (own, *sorted(own.parents[1].rglob("*.py"))):
-        found = definition.search(path.read_text())
+        found = definition.search(path.read_text(errors="replace"))
         if found and (text := found[2] or re.sub(r"^#:? ?", "", found[1], flags=re.M)):
             return text
     return ""

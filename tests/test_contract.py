@@ -148,7 +148,7 @@ def test_a_missing_attribute_is_named(name):
         ("roles", ("leader", "follower"), "roles .*one name per agent, 1 in all, not .*'follower'"),
         ("roles", (), r"roles .*not \(\)"),
         ("roles", "a", "roles .*not 'a'"),
-        ("roles", ("the leader",), "roles .*not .*the leader"),
+        ("roles", ("red team",), "roles must be identifiers, such as red_team, .*not .*red team"),
         ("roles", (1,), r"roles .*not \(1,\)"),
     ],
 )

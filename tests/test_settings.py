@@ -2,17 +2,20 @@
 
 import dataclasses
 import inspect
+import json
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
+import yaml
 from pydantic import Field
 
 from megastep import envs
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory.check import as_tree, check
+from megastep.agents.runs import typed_json
 from megastep.settings import checked, settings_of
 
 NAN = float("nan")
@@ -163,3 +166,74 @@ def test_environment_bounds(name):
         for value in values:
             with pytest.raises(ValueError, match=f"^{argument}: .* is out of range: "):
                 envs.ENVS[name](**{"n_envs": 1, "device": "cpu", argument: value})
+
+
+# ---- Values as they were typed ----
+
+
+class Shelf:
+    """Takes what a stranger's constructor may take."""
+
+    def __init__(
+        self,
+        cap=None,
+        prices: dict[int, float] | None = None,
+        start: list[float] | None = None,
+        more: dict[str, Any] | None = None,
+        shape=(2, 3),
+        limit: float = None,
+        pick=max,
+        pairs=[(1, 2)],  # noqa: B006, an argument of a stranger's
+        gain: float = math.inf,
+        n: int = 1,
+    ): ...
+
+
+TYPED = [
+    {"cap": math.inf},
+    {"cap": NAN},
+    {"cap": 3.0},
+    {"cap": 3},
+    {"cap": 1e6},
+    {"cap": "1e6"},
+    {"cap": [0.0, 0, True, None, "0", [-math.inf]]},
+    {"cap": {0: 1.0, "0": 2, True: {0.5: [NAN]}}},
+    {"cap": {"$float": "inf", "$dict": [[1]]}},
+    {"cap": {"$dict": {"$float": "x"}}},
+    {"prices": {0: 1.0, 7: -0.0}},
+    {"start": [0.0, 2.0]},
+    {"more": {"a": {1: [math.inf, {2: 3.0}]}}},
+    {"gain": -math.inf},
+    {},
+]
+
+
+@pytest.mark.parametrize("tree", TYPED, ids=str)
+def test_values_are_kept_as_they_were_typed(tree):
+    kind = settings_of(Shelf, is_finite=False)
+    chosen = check(kind, tree)
+    for name, value in tree.items():
+        assert repr(getattr(chosen, name)) == repr(value)
+    kept = as_tree(chosen)
+    saved = typed_json.loads(typed_json.dumps(kept))
+    assert repr(check(kind, saved)) == repr(chosen) and (chosen.shape, chosen.pick) == ((2, 3), max)
+    json.loads(typed_json.dumps(kept), parse_constant=pytest.fail)  # standard JSON
+    assert repr(yaml.safe_load(yaml.safe_dump(kept, sort_keys=False))) == repr(kept)
+
+
+def test_annotations_decide_where_they_can():
+    kind = settings_of(Shelf, is_finite=False)
+    chosen = check(kind, {"n": 1e3, "gain": 2, "prices": {0: 1}, "start": [1], "shape": [1.0, 2]})
+    values = chosen.n, chosen.gain, chosen.prices, chosen.start, chosen.shape
+    assert repr(values) == "(1000, 2.0, {0: 1.0}, [1.0], (1.0, 2))"
+    assert messages(kind, more={0: 1}) == {"more": "expected a word, got 0"}
+    assert messages(kind, prices={"a": 1})["prices"].startswith("expected an integer")
+    assert messages(kind, cap=[b"x"]) == {
+        "cap": "[b'x'] cannot be kept in a checkpoint; use numbers, words and lists"
+    }
+
+
+@pytest.mark.parametrize("text", ['{"$float": [1]}', '{"$dict": 3}', '{"$dict": [[[1], 2]]}', "{"])
+def test_damaged_json_is_an_error_of_values(text):
+    with pytest.raises(ValueError):
+        typed_json.loads(text)

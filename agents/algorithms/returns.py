@@ -181,7 +181,7 @@ def n_step_returns(
     """
     following = _following(value, last_value)
     total = value
-    for _ in range(n):
+    for _ in range(min(n, len(reward))):  # no return is longer than the rows
         beyond = torch.where(truncated, following, _following(total, last_value))
         total = reward + gamma * beyond.masked_fill(terminal, 0.0)
         total = torch.where(reset, value, total)

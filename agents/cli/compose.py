@@ -259,6 +259,8 @@ class Composer:
                 if override.is_delete():
                     parent, _, leaf = key.rpartition(".")
                     del (OmegaConf.select(config, parent) if parent else config)[leaf]
+                elif problem := _text_of_a_key(config, key):
+                    errors.append((key, problem))
                 else:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
@@ -298,6 +300,19 @@ class Composer:
 def key_of(override: types.Override) -> str:
     """The key or group@package of a word, without the sign before it."""
     return override.get_key_element().lstrip("+~")
+
+
+def _text_of_a_key(config: DictConfig, key: str) -> str:
+    """Returns why a key is refused a part of which looks like a number that is a key; else ""."""
+    parts = key.split(".")
+    for i, part in enumerate(parts):
+        node = OmegaConf.select(config, ".".join(parts[:i])) if i else config
+        if not OmegaConf.is_dict(node):
+            break
+        if near := [one for one in node if not isinstance(one, str) and str(one) == part]:
+            group = ".".join(parts[:i])
+            return f"{group} has the key {near[0]}, a number; write {group}={{{near[0]}: ...}}"
+    return ""
 
 
 def refused_resolvers(tree: check.Tree) -> Iterator[tuple[str, str]]:

@@ -47,8 +47,9 @@ def main() -> int:
 
     console.open_streams()
     if words[0] in ("-h", "--help"):
-        for name, text in COMMANDS.items():
-            console.say(f"  {package.command(name, 'python -m '):<28}{text}")
+        names = {package.command(name, "python -m "): text for name, text in COMMANDS.items()}
+        for name, text in names.items():
+            console.say(f"  {name:<{max(map(len, names))}}  {text}")
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
     elif words[0] == "--version":
         console.say(package.version())

@@ -30,19 +30,32 @@ def main(words: list[str]) -> int:
     path = folders.find(words[0])
     if agent_file.is_agent_file(path):
         return _inspect([path], _lines_of_agent)
+    if folders.checkpoints_of(path) == path:
+        return _inspect([path], _lines)
     path = folders.checkpoints_of(path)
-    paths = [path] if (path / "manifest.json").exists() else checkpoint.list_checkpoints(path)
-    if not paths:
+    if not checkpoint.list_checkpoints(path):
         raise UserError(f"There is no checkpoint in {path}; has the run saved one yet?")
-    return _inspect(paths, _lines)
+    return _inspect(checkpoint.list_checkpoints(path), _lines, path)
 
 
-def _inspect(paths: list[Path], lines_of: Callable[[Path], Iterable[str]]) -> int:
-    """Prints the lines about each path. Returns 1 if one is damaged, else 0."""
-    is_damaged = False
-    for path in paths:
+def _inspect(
+    paths: list[Path], lines_of: Callable[[Path], Iterable[str]], folder: Path | None = None
+) -> int:
+    """Prints the lines about each path. Returns 1 if one is damaged, else 0.
+
+    Args:
+        folder: where a run may delete some of these checkpoints meanwhile, and save others.
+    """
+    is_damaged, n_printed = False, 0
+    while paths:
+        path, *paths = paths
         try:
             console.say("\n".join(lines_of(path)))
+            n_printed += 1
+        except checkpoint.GoneCheckpoint as error:
+            if folder is None:
+                raise UserError(str(error)) from None
+            paths = paths if paths or n_printed else checkpoint.list_checkpoints(folder)
         except checkpoint.CheckpointError as error:
             is_damaged = True
             console.say(str(error))
@@ -53,7 +66,10 @@ def _lines(path: Path) -> Iterator[str]:
     """Yields the text about a checkpoint."""
     manifest = checkpoint_format.read_manifest(path)
     loaded = checkpoint_format.read(path, "cpu", is_whole=True)
-    written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
+    try:
+        written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
+    except FileNotFoundError:
+        raise checkpoint.GoneCheckpoint(path) from None
     numbers = [f"{name} {value:,.6g}" for name, value in loaded.numbers.items()]
     made_with = [f"{name} {value}" for name, value in loaded.made_with.items()]
     yield f"{path}: intact, format {manifest['format']}, written {written:%Y-%m-%d %H:%M:%S}"

@@ -186,7 +186,8 @@ def check_training(cfg: settings.Train) -> None:
     """Raises UserError if there are fewer GPUs than ranks, or the run's folder is taken: by another
     run or, if it is resumed, by the process that trains in it.
     """
-    if environment.rank() > 0:  # rank 0 checks
+    info = environment.rank_info()
+    if environment.rank() > 0 or (info and info.attempt > 0):  # rank 0 checks
         return
     launcher.n_ranks(cfg)
     if cfg.resume == AUTO:

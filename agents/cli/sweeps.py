@@ -40,7 +40,7 @@ from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
 from megastep.agents.launch.again import AUTO
 from megastep.agents.runs import folders, scores
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.runs.atomic_files import make_folders, write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -121,7 +121,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     with user_errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
             folder = folders.make(folder)  # another sweep may start in the same second
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folders(folder)
     options = SEARCH if config.runtime.choices["hydra/sweeper"] == "optuna" else {}
     options = options | {
         "hydra.job.name": composer.script.name,
@@ -222,7 +222,7 @@ class Job:
         fixed = hydra.job.config.override_dirname.exclude_keys
         row: Row = dict(
             number=number,
-            varied={key: value.strip("\"'") for key, _, value in pairs if key not in fixed},
+            varied={key: _unquoted(value) for key, _, value in pairs if key not in fixed},
             state=RUNNING,
             folder=hydra.runtime.output_dir,
         )
@@ -406,6 +406,11 @@ def write_table(folder: Path, rows: "list[Row]") -> None:
     rows = [row | row["varied"] | {"job": row["number"]} for row in rows]
     csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
     write_atomically(folder / "sweep.csv", text.getvalue().encode())
+
+
+def _unquoted(value: str) -> str:
+    # as it was typed: Hydra puts a \ before what its grammar knows
+    return re.sub(r"\\([\\()\[\]{}:=, \t'\"])", r"\1", value.strip("\"'"))
 
 
 def _head(rows) -> list[str]:

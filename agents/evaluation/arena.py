@@ -151,7 +151,12 @@ class Arena:
             or checkpoint.list_checkpoints(folder / "checkpoints")
             or [self.run.path]  # the file of an agent
         ):
-            player = find_player(str(path), self.run, None, self.sample, self.cfg.trust)
+            try:
+                player = find_player(str(path), self.run, None, self.sample, self.cfg.trust)
+            except UserError:
+                if path.exists():
+                    raise
+                continue  # its run, which is training, has deleted it
             players.append(player._replace(name=f"{player.step:,} samples"))
         players += self.others
         if len(players) < 2:

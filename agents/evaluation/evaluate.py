@@ -85,9 +85,11 @@ def play(
     source: str | None = None,
 ) -> list[dict]:
     """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the table rows."""
-    homes = factory.spread(homes, cfg.episodes)
-    shard = Shard.of_this_rank(cfg.episodes, len(homes))
     seed, trained = rank_seed(cfg.seed, process_group.rank()), factory.config_of(loaded)
+    sample = factory.make_sample(env_settings, homes, seed=seed, device=device)
+    n_envs = -(-cfg.episodes // optional(sample, "n_agents"))
+    homes = factory.spread(homes, n_envs)
+    shard = Shard.of_this_rank(n_envs, len(homes))
     env_settings = settings.changed(env_settings, n_envs=len(shard.envs), resample=False)
     where = dict(geometries=[homes[home] for home in shard.homes], seed=seed, device=device)
     env, rows = factory.construct(env_settings, **where), []

@@ -13,6 +13,7 @@ from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import arena, duels
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import folders
+from megastep.agents.runs.atomic_files import make_folders, remove_folders
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import PolicyLike, optional
 
@@ -53,6 +54,9 @@ def run(cfg: settings.Record) -> Path:
         path = Path(cfg.file) if cfg.file else take_free_name(folder / "video.mp4")
         if not cfg.file:
             undo.callback(path.unlink, missing_ok=True)
+        else:
+            with user_errors(f"The video {path} could not be made: "):
+                undo.callback(remove_folders, make_folders(path.parent))
         # a video is the last thing that a run should fail for
         problem = f"The video {path} could not be made: "
         with (

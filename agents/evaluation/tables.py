@@ -11,6 +11,7 @@ from megastep.agents.factory.settings import Env, Evaluate, Geometry, env_name, 
 from megastep.agents.runs import checkpoint
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.folders import folder_of, for_file
+from megastep.agents.runs.typed_json import encoded
 
 INTERVAL = "95 % interval"
 
@@ -68,7 +69,7 @@ def write_table(
         title=title,
         checkpoint=str(loaded.path),
         step=loaded.step,
-        evaluation=as_tree(cfg),
+        evaluation=encoded(as_tree(cfg)),
         rows=rows,
     )
     console.say(f"{title}\n{console.table(head, lines)}")

@@ -3,17 +3,19 @@
 import contextlib
 import dataclasses
 import difflib
-import json
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
+from pydantic_core import PydanticSerializationError, to_jsonable_python
 
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import components, settings
 from megastep.settings import sentence
 
 Tree = dict[str, Any]
+#: Types of what files and words hold, beside lists and dicts.
+SCALARS = (str, int, float, bool, type(None))
 T = TypeVar("T")
 
 
@@ -29,13 +31,10 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
         ConfigErrors: with everything that is wrong.
     """
     fields, errors = dict(fields_of(kind, tree)), {}
-    tree = json.loads(
-        json.dumps(tree),
-        parse_float=lambda text: int(float(text)) if float(text).is_integer() else float(text),
-    )
     try:
-        # JSON is text, as YAML is: pydantic takes its lists for tuples and its strings for paths
-        return TypeAdapter(kind).validate_json(json.dumps(tree))
+        chosen = settings.as_typed(kind, tree)
+        as_tree(chosen)
+        return chosen
     except ValidationError as error:
         for line in error.errors():
             path = [str(part) for part in line["loc"]]
@@ -51,9 +50,49 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
         raise ConfigErrors(errors.items()) from None
 
 
-def as_tree(chosen: object) -> Tree:
-    """The inverse of `check`."""
-    return TypeAdapter(type(chosen)).dump_python(chosen, mode="json")
+def as_tree(chosen: Any, prefix: str = "") -> Tree:
+    """The inverse of `check`: strings, numbers, true, false, None, lists and nested dicts.
+
+    Leaves out defaults that only the constructor can give, such as functions, or None where the
+    annotation is `float`.
+
+    Args:
+        prefix: of the keys in errors.
+
+    Raises:
+        ConfigErrors: other values that would come back changed.
+    """
+    kind, tree = type(chosen), {}
+    fields = kind.__pydantic_fields__
+    for name in fields:
+        with contextlib.suppress(PydanticSerializationError):
+            tree[name] = _plain(getattr(chosen, name), f"{prefix}{name}.")
+    while True:
+        try:
+            again = settings.as_typed(kind, tree)
+            changed = [n for n in fields if repr(getattr(again, n)) != repr(getattr(chosen, n))]
+        except ValidationError as error:
+            changed = [*dict.fromkeys(str(line["loc"][0]) for line in error.errors())]
+        if not changed:
+            return tree
+        for name in changed:
+            field, value = fields[name], getattr(chosen, name)
+            default = field.default_factory() if field.default_factory else field.default
+            if name not in tree or repr(default) != repr(value):
+                text = f"{value!r} cannot be kept in a checkpoint; use numbers, words and lists"
+                raise ConfigErrors([(prefix + name, text)])
+            del tree[name]
+
+
+def _plain(value, prefix="") -> Any:
+    """Returns a value as JSON has it, but with keys, infinity and NaN as they are."""
+    if dataclasses.is_dataclass(value):
+        return as_tree(value, prefix)
+    if isinstance(value, dict):
+        return {_plain(key): _plain(part, f"{prefix}{key}.") for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return value if type(value) in SCALARS else to_jsonable_python(value)
 
 
 def fields_of(kind: type, tree: object, prefix: str = "") -> Iterator[tuple[str, Any]]:

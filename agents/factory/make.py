@@ -1,5 +1,6 @@
 """Builds the objects of a run from its settings: device, homes, environment, policy, learner."""
 
+import copy
 import functools
 import inspect
 import math
@@ -78,8 +79,11 @@ def construct(settings: "Member", constructor: Callable | None = None, **argumen
         values = {
             key: value
             for key, value in vars(settings).items()
-            if key in own or (key in taken and value != taken[key].default)
+            if key in own
+            or (key in taken and value is not taken[key].default and value != taken[key].default)
         }
+        # an environment may change a list that it is given, and the next one is to get it whole
+        values = {k: copy.deepcopy(v) if type(v) in (dict, list) else v for k, v in values.items()}
         values |= {key: value for key, value in arguments.items() if key in taken}
         try:
             return constructor(**values)

@@ -4,6 +4,7 @@ configs/ holds the defaults of a run. The settings of environments, geometries, 
 opponents are the arguments of their constructors, with the bounds and defaults given there.
 """
 
+import copy
 import dataclasses
 import functools
 import inspect
@@ -97,9 +98,27 @@ def kind_of(group: str, name: str) -> type:
         methods = METHODS.get(group, ()) if inspect.isclass(constructor) else ()
         if absent := [method for method in methods if not hasattr(constructor, method)]:
             raise ValueError(f"it has no method {absent[0]}")
-        return settings_of(constructor, **spec)
+        return settings_of(constructor, is_finite=False, **spec)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from error
+
+
+def as_typed(kind: type[T], tree: object) -> T:
+    """Returns the settings of a dataclass from nested dicts. A value keeps the type that it was
+    typed with, unless an annotation asks for another: 1e6 counts as an integer, a list as a tuple.
+
+    Raises:
+        ValidationError: of pydantic.
+    """
+    adapter = TypeAdapter(kind)
+    whole = json.loads(
+        json.dumps(tree, skipkeys=True, default=repr),  # bytes of a file, which `as_tree` refuses
+        parse_float=lambda text: int(float(text)) if float(text).is_integer() else float(text),
+    )
+    # in strict mode pydantic takes lists for tuples and strings for paths in JSON alone, whose keys
+    # are strings; otherwise it keeps keys, and takes "3" and true for numbers
+    adapter.validate_json(json.dumps(whole))
+    return adapter.validate_python(tree, strict=False)
 
 
 def _group(group: str) -> object:
@@ -112,15 +131,21 @@ def _group(group: str) -> object:
             raise ValueError(f"is a group of keys, got {value!r}")
         if "name" not in value:
             raise ValueError(f"its keys need a member: give {group}= as well")
-        return TypeAdapter(kind_of(group, str(value["name"]))).validate_json(json.dumps(value))
+        return as_typed(kind_of(group, str(value["name"])), value)
 
     return Annotated[Any, BeforeValidator(settings)]
 
 
 def changed(settings: T, **changes: object) -> T:
-    """Returns a copy of settings with those of the changes that it has."""
-    known = {k: v for k, v in changes.items() if hasattr(settings, k)}
-    return dataclasses.replace(cast(Any, settings), **known)
+    """Returns a copy of settings with those of the changes that it has.
+
+    Nothing is checked again, since a stranger's default need not be what its annotation says.
+    """
+    result = copy.copy(settings)
+    for name, value in changes.items():
+        if hasattr(settings, name):
+            object.__setattr__(result, name, value)  # of a frozen class
+    return result
 
 
 def takes_geometries(env: "Env") -> bool:
@@ -371,6 +396,9 @@ class Record(Played):
             "run": not (has_run or has_env)
             and "is missing; without a run, env=explorer records random actions",
             "env": has_run and has_env and "cannot be combined with run, which has its own",
+            "file": self.file is not None
+            and not self.file.endswith((".mp4", ".png"))
+            and f"{self.file!r} is neither a video, .mp4, nor its last frame, .png",
             "against": has_env
             and self.against is not None
             and "needs run=, the agent that plays against it",

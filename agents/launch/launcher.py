@@ -9,7 +9,6 @@ than 30 s to save.
 """
 
 import contextlib
-import json
 import logging
 import os
 import shutil
@@ -26,7 +25,7 @@ from megastep.agents.errors import ConfigErrors, shortened
 from megastep.agents.factory import check, settings
 from megastep.agents.launch import gpu, signals
 from megastep.agents.launch.endings import Ending
-from megastep.agents.runs import folders
+from megastep.agents.runs import checkpoint, folders, typed_json
 
 #: Environment variable with the job folder, set for ranks that this module started.
 JOB = "MEGASTEP_JOB"
@@ -122,7 +121,7 @@ class Job:
             prefix=console.prefix,
             parent=os.getpid(),
         )
-        (folder / SETTINGS).write_text(json.dumps(facts))
+        (folder / SETTINGS).write_text(typed_json.dumps(facts))
 
     def run_agent(self) -> None:
         """Runs torchrun's agent until all ranks have ended."""
@@ -195,7 +194,7 @@ class Job:
 
 def hint(folder: Path | None) -> str:
     """Returns how to continue a run whose ranks were lost in the middle of an update."""
-    if folder is None or not any((folder / "checkpoints").glob("*")):
+    if folder is None or not checkpoint.list_checkpoints(folder / "checkpoints"):
         return "Nothing was saved yet"
     return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
 

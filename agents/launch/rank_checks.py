@@ -23,7 +23,7 @@ from megastep.agents.distributed.drift import first_difference, first_differing_
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import check, settings
 from megastep.agents.launch.rank import Team
-from megastep.agents.runs import folders, provenance
+from megastep.agents.runs import checkpoint, folders, provenance
 from megastep.agents.training.trainer import Trainer
 
 #: Seconds within which a file of rank 0 must be visible on the other machines.
@@ -117,7 +117,7 @@ def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:
         return cfg
 
     def totals() -> dict[str, float] | None:
-        if not any((folder / "checkpoints").glob("*")):
+        if not checkpoint.list_checkpoints(folder / "checkpoints"):
             if not cfg.resume:
                 shutil.rmtree(folder, ignore_errors=True)
             return None

@@ -1,6 +1,5 @@
 """The process of one rank that `launcher` started."""
 
-import json
 import os
 import signal
 import sys
@@ -14,6 +13,7 @@ from megastep.agents import console
 from megastep.agents.distributed import environment
 from megastep.agents.errors import shortened
 from megastep.agents.launch import endings, launcher, rank, signals
+from megastep.agents.runs import typed_json
 
 
 def main() -> int:
@@ -29,7 +29,7 @@ def main() -> int:
     (job / f"pid-{info.attempt}-{info.rank}").write_text(str(os.getpid()))
     if (job / launcher.STOPPED).exists():
         return 0
-    facts = json.loads((job / launcher.SETTINGS).read_text())
+    facts = typed_json.loads((job / launcher.SETTINGS).read_text())
     sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
     workers.end_with_parent(facts["parent"])
     console.open_streams()

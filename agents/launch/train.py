@@ -131,8 +131,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
                 console.say(f"Training on {ranks} in {folder}")
             undo.pop_all()
-        resume = f"To continue: {folders.resume_command(folder)}"
-        saved = functools.partial(saved_by, trainer, resume)
+        saved = functools.partial(saved_by, trainer, folder)
         try:
             with (
                 env_failures.told(cfg.env, folder, saved, process_group.rank()),
@@ -162,7 +161,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         ends = process_group.gather_objects((numbers[:1], trainer.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
-                signal, f"Stopped after {trainer.samples:,} samples. {resume}"
+                signal,
+                f"Stopped after {trainer.samples:,} samples. {folders.to_continue(folder)}",
             )
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
@@ -187,11 +187,11 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     return folder
 
 
-def saved_by(trainer: Trainer, resume: str) -> str:
+def saved_by(trainer: Trainer, folder: Path) -> str:
     """Returns what is saved of a training run that an error ended, and how to resume it."""
     text = trainer.saver.error or "The latest updates could not be saved"
     text = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else text
-    return f"{text}. {resume}"
+    return f"{text}. {folders.to_continue(folder)}"
 
 
 def write_config(folder: Path, config: "Config") -> None:

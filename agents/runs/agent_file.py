@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import safetensors
 
 from megastep.agents.errors import shortened
-from megastep.agents.runs import formats, strange_files, trust
+from megastep.agents.runs import formats, strange_files, trust, typed_json
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
 
@@ -86,7 +86,7 @@ def write(
             path: getattr(value, "tolist", lambda value=value: value)()
             for path, value in wrappers.items()
         }
-    metadata |= {name: json.dumps(value) for name, value in texts.items()}
+    metadata |= {name: typed_json.dumps(value) for name, value in texts.items()}
     write_atomically(path, sealed(save(arrays, metadata)))
 
 
@@ -161,8 +161,9 @@ def _read(path) -> tuple[Row, Row]:
                 raise ValueError("its bytes do not match their SHA-256")
             if any(entry["dtype"] not in DTYPES for entry in entries.values()):
                 raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
-            metadata = {name: json.loads(texts[name]) for name in ("config", "facts", "tables")}
-            metadata["wrappers"] = json.loads(texts.get("wrappers", "{}"))
+            texts = {"wrappers": "{}", **texts}
+            names = "config", "facts", "tables", "wrappers"
+            metadata = {name: typed_json.loads(texts[name]) for name in names}
             formats.check(formats.Facts, metadata["facts"])
             formats.check(formats.Tables, metadata["tables"])
             if not {"train", "spaces"} <= metadata["config"].keys():

@@ -8,6 +8,7 @@ import secrets
 import shutil
 import socket
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from megastep.agents.runs import strange_files
@@ -15,6 +16,8 @@ from megastep.agents.runs import strange_files
 #: Age in seconds at which temporary files of other machines are deleted, whose processes cannot be
 #: checked from here.
 ABANDONED = 24 * 3600
+#: As long as the longest name of a file or folder of a run.
+ROOM = 120 * "x"
 _NAME = re.compile(r".*\.tmp-(?P<machine>.+)-(?P<pid>\d+)-(?P<token>\w+)-\d+")
 #: The token distinguishes this process from an earlier one with the same id.
 _TOKEN, _COUNT = secrets.token_hex(4), itertools.count()
@@ -38,6 +41,37 @@ def write_atomically(path: Path, data: bytes) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def make_folders(path: Path) -> list[Path]:
+    """Makes a folder and those above it, all or none of them. Returns those that it made, the
+    innermost first.
+
+    Raises:
+        OSError: they cannot be made, or their path leaves no room for the files of a run.
+    """
+    check_room(path)
+    absent = [one for one in (path, *path.parents) if not os.path.lexists(one)]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        remove_folders(absent)
+        raise
+    return absent
+
+
+def check_room(path: Path) -> None:
+    """Raises OSError if a folder's path is so long that files of a run below it have none."""
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+        os.lstat(path.absolute() / ROOM / ROOM)
+
+
+def remove_folders(paths: Iterable[Path]) -> None:
+    """Removes what `make_folders` made, as far as it is empty."""
+    with contextlib.suppress(OSError):
+        for path in paths:
+            if os.path.lexists(path):
+                path.rmdir()
 
 
 def write_synced(path: Path, data: bytes) -> None:

@@ -17,17 +17,25 @@ from typing import TYPE_CHECKING
 
 from megastep.agents.runs import checkpoint_format
 from megastep.agents.runs.atomic_files import delete_leftovers, sync_folder, temporary_path
-from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
+from megastep.agents.runs.checkpoint_format import (
+    Checkpoint,
+    CheckpointError,
+    DamagedCheckpoint,
+    GoneCheckpoint,
+)
 
 if TYPE_CHECKING:
     import torch
 
     from megastep.agents.types import Config, Row, StateDict
 
+_NAME = re.compile(r"step_\d+(-\d+)?")
+
 __all__ = [
     "Checkpoint",
     "CheckpointError",
     "DamagedCheckpoint",
+    "GoneCheckpoint",
     "list_checkpoints",
     "load_latest",
     "save",
@@ -74,7 +82,9 @@ def save(
             temporary, step, state, config, score, made_with, replay_seconds, add_files
         )
         # verify before deleting any old one
-        checkpoint_format.verify(temporary, checkpoint_format.read_manifest(temporary))
+        manifest = checkpoint_format.read_manifest(temporary)
+        with checkpoint_format.verified(temporary, manifest, manifest["files"]):
+            pass
         path = folder / _next_name(folder, step)
         os.replace(temporary, path)
         sync_folder(folder)
@@ -104,20 +114,22 @@ def load_latest(
         rank: the rank whose state is loaded, see `checkpoint_format.read`.
 
     Raises:
+        GoneCheckpoint: its run has deleted the one at `folder`.
         CheckpointError: there is none, all are damaged, or another version of megastep wrote it.
     """
-    folder = Path(folder)
-    if (folder / "manifest.json").exists():
+    folder, messages = Path(folder), []
+    if (folder / "manifest.json").exists() or _NAME.fullmatch(folder.name):
         return checkpoint_format.read(folder, device, is_whole, rank)
-    messages, tried = [], set()
-    # a run that is being trained replaces its checkpoints meanwhile
-    while paths := [path for path in list_checkpoints(folder) if path not in tried]:
-        tried.add(path := paths[-1])
+    paths = list_checkpoints(folder)
+    while paths:
+        path = paths.pop()
         try:
             checkpoint = checkpoint_format.read(path, device, is_whole, rank)
+        except GoneCheckpoint:  # its run has saved another
+            paths, messages = list_checkpoints(folder), []
+            continue
         except DamagedCheckpoint as error:
-            if path.exists():
-                messages.append(str(error))
+            messages.append(str(error))
             continue
         for message in messages:
             warnings.warn(f"{message}; using {path.name} instead", stacklevel=2)
@@ -142,8 +154,7 @@ def set_aside_after(folder: Path | str, step: int) -> None:
 def list_checkpoints(folder: Path | str) -> list[Path]:
     """Returns the checkpoints in a folder, oldest first. Skips unfinished and set-aside ones."""
     paths = Path(folder).glob("step_*")
-    names = re.compile(r"step_\d+(-\d+)?")
-    return sorted((path for path in paths if names.fullmatch(path.name)), key=_step_and_number)
+    return sorted((path for path in paths if _NAME.fullmatch(path.name)), key=_step_and_number)
 
 
 def step_of(path: Path) -> int:

@@ -2,7 +2,8 @@
 
     manifest.json  size and SHA-256 of every file and of itself, to detect damage; format, step,
                    score, versions and device, and the counters of the state, such as samples
-    config.json    the run's configuration
+    config.json    the run's configuration; infinity is {"$float": "inf"}, and a dict whose keys are
+                   no strings {"$dict": [[0, 1.0]]}
     state.pt       weights, optimizer, statistics and everything else that is small
     world.pt       environments and the actor state (observations and hidden states)
     replay.pt      the replay buffer, if it was saved
@@ -15,6 +16,7 @@ only `state.pt`. JSON is read without PyTorch.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -24,12 +26,12 @@ import pickle
 import re
 import time
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from megastep.agents.errors import memory_problem, shortened
-from megastep.agents.runs import formats, strange_files, trust
+from megastep.agents.runs import formats, strange_files, trust, typed_json
 from megastep.agents.runs.atomic_files import sync_folder
 
 if TYPE_CHECKING:
@@ -56,6 +58,16 @@ class CheckpointError(RuntimeError):
 
 class DamagedCheckpoint(CheckpointError):
     """A checkpoint does not match its manifest. An earlier checkpoint may be intact."""
+
+
+class GoneCheckpoint(CheckpointError):
+    """A checkpoint was deleted before all of it was open, as its run has saved later ones."""
+
+    def __init__(self, path: Path):
+        super().__init__(
+            f"Checkpoint {path} is gone: a run deletes its earlier checkpoints as it saves later "
+            "ones; name the run's folder to get its newest"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +138,7 @@ def write(
             files[name] = _write_file(path / name, functools.partial(torch.save, part), deadline)
         except _TooLate:
             (path / name).unlink()
-    text = json.dumps(config, indent=2).encode()
+    text = typed_json.dumps(config, indent=2).encode()
     files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
     files |= add_files(path)
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
@@ -239,7 +251,8 @@ def sealed(manifest: Row) -> bytes:
 def read(
     path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
 ) -> Checkpoint:
-    """Loads a checkpoint.
+    """Loads a checkpoint. Opens all files before it reads any, so that it can read them to their
+    end if the run deletes them meanwhile.
 
     Args:
         path: the checkpoint's folder.
@@ -249,6 +262,7 @@ def read(
 
     Raises:
         DamagedCheckpoint: a file is missing, damaged, or could run code when loaded.
+        GoneCheckpoint: it was deleted before all files were open.
         CheckpointError: another version of megastep wrote it.
     """
     manifest = read_manifest(path)
@@ -257,40 +271,43 @@ def read(
     if is_whole:
         parts += [rank_file(rank)] if rank else PARTS
         parts = [name for name in parts if name in manifest["files"]]
-    if device is None or (is_whole and rank == 0):
-        verify(path, manifest)
-    else:
-        verify(path, manifest, [*parts, "config.json"])
-    try:
-        text = strange_files.read_bytes(path / "config.json", _MAX_JSON)
-        config = json.loads(text)
-    except (OSError, ValueError, RecursionError):
-        raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is not JSON") from None
-    checkpoint = Checkpoint(
-        path,
-        manifest["step"],
-        manifest["numbers"],
-        config,
-        manifest.get("made_with", {}),
-        untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
-        n_ranks=n_ranks,
-    )
-    if device is None:
-        return checkpoint
-    state = {}
-    for name in parts:
-        state |= _load(path / name, device if name == "state.pt" else "cpu")
+    is_verified = device is None or (is_whole and rank == 0)
+    names = manifest["files"] if is_verified else [*parts, "config.json"]
+    with verified(path, manifest, names) as files:
+        text = files["config.json"].read(_MAX_JSON + 1)
+        try:
+            if len(text) > _MAX_JSON:
+                raise ValueError("it is too long")
+            config = typed_json.loads(text)
+        except (ValueError, RecursionError):
+            problem = f"Checkpoint {path} is damaged: config.json is not JSON"
+            raise DamagedCheckpoint(problem) from None
+        checkpoint = Checkpoint(
+            path,
+            manifest["step"],
+            manifest["numbers"],
+            config,
+            manifest.get("made_with", {}),
+            untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
+            n_ranks=n_ranks,
+        )
+        if device is None:
+            return checkpoint
+        state = {}
+        for name in parts:
+            to = device if name == "state.pt" else "cpu"
+            state |= _load(path / name, files[name], to)
     return dataclasses.replace(checkpoint, state=_migrated(state, manifest))
 
 
-def _load(path, device) -> Any:
-    """Returns the state in a file. Raises DamagedCheckpoint."""
+def _load(path, file, device) -> Any:
+    """Returns the state in an open file. Raises DamagedCheckpoint."""
     import torch
 
     try:
-        with open(path, "rb", opener=strange_files.opener) as file:
-            _check_zip(file)
-        state = torch.load(path, map_location=device, weights_only=True)
+        _check_zip(file)
+        file.seek(0)
+        state = torch.load(file, map_location=device, weights_only=True)
         if not isinstance(state, dict):
             raise ValueError("it is no dict")
         return state
@@ -348,30 +365,49 @@ def with_loggers(config: Config) -> Config:
     return config
 
 
-def verify(path: Path, manifest: Row, names: Iterable[str] | None = None) -> None:
-    """Compares files of a checkpoint, by default all, with the SHA-256 in its manifest.
+@contextlib.contextmanager
+def verified(path: Path, manifest: Row, names: Iterable[str]) -> Iterator[dict[str, BinaryIO]]:
+    """Opens files of a checkpoint and compares each with the SHA-256 in its manifest.
+
+    Yields:
+        The open files by name, each at its beginning.
 
     Raises:
         DamagedCheckpoint: a file is missing or differs.
+        GoneCheckpoint: the checkpoint was deleted before all were open.
     """
-    for name in manifest["files"] if names is None else names:
-        try:
-            digest = _digest(path / name)
-        except OSError as error:
-            raise DamagedCheckpoint(
-                f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
-            ) from None
-        if digest != manifest["files"][name]["sha256"]:
-            raise DamagedCheckpoint(
-                f"Checkpoint {path} is damaged: {name} does not match the SHA-256 in its manifest"
-            )
+    with contextlib.ExitStack() as stack:
+        files = {}
+        for name in names:
+            with _readable(path, name):
+                file = open(path / name, "rb", opener=strange_files.opener)
+                files[name] = stack.enter_context(file)
+        for name, file in files.items():
+            with _readable(path, name):
+                digest = _digest(file)
+            if digest != manifest["files"][name]["sha256"]:
+                problem = f"{name} does not match the SHA-256 in its manifest"
+                raise DamagedCheckpoint(f"Checkpoint {path} is damaged: {problem}")
+        yield files
 
 
-def _digest(path) -> str:
+@contextlib.contextmanager
+def _readable(path, name) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if not path.exists():
+            raise GoneCheckpoint(path) from None
+        raise DamagedCheckpoint(
+            f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
+        ) from None
+
+
+def _digest(file) -> str:
     digest = hashlib.sha256()
-    with open(path, "rb", opener=strange_files.opener) as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
+    while chunk := file.read(_CHUNK):
+        digest.update(chunk)
+    file.seek(0)
     return digest.hexdigest()
 
 
@@ -380,6 +416,7 @@ def read_manifest(path: Path) -> Row:
 
     Raises:
         DamagedCheckpoint: it is not, byte for byte, what `sealed` writes.
+        GoneCheckpoint: there is no such checkpoint any more.
         CheckpointError: it has an unknown format.
     """
     try:
@@ -401,6 +438,8 @@ def read_manifest(path: Path) -> Row:
         is_intact = all(map(_RANK_FILE.fullmatch, others))  # a forged manifest may name any path
         is_intact &= {"config.json", "state.pt"} <= {*manifest["files"]}
     is_without_digest = version == 1 and "sha256" not in manifest
+    if not (is_intact or is_without_digest or path.exists()):
+        raise GoneCheckpoint(path)
     if not (is_intact or is_without_digest):
         raise DamagedCheckpoint(
             f"Checkpoint {path} is damaged: manifest.json cannot be read or does not match its own "

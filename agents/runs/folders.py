@@ -22,6 +22,7 @@ from megastep.agents.runs import (
     formats,
     strange_files,
 )
+from megastep.agents.runs.atomic_files import check_room, make_folders, remove_folders
 
 if TYPE_CHECKING:
     import torch
@@ -46,12 +47,17 @@ def for_file(name: str) -> str:
 def make(path: Path) -> Path:
     """Creates a folder and returns it; if it exists, `path`-2, -3, ..."""
     with user_errors(CANNOT.format(shortened(path))):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for number in itertools.count(1):
-            folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-            with contextlib.suppress(FileExistsError):  # taken, perhaps by another process just now
-                folder.mkdir()
-                return folder
+        check_room(path)
+        made = make_folders(path.parent)
+        try:
+            for number in itertools.count(1):
+                folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+                with contextlib.suppress(FileExistsError):  # taken, perhaps by another process
+                    folder.mkdir()
+                    return folder
+        except OSError:
+            remove_folders(made)
+            raise
     raise AssertionError("counting never ends")
 
 
@@ -79,7 +85,11 @@ def check_free(name: str | None, is_again: bool = False) -> None:
         is_again: it may be that of a run which ended before it saved anything.
     """
     folder = Path(name or "")
+    if os.path.islink(folder) and not os.path.exists(folder):
+        target = os.readlink(folder)
+        raise UserError(f"{CANNOT.format(folder)}it is a link to {target}, which does not exist")
     with user_errors(CANNOT.format(shortened(folder))):
+        check_room(folder)
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
     # Hydra writes .hydra/ and a log before the job of a sweep starts
     used = [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]
@@ -87,10 +97,10 @@ def check_free(name: str | None, is_again: bool = False) -> None:
         strange_files.check_folder(folder)
         used = used if not {"lock", "config.yaml"} & {path.name for path in used} else []
     if used:
-        raise UserError(
-            f"The run folder {folder} is not empty; choose another with folder=, or continue "
-            f"its run: {resume_command(folder)}"
-        )
+        text = f"The run folder {folder} is not empty; choose another with folder="
+        if checkpoint.list_checkpoints(folder / "checkpoints"):
+            text = f"{text}, or continue its run: {resume_command(folder)}"
+        raise UserError(text)
 
 
 @contextlib.contextmanager
@@ -241,9 +251,18 @@ def resume_command(folder: Path, key: str = "resume") -> str:
     return f"{package.command('train', 'python ')} {shlex.quote(f'{key}={name}')}"
 
 
+def to_continue(folder: Path) -> str:
+    """Returns a sentence on how a run that has ended goes on."""
+    if not checkpoint.list_checkpoints(folder / "checkpoints"):
+        return "It has no checkpoint, so it cannot be continued"
+    return f"To continue: {resume_command(folder)}"
+
+
 def checkpoints_of(path: Path) -> Path:
-    """Returns the `checkpoints` folder of a run; a checkpoint is returned as it is."""
-    return path if (path / "manifest.json").exists() else path / "checkpoints"
+    """Returns the `checkpoints` folder of a run; a checkpoint, which its run may have deleted, is
+    returned as it is.
+    """
+    return path / "checkpoints" if (path / "checkpoints").exists() else path
 
 
 def folder_of(path: Path) -> Path:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents.errors import UserError
-from megastep.agents.runs import annealing, checkpoint, folders
+from megastep.agents.runs import annealing, checkpoint, folders, typed_json
 
 if TYPE_CHECKING:
     from megastep.agents.algorithms.nonfinite import NonFiniteValue
@@ -69,7 +68,7 @@ def _is_whole(path, trainer) -> bool:
 
 def _changed(path: Path, config: Config) -> Config:
     """Returns the settings in `CHANGEABLE` whose values differ from the checkpoint's."""
-    before = json.loads((path / "config.json").read_bytes())["train"]
+    before = typed_json.loads((path / "config.json").read_bytes())["train"]
     return {key: config[key] for key in CHANGEABLE if config[key] != before.get(key)}
 
 

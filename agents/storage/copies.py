@@ -9,7 +9,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
-from megastep.types import Tree
+from megastep.types import Tree, is_stored
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 _MAX_COPIES = LIBRARY.constants["MAX_COPIES"]
@@ -132,3 +132,15 @@ def _can_select(tensor, n_selected) -> bool:
     n_bytes = tensor[:, :1].numel() * tensor.element_size()  # of one lane
     is_small = 0 < n_bytes * max(n_selected, tensor.shape[1]) < _MAX_BYTES
     return tensor.is_cuda and tensor.is_contiguous() and is_small
+
+
+def require_stored(**tensors: torch.Tensor) -> None:
+    """Raises ValueError naming a tensor that lies outside its storage: on a CPU, PyTorch's own
+    operations would crash.
+    """
+    for name, tensor in tensors.items():
+        if not is_stored(tensor):
+            n_bytes = tensor.untyped_storage().nbytes()
+            raise ValueError(
+                f"{name} has shape {tuple(tensor.shape)}, but its storage has only {n_bytes} bytes"
+            )

@@ -15,6 +15,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage import replay_kernels as kernels
+from megastep.agents.storage.copies import require_stored
 from megastep.agents.storage.replay_columns import Column, stored_dtype
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, copy_tree
@@ -225,6 +226,7 @@ class ReplayBuffer:
                 f"values must have one priority for each index, so shape {tuple(index.shape)}, but "
                 f"it is {tuple(values.shape)}"
             )
+        require_stored(index=index, values=values)
         if self.settings.alpha == 0:
             return
         if self.tree.is_fused and len(index) <= kernels.MAX_SET:

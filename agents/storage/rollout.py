@@ -13,7 +13,12 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.copies import copy_all, select_lanes, select_tree
+from megastep.agents.storage.copies import (
+    copy_all,
+    require_stored,
+    select_lanes,
+    select_tree,
+)
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
@@ -286,8 +291,13 @@ def bytes_per_step(env: Env, policy: Policy) -> int:
 
 
 def copy_tree(target: Tree, source: Tree) -> None:
-    """Copies the tensors of a tree into those of another with the same keys, on any device."""
+    """Copies the tensors of a tree into those of another with the same keys, on any device.
+
+    Raises:
+        ValueError: if one has no memory.
+    """
     if isinstance(target, torch.Tensor):
+        require_stored(target=target, source=source)
         target.copy_(source)
         return
     for key, part in target.items():

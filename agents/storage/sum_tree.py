@@ -11,6 +11,7 @@ import itertools
 import torch
 
 from megastep.agents.storage import replay_kernels as kernels
+from megastep.agents.storage.copies import require_stored
 
 
 class SumTree:
@@ -68,13 +69,14 @@ class SumTree:
             values: (M,), finite and at least 0.
 
         Raises:
-            ValueError: if index and values are not of one shape (M,).
+            ValueError: if index and values are not of one shape (M,), or have no memory.
         """
         if index.ndim != 1 or index.shape != values.shape:
             raise ValueError(
                 f"index and values must have one shape (M,), but index is {tuple(index.shape)} and "
                 f"values is {tuple(values.shape)}"
             )
+        require_stored(index=index, values=values)
         values = values.to(torch.float64)
         if self.is_fused and len(index) <= kernels.MAX_SET:
             if len(index):
@@ -125,6 +127,7 @@ class SumTree:
 
     def probability(self, index: torch.Tensor) -> torch.Tensor:
         """Returns the probability (M,) float64 of each index; 0 while all priorities are 0."""
+        require_stored(index=index)
         tiny = torch.finfo(torch.float64).tiny
         return self.priorities.index_select(0, index) / self.total.clamp(min=tiny)
 

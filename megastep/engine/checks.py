@@ -10,6 +10,7 @@ import torch
 
 from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor
+from megastep.types import is_stored
 
 __all__ = [
     "address",
@@ -47,7 +48,7 @@ def integer(name: str, value: object, min: int, max: float = math.inf) -> int:
 
 def _index(value) -> int | None:
     """Returns a value as an int, or None if it is none."""
-    if isinstance(value, bool) or isinstance(value, torch.Tensor) and not _is_stored(value):
+    if isinstance(value, bool) or isinstance(value, torch.Tensor) and not is_stored(value):
         return None
     try:
         return operator.index(value)
@@ -119,7 +120,7 @@ def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) 
     """
     try:
         tensor = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
-        usable = _is_stored(tensor) and not tensor.is_complex()
+        usable = is_stored(tensor) and not tensor.is_complex()
         tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
         tensor = tensor.resolve_neg().to(device=device, dtype=torch.float32) if usable else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
@@ -150,7 +151,7 @@ def integers(
     try:
         tensor = torch.as_tensor(value).detach()
         real = tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool
-        usable = _is_stored(tensor) and not (real and tensor.numel())
+        usable = is_stored(tensor) and not (real and tensor.numel())
         tensor = tensor.clone().to(device=device, dtype=torch.int64) if usable else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
@@ -229,7 +230,7 @@ def stored(name: str, tensor: torch.Tensor) -> torch.Tensor:
     """Returns ``tensor``. ValueError unless it lies inside its storage: most functions of PyTorch
     crash the interpreter if the storage was resized.
     """
-    if not _is_stored(tensor):
+    if not is_stored(tensor):
         raise ValueError(f"{name} must lie inside its storage, but is {_described(tensor)}")
     return tensor
 
@@ -239,12 +240,7 @@ def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
     ``like``, on its device. Does not synchronise.
     """
     fits = isinstance(value, torch.Tensor) and value.shape == like.shape
-    if (
-        not fits
-        or value.dtype != like.dtype
-        or value.device != like.device
-        or not _is_stored(value)
-    ):
+    if not fits or value.dtype != like.dtype or value.device != like.device or not is_stored(value):
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a {like.dtype} tensor of shape {tuple(like.shape)} on {like.device}, "
             f"but {_described(value)} was given"
@@ -257,7 +253,7 @@ def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Te
     with one integer per lane. Does not synchronise.
     """
     fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
-    if not fits or value.dtype not in _INTEGERS or not _is_stored(value):
+    if not fits or value.dtype not in _INTEGERS or not is_stored(value):
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a tensor of integers, one for each of the {n_lanes} lanes, on "
             f"{device}, but {_described(value)} was given"
@@ -275,7 +271,7 @@ def vectors(name: str, value: Any, n_lanes: int, dim: int, device: torch.device)
         or value.numel() != n_lanes * dim
         or value.dtype != torch.float32
         or value.device != device
-        or not _is_stored(value)
+        or not is_stored(value)
     ):
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a tensor of float32 numbers, {dim} for each of the {n_lanes} lanes, "
@@ -288,18 +284,6 @@ def _sizes(shape) -> str:
     return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
 
 
-def _is_stored(tensor) -> bool:
-    """Returns True if a tensor has memory and lies inside its storage."""
-    if tensor.layout is not torch.strided:
-        return False
-    if tensor.is_contiguous():
-        n = tensor.numel()
-    else:
-        n = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride()))
-    n_bytes = (tensor.storage_offset() + n) * tensor.itemsize
-    return n_bytes <= tensor.untyped_storage().nbytes() or not tensor.numel()
-
-
 def _described(value) -> str:
     """Describes a value in a few words."""
     if isinstance(value, torch.Tensor):
@@ -309,7 +293,7 @@ def _described(value) -> str:
         text = f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
         if value.is_neg():
             return f"{text} that is negated lazily (call resolve_neg)"
-        if not _is_stored(value):
+        if not is_stored(value):
             n_bytes = value.untyped_storage().nbytes()
             return f"{text} whose storage has only {n_bytes} bytes"
         return text

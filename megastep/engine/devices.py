@@ -75,8 +75,9 @@ def fit(n: int, bytes_each: float, device: torch.device | str, what: str = "envi
     free = free_memory(device)
     if n * bytes_each > 0.95 * free:
         raise EngineError(
-            f"{n:,} {what} need {n * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB "
-            f"are free on {device}: at most {int(0.95 * free / bytes_each):,} fit."
+            f"{n:,} {what} need {n * bytes_each / 1e9:.1f} GB, but {0.95 * free / 1e9:.1f} GB of "
+            f"the {free / 1e9:.1f} GB that are free on {device} may be used: at most "
+            f"{int(0.95 * free / bytes_each):,} fit."
         )
 
 

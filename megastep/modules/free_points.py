@@ -30,7 +30,8 @@ class FreePoints:
         points: (D, n_points, 2) float32 metres, the points of each layout.
 
     Raises:
-        ValueError: if a geometry has no point where an agent fits, or a number is below 1.
+        ValueError: if a geometry has no point where an agent fits, there are fewer geometries than
+            layouts, or a number is below 1.
     """
 
     def __init__(
@@ -46,7 +47,13 @@ class FreePoints:
         n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         seed = seed + (4 << 32)  # differs from the spawns' seed
-        geometries = geometries[: len(core.scenery.layouts)]
+        n_layouts = len(core.scenery.layouts)
+        if len(geometries) < n_layouts:
+            raise ValueError(
+                f"geometries must be those that the scenery was made from, one for each of its "
+                f"{n_layouts} layouts, but {len(geometries)} were given"
+            )
+        geometries = geometries[:n_layouts]
         points = cached_points(geometries, n_points, 1, core.agents.radius, seed)
         self.points = torch.as_tensor(points, device=core.device)
         self.generator = CounterGenerator(core.n_envs * self.per_env, seed, core.device)

@@ -33,6 +33,11 @@ def _newest():
     return records.newest(records.read(paths.RECORDS))
 
 
+@functools.cache
+def _rows():
+    return yaml.safe_load(ROWS.read_text())["rows"]
+
+
 def text_of(name: str) -> str:
     """Returns the text of a quote.
 
@@ -43,7 +48,7 @@ def text_of(name: str) -> str:
         raise ValueError(f"docs/lab/quoted.yaml has no {name}")
     quote = quotes()[name]
     if "row" in quote:
-        stated = yaml.safe_load(ROWS.read_text())["rows"][quote["row"]]["results"]
+        stated = _rows()[quote["row"]]["results"]
         values = {key: text for result in stated for key, text in result["states"].items()}
         return values[quote["states"]].partition(" ")[0]
     if "page" in quote:

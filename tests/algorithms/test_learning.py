@@ -205,8 +205,6 @@ ONE_OR_ALL = [
     name if name == "ppo" else pytest.param(name, marks=pytest.mark.slow) for name in LEARNERS
 ]
 
-CONTINUOUS = [name for name in LEARNERS if name != "r2d2"]
-
 
 class NeverResets(Policy):
     """A policy whose hidden state leaks from one episode into the next."""
@@ -240,10 +238,18 @@ def test_remembers_cue(name):
     assert rewards / ends > (0.85 if name == "r2d2" else 0.9)
 
 
-@pytest.mark.parametrize("continuous", ["gaussian", "beta"])
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name != "ppo")) for name in CONTINUOUS],
+    "name, continuous",
+    [
+        ("ppo", "gaussian"),
+        ("ppo", "beta"),
+        pytest.param("vtrace", "beta", marks=pytest.mark.slow),
+        pytest.param("vtrace-lag", "gaussian", marks=pytest.mark.slow),
+        pytest.param("vtrace-replay", "beta", marks=pytest.mark.slow),
+        pytest.param("vtrace", "gaussian", marks=pytest.mark.nightly),
+        pytest.param("vtrace-lag", "beta", marks=pytest.mark.nightly),
+        pytest.param("vtrace-replay", "gaussian", marks=pytest.mark.nightly),
+    ],
 )
 def test_learns_to_reach(name, continuous):
     env = Reach()

@@ -189,6 +189,8 @@ def test_n_step_returns_match_hand_calculation():
     result = returns.n_step_returns(**case, gamma=0.5, n=2)
     assert result[:, 0].tolist() == [2.5, 6.0, 8.0]
     assert returns.n_step_returns(**case, gamma=0.5, n=1)[:, 0].tolist() == [3.0, 3.0, 8.0]
+    whole, longer = (returns.n_step_returns(**case, gamma=0.5, n=n) for n in (3, 2**63))
+    assert torch.equal(whole, longer), "no return is longer than the rows"
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 40])

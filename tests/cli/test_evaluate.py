@@ -13,6 +13,7 @@ from megastep import envs, scene, spaces
 from megastep.agents import factory
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
+from megastep.agents.evaluation import evaluate as evaluation
 from megastep.agents.evaluation import playing, statistics, tables
 from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.bots.random import RandomActions
@@ -498,6 +499,23 @@ def test_few_episodes_are_spread_over_all_homes(trained, played, monkeypatch):
     layouts = env.core.scenery.layouts
     expected = scene.scenery([homes[0], homes[20]], device="cpu").layouts
     assert torch.equal(layouts.lines.vals, expected.lines.vals)
+
+
+def test_checkpoint_deleted_while_it_is_evaluated(trained, monkeypatch, tmp_path):
+    """As a run that is training deletes it."""
+    copy = shutil.copytree(trained, tmp_path / "copy", ignore=lambda *_: ["evaluations"])
+    (deleted,) = checkpoint.list_checkpoints(copy / "checkpoints")
+    play = evaluation.play
+
+    def late(*args):
+        if deleted.exists():
+            shutil.rmtree(deleted)
+        return play(*args)
+
+    monkeypatch.setattr(evaluation, "play", late)
+    written = evaluate.run(configured(run=str(copy), baseline=False))
+    assert written.parent == copy / "evaluations" and written.exists()
+    assert json.loads(written.read_text())["checkpoint"] == str(deleted) and not deleted.exists()
 
 
 def test_unwritable_table(trained, monkeypatch, tmp_path):

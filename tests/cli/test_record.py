@@ -86,10 +86,20 @@ def test_several_cameras(env, tmp_path):
     assert heights[0] - heights[1] == pytest.approx(2 * 2 * strip, abs=2)
 
 
-@pytest.mark.parametrize("file, reason", [("/proc/video.mp4", ""), ("video.gif", ": videos are")])
-def test_video_that_cannot_be_made(trained, capsys, file, reason):
+@pytest.mark.parametrize(
+    "file, text",
+    [
+        ("/proc/video.mp4", "The video /proc/video.mp4 could not be made: "),
+        ("a/video.gif", "file: 'a/video.gif' is neither a video, .mp4, nor its last frame, .png"),
+        ("folder.mp4", "The video folder.mp4 could not be made: folder.mp4 is a folder"),
+        (f"{300 * 'longer/'}{300 * 'x'}.mp4", "File name too long"),
+    ],
+)
+def test_video_that_cannot_be_made(trained, here, monkeypatch, capsys, file, text):
+    (here / "folder.mp4").mkdir()
+    monkeypatch.setattr(recording, "_states", lambda *_: pytest.fail("it is drawn"))
     assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
-    assert f"{file} could not be made{reason}" in capsys.readouterr().err
+    assert text in capsys.readouterr().err and os.listdir() == ["folder.mp4"]
 
 
 def test_run_of_another_environment(trained, tmp_path, capsys):

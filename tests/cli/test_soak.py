@@ -5,16 +5,21 @@ are stepped for long.
 import itertools
 import os
 import pathlib
+import signal
 
 import pytest
 import soak
 import torch
 
 from megastep import engine, envs
+from megastep.agents.cli import inspect
+from megastep.agents.runs import checkpoint
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 from megastep.geometries import sample
 from megastep.modules.spawning import distances
+from tests.helpers import tiny
+from tests.helpers.processes import finished, start, wait_until
 
 pytestmark = pytest.mark.nightly
 
@@ -67,3 +72,31 @@ def test_environment_stepped_for_long(name):
             break
     memory, files = resources()
     assert memory - early[0] < 8 and files == early[1], (early, memory, files)
+
+
+def test_commands_beside_a_run_that_is_training(tmp_path):
+    """A checkpoint after each update, so that each is deleted at once."""
+    words = ["checkpoint_seconds=1e-3", "logger=none", "folder=run"]
+    training = start("train", *tiny.TINY, *words, cwd=tmp_path)
+    saved = tmp_path / "run/checkpoints"
+    wait_until(lambda: saved.is_dir() and checkpoint.list_checkpoints(saved), training)
+    played = ["run=run", "device=cpu"]
+    for n in range(3):
+        for script, *words in (
+            ("evaluate", *played, "episodes=4", "baseline=false"),
+            ("record", *played, "steps=2"),
+            ("train", *tiny.TINY, "init=run", "samples=32", f"folder=next-{n}"),
+        ):
+            code, out, err = finished(script, *words, cwd=tmp_path)
+            assert code == 0 and "damaged" not in out + err and "Traceback" not in err, (
+                script,
+                err,
+            )
+            assert inspect.main([str(tmp_path / "run")]) == 0
+        assert len([*tmp_path.glob("run/evaluations/*.json")]) > n
+    assert len([*tmp_path.glob("run/video*.mp4")]) == 3
+    assert training.poll() is None, "it has not ended before"
+    training.send_signal(signal.SIGTERM)
+    training.communicate()
+    names = {path.name for path in saved.rglob("*") if path.is_dir()}
+    assert training.returncode == 143 and len(names) <= 3, names

@@ -117,12 +117,11 @@ def test_sweep_folders_and_table(here, capsys):
 def test_failed_jobs(here, capsys, more):
     words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine", *more]
     assert train.main(words) == 1
-    assert [row["state"] for row in rows("mine")] == [
-        "FAILED: RuntimeError: by chance",
-        "done",
-        "FAILED: RuntimeError: by chance",
-    ]
-    assert "Job 0 FAILED: RuntimeError: by chance" in capsys.readouterr().err
+    failed = "FAILED: payer:Payer failed: RuntimeError: by chance. Its traceback is in mine/{}_env"
+    states = [row["state"] for row in rows("mine")]
+    assert states[1] == "done"
+    assert all(states[k].startswith(failed.format(k)) for k in (0, 2)), states
+    assert "Job 0 FAILED: payer:Payer failed: RuntimeError" in capsys.readouterr().err
     assert "by chance" in (here / "mine/0_env.mood=cross/error.txt").read_text()
     assert not (here / "mine/0_env.mood=cross/checkpoints").exists()
 
@@ -438,7 +437,7 @@ LOCAL, SLURM = ["hydra/launcher=submitit_local"], ["hydra/launcher=submitit_slur
     [
         (["ranks=8"], "ranks: 8 is more than the 4 GPUs of this machine"),
         (["ranks=2,5"], "ranks: 5 is more than the 4 GPUs of this machine"),
-        (["ranks=2", "device=cuda:1"], "device: 'cuda:1' is one GPU"),
+        (["ranks=2", "device=cuda:1"], "device: 'cuda:1' names one GPU"),
         ([*LOCAL, "ranks=5"], "ranks: 5 is more than the 4 GPUs of this machine"),
         ([*SLURM, "hydra.launcher.gpus_per_node=2", "ranks=4"], "ranks: 4 is more than hydra"),
         ([*SLURM, "hydra.launcher.nodes=2"], "hydra.launcher.nodes: 2 would run each job 2 times"),

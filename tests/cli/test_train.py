@@ -20,7 +20,7 @@ from megastep.agents import factory
 from megastep.agents.algorithms import ppo
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.cli import evaluate, train
-from megastep.agents.errors import ConfigErrors, UserError
+from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory.check import check
 from megastep.agents.factory.settings import Train
 from megastep.agents.factory.trainer import annealed
@@ -431,23 +431,31 @@ def test_settings_that_no_environment_can_have(here, capsys):
 def test_too_many_environments(here, capsys):
     assert train.main([*TINY, f"env.n_envs={MAX_ENVS}", "learner.n_steps=4096"]) == 2
     message = re.search(
-        "67,108,864 environments need .* free on cpu: at most ([0-9,]+) fit",
+        "67,108,864 environments need .* free on cpu may be used: at most ([0-9,]+) fit",
         capsys.readouterr().err,
     )
     assert 10 < int(message[1].replace(",", "")) < MAX_ENVS
     assert not any((here / "runs").iterdir())
 
 
-@pytest.mark.parametrize("folder", ["file", "file/below", "/proc/run", "full"])
+LONG = "/".join(570 * ["longer"])
+
+
+@pytest.mark.parametrize(
+    "folder", ["file", "file/below", "/proc/run", "full", "link", "link/below", 300 * "x", LONG]
+)
 def test_unusable_run_folder(here, monkeypatch, capsys, folder):
     (here / "file").write_text("")
+    (here / "link").symlink_to("nowhere")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("")
     monkeypatch.setattr(launch_train, "make_trainer", None)
     assert train.main([*TINY, f"folder={folder}"]) == 2
     error = capsys.readouterr().err.strip()
-    assert folder in error and "folder=" in error and "\n" not in error
-    assert (here / "full" / "mine.txt").exists()
+    assert shortened(folder) in error and "folder=" in error and "\n" not in error
+    assert "resume=" not in error, "there is no checkpoint"
+    left = {path.relative_to(here).as_posix() for path in here.rglob("*")}
+    assert left == {"file", "full", "full/mine.txt", "link"}
 
 
 def test_finish(here, capsys):

@@ -2,6 +2,8 @@
 not there.
 """
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -200,3 +202,6 @@ def test_trains_and_evaluates(tmp_path, monkeypatch):
     ]
     assert train.main([*words, "folder=run"]) == 0
     assert evaluate.main(["run=run", "episodes=4", "against=random"]) == 0
+    assert evaluate.main(["run=run", "episodes=30", "baseline=false"]) == 0
+    (path,) = (tmp_path / "run" / "evaluations").glob("[!d]*.json")
+    assert json.loads(path.read_text())["rows"][0]["lanes"] == 30, "of ten environments"

@@ -19,7 +19,8 @@ def code(text):
 
 def commands(text):
     """Returns the commands of a page, (script, words) each, in order."""
-    return [(s, shlex.split(words)) for s, words in re.findall(r"^python (\S+) (.*)$", text, re.M)]
+    lines = re.findall(r"^python (\S+) (.*)$", text, re.M)
+    return [(script, shlex.split(words, comments=True)) for script, words in lines]
 
 
 def few(script, words):

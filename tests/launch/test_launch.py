@@ -411,7 +411,8 @@ from megastep.envs import Minimal
 class Killed(Minimal):
     def step(self, decision):
         first = os.environ.get("TORCHELASTIC_RESTART_COUNT") == "0"
-        if first and os.environ["RANK"] == "1" and [*Path("run/checkpoints").glob("step_*[0-9]")]:
+        saved = [p for p in Path("run/checkpoints").glob("step_*") if p.name[5:].isdecimal()]
+        if first and os.environ["RANK"] == "1" and saved:
             os.kill(os.getpid(), 9)
         return super().step(decision)
 """

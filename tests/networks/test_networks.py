@@ -25,11 +25,12 @@ def folder(tmp_path_factory):
 @pytest.mark.slow
 def test_commands_of_page_train_and_evaluate(folder, monkeypatch):
     scripts = pages.type_all(PAGE.read_text(), folder, monkeypatch)
-    assert scripts == 2 * ["train.py", "evaluate.py"]
+    assert scripts == 2 * ["train.py"] + 2 * ["train.py", "evaluate.py"]
     runs = [path for path in (folder / "runs").iterdir() if path.is_dir()]
     agents = [config(run)["agent"] for run in runs]
     parts = {(agent["core"], agent["encoder"]) for agent in agents}
-    assert parts == {("cores:Trace", "linear"), ("lstm", "encoders:Patches")}
+    of_page = {("cores:Trace", "linear"), ("lstm", "encoders:Patches")}
+    assert parts == {("gru", "linear"), ("none", "linear"), *of_page}
 
 
 def config(run):

@@ -15,7 +15,9 @@ import sys
 import pytest
 import torch
 
-from megastep.agents.runs import atomic_files, checkpoint, checkpoint_format
+from megastep.agents.cli import inspect
+from megastep.agents.errors import UserError
+from megastep.agents.runs import atomic_files, checkpoint, checkpoint_format, folders
 from megastep.agents.runs.checkpoint import CheckpointError
 from tests.helpers import faults
 from tests.helpers.processes import HUNG
@@ -423,3 +425,73 @@ def test_leftovers_of_killed_processes_are_ignored_and_deleted(folder, monkeypat
     assert checkpoint.load_latest(folder).step == 30
     checkpoint.save(folder, 60, state(60), CONFIG)
     assert not leftover.exists()
+
+
+# ---- Readers beside a writer ----
+
+
+@pytest.fixture
+def between_steps():
+    """Returns a function that calls a reader with a writer at its n-th file operation, for each n.
+    Yields what the reader returns.
+    """
+
+    def call(read, write, operations=("open", "seek", "scandir")):
+        for n in itertools.count():
+            n_seen = -1
+
+            def look(frame, event, called, n=n):
+                nonlocal n_seen
+                if event == "c_call" and called.__name__ in operations:
+                    n_seen += 1
+                    if n_seen == n:
+                        sys.setprofile(None)
+                        write()
+
+            sys.setprofile(look)
+            try:
+                result = read()
+            finally:
+                sys.setprofile(None)
+            if n_seen < n:
+                return
+            yield result
+
+    return call
+
+
+@pytest.fixture
+def writer(tmp_path):
+    """Returns a function that saves two checkpoints and so deletes the earlier ones."""
+    steps = itertools.count(1)
+
+    def save():
+        for n in itertools.islice(steps, 2):
+            checkpoint.save(tmp_path / "checkpoints", n, state(n), CONFIG)
+
+    save()
+    return save
+
+
+def test_reader_never_meets_a_checkpoint_that_is_being_deleted(tmp_path, writer, between_steps):
+    n = 0
+    for loaded in between_steps(lambda: checkpoint.load_latest(tmp_path / "checkpoints"), writer):
+        assert (loaded.state["weights"]["w"] == loaded.state["samples"]).all()
+        n += 1
+    assert n > 5 and names(tmp_path / "checkpoints")[0] == f"step_{2 * n + 1}"
+
+
+def test_inspect_of_a_run_that_is_training(tmp_path, writer, between_steps, capsys):
+    results = [*between_steps(lambda: inspect.main([str(tmp_path)]), writer, ("open",))]
+    text = capsys.readouterr().out
+    assert len(results) > 5 and not any(results) and "damaged" not in text
+    assert text.count("intact") > len(results)
+
+
+def test_checkpoint_that_is_gone_keeps_its_run_folder(tmp_path, writer):
+    gone = tmp_path / "checkpoints" / "step_1"
+    assert folders.folder_of(gone) == tmp_path
+    writer()
+    assert not gone.exists() and folders.folder_of(gone) == tmp_path
+    with pytest.raises(UserError, match="step_1 is gone: a run deletes .*; name the run's folder"):
+        folders.load_checkpoint(gone, trust=False)

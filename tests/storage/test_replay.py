@@ -245,6 +245,10 @@ def test_sequences_that_cannot_be_drawn_get_no_priority():
     for _ in range(4):
         replay.add(world.next())
     replay.set_priorities(torch.arange(9), torch.full((9,), 3.0))
+    values = torch.ones(9)
+    values.untyped_storage().resize_(0)
+    with pytest.raises(ValueError, match="values has shape .9,., but its storage has only 0 bytes"):
+        replay.set_priorities(torch.arange(9), values)
     assert replay.tree.priorities.tolist() == [0, 0, 0, 3, 3, 3, 0, 0, 0]
 
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import testing
 
+from megastep.agents.storage.rollout import copy_tree
 from megastep.agents.storage.sum_tree import SumTree
 from megastep.capture import Graph
 from tests.helpers.synchronisation import no_synchronisation
@@ -189,3 +190,19 @@ def test_values_of_another_shape_are_named(values):
     with pytest.raises(ValueError, match="^n must be at least 1 .* 0 was given"):
         tree.sample(0)
     assert tree.priorities.tolist() == 9 * [1.0]
+
+
+def test_tensors_without_memory_are_refused():
+    """PyTorch's own operations crash on them."""
+    tree, index, values = filled([1.0, 2.0]), torch.tensor([0, 1]), torch.tensor([3.0, 4.0])
+    for name, tensor in (("index", index), ("values", values)):
+        empty = tensor.clone()
+        empty.untyped_storage().resize_(0)
+        with pytest.raises(
+            ValueError, match=f"{name} has shape .2,., but its storage has only 0 b"
+        ):
+            tree.set(**{"index": index, "values": values, name: empty})
+    with pytest.raises(ValueError, match="target has shape"):
+        copy_tree({"index": empty}, {"index": values})
+    with pytest.raises(ValueError, match="source has shape"):
+        copy_tree({"index": values}, {"index": empty})

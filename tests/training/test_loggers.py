@@ -53,6 +53,23 @@ def test_resumed_run_replaces_lines_after_its_checkpoint(tmp_path):
     assert [row["x"] for row in json_lines.read(tmp_path / "metrics.jsonl")] == [10, 20, -1]
 
 
+def test_tensorboard_has_the_points_of_the_lines_after_two_resumes(tmp_path):
+    for first, saved, last in ((0, 0, 40), (3, 30, 60), (6, 60, 70)):
+        others = {"tensorboard": lambda saved=saved: TensorBoard(tmp_path, saved)}
+        run_loggers = Loggers(tmp_path, saved, others)
+        for step in range(10 * first + 10, last + 1, 10):
+            run_loggers.write(step, {"x": step + saved / 100}, {"rate": 1.0})
+        run_loggers.close()
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    rows = json_lines.read(tmp_path / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [10, 20, 30, 40, 50, 60, 70]
+    points = [(event.step, pytest.approx(event.value)) for event in events.Scalars("x")]
+    assert [(row["samples"], row["x"]) for row in rows] == points
+    assert [event.step for event in events.Scalars("rate")] == [row["samples"] for row in rows]
+
+
 def lines(n, **values):
     return "".join(json.dumps({"samples": i, **values}) + "\n" for i in range(n)).encode()
 

@@ -27,7 +27,8 @@ class TensorBoard:
         try:
             from torch.utils.tensorboard import SummaryWriter
 
-            with SummaryWriter(str(self.folder), purge_step=self.step or None) as writer:
+            # which drops the events of that step, too
+            with SummaryWriter(str(self.folder), purge_step=self.step + 1) as writer:
                 while report := self.reports.get():
                     step, values = report
                     for name, value in values.items():
