@@ -4,12 +4,12 @@ PyTorch.
 
 import numbers
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-__all__ = ["problem_of_error", "problem_of_observation", "problem_of_result"]
+__all__ = ["beyond_bounds", "problem_of_error", "problem_of_observation", "problem_of_result"]
 
 FORMS = {
     "reset": "(observation, info)",
@@ -69,11 +69,42 @@ def problem_of_error(method: str, error: Exception) -> str | None:
     return f"{method}() must return {FORMS[method]}, and returned something else ({error})"
 
 
+def beyond_bounds(space: Any, batch: Any, path: str = "it") -> Iterator[tuple[str, bool]]:
+    """Yields which observations of a batch are beyond the bounds of their space, as clauses, and
+    whether the space is a Box, by whose bounds nothing is scaled.
+
+    Args:
+        space: of one observation.
+        batch: observations of B lanes.
+        path: the observation's name in clauses.
+    """
+    from gymnasium import spaces
+
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        for key, part in space.items() if isinstance(space, spaces.Dict) else enumerate(space):
+            yield from beyond_bounds(part, batch[key], f"its part {key!r}")
+        return
+    is_box = isinstance(space, spaces.Box)
+    if is_box:
+        low, high = space.low, space.high
+    elif isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        n = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        low, high = space.start, space.start + n - 1
+    elif isinstance(space, spaces.MultiBinary):
+        low, high = 0, 1
+    else:
+        return
+    beyond = (batch < low) | (batch > high)
+    if beyond.any():
+        beyond &= ~(np.isclose(batch, low) | np.isclose(batch, high))  # rounding errors
+    for lane, *place in np.argwhere(beyond)[:1]:
+        yield f"{path} has {batch[(lane, *place)]} in lane {lane}, and the space is {space}", is_box
+
+
 def problem_of_observation(space: Any, value: Any, path: str = "it") -> str | None:
     """Returns why a value is not in a space of Gymnasium's, as a clause, None if it is.
 
-    Numbers beyond the bounds of a Box are left to the environment, and so is their dtype: nothing
-    is scaled by these bounds.
+    Leaves numbers beyond the bounds of a Box to `beyond_bounds`, and lets their dtype be.
     """
     from gymnasium import spaces
 

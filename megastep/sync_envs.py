@@ -17,7 +17,7 @@ import numpy as np
 
 from megastep.env_values import problem_of_error, problem_of_result
 from megastep.global_generators import KINDS, GlobalGenerators
-from megastep.wrapper_state import freeze, load_wrapper_state, wrapper_state
+from megastep.wrapper_state import WrappedEnvs, load_wrapper_state, wrapper_state
 
 if TYPE_CHECKING:
     import gymnasium
@@ -129,7 +129,7 @@ class RewardRecorder:
         return env
 
 
-class SyncEnvs:
+class SyncEnvs(WrappedEnvs):
     """N environments with the interface of Gymnasium's vector environments. The step after an
     episode's end resets it.
 
@@ -168,12 +168,13 @@ class SyncEnvs:
     ):
         from gymnasium.vector.utils import batch_space, create_empty_array
 
-        self.make, self.restart_failed, self.first = make, restart_failed, first
+        self.make, self.restart_failed = make, restart_failed
+        self.first, self.seed = first, seed
         self.generators = [GlobalGenerators([seed, first + i]) for i in range(n_envs)]
         self.kinds = KINDS
         self.envs = [self._make(i) for i in range(n_envs)]
         self.use(names, generators, learnt)
-        self.checks, self.frozen = check, None
+        self.checks = check
         self.n_checked, self.true_returns = np.zeros(n_envs, np.int64), np.zeros(n_envs)
         example = self.envs[0]
         self.metadata, self.render_mode = dict(example.metadata), example.render_mode
@@ -251,25 +252,6 @@ class SyncEnvs:
         """Closes every environment. Raises the first error, once all are closed."""
         close_all(self.envs)
 
-    def wrapper_state(self) -> dict[str, Any]:
-        """Returns what the wrappers of the first environment have learnt, by path."""
-        return wrapper_state(self.envs[0], self.learnt) if self.learnt else {}
-
-    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what others have learnt.
-
-        Args:
-            is_frozen: it stays as it is from now on.
-
-        Raises:
-            ValueError: the environments are not in such wrappers.
-        """
-        for env in self.envs:
-            load_wrapper_state(env, state)
-            if is_frozen:
-                freeze(env)
-        self.frozen = state if is_frozen else None
-
     def _make(self, i) -> "gymnasium.Env":
         with self.generators[i].installed(self.kinds) if self.kinds else contextlib.nullcontext():
             return self.make()
@@ -287,8 +269,7 @@ class SyncEnvs:
         except (TypeError, ValueError) as error:
             if not is_checked or not (problem := problem_of_error(method, error)):
                 raise
-        if self.frozen:
-            load_wrapper_state(env, self.frozen)
+        self._keep_frozen(env)
         if is_checked:
             self.n_checked[i] += 1
             problem = problem or problem_of_result(method, result, env.observation_space)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from megastep import workers
+from megastep import global_generators, workers
 from megastep.env_probe import Probe, probe
 from megastep.sync_envs import EnvError, SyncEnvs
 
@@ -204,6 +204,9 @@ def start_rendering(vector: Any) -> None:
 def _serve(pipe, make, rows) -> None:
     """Answers commands until the pipe is closed, which it is when the other process ends."""
     envs = _attempt(make, n_envs=rows.stop - rows.start, first=rows.start)
+    if not isinstance(envs, Exception):  # for what draws too rarely to be found by a probe
+        seeds = np.random.SeedSequence([envs.seed, envs.first])
+        global_generators.seed_all(int(seeds.generate_state(1)[0]))
     with contextlib.suppress(EOFError, OSError):
         while True:
             command, argument = pipe.recv()

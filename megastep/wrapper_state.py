@@ -1,17 +1,18 @@
-"""What the wrappers around an environment of Gymnasium keep in their attributes, such as running
-statistics: to read it, and to put it into other wrappers of the same classes. Workers import it.
+"""What the wrappers around an environment of Gymnasium or PettingZoo keep in their attributes, such
+as running statistics: to read it, and to put it into other wrappers of the same classes. Workers
+import it.
 """
 
 import collections
 import copy
 import numbers
 import types
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-__all__ = ["freeze", "load_wrapper_state", "wrapper_state"]
+__all__ = ["WrappedEnvs", "freeze", "load_wrapper_state", "wrapper_state"]
 
 #: Attributes of a wrapper that are no state of its own.
 SKIPPED = "env", "metadata", "spec", "_np_random", "recorded_reward"
@@ -89,12 +90,48 @@ def freeze(env: Any) -> None:
             wrapper.update_running_mean = False
 
 
+class WrappedEnvs:
+    """Environments in wrappers that may have learnt something.
+
+    Attributes:
+        envs: the environments, in equal wrappers.
+        learnt: paths of what the wrappers have learnt.
+        frozen: what stays as it is, None if nothing does.
+    """
+
+    envs: Sequence[Any]
+    learnt: Sequence[str] = ()
+    frozen: Mapping[str, Any] | None = None
+
+    def wrapper_state(self) -> dict[str, Any]:
+        """Returns what the wrappers of the first environment have learnt, by path."""
+        return wrapper_state(self.envs[0], self.learnt) if self.learnt else {}
+
+    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
+        """Gives the wrappers of all environments what others have learnt.
+
+        Args:
+            is_frozen: it stays as it is from now on.
+
+        Raises:
+            ValueError: the environments are not in such wrappers.
+        """
+        for env in self.envs:
+            load_wrapper_state(env, state)
+            if is_frozen:
+                freeze(env)
+        self.frozen = state if is_frozen else None
+
+    def _keep_frozen(self, env) -> None:
+        """Called after each step and reset of an environment."""
+        if self.frozen:
+            load_wrapper_state(env, self.frozen)
+
+
 def _wrappers(env) -> Iterator[tuple[str, Any]]:
     """Yields (number and class, wrapper), the outermost first."""
-    import gymnasium
-
     number = 0
-    while isinstance(env, gymnasium.Wrapper):
+    while "env" in getattr(env, "__dict__", ()) and env.unwrapped is not env:
         yield f"{number}.{type(env).__name__}", env
         env, number = env.env, number + 1
 
@@ -131,6 +168,7 @@ def _has_values(value) -> bool:
 
     others = gymnasium.Env, gymnasium.Space, types.ModuleType, type
     is_object = hasattr(value, "__dict__") and not callable(value)
+    is_object = is_object and not hasattr(value, "possible_agents")
     is_gymnasiums = type(value).__module__.startswith("gymnasium.envs")
     return isinstance(value, dict) or (
         is_object and not isinstance(value, others) and not is_gymnasiums

@@ -2,8 +2,11 @@
 
 import functools
 import itertools
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
@@ -47,7 +50,18 @@ def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpo
             f"{settings.label(own.env.name)}; choose a run in the same environment"
         )
     policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    if _of_wrappers(loaded) != _of_wrappers(run):
+        warnings.warn(
+            f"{loaded.path} observes through what the wrappers of {run.path} have learnt, not its "
+            "own",
+            stacklevel=3,
+        )
     return Player(f"{folders.name_of(loaded.path)}, {loaded.step:,} samples", policy, loaded.step)
+
+
+def _of_wrappers(loaded) -> dict:
+    state = (loaded.state or {}).get("wrappers", {})
+    return {name: np.asarray(value).tolist() for name, value in state.items()}
 
 
 def find_player(

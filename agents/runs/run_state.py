@@ -70,7 +70,7 @@ class RunState:
             has_episodes: includes the environment, if it is `resumable`, and the actor state.
         """
         parts = dict(
-            policy=self.policy.state_dict(),
+            **self.of_policy(),
             learner=self.learner.state_dict(),
             episode_stats=self.episode_stats.state_dict(),
         )
@@ -81,11 +81,16 @@ class RunState:
             parts["opponents"] = self.opponents.state_dict()
         if self.curriculum is not None:
             parts["curriculum"] = self.curriculum.state_dict()
-        if wrappers := optional(self.env_state.env, "wrapper_state")():
-            parts["wrappers"] = wrappers
         if self.replay_buffer is not None:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
+
+    def of_policy(self) -> StateDict:
+        """Returns what the policy acts with: its weights, and what wrappers of the environment have
+        learnt, if anything.
+        """
+        wrappers = optional(self.env_state.env, "wrapper_state")()
+        return dict(policy=self.policy.state_dict(), **({"wrappers": wrappers} if wrappers else {}))
 
     def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> list[str]:
         """Restores a `state_dict`.

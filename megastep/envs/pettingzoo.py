@@ -13,11 +13,13 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from megastep.env_probe import play_parallel, probe
 from megastep.env_values import problem_of_result
 from megastep.envs.on_host.env import VectorizedEnv
 from megastep.imports import import_object
 from megastep.settings import checked
 from megastep.sync_envs import CHECKED_STEPS, BadValue, close_all
+from megastep.wrapper_state import WrappedEnvs, wrapper_state
 
 if TYPE_CHECKING:
     import gymnasium
@@ -90,7 +92,7 @@ class PettingZoo(VectorizedEnv):
         super().__init__(id, vector, n_envs, len(vector.agents), seeds, device, check)
 
 
-class ParallelEnvs:
+class ParallelEnvs(WrappedEnvs):
     """N parallel environments as one of Gymnasium's vector environments, with a row per agent.
 
     Args:
@@ -113,7 +115,11 @@ class ParallelEnvs:
         parameters = inspect.signature(make).parameters
         if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             kwargs = {"render_mode": "rgb_array", **kwargs}
-        self.envs = [_parallel(make(**kwargs)) for _ in range(n_envs)]
+
+        def make_one() -> Any:
+            return _parallel(make(**kwargs))
+
+        self.envs = [make_one() for _ in range(n_envs)]
         self.render_mode, env = kwargs.get("render_mode"), self.envs[0]
         self.agents, self.metadata = list(env.possible_agents), env.metadata
         env.reset()
@@ -128,6 +134,8 @@ class ParallelEnvs:
         self.reward, self.present = np.zeros(shape), np.zeros(shape, bool)
         self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
         self.checks, self.n_checked = check, np.zeros(n_envs, np.int64)
+        if wrapper_state(env):
+            self.learnt = probe(make_one, play=play_parallel).learnt
 
     def _common(self, space_of) -> "gymnasium.Space":
         first, *others = self.agents
@@ -191,6 +199,7 @@ class ParallelEnvs:
 
     def _checked(self, e, method, result) -> tuple:
         """Returns the result of `reset` or `step`. Raises BadValue if its form is wrong."""
+        self._keep_frozen(self.envs[e])
         if not self.checks or self.n_checked[e] >= CHECKED_STEPS:
             return result
         self.n_checked[e] += 1

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from megastep import contract
 from megastep.arrdict import arrdict
 
 gymnasium = pytest.importorskip("gymnasium")
 from gymnasium import spaces  # noqa: E402
 
-from megastep.env_values import problem_of_observation  # noqa: E402
+from megastep.env_values import beyond_bounds, problem_of_observation  # noqa: E402
 from megastep.envs import Gymnasium  # noqa: E402
 from megastep.sync_envs import BadValue, SyncEnvs  # noqa: E402
 from tests.helpers.odd_envs import Odd  # noqa: E402
@@ -97,6 +98,44 @@ def test_checks_can_be_left_out():
 def test_observations_outside_their_space(space, value, problem):
     found = problem_of_observation(space, value)
     assert found is None if problem is None else found.startswith(problem)
+
+
+@pytest.mark.parametrize(
+    "space, batch, problem",
+    [
+        (spaces.Box(0, 1, (2,)), [[0, 1], [0.5, 1.00001]], None),  # a rounding error
+        (spaces.Box(0, 1, (2,)), [[0, 1], [0.5, 1.1]], "it has 1.1 in lane 1, and the space is Bo"),
+        (spaces.Box(-np.inf, 1, (1,)), [[np.nan], [-1e30]], None),
+        (spaces.Discrete(3, start=1), [1, 3], None),
+        (spaces.Discrete(3), [0, 3], "it has 3 in lane 1, and the space is Discrete(3)"),
+        (spaces.MultiBinary(2), [[0, 1], [2, 0]], "it has 2 in lane 1"),
+        (spaces.Dict(a=spaces.Discrete(2)), {"a": [2]}, "its part 'a' has 2 in lane 0"),
+    ],
+)
+def test_batches_beyond_bounds(space, batch, problem):
+    arrays = {key: np.array(part) for key, part in batch.items()} if "a" in batch else None
+    found = [*beyond_bounds(space, arrays or np.array(batch))]
+    assert (not found) == (problem is None) and len(found) < 2
+    for text, is_box in found:
+        assert text.startswith(problem) and is_box == isinstance(space, spaces.Box)
+
+
+class Far(Odd):
+    """Observes up to 10, where 5 is the bound."""
+
+    observation_space = spaces.Box(0, 5, (1,))
+
+
+gymnasium.register("Far-v0", Far)
+
+
+def test_numbers_beyond_a_box_are_a_warning():
+    env = Gymnasium(2, id=f"{__name__}:Far-v0", device="cpu")
+    with pytest.warns(
+        UserWarning, match="Far-v0: .*it has 6.0 in lane 0.* It is used as it is"
+    ) as w:
+        worlds = contract.rollout(env, 25)
+    assert len(w) == 1 and worlds[10].obs.tolist() == [[[10.0]], [[10.0]]]
 
 
 def test_actions_that_are_not_finite_are_named():

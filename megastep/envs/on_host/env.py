@@ -16,11 +16,12 @@ from megastep import engine, spaces
 from megastep.arrdict import arrdict
 from megastep.contract import FLAGS, RESERVED
 from megastep.env_state import EnvState
+from megastep.env_values import beyond_bounds
 from megastep.envs.on_host.buffers import HostBuffers
 from megastep.envs.on_host.frames import as_frame
 from megastep.envs.on_host.spaces import RESERVED as RESERVED_KEYS
 from megastep.envs.on_host.spaces import actions, identifiers, observation
-from megastep.sync_envs import BadValue, EnvError
+from megastep.sync_envs import CHECKED_STEPS, BadValue, EnvError
 from megastep.vector_processes import VectorProcesses, start_rendering
 
 __all__ = ["VectorizedEnv"]
@@ -46,7 +47,8 @@ class VectorizedEnv:
         n_agents: lanes per environment, A.
         seeds: passed to the first ``vector.reset``, one per environment or one for all.
         device: where worlds and actions are. Default: a GPU if there is one.
-        check: refuses actions that are not finite.
+        check: refuses actions that are not finite, and in the first `CHECKED_STEPS` observations
+            that are not in their space; warns of those beyond the bounds of a Box.
 
     Raises:
         ValueError: if a space has no conversion, with its name and the cure.
@@ -98,6 +100,7 @@ class VectorizedEnv:
         )
         self._ended = np.ones(n_lanes, bool)
         self._n_restarts = np.zeros(1, np.int64)  # an array, so that checkpoints hold it
+        self._n_to_check = np.full(1, CHECKED_STEPS if check else 0)
 
     def reset(self) -> arrdict:
         """Starts a new episode in every lane. Returns the first world.
@@ -135,6 +138,16 @@ class VectorizedEnv:
                     "observations are not",
                     str(self.id),
                 )
+
+    def _check_observations(self, obs) -> None:
+        """Raises BadValue for those outside their space, and warns once of those beyond a Box."""
+        self._n_to_check -= 1
+        for problem, is_box in beyond_bounds(self.vector.single_observation_space, obs):
+            sentence = f"an observation is not in its space: {problem}"
+            if not is_box:
+                raise BadValue.of(sentence, str(self.id))
+            self._n_to_check[:] = 0
+            warnings.warn(f"{self.id}: {sentence}. It is used as it is", stacklevel=4)
 
     def wrapper_state(self) -> dict[str, Any]:
         """Returns what the wrappers of an environment have learnt, such as running statistics, as
@@ -244,6 +257,8 @@ class VectorizedEnv:
         reset = self._ended.copy()
         terminal = terminated > reset
         truncated = truncated > (reset | terminal)
+        if self._n_to_check[0] > 0:
+            self._check_observations(obs)
         present = news.get("present") if isinstance(news, Mapping) else None
         self._ended[:] = (terminal | truncated) if present is None else ~present
         world = arrdict(
