@@ -94,12 +94,12 @@ class WrappedEnvs:
     """Environments in wrappers that may have learnt something.
 
     Attributes:
-        envs: the environments, in equal wrappers.
+        envs: environments in equal wrappers.
         learnt: paths of what the wrappers have learnt.
         frozen: what stays as it is, None if nothing does.
     """
 
-    envs: Sequence[Any]
+    envs: list[Any]
     learnt: Sequence[str] = ()
     frozen: Mapping[str, Any] | None = None
 

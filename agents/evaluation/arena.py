@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
+import torch
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
@@ -21,8 +21,6 @@ from megastep.agents.selfplay.slots import rotating_slots
 from megastep.types import Env, PolicyLike, optional
 
 if TYPE_CHECKING:
-    import torch
-
     from megastep.arrdict import arrdict
 
 
@@ -61,7 +59,7 @@ def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpo
 
 def _of_wrappers(loaded) -> dict:
     state = (loaded.state or {}).get("wrappers", {})
-    return {name: np.asarray(value).tolist() for name, value in state.items()}
+    return {name: torch.as_tensor(value).tolist() for name, value in state.items()}
 
 
 def find_player(
@@ -105,7 +103,7 @@ class Arena:
         env: settings.Env,
         geometry: settings.Geometry,
         homes: list,
-        device: "torch.device",
+        device: torch.device,
     ):
         self.cfg, self.run, env = cfg, run, settings.changed(env, **FOR_TWO)
         where = dict(seed=cfg.seed, device=device)

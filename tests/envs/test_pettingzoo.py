@@ -3,6 +3,8 @@ not there.
 """
 
 import json
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -212,6 +214,18 @@ class Turns(Relay):
     """As turn-based environments are, which have no parallel `step`."""
 
     agent_iter = None
+
+
+def convertible():
+    env = Turns()
+    env.metadata = {"is_parallelizable": True}
+    return env
+
+
+def test_turns_that_can_be_together_are_converted(monkeypatch):
+    conversions = types.SimpleNamespace(aec_to_parallel=lambda env: Free())
+    monkeypatch.setitem(sys.modules, "pettingzoo.utils.conversions", conversions)
+    contract.rollout(PettingZoo(1, id=f"{__name__}:convertible", device="cpu"), 8)
 
 
 def test_agents_that_differ_or_act_in_turns_are_refused():

@@ -83,8 +83,11 @@ def test_returns_before_wrappers_change_rewards_are_a_metric():
 # ---- In runs ----
 
 SMALL = [
-    *("env=gymnasium", "env.id=Pendulum-v1", "env.n_envs=4", "env.kwargs.max_episode_steps=20"),
-    *("learner.n_steps=16", "learner.n_minibatches=2", "agent.width=8", "device=cpu"),
+    *("env=gymnasium", "env.n_envs=4", "learner.n_steps=16", "learner.n_minibatches=2"),
+    *("agent.width=8", "device=cpu"),
+]
+PENDULUM = [
+    *(*SMALL, "env.id=Pendulum-v1", "env.kwargs.max_episode_steps=20"),
     f"env.wrappers=[{NORMALIZE},gymnasium.wrappers:NormalizeReward]",
 ]
 
@@ -106,7 +109,7 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     """To an evaluation, to another run, to one that resumes without its environments, to a snapshot
     and in the file of an agent.
     """
-    words = [*SMALL, "samples=256", "folder=run", "env.vectorization=async", "snapshots=1"]
+    words = [*PENDULUM, "samples=256", "folder=run", "env.vectorization=async", "snapshots=1"]
     assert train.main(words) == 0
     saved = checkpoint.load_latest("run/checkpoints")
     learnt = saved.state["wrappers"]
@@ -114,7 +117,7 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     assert count == pytest.approx(64 + 1, abs=5) and not loads
     assert is_same(checkpoint.load_latest("run/snapshots").state["wrappers"], learnt)
     assert evaluate.main(["run=run", "episodes=3"]) == 0
-    assert train.main(["init=run", *SMALL, "samples=128", "folder=next"]) == 0
+    assert train.main(["init=run", *PENDULUM, "samples=128", "folder=next"]) == 0
     assert train.main(["resume=run", "more_samples=128"]) == 0
     states, frozen = zip(*loads, strict=True)
     assert frozen == (True, False, False)
@@ -154,3 +157,11 @@ def test_environments_draw_the_same_from_global_generators_in_any_process():
     assert torch.equal(first, again) and torch.equal(first, in_processes)
     assert len(first.unique()) == first.numel() and not torch.equal(first, numbers(seed=2))
     assert np.random.get_state()[1].tolist() == state
+
+
+def test_runs_that_draw_from_global_generators_have_the_same_file(here):
+    words = [*SMALL, f"env.id={HELPERS}:Draws-v0", "samples=256", "log_every=1"]
+    for name in ("sync", "async"):
+        assert train.main([*words, f"env.vectorization={name}", f"folder={name}"]) == 0
+    files = [(here / name / "metrics.jsonl").read_bytes() for name in ("sync", "async")]
+    assert files[0] == files[1]

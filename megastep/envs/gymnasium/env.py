@@ -61,9 +61,9 @@ class Gymnasium(VectorizedEnv):
         seed: each environment is reset with a seed of its own, which derives from this one.
         films: renders images from the start, if it can. Some environments make their renderer in
             the constructor, and some step more slowly with it.
-        check: refuses observations that are not in their space, results of another form than
-            Gymnasium's, and actions that are not finite. Looks at the first steps of each
-            environment.
+        check: refuses, in the first steps of each environment, observations that are not in their
+            space and results of another form than Gymnasium's, and at any time actions that are
+            not finite. Numbers beyond the bounds of a Box are a warning.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
 
