@@ -90,7 +90,7 @@ def first_episodes(
     greedy: bool = False,
     max_steps: int | None = None,
 ) -> arrdict:
-    """Plays the first episode of each lane.
+    """Plays the first episode of each lane that learns, or of all lanes if none does.
 
     Args:
         seed: of the action sampling.
@@ -102,7 +102,7 @@ def first_episodes(
         An arrdict on the environment's device:
 
         - returns, lengths: (B,) float32; lengths in steps
-        - done: (B,) bool, true if the episode ended
+        - done: (B,) bool, true if the episode ended, or is not played
         - learns: (B,) bool, from the first world; all true if worlds have no `learns`
         - metrics: name -> (B,) float32, from the last world of the episode; nan if unfinished
         - envs: (B,) int64, the lane's environment
