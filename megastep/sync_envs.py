@@ -6,32 +6,39 @@ environment anew.
 
 import contextlib
 import copy
+import functools
 import itertools
 import numbers
-import random
-import sys
-import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from megastep.env_values import problem_of_error, problem_of_result
+from megastep.global_generators import KINDS, GlobalGenerators
+from megastep.wrapper_state import WrappedEnvs, load_wrapper_state, wrapper_state
 
 if TYPE_CHECKING:
     import gymnasium
     from gymnasium.envs.registration import EnvSpec
 
 __all__ = [
+    "TRUE_RETURN",
+    "BadValue",
     "EnvError",
+    "RewardRecorder",
     "SyncEnvs",
     "close_all",
     "make_env",
-    "names_of_numbers",
+    "numbers_of",
     "one_line",
 ]
 
-#: Steps and seconds of the episode that tells which numbers the last ``info`` has.
-PROBE_STEPS, PROBE_SECONDS = 1000, 5.0
+#: Name of the sum of an episode's rewards before wrappers change them.
+TRUE_RETURN = "true_return"
+#: Steps of each environment in which the form of its values is checked.
+CHECKED_STEPS = 100
 
 
 class EnvError(RuntimeError):
@@ -57,6 +64,8 @@ class EnvError(RuntimeError):
             place: what failed, such as `environment 3`.
         """
         frames = error.__traceback__ and error.__traceback__.tb_next  # without the caller's
+        while frames and frames.tb_frame.f_code.co_filename == __file__:
+            frames = frames.tb_next
         trace = "".join(traceback.format_exception(type(error), error, frames))
         return cls(f"{place} failed: {one_line(error)}", trace)
 
@@ -74,12 +83,53 @@ def make_env(
     import gymnasium
 
     env = gymnasium.make(spec, **settings)
+    if wrappers:
+        env = RewardRecorder.around(env)
     for wrapper in wrappers:
         env = wrapper(env)
     return env
 
 
-class SyncEnvs:
+class BadValue(EnvError):
+    """An environment gave what its spaces or Gymnasium's interface do not allow."""
+
+    @classmethod
+    def of(cls, problem: str, place: str) -> "BadValue":
+        return cls(f"{place}: {problem}. To leave it as it is, use env.check=false")
+
+
+class RewardRecorder:
+    """Keeps the last reward of an environment, which wrappers around it may change."""
+
+    recorded_reward = 0.0
+
+    @staticmethod
+    @functools.cache
+    def _wrapper() -> type:
+        import gymnasium
+
+        class Recorder(gymnasium.Wrapper, RewardRecorder):
+            def step(self, action) -> tuple:
+                result = super().step(action)
+                self.recorded_reward = result[1]
+                return result
+
+        return Recorder
+
+    @classmethod
+    def around(cls, env: Any) -> Any:
+        """Returns a wrapper around an environment that keeps its last `recorded_reward`."""
+        return cls._wrapper()(env)
+
+    @classmethod
+    def inside(cls, env: Any) -> Any:
+        """Returns the wrapper of `around` in other wrappers, None if there is none."""
+        while env is not None and not isinstance(env, cls):
+            env = vars(env).get("env")
+        return env
+
+
+class SyncEnvs(WrappedEnvs):
     """N environments with the interface of Gymnasium's vector environments. The step after an
     episode's end resets it.
 
@@ -89,7 +139,11 @@ class SyncEnvs:
         restart_failed: how often each environment is made anew after an error. Its episode ends
             as truncated at its last observation, and the next one gets a seed of its own.
         names: keys of `info` whose numbers are returned at the end of an episode.
-        first: number of the first environment, for messages.
+        first: number of the first environment.
+        seed: of the global generators that each environment finds.
+        generators: kinds of global generators that the environments draw from.
+        learnt: paths of what their wrappers have learnt.
+        check: checks the form of what the environments return in their first `CHECKED_STEPS`.
 
     Attributes:
         restarts: (N,) int64, how often each was made anew.
@@ -107,12 +161,21 @@ class SyncEnvs:
         restart_failed: int = 0,
         names: Sequence[str] = (),
         first: int = 0,
+        seed: int = 0,
+        generators: Collection[str] = KINDS,
+        learnt: Collection[str] = (),
+        check: bool = True,
     ):
         from gymnasium.vector.utils import batch_space, create_empty_array
 
-        self.make, self.restart_failed, self.first = make, restart_failed, first
-        self.names = tuple(names)
-        self.envs = [make() for _ in range(n_envs)]
+        self.make, self.restart_failed = make, restart_failed
+        self.first, self.seed = first, seed
+        self.generators = [GlobalGenerators([seed, first + i]) for i in range(n_envs)]
+        self.kinds = KINDS
+        self.envs = [self._make(i) for i in range(n_envs)]
+        self.use(names, generators, learnt)
+        self.checks = check
+        self.n_checked, self.true_returns = np.zeros(n_envs, np.int64), np.zeros(n_envs)
         example = self.envs[0]
         self.metadata, self.render_mode = dict(example.metadata), example.render_mode
         self.single_observation_space = example.observation_space
@@ -128,6 +191,15 @@ class SyncEnvs:
         self.restarts, self.seeds = np.zeros(n_envs, np.int64), np.zeros(n_envs, np.int64)
         self.is_new = np.zeros(n_envs, bool)  # made anew, and not seeded yet
         self._failures = []
+
+    def use(self, names: Sequence[str], kinds: Collection[str], learnt: Collection[str]) -> None:
+        """Sets what a `Probe` has told, see above."""
+        self.names, self.learnt, self.kinds = tuple(names), tuple(learnt), tuple(kinds)
+        for generators in self.generators:
+            generators.drop({*KINDS} - {*kinds})  # which checkpoints need not hold
+        self.recorders = (
+            [*map(RewardRecorder.inside, self.envs)] if TRUE_RETURN in self.names else []
+        )
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Any, dict]:
         """Resets every environment. Returns (observations, news), see `step`."""
@@ -154,7 +226,10 @@ class SyncEnvs:
                 self.rewards[i], self.terminated[i], self.truncated[i] = 0.0, False, False
                 continue
             try:
-                obs, reward, terminated, truncated, info = self.envs[i].step(action)
+                result = self._call(i, "step", action)
+                obs, reward, terminated, truncated, info = result
+                if self.recorders:
+                    self.true_returns[i] += self.recorders[i].recorded_reward
             except Exception as error:
                 self._begin_anew(i, error)
                 obs, reward, terminated, truncated, info = self._last(i), 0.0, False, True, {}
@@ -162,7 +237,8 @@ class SyncEnvs:
             self.rewards[i], self.terminated[i], self.truncated[i] = reward, terminated, truncated
             if self.names and (terminated or truncated):
                 numbers = numbers or {name: np.full(len(self.envs), np.nan) for name in self.names}
-                for name, value in numbers_of(info).items():
+                own = {TRUE_RETURN: self.true_returns[i]} if self.recorders else {}
+                for name, value in (numbers_of(info) | own).items():
                     if name in numbers:
                         numbers[name][i] = value
         flags = self.terminated.copy(), self.truncated.copy()
@@ -175,6 +251,31 @@ class SyncEnvs:
     def close(self) -> None:
         """Closes every environment. Raises the first error, once all are closed."""
         close_all(self.envs)
+
+    def _make(self, i) -> "gymnasium.Env":
+        with self.generators[i].installed(self.kinds) if self.kinds else contextlib.nullcontext():
+            return self.make()
+
+    def _call(self, i, method, *arguments, **more) -> Any:
+        """Calls a method of an environment, which draws from global generators of its own."""
+        env, problem = self.envs[i], None
+        is_checked = self.checks and self.n_checked[i] < CHECKED_STEPS
+        try:
+            if self.kinds:
+                with self.generators[i].installed(self.kinds):
+                    result = getattr(env, method)(*arguments, **more)
+            else:
+                result = getattr(env, method)(*arguments, **more)
+        except (TypeError, ValueError) as error:
+            if not is_checked or not (problem := problem_of_error(method, error)):
+                raise
+        self._keep_frozen(env)
+        if is_checked:
+            self.n_checked[i] += 1
+            problem = problem or problem_of_result(method, result, env.observation_space)
+            if problem:
+                raise BadValue.of(problem, f"environment {self.first + i}")
+        return result
 
     def _observations(self, latest) -> object:
         from gymnasium.vector.utils import concatenate
@@ -200,25 +301,31 @@ class SyncEnvs:
                 number = [int(self.seeds[i]), int(self.restarts[i])]
                 seed = int(np.random.SeedSequence(number).generate_state(1)[0])
             try:
-                obs, _ = self.envs[i].reset(**{} if seed is None else {"seed": seed})
+                obs, _ = self._call(i, "reset", **{} if seed is None else {"seed": seed})
             except Exception as error:
                 self._begin_anew(i, error)
             else:
-                self.is_new[i] = False
+                self.is_new[i], self.true_returns[i] = False, 0.0
                 return obs
 
     def _begin_anew(self, i, error) -> None:
         """Makes an environment again after an error. Raises EnvError if it had all its restarts."""
+        if isinstance(error, BadValue):
+            raise error
         failure = EnvError.of(error, f"environment {self.first + i}")
         if self.restarts[i] >= self.restart_failed or isinstance(error, MemoryError):
             raise error if isinstance(error, MemoryError) else failure from error
         self.restarts[i] += 1
+        learnt = wrapper_state(self.envs[i], self.learnt) if self.learnt else {}
         with contextlib.suppress(Exception):
             self.envs[i].close()
         try:
-            self.envs[i] = self.make()
+            self.envs[i] = self._make(i)
+            load_wrapper_state(self.envs[i], learnt)
         except Exception as again:
             raise EnvError.of(again, f"environment {self.first + i}") from again
+        if self.recorders:
+            self.recorders[i] = RewardRecorder.inside(self.envs[i])
         self._failures.append(failure)
         self.is_new[i] = True
 
@@ -250,38 +357,3 @@ def numbers_of(info: object) -> dict[str, float]:
             with contextlib.suppress(OverflowError):
                 values[key] = float(value)
     return values
-
-
-def names_of_numbers(env: "gymnasium.Env", seed: int = 0) -> list[str]:
-    """Plays an episode with random actions, of at most `PROBE_STEPS` and `PROBE_SECONDS`. Returns
-    the keys of the numbers in its last `info`, `is_success` first. Closes the environment.
-
-    An error ends it: the same one comes in training, which tells of it.
-    """
-    names, end = [], time.monotonic() + PROBE_SECONDS
-    with _global_generators_kept(), contextlib.suppress(Exception):
-        actions = copy.deepcopy(env.action_space)  # which may be that of a class
-        actions.seed(seed)
-        env.reset(seed=seed)
-        for _ in range(PROBE_STEPS):
-            *_, terminated, truncated, info = env.step(actions.sample())
-            names = sorted(numbers_of(info), key=lambda name: name != "is_success")
-            if terminated or truncated or time.monotonic() > end:
-                break
-    with contextlib.suppress(Exception):
-        env.close()
-    return names
-
-
-@contextlib.contextmanager
-def _global_generators_kept() -> Iterator[None]:
-    """What is drawn inside leaves the generators of Python, NumPy and PyTorch as they were."""
-    torch, states = sys.modules.get("torch"), (random.getstate(), np.random.get_state())
-    of_torch = torch and torch.get_rng_state()
-    try:
-        yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])
-        if torch:
-            torch.set_rng_state(of_torch)

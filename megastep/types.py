@@ -80,6 +80,10 @@ class Env(Protocol):
         close(): ends what it started, such as processes. Called after training. Default: none.
         pop_restarts(): returns how many environments were made anew after an error since the last
             call, which reports have as ``episode/restarts``. Default: None, none ever is.
+        wrapper_state(), load_wrapper_state(state, is_frozen): what wrappers around the environments
+            have learnt, such as running statistics, as tensors and numbers by name. It belongs to
+            the policy: evaluations give it to their environments and freeze it, and `init` gives
+            it to those of the next run. Default: none.
         max_episode_steps: steps at which an evaluation cuts an episode off. Default: 100,000.
         desync(): gives every lane a random age, as if its episode had been going on for some steps.
             Training calls it after ``reset``, so that lanes do not end their episodes in the same
@@ -109,6 +113,8 @@ DEFAULTS: dict[str, Any] = {
     "resumable": True,
     "close": lambda: None,
     "pop_restarts": lambda: None,
+    "wrapper_state": dict,
+    "load_wrapper_state": None,
     "max_episode_steps": 100_000,
     "check": lambda: None,
     "layout": None,

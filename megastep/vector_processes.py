@@ -10,13 +10,14 @@ import signal
 import sys
 import time
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from megastep import workers
-from megastep.sync_envs import EnvError, SyncEnvs, names_of_numbers
+from megastep import global_generators, workers
+from megastep.env_probe import Probe, probe
+from megastep.sync_envs import EnvError, SyncEnvs
 
 __all__ = ["VectorProcesses", "start_rendering"]
 
@@ -74,10 +75,11 @@ class VectorProcesses:
                 far_end.close()
                 self.pipes.append(pipe)
                 self.processes.append(process)
-        self.pipes[0].send(("try", None))
-        names = self._receive(0)
-        self.names = () if isinstance(names, Exception) else names
-        self._ask("name", [self.names for _ in self.pipes])
+        self.pipes[0].send(("probe", None))
+        found = self._receive(0)
+        found = Probe() if isinstance(found, Exception) else found
+        self.names, self.learnt, self.latest_state = found.names, found.learnt, {}
+        self._ask("use", [found for _ in self.pipes])
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Any, dict]:
         """Resets every environment. Returns (observations, news), see `step`."""
@@ -99,6 +101,22 @@ class VectorProcesses:
     def render(self) -> list:
         """Returns a frame of every environment."""
         return [frame for frames in self._ask("render", self.rows) for frame in frames]
+
+    def wrapper_state(self) -> dict[str, Any]:
+        """Returns what the wrappers of the first environment have learnt, by path; of a process
+        that has ended, what it was at the last call.
+        """
+        if self.learnt:
+            with contextlib.suppress(OSError, EnvError, MemoryError):
+                self.pipes[0].send(("wrapper_state", None))
+                answer = self._receive(0)
+                if not isinstance(answer, Exception):
+                    self.latest_state = answer
+        return self.latest_state
+
+    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
+        """As :meth:`SyncEnvs.load_wrapper_state`."""
+        self._ask("load_wrapper_state", [(state, is_frozen) for _ in self.pipes])
 
     def close(self) -> None:
         """Closes the environments and ends their processes, by force after `PATIENCE` seconds.
@@ -186,6 +204,9 @@ def start_rendering(vector: Any) -> None:
 def _serve(pipe, make, rows) -> None:
     """Answers commands until the pipe is closed, which it is when the other process ends."""
     envs = _attempt(make, n_envs=rows.stop - rows.start, first=rows.start)
+    if not isinstance(envs, Exception):  # for what draws too rarely to be found by a probe
+        seeds = np.random.SeedSequence([envs.seed, envs.first])
+        global_generators.seed_all(int(seeds.generate_state(1)[0]))
     with contextlib.suppress(EOFError, OSError):
         while True:
             command, argument = pipe.recv()
@@ -205,11 +226,14 @@ def _answer(envs, command, argument) -> object:
         return envs.reset(seed=argument)
     if command == "step":
         return envs.step(argument)
-    if command == "try":
-        return names_of_numbers(envs.make())
-    if command == "name":
-        envs.names = argument
-        return None
+    if command == "probe":
+        return probe(envs.make)
+    if command == "use":
+        return envs.use(*argument)
+    if command == "wrapper_state":
+        return envs.wrapper_state()
+    if command == "load_wrapper_state":
+        return envs.load_wrapper_state(*argument)
     if command == "close":
         return envs.close()
     start_rendering(envs)

@@ -184,7 +184,8 @@ def export(
     temporary = file.with_name(f"{name}-new{agent_file.SUFFIX}")
     with user_errors(f"{folder} cannot be written: "):
         folder.mkdir(parents=True, exist_ok=True)
-        agent_file.write(temporary, state, config, facts, tables)
+        learnt = loaded.state.get("wrappers")
+        agent_file.write(temporary, state, config, facts, tables, learnt)
     try:
         check_file(temporary, state)
         temporary.replace(file)

@@ -16,6 +16,7 @@ SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
+    ("env_values", "global_generators", "wrapper_state"),
     (
         "cache",
         "colour",
@@ -27,6 +28,7 @@ SIMULATOR = (
         "video",
         "workers",
     ),
+    ("env_probe",),
     ("arrdict", "geometry", "imports", "kernels", "plotting", "ragged", "vector_processes"),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "env_state", "geometries", "scene"),
@@ -121,9 +123,11 @@ OUTSIDE_USERS = {
     "gymnasium": (
         "megastep/envs/gymnasium/*.py",
         "megastep/envs/on_host/*.py",
+        "megastep/env_values.py",
         "megastep/envs/pettingzoo.py",
         "megastep/sync_envs.py",
         "megastep/vector_processes.py",
+        "megastep/wrapper_state.py",
     ),
     "hydra": ("agents/cli/*.py",),
     "hydra_plugins": ("agents/cli/*.py",),

@@ -2,8 +2,11 @@
 
 import functools
 import itertools
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import torch
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
@@ -18,8 +21,6 @@ from megastep.agents.selfplay.slots import rotating_slots
 from megastep.types import Env, PolicyLike, optional
 
 if TYPE_CHECKING:
-    import torch
-
     from megastep.arrdict import arrdict
 
 
@@ -47,7 +48,18 @@ def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpo
             f"{settings.label(own.env.name)}; choose a run in the same environment"
         )
     policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    if _of_wrappers(loaded) != _of_wrappers(run):
+        warnings.warn(
+            f"{loaded.path} observes through what the wrappers of {run.path} have learnt, not its "
+            "own",
+            stacklevel=3,
+        )
     return Player(f"{folders.name_of(loaded.path)}, {loaded.step:,} samples", policy, loaded.step)
+
+
+def _of_wrappers(loaded) -> dict:
+    state = (loaded.state or {}).get("wrappers", {})
+    return {name: torch.as_tensor(value).tolist() for name, value in state.items()}
 
 
 def find_player(
@@ -95,7 +107,7 @@ class Arena:
         env: settings.Env,
         geometry: settings.Geometry,
         homes: list,
-        device: "torch.device",
+        device: torch.device,
     ):
         self.cfg, self.run, env = cfg, run, settings.changed(env, **FOR_TWO)
         where = dict(seed=cfg.seed, device=device)
@@ -112,6 +124,7 @@ class Arena:
         env = settings.changed(env, n_envs=len(self.shard.envs))
         where |= dict(geometries=[homes[home] for home in self.shard.homes], seed=self.seed)
         self.env, self.sample = factory.construct(env, **where), sample
+        factory.load_wrappers(self.env, run)
         self.others = [
             player._replace(policy=factory.in_env(player.policy, env, self.env))
             for player in self.others

@@ -127,6 +127,7 @@ def players_of(
     """Returns who plays, the run's agent and each of `cfg.baseline`, and whether it is greedy."""
     policy = factory.make_policy(factory.config_of(loaded).agent, stage.env)
     policy = factory.load_weights(policy, stage.env, loaded)
+    factory.load_wrappers(stage.env, loaded)
     players = [(arena.Player("trained, greedy" if cfg.greedy else "trained", policy), cfg.greedy)]
     for name in cfg.baseline:
         player = arena.find_player(name, loaded, stage.settings, stage.sample, cfg.trust)

@@ -90,7 +90,7 @@ def first_episodes(
     greedy: bool = False,
     max_steps: int | None = None,
 ) -> arrdict:
-    """Plays the first episode of each lane.
+    """Plays the first episode of each lane that learns, or of all lanes if none does.
 
     Args:
         seed: of the action sampling.
@@ -102,7 +102,8 @@ def first_episodes(
         An arrdict on the environment's device:
 
         - returns, lengths: (B,) float32; lengths in steps
-        - done, terminal: (B,) bool, true if the episode ended, and if it was not truncated
+        - done, terminal: (B,) bool, true if the episode ended or is not played, and if it was not
+          truncated
         - starts: (B, 3) float32, where each agent was put: x and y in metres, degrees; only of
           environments with a `core`
         - learns: (B,) bool, from the first world; all true if worlds have no `learns`
@@ -122,6 +123,8 @@ def first_episodes(
     returns, lengths = (torch.zeros(n_lanes(env), device=device) for _ in range(2))
     done, terminal = torch.zeros(2, n_lanes(env), dtype=torch.bool, device=device)
     learns = torch.ones_like(done) if "learns" not in world else world["learns"].clone()
+    if learns.any():  # the others are not counted, and may be of agents that are not there
+        done |= ~learns
     metrics = arrdict(
         {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}
     )

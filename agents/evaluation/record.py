@@ -44,6 +44,7 @@ def run(cfg: settings.Record) -> Path:
     policy: PolicyLike = random
     if cfg.run:
         policy = arena.load_player(loaded, env, loaded).policy
+        factory.load_wrappers(env, loaded)
     if cfg.against is not None:
         arena.check_duels(env)
         opponent = arena.find_player(cfg.against, loaded, env_settings, env, cfg.trust)

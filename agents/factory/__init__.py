@@ -20,6 +20,7 @@ _FUNCTIONS = (
     "in_env",
     "layout_sources",
     "load_weights",
+    "load_wrappers",
     "make_bot",
     "make_curriculum",
     "make_device",

@@ -11,7 +11,7 @@ from megastep import engine
 from megastep.agents.errors import EnvFailed, UserError, memory_problem
 from megastep.agents.factory.settings import Env
 from megastep.imports import import_object
-from megastep.sync_envs import EnvError, one_line
+from megastep.sync_envs import BadValue, EnvError, one_line
 
 #: Has the traceback, in the run's folder.
 FILE = "env_error.txt"
@@ -43,7 +43,8 @@ def told(
         if failure.trace:
             name = f"rank_{rank}_{FILE}" if rank else FILE
             text.append(f"Its traceback is in {_write(folder, name, failure.trace)}")
-        if getattr(env, "restart_failed", None) == 0 and not is_told:
+        may_pass = not isinstance(failure, BadValue)
+        if getattr(env, "restart_failed", None) == 0 and may_pass and not is_told:
             text.append("env.restart_failed=3 would make it anew up to 3 times")
         raise EnvFailed(". ".join(filter(None, [*text, saved()]))) from error
 

@@ -393,6 +393,23 @@ def load_weights(policy: Policy, env: types.Env, loaded: checkpoint.Checkpoint) 
     return policy
 
 
+def load_wrappers(env: Env, loaded: checkpoint.Checkpoint, is_frozen: bool = True) -> None:
+    """Gives the wrappers of an environment what those of a checkpoint's have learnt.
+
+    Args:
+        is_frozen: it stays as it is from now on.
+
+    Raises:
+        UserError: the environment is not in the same wrappers.
+    """
+    if state := (loaded.state or {}).get("wrappers"):
+        load = optional(env, "load_wrapper_state")
+        with errors(f"{loaded.path} cannot be used here: "):
+            if load is None:
+                raise ValueError(f"{type(env).__name__} has no load_wrapper_state")
+            load(state, is_frozen)
+
+
 def check_weights(weights: Any, own: Mapping[str, torch.Tensor]) -> None:
     """Raises ValueError for what are no weights: other numbers than a policy's own are, which would
     be converted without a word, and NaN and infinity.

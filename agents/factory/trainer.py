@@ -80,6 +80,8 @@ def make_trainer(
         path = folders.find(start)
         loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
+        if cfg.init:
+            factory.load_wrappers(env, loaded, is_frozen=False)
         if cfg.resume:
             state = loaded.state or {}
             with state_errors(loaded.path):

@@ -2,7 +2,6 @@
 
     from megastep import geometries
     from megastep.agents import pretrained
-from megastep.agents.errors import UserError
 
     env = pretrained.make_env("pointgoal_anywhere", geometries.sample("maze", 16), n_envs=16)
     policy = pretrained.load("pointgoal_anywhere")
@@ -65,7 +64,8 @@ def make_env(
     device: str = "auto",
     **changes: Any,
 ) -> Any:
-    """Returns an environment with the settings that an agent was trained with.
+    """Returns an environment with the settings that an agent was trained with, and with what
+    wrappers had learnt then.
 
     Args:
         name: as for `load`.
@@ -80,11 +80,14 @@ def make_env(
         UserError: as `load`; or the environment has no such setting, or refuses its value.
     """
     device = factory.make_device(device)
-    trained = factory.config_of(folders.load_checkpoint(folders.find(name), False)).env
+    loaded = folders.load_checkpoint(folders.find(name), False, device)
+    trained = factory.config_of(loaded).env
     if unknown := [key for key in changes if not hasattr(trained, key)]:
         raise UserError(
             f"{settings.env_name(trained)} has no setting {unknown[0]}; it has "
             f"{', '.join(key for key in vars(trained) if key != 'name')}"
         )
     env = settings.changed(trained, n_envs=n_envs, **changes)
-    return factory.construct(env, geometries=[*geometries], seed=seed, device=device)
+    made = factory.construct(env, geometries=[*geometries], seed=seed, device=device)
+    factory.load_wrappers(made, loaded)
+    return made

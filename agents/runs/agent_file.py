@@ -7,6 +7,7 @@ maps names to strings:
     config    config.json of a checkpoint
     facts     how the agent was trained, such as samples, seconds, command and commit; JSON
     tables    its evaluations: a list of {title, command, rows}; JSON
+    wrappers  what wrappers around its environment have learnt, if anything; JSON
     sha256    hash of the whole file, with zeros in place of these 64 digits
 
 Weights are float16, statistics float32. Without a device, reading does not import PyTorch. In files
@@ -55,6 +56,7 @@ def write(
     config: Config,
     facts: Mapping[str, object],
     tables: Sequence[Row] = (),
+    wrappers: Mapping[str, object] | None = None,
 ) -> None:
     """Writes an agent file atomically.
 
@@ -64,6 +66,7 @@ def write(
         config: configuration as in a checkpoint.
         facts: plain values by name, among them `samples`.
         tables: evaluations.
+        wrappers: of the environment, what they have learnt, by path: tensors and numbers.
 
     Raises:
         ValueError: a dtype is not in `DTYPES`.
@@ -77,8 +80,13 @@ def write(
             allowed = ", ".join(DTYPES.values())
             raise ValueError(f"{name} is {array.dtype}, but agent files hold {allowed}")
     metadata = {"format": FORMAT, "sha256": "0" * 64}
-    for name, value in (("config", config), ("facts", dict(facts)), ("tables", [*tables])):
-        metadata[name] = typed_json.dumps(value)
+    texts = dict(config=config, facts=dict(facts), tables=[*tables])
+    if wrappers:
+        texts["wrappers"] = {
+            path: getattr(value, "tolist", lambda value=value: value)()
+            for path, value in wrappers.items()
+        }
+    metadata |= {name: typed_json.dumps(value) for name, value in texts.items()}
     write_atomically(path, sealed(save(arrays, metadata)))
 
 
@@ -115,14 +123,16 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
         numbers={},
         config=metadata["config"],
         made_with={},
-        state=None if device is None else {"policy": _tensors(entries, device)},
+        state=None
+        if device is None
+        else {"policy": _tensors(entries, device), "wrappers": metadata["wrappers"]},
         untrusted=metadata["untrusted"],
     )
 
 
 def read_metadata(path: Path) -> Row:
-    """Returns `config`, `facts` and `tables` of an agent file, and `untrusted`: the import paths
-    outside megastep in its configuration.
+    """Returns `config`, `facts`, `tables` and `wrappers` of an agent file, and `untrusted`: the
+    import paths outside megastep in its configuration.
 
     Raises:
         CheckpointError: as `read`.
@@ -151,7 +161,8 @@ def _read(path) -> tuple[Row, Row]:
                 raise ValueError("its bytes do not match their SHA-256")
             if any(entry["dtype"] not in DTYPES for entry in entries.values()):
                 raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
-            names = "config", "facts", "tables"
+            texts = {"wrappers": "{}", **texts}
+            names = "config", "facts", "tables", "wrappers"
             metadata = {name: typed_json.loads(texts[name]) for name in names}
             formats.check(formats.Facts, metadata["facts"])
             formats.check(formats.Tables, metadata["tables"])

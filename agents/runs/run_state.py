@@ -70,7 +70,7 @@ class RunState:
             has_episodes: includes the environment, if it is `resumable`, and the actor state.
         """
         parts = dict(
-            policy=self.policy.state_dict(),
+            **self.of_policy(),
             learner=self.learner.state_dict(),
             episode_stats=self.episode_stats.state_dict(),
         )
@@ -84,6 +84,13 @@ class RunState:
         if self.replay_buffer is not None:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
+
+    def of_policy(self) -> StateDict:
+        """Returns what the policy acts with: its weights, and what wrappers of the environment have
+        learnt, if anything.
+        """
+        wrappers = optional(self.env_state.env, "wrapper_state")()
+        return dict(policy=self.policy.state_dict(), **({"wrappers": wrappers} if wrappers else {}))
 
     def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> list[str]:
         """Restores a `state_dict`.
@@ -137,6 +144,8 @@ class RunState:
                 self.env_state.load_state_dict(state["env"])
             except ValueError as error:
                 lost.append(f"{error}; new episodes start")
+        if lost and "wrappers" in state:
+            optional(self.env_state.env, "load_wrapper_state")(state["wrappers"], False)
         if lost:  # unfinished episodes are lost
             state["episode_stats"] = {
                 name: state["episode_stats"][name] for name in ("sums", "windows")

@@ -241,7 +241,7 @@ def _nbytes(state) -> int:
 
 
 class SnapshotSaver:
-    """Saves the policy's weights at the end of each of `n` equal parts of the budget.
+    """Saves what the policy acts with at the end of each of `n` equal parts of the budget.
 
     `evaluate.py ratings=true` compares these snapshots. :class:`Trainer` calls it once per update.
 
@@ -257,6 +257,6 @@ class SnapshotSaver:
     def __call__(self, trainer: Trainer) -> None:
         n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
         if self.n_parts_done is not None and n_parts_done > self.n_parts_done:
-            self.saver(trainer.samples, {"policy": trainer.policy.state_dict()})
+            self.saver(trainer.samples, trainer.run_state.of_policy())
             self.saver.wait()
         self.n_parts_done = n_parts_done

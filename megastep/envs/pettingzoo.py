@@ -3,6 +3,8 @@
 They step on the CPU, one after the other, even if the learner is on a GPU. B = N A lanes.
 """
 
+import copy
+import importlib
 import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,9 +13,13 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from megastep.env_probe import play_parallel, probe
+from megastep.env_values import problem_of_result
 from megastep.envs.on_host.env import VectorizedEnv
 from megastep.imports import import_object
 from megastep.settings import checked
+from megastep.sync_envs import CHECKED_STEPS, BadValue, close_all
+from megastep.wrapper_state import WrappedEnvs, wrapper_state
 
 if TYPE_CHECKING:
     import gymnasium
@@ -27,18 +33,19 @@ class PettingZoo(VectorizedEnv):
     """Any parallel environment of PettingZoo whose agents have the same spaces.
 
     Observation:
-        As that of :class:`~megastep.envs.gymnasium.Gymnasium`, for each agent. An agent that is out
-        before the others keeps its last observation.
+        As that of :class:`~megastep.envs.gymnasium.Gymnasium`, for each agent. That of an agent
+        that is not there is its last one.
 
     Actions:
         As those of Gymnasium, for each agent.
 
     Reward:
-        The environment's own. 0 for an agent that is out.
+        The environment's own. 0 for an agent that is not there.
 
     Episode end:
-        When all agents are out: terminal for those that the environment terminated, truncated for
-        the others.
+        Each agent's own: terminal if the environment terminated it, else truncated. The environment
+        is reset when no agent is left. Until then the lane of one that is out, or that the reset
+        left out, begins anew in each step and does not learn.
 
     Metrics:
         None.
@@ -49,6 +56,7 @@ class PettingZoo(VectorizedEnv):
             ``pettingzoo.sisl.multiwalker_v9:parallel_env``.
         kwargs: arguments of that function.
         seed: each environment is reset with a seed of its own, which derives from this one.
+        check: as for Gymnasium.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
 
@@ -60,6 +68,7 @@ class PettingZoo(VectorizedEnv):
         id: str | None = None,
         kwargs: dict[str, Any] | None = None,
         seed: int = 1,
+        check: bool = True,
         device: torch.device | str | None = None,
     ):
         if id is None:
@@ -73,48 +82,60 @@ class PettingZoo(VectorizedEnv):
             raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
         make = import_object(id)
         try:
-            vector = ParallelEnvs(make, n_envs, kwargs or {})
+            vector = ParallelEnvs(make, n_envs, kwargs or {}, check)
         except Exception as error:  # whatever another's constructor raises
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
             line = (str(error).splitlines() or [""])[0]
             cause = f" with env.kwargs={kwargs}" if kwargs else ""
             raise ValueError(f"{id} cannot be made{cause}: {kind}{line}") from error
         seeds = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
-        super().__init__(id, vector, n_envs, len(vector.agents), seeds, device)
+        super().__init__(id, vector, n_envs, len(vector.agents), seeds, device, check)
 
 
-class ParallelEnvs:
+class ParallelEnvs(WrappedEnvs):
     """N parallel environments as one of Gymnasium's vector environments, with a row per agent.
 
     Args:
-        make: returns a parallel environment.
+        make: returns a parallel environment, or a turn-based one that PettingZoo can convert.
         n_envs: number of environments, N.
         kwargs: arguments of ``make``.
+        check: checks the form of what the environments return in their first `CHECKED_STEPS`.
+
+    Attributes:
+        present: (N, A) bool, agents that act in the next step. An agent is not if the reset left it
+            out or its episode has ended, until it is among the environment's agents again.
 
     Raises:
-        ValueError: if the spaces of two agents differ, or agents come later.
+        ValueError: it is turn-based, or the spaces of two agents differ.
     """
 
-    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, object]):
-        from gymnasium.vector.utils import batch_space, create_empty_array
+    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, object], check: bool = True):
+        from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 
         parameters = inspect.signature(make).parameters
         if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             kwargs = {"render_mode": "rgb_array", **kwargs}
-        self.envs = [make(**kwargs) for _ in range(n_envs)]
+
+        def make_one() -> Any:
+            return _parallel(make(**kwargs))
+
+        self.envs = [make_one() for _ in range(n_envs)]
         self.render_mode, env = kwargs.get("render_mode"), self.envs[0]
         self.agents, self.metadata = list(env.possible_agents), env.metadata
         env.reset()
-        if set(env.agents) != set(self.agents):
-            raise ValueError("some of its agents come later, but each needs a lane from the start")
         self.single_observation_space = self._common(env.observation_space)
         self.single_action_space = self._common(env.action_space)
         n_lanes = n_envs * len(self.agents)
         self.actions = batch_space(self.single_action_space, n_lanes)
         self.batch = create_empty_array(self.single_observation_space, n_lanes)
-        self.latest = [None] * n_lanes  # observations
-        self.reward = np.zeros((n_envs, len(self.agents)))
-        self.terminated = np.zeros(self.reward.shape, bool)
+        lanes = batch_space(self.single_observation_space, n_lanes)
+        self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]  # observations
+        shape = n_envs, len(self.agents)
+        self.reward, self.present = np.zeros(shape), np.zeros(shape, bool)
+        self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
+        self.checks, self.n_checked = check, np.zeros(n_envs, np.int64)
+        if wrapper_state(env):
+            self.learnt = probe(make_one, play=play_parallel).learnt
 
     def _common(self, space_of) -> "gymnasium.Space":
         first, *others = self.agents
@@ -126,9 +147,9 @@ class ParallelEnvs:
         return space_of(first)
 
     def reset(self, *, seed: list[int] | None = None) -> tuple[Any, dict]:
-        for e, env in enumerate(self.envs):
-            self._begin(e, env, seed and seed[e])
-        return self._observations(), {}
+        for e in range(len(self.envs)):
+            self._begin(e, seed and seed[e])
+        return self._observations(), {"present": self.present.ravel()}
 
     def step(self, actions: Any) -> tuple[Any, ...]:
         from gymnasium.vector.utils import iterate
@@ -136,28 +157,56 @@ class ParallelEnvs:
         rows = iterate(self.actions, actions)
         for e, env in enumerate(self.envs):
             chosen = dict(zip(self.agents, rows))
-            if not env.agents:
-                self._begin(e, env)
-                continue
-            observed, rewards, ended, *_ = env.step({agent: chosen[agent] for agent in env.agents})
-            self._observe(e, observed)
-            for a, agent in enumerate(self.agents):
-                self.reward[e, a] = rewards.get(agent, 0.0)
-                self.terminated[e, a] |= ended.get(agent, False)
-        is_over = np.array([[not env.agents] for env in self.envs])
-        ends = (is_over & self.terminated).ravel(), (is_over & ~self.terminated).ravel()
-        return self._observations(), self.reward.ravel(), *ends, {}
+            if self.present[e].any():
+                self._step(e, {agent: chosen[agent] for agent in env.agents})
+            else:
+                self._begin(e)
+        flags = self.terminated.ravel(), self.truncated.ravel()
+        return (
+            *(self._observations(), self.reward.ravel(), *flags),
+            {"present": self.present.ravel()},
+        )
 
     def render(self) -> list[np.ndarray]:
         return [env.render() for env in self.envs]
 
     def close(self) -> None:
-        for env in self.envs:
-            env.close()
+        close_all(self.envs)
 
-    def _begin(self, e, env, seed=None) -> None:
-        self._observe(e, env.reset(seed=seed)[0])
-        self.reward[e], self.terminated[e] = 0, False
+    def _begin(self, e, seed=None) -> None:
+        observed = self._checked(e, "reset", self.envs[e].reset(seed=seed))[0]
+        self._observe(e, observed)
+        for flags in (self.reward, self.terminated, self.truncated):
+            flags[e] = 0
+        agents = self.envs[e].agents
+        self.present[e] = [agent in agents and agent in observed for agent in self.agents]
+
+    def _step(self, e, actions) -> None:
+        env = self.envs[e]
+        observed, rewards, terminated, truncated, _ = self._checked(e, "step", env.step(actions))
+        self._observe(e, observed)
+        for a, agent in enumerate(self.agents):
+            was_present = self.present[e, a]
+            ends, cut = (
+                bool(flags.get(agent, False) or flags.get("__all__", False))
+                for flags in (terminated, truncated)
+            )
+            is_here = agent in env.agents and agent in observed and not (ends or cut)
+            self.reward[e, a] = rewards.get(agent, 0.0) if was_present else 0.0
+            self.terminated[e, a] = was_present and ends
+            self.truncated[e, a] = was_present and not ends and not is_here
+            self.present[e, a] = is_here
+
+    def _checked(self, e, method, result) -> tuple:
+        """Returns the result of `reset` or `step`. Raises BadValue if its form is wrong."""
+        self._keep_frozen(self.envs[e])
+        if not self.checks or self.n_checked[e] >= CHECKED_STEPS:
+            return result
+        self.n_checked[e] += 1
+        problem = problem_of_result(method, result, self.single_observation_space, self.agents)
+        if problem:
+            raise BadValue.of(problem, f"environment {e}")
+        return result
 
     def _observe(self, e, observed) -> None:
         for a, agent in enumerate(self.agents):
@@ -168,3 +217,17 @@ class ParallelEnvs:
         from gymnasium.vector.utils import concatenate
 
         return concatenate(self.single_observation_space, self.latest, self.batch)
+
+
+def _parallel(env) -> Any:
+    """Returns an environment in which agents act together."""
+    if not hasattr(env, "agent_iter"):
+        return env
+    if getattr(env, "metadata", {}).get("is_parallelizable"):
+        conversions = importlib.import_module("pettingzoo.utils.conversions")
+        return conversions.aec_to_parallel(env)
+    raise ValueError(
+        "it is turn-based, and agents have to act together; name the function that makes its "
+        "parallel form, such as env.id=package.module:parallel_env, or one whose metadata has "
+        "is_parallelizable"
+    )

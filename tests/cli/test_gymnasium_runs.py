@@ -79,3 +79,13 @@ def test_weights_of_another_environment_are_refused_by_its_name(capsys):
 def test_bad_input_leaves_nothing(here, words, text, capsys):
     assert train.main([*WORDS, *words]) == 2
     assert text in capsys.readouterr().err and not [*here.glob("runs/*")]
+
+
+def test_value_outside_its_space_is_named(here, capsys):
+    """And everything is saved, as for any failure of an environment."""
+    words = [*WORDS, "env.id=tests.helpers.learning_wrappers:Seven-v0", "folder=run"]
+    assert train.main(words) == 4
+    error = capsys.readouterr().err
+    assert "Seven-v0: environment 0: step() returned an observation that is not in its" in error
+    assert "it is 7, and the space is Discrete(4)" in error and "env.check=false" in error
+    assert "restart_failed" not in error and "Traceback" not in error

@@ -12,9 +12,10 @@ from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
 
 gymnasium = pytest.importorskip("gymnasium")
+from megastep.env_probe import probe  # noqa: E402
 from megastep.envs import Gymnasium  # noqa: E402
 from megastep.envs.on_host.frames import as_frame  # noqa: E402
-from megastep.sync_envs import EnvError, SyncEnvs, names_of_numbers  # noqa: E402
+from megastep.sync_envs import EnvError, SyncEnvs  # noqa: E402
 from tests.helpers import odd_envs  # noqa: E402
 
 
@@ -137,7 +138,7 @@ def test_the_try_leaves_global_generators_alone():
 
     np.random.seed(1), torch.manual_seed(1)
     expected = np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()
-    names_of_numbers(Draws())
+    assert probe(Draws).generators == ("numpy", "torch")
     assert (np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()) == expected
 
 

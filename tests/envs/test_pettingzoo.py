@@ -1,6 +1,10 @@
-"""Parallel environments of PettingZoo: agents as lanes, and agents that are out before others."""
+"""Parallel environments of PettingZoo: agents as lanes, and agents that are out before others, or
+not there.
+"""
 
 import json
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -8,6 +12,8 @@ import torch
 
 from megastep import contract
 from megastep.agents.cli import evaluate, train
+from megastep.agents.evaluation import playing, statistics
+from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from megastep.envs import PettingZoo
 
@@ -21,8 +27,8 @@ class Relay:
 
     metadata, possible_agents = {"render_fps": 5}, ["one", "two", "three"]
 
-    def __init__(self, render_mode=None, odd=False, late=False):
-        self.odd, self.late = odd, late
+    def __init__(self, render_mode=None, odd=False):
+        self.odd = odd
 
     def observation_space(self, agent):
         return spaces.Box(0, 10_000, (1 + (self.odd and agent == "two"),))
@@ -31,7 +37,7 @@ class Relay:
         return spaces.Discrete(4)
 
     def reset(self, seed=None, options=None):
-        self.agents, self.count = self.possible_agents[: 2 if self.late else 3], 0
+        self.agents, self.count = self.possible_agents[:], 0
         return self.facts(), {}
 
     def facts(self):
@@ -66,7 +72,8 @@ class Undrawn(Relay):
 ID = f"{__name__}:Relay"
 
 
-def test_all_agents_of_an_environment_end_together():
+def test_each_agent_ends_by_itself_and_the_environment_with_the_last():
+    """One that is out begins anew in each step, without learning, until the others are out."""
     env = PettingZoo(2, id=ID, device="cpu")
     contract.check_environment(env)
     decision = arrdict(actions=torch.tensor([[0], [1], [2]] * 2))
@@ -78,9 +85,10 @@ def test_all_agents_of_an_environment_end_together():
     for key, rows in {
         "obs": [[0, 0, 0], [1, 10, 100], [1, 20, 200], [1, 20, 300], [0, 0, 0], [1, 10, 100]],
         "reward": [[0, 0, 0], [1, 10, 100], [0, 20, 200], [0, 0, 300], [0, 0, 0], [1, 10, 100]],
-        "reset": [[1, 1, 1], 3 * [0], 3 * [0], 3 * [0], [1, 1, 1], 3 * [0]],
-        "terminal": [*3 * [3 * [0]], [1, 1, 0], 3 * [0], 3 * [0]],
+        "reset": [[1, 1, 1], 3 * [0], [1, 0, 0], [1, 1, 0], [1, 1, 1], 3 * [0]],
+        "terminal": [3 * [0], [1, 0, 0], [0, 1, 0], 3 * [0], 3 * [0], [1, 0, 0]],
         "truncated": [*3 * [3 * [0]], [0, 0, 1], 3 * [0], 3 * [0]],
+        "learns": [[1, 1, 1], [0, 1, 1], [0, 0, 1], 3 * [0], [1, 1, 1], [0, 1, 1]],
     }.items():
         values = torch.stack([world[key].float().view(6) for world in worlds])
         assert values.tolist() == [[*row, *row] for row in rows], key
@@ -94,10 +102,137 @@ def test_constructor_without_a_render_mode():
         env.state(0)
 
 
-def test_agents_that_differ_or_come_later_are_refused():
+class Habits(Relay):
+    """Ends after 3 steps, as `habit` says."""
+
+    def __init__(self, habit):
+        super().__init__()
+        self.habit, self.n_resets = habit, 0
+
+    def reset(self, seed=None, options=None):
+        super().reset()
+        self.n_resets += 1
+        if self.habit == "absent" and self.n_resets % 2:  # the first is the constructor's
+            self.agents = ["one", "three"]
+        return self.facts(), {}
+
+    def step(self, actions):
+        assert actions.keys() == set(self.agents)
+        self.count += 1
+        if self.habit == "joins" and self.count == 2:
+            self.agents = self.possible_agents[:]
+        if self.habit == "joins" and self.count == 1:
+            self.agents = ["one", "three"]
+        is_over = self.count == 3
+        ends = {agent: is_over for agent in self.agents}
+        ends = {"__all__": is_over} if self.habit == "all" else ends
+        result = self.facts(), {agent: 1.0 for agent in self.agents}, ends, {}, {}
+        self.agents = [] if is_over and self.habit not in ("keeps", "all") else self.agents
+        return result
+
+
+def played(habit, n_steps=8):
+    env = PettingZoo(1, id=f"{__name__}:Habits", kwargs={"habit": habit}, device="cpu")
+    worlds = contract.rollout(env, n_steps)
+    return env, lambda key: [world[key].int().tolist() for world in worlds]
+
+
+@pytest.mark.parametrize("habit", ["keeps", "all", "none"])
+def test_environment_is_over_when_all_agents_have_ended(habit):
+    """Whatever `agents` says, and if only `__all__` says so."""
+    _, rows = played(habit)
+    assert rows("terminal") == [[int(t % 4 == 3)] * 3 for t in range(9)]
+    assert rows("reset") == [[int(t % 4 == 0)] * 3 for t in range(9)]
+
+
+def test_absent_agents_do_not_learn_and_are_not_counted():
+    env, rows = played("absent", 8)
+    assert rows("learns") == [
+        *3 * [[1, 1, 1]],
+        [0, 0, 0],
+        *3 * [[1, 0, 1]],
+        [0, 0, 0],
+        [1, 1, 1],
+    ]
+    episodes = playing.first_episodes(env, RandomActions(env.action_space))  # of an odd reset
+    assert episodes.learns.tolist() == [True, False, True]
+    assert episodes.returns[episodes.learns].tolist() == [3, 3]
+    (row,) = statistics.summaries(episodes)
+    assert row["return"] == 3 and row["lanes"] == 2
+
+
+def test_agents_may_leave_and_join():
+    _, rows = played("joins", 4)
+    assert rows("learns") == [[1, 1, 1], [1, 0, 1], [1, 1, 1], [0, 0, 0], [1, 1, 1]]
+    assert rows("truncated")[1] == [0, 1, 0] and rows("reset")[2] == [0, 1, 0]
+
+
+class Learns:
+    """A wrapper that adds the number of episodes to observations, and counts steps."""
+
+    def __init__(self, env):
+        self.env, self.n_episodes, self.n_steps = env, 0, 0
+
+    def __getattr__(self, name):
+        return getattr(self.env, name)
+
+    @property
+    def unwrapped(self):
+        return self.env
+
+    def reset(self, seed=None, options=None):
+        self.n_steps = 0
+        return self.seen(self.env.reset(seed)[0]), {}
+
+    def step(self, actions):
+        obs, *others = self.env.step(actions)
+        self.n_steps += 1
+        self.n_episodes += not self.env.agents
+        return self.seen(obs), *others
+
+    def seen(self, obs):
+        return {agent: value + self.n_episodes for agent, value in obs.items()}
+
+
+def in_wrapper(habit="none"):
+    return Learns(Habits(habit))
+
+
+def test_what_a_wrapper_has_learnt_is_carried_and_frozen():
+    first, other = (PettingZoo(2, id=f"{__name__}:in_wrapper", device="cpu") for _ in range(2))
+    contract.rollout(first, 8)
+    state = first.wrapper_state()
+    assert state == {"0.Learns.n_episodes": 2}
+    other.load_wrapper_state(state, is_frozen=True)
+    worlds = contract.rollout(other, 8)
+    assert worlds[0].obs.flatten().tolist() == worlds[8].obs.flatten().tolist() == 6 * [2]
+    assert other.wrapper_state() == state
+    assert PettingZoo(2, id=ID, device="cpu").wrapper_state() == {}
+
+
+class Turns(Relay):
+    """As turn-based environments are, which have no parallel `step`."""
+
+    agent_iter = None
+
+
+def convertible():
+    env = Turns()
+    env.metadata = {"is_parallelizable": True}
+    return env
+
+
+def test_turns_that_can_be_together_are_converted(monkeypatch):
+    conversions = types.SimpleNamespace(aec_to_parallel=lambda env: Free())
+    monkeypatch.setitem(sys.modules, "pettingzoo.utils.conversions", conversions)
+    contract.rollout(PettingZoo(1, id=f"{__name__}:convertible", device="cpu"), 8)
+
+
+def test_agents_that_differ_or_act_in_turns_are_refused():
+    with pytest.raises(ValueError, match="it is turn-based, and agents have to act together; name"):
+        PettingZoo(1, id=f"{__name__}:Turns", device="cpu")
     for settings, message in (
         ({"odd": True}, "the spaces of one and two differ, but one policy acts for all"),
-        ({"late": True}, "some of its agents come later"),
         ({"odder": True}, "with env.kwargs={'odder': True}: TypeError: .*odder"),
     ):
         with pytest.raises(ValueError, match=message):

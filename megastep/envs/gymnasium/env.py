@@ -61,6 +61,9 @@ class Gymnasium(VectorizedEnv):
         seed: each environment is reset with a seed of its own, which derives from this one.
         films: renders images from the start, if it can. Some environments make their renderer in
             the constructor, and some step more slowly with it.
+        check: refuses, in the first steps of each environment, observations that are not in their
+            space and results of another form than Gymnasium's, and at any time actions that are
+            not finite. Numbers beyond the bounds of a Box are a warning.
         device: where worlds and actions are. Default: a GPU if there is one.
     """
 
@@ -76,12 +79,13 @@ class Gymnasium(VectorizedEnv):
         restart_failed: Annotated[int, Field(ge=0, le=1_000_000)] = 0,
         seed: int = 1,
         films: bool = False,
+        check: bool = True,
         device: torch.device | str | None = None,
     ):
         vector = vector_env(
-            id, n_envs, kwargs or {}, wrappers, vectorization, restart_failed, films
+            id, n_envs, kwargs or {}, wrappers, vectorization, restart_failed, films, seed, check
         )
         # one seed for each, or one for all
         seeds = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
         seeds = seeds[0] if vectorization == "own" else seeds
-        super().__init__(id, vector, n_envs, 1, seeds, device)
+        super().__init__(id, vector, n_envs, 1, seeds, device, check)

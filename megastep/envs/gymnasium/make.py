@@ -7,8 +7,10 @@ import importlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from megastep import global_generators
+from megastep.env_probe import probe
 from megastep.imports import import_object, search_current_folder
-from megastep.sync_envs import SyncEnvs, make_env, names_of_numbers
+from megastep.sync_envs import SyncEnvs, make_env
 from megastep.vector_processes import VectorProcesses
 
 if TYPE_CHECKING:
@@ -28,6 +30,8 @@ def vector_env(
     vectorization: str,
     restart_failed: int = 0,
     films: bool = False,
+    seed: int = 1,
+    check: bool = True,
 ) -> "VectorEnv | SyncEnvs | VectorProcesses":
     """Returns a vector environment. The step after an episode's end resets it.
 
@@ -56,18 +60,22 @@ def vector_env(
             return _checked(id, _own(make_vec, spec, functions, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
         settings = {"disable_env_checker": True, **kwargs}
-        example = make_env(spec, functions, settings)
+        with global_generators.kept():
+            example = make_env(spec, functions, settings)
         max_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
         if films and "rgb_array" in (example.metadata.get("render_modes") or ()):
             settings = {"render_mode": "rgb_array", **settings}
         make_one = functools.partial(make_env, spec, functions, settings)
-        make = functools.partial(SyncEnvs, make_one, restart_failed=restart_failed)
+        with contextlib.suppress(Exception):
+            example.close()
+        make = functools.partial(
+            SyncEnvs, make_one, restart_failed=restart_failed, seed=seed, check=check
+        )
         if vectorization == "sync":
-            vector = make(n_envs=n_envs, names=names_of_numbers(example))
+            names, generators, learnt = probe(make_one)
+            vector = make(n_envs=n_envs, names=names, generators=generators, learnt=learnt)
         else:  # a fault may end the process that it happens in
             vector = VectorProcesses(make, n_envs)
-            with contextlib.suppress(Exception):
-                example.close()
         vector.max_episode_steps = max_steps
         return vector
     except gymnasium.error.DependencyNotInstalled as error:

@@ -7,6 +7,7 @@ import torch
 
 from megastep import spaces
 from megastep.arrdict import arrdict
+from megastep.contract import FLAGS
 from megastep.dotdict import leaves
 from megastep.types import Space, Tree
 
@@ -22,6 +23,7 @@ class HostBuffers:
         action_space: space of one lane's actions.
         device: where worlds go and actions come from.
         metrics: names of the metrics in worlds.
+        flags: names of the bools in worlds.
     """
 
     IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
@@ -33,6 +35,7 @@ class HostBuffers:
         action_space: Space,
         device: torch.device,
         metrics: Sequence[str] = (),
+        flags: Sequence[str] = FLAGS,
     ):
         self.device, self.on_gpu = device, device.type == "cuda"
 
@@ -43,9 +46,10 @@ class HostBuffers:
             dtypes = {spaces.MultiDiscrete: torch.int64, spaces.MultiContinuous: torch.float32}
             return empty(dtypes.get(type(space)) or space.dtype, *space.shape)
 
-        flags = {name: empty(torch.bool) for name in ("reset", "terminal", "truncated")}
         self.world = arrdict(
-            obs=spaces.map(of_space, obs_space), reward=empty(torch.float32), **flags
+            obs=spaces.map(of_space, obs_space),
+            reward=empty(torch.float32),
+            **{name: empty(torch.bool) for name in flags},
         )
         if metrics:
             self.world["metrics"] = arrdict({name: empty(torch.float32) for name in metrics})

@@ -1,0 +1,102 @@
+"""The global generators of NumPy, Python and PyTorch, one set for each environment that draws from
+them: its numbers then do not depend on which others step in the same process, or on how many.
+
+Workers import it, so PyTorch's is one of them only where PyTorch is imported.
+"""
+
+import contextlib
+import random
+import sys
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+__all__ = ["KINDS", "GlobalGenerators", "changed_kinds", "kept", "seed_all", "states"]
+
+KINDS = "numpy", "python", "torch"
+_NUMPY: Any = np.random  # whose types leave out the functions that exchange its bit generator
+
+
+class GlobalGenerators:
+    """The global generators as one environment finds them, each at a place of its own.
+
+    Args:
+        seed: integers from 0.
+    """
+
+    def __init__(self, seed: Sequence[int]):
+        sequence = np.random.SeedSequence(seed)
+        self.numpy = np.random.Generator(np.random.MT19937(sequence))
+        self.python = random.Random(int(sequence.generate_state(1)[0]))
+        self.torch, self.torch_seed = None, int(sequence.generate_state(2)[1])
+        if torch := sys.modules.get("torch"):
+            self.torch = torch.Generator().manual_seed(self.torch_seed)
+
+    def drop(self, kinds: Collection[str]) -> None:
+        """Forgets generators of some of `KINDS`."""
+        for kind in kinds:
+            setattr(self, kind, None)
+
+    @contextlib.contextmanager
+    def installed(self, kinds: Collection[str]) -> Iterator[None]:
+        """Draws inside come from these generators, of some of `KINDS`. Others stay as they are."""
+        torch = sys.modules.get("torch") if "torch" in kinds else None
+        with contextlib.ExitStack() as undo:
+            if "numpy" in kinds:
+                undo.callback(_NUMPY.set_bit_generator, _NUMPY.get_bit_generator())
+                _NUMPY.set_bit_generator(self.numpy.bit_generator)
+            if "python" in kinds:
+                undo.callback(random.setstate, random.getstate())
+                random.setstate(self.python.getstate())
+                undo.callback(lambda: self.python.setstate(random.getstate()))
+            if torch is not None:
+                own = self.torch or torch.Generator().manual_seed(self.torch_seed)
+                self.torch = own
+                undo.callback(torch.set_rng_state, torch.get_rng_state())
+                torch.set_rng_state(own.get_state())
+                undo.callback(lambda: own.set_state(torch.get_rng_state()))
+            yield
+
+
+def seed_all(seed: int) -> None:
+    """Seeds the global generators."""
+    np.random.seed(seed)
+    random.seed(seed)
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(seed)
+
+
+def states() -> dict[str, tuple]:
+    """Returns the states of the global generators by kind."""
+    torch = sys.modules.get("torch")
+    found = {"numpy": np.random.get_state(), "python": random.getstate()}
+    return found | ({"torch": torch.get_rng_state()} if torch else {})
+
+
+def changed_kinds(before: dict[str, tuple]) -> tuple[str, ...]:
+    """Returns the kinds of generators from which was drawn since their `states`."""
+    return tuple(
+        kind
+        for kind, state in states().items()
+        if repr(_plain(state)) != repr(_plain(before.get(kind)))
+    )
+
+
+def _plain(state) -> list | None:
+    if isinstance(state, tuple):
+        return [part.tolist() if isinstance(part, np.ndarray) else part for part in state]
+    return None if state is None else state.tolist()
+
+
+@contextlib.contextmanager
+def kept() -> Iterator[None]:
+    """Draws inside leave the global generators as they were."""
+    before = states()
+    try:
+        yield
+    finally:
+        random.setstate(before["python"])
+        np.random.set_state(before["numpy"])
+        if "torch" in before:
+            sys.modules["torch"].set_rng_state(before["torch"])

@@ -1,0 +1,175 @@
+"""What the wrappers around an environment of Gymnasium or PettingZoo keep in their attributes, such
+as running statistics: to read it, and to put it into other wrappers of the same classes. Workers
+import it.
+"""
+
+import collections
+import copy
+import numbers
+import types
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+__all__ = ["WrappedEnvs", "freeze", "load_wrapper_state", "wrapper_state"]
+
+#: Attributes of a wrapper that are no state of its own.
+SKIPPED = "env", "metadata", "spec", "_np_random", "recorded_reward"
+SEQUENCES = list, tuple, collections.deque
+
+
+def wrapper_state(env: Any, paths: Collection[str] | None = None) -> dict[str, Any]:
+    """Returns copies of the numbers, the arrays and the lists of numbers in wrappers by path, such
+    as `0.NormalizeObservation.obs_rms.mean`; wrapper 0 is the outermost.
+
+    Args:
+        paths: those wanted. None: all.
+    """
+    state, visited = {}, set()
+    for place, wrapper in _wrappers(env):
+        state |= {
+            path: copy.deepcopy(value)
+            for path, value in _values(place, wrapper, visited)
+            if paths is None or path in paths
+        }
+    return state
+
+
+def load_wrapper_state(env: Any, state: Mapping[str, Any]) -> None:
+    """Puts a `wrapper_state` into the wrappers of another environment.
+
+    Raises:
+        ValueError: it is not in such wrappers.
+    """
+    wrappers = dict(_wrappers(env))
+    for path, value in state.items():
+        number, kind, *keys, last = path.split(".") if _is_safe(path, value) else ("", "", "")
+        holder = wrappers.get(f"{number}.{kind}")
+        for key in keys:
+            holder = _children(holder).get(key)
+        if holder is None:
+            raise ValueError(
+                f"the agent needs what its wrapper {kind} has learnt, and this environment is in "
+                "other wrappers; give env.wrappers as in training"
+            )
+        now = _children(holder).get(last)
+        if isinstance(now, np.ndarray) or isinstance(value, np.ndarray):
+            value = np.array(value, getattr(now, "dtype", None))
+        elif isinstance(now, collections.deque):
+            value = collections.deque(value, now.maxlen)
+        elif now is not None:
+            value = type(now)(value)
+        if isinstance(now, np.ndarray) and now.shape == np.shape(value):
+            np.copyto(now, value)
+        elif isinstance(holder, dict):
+            holder[last] = value
+        else:
+            setattr(holder, last, value)
+
+
+def _is_safe(path, value) -> bool:
+    """Returns whether a part of a state, which may be a stranger's, is numbers for an attribute
+    that is not special.
+    """
+    _, *names = str(path).split(".")
+    is_named = len(names) > 1 and all(name.isidentifier() for name in names)
+    is_special = any(name.startswith("__") or name in SKIPPED for name in names)
+    return is_named and not is_special and _are_numbers(value)
+
+
+def _are_numbers(value) -> bool:
+    is_nested = isinstance(value, SEQUENCES)  # as arrays are in the files of agents
+    return all(map(_are_numbers, value)) if is_nested else _is_value(value)
+
+
+def freeze(env: Any) -> None:
+    """Stops the running statistics of Gymnasium's own wrappers."""
+    for _, wrapper in _wrappers(env):
+        if hasattr(type(wrapper), "update_running_mean"):
+            wrapper.update_running_mean = False
+
+
+class WrappedEnvs:
+    """Environments in wrappers that may have learnt something.
+
+    Attributes:
+        envs: environments in equal wrappers.
+        learnt: paths of what the wrappers have learnt.
+        frozen: what stays as it is, None if nothing does.
+    """
+
+    envs: list[Any]
+    learnt: Sequence[str] = ()
+    frozen: Mapping[str, Any] | None = None
+
+    def wrapper_state(self) -> dict[str, Any]:
+        """Returns what the wrappers of the first environment have learnt, by path."""
+        return wrapper_state(self.envs[0], self.learnt) if self.learnt else {}
+
+    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
+        """Gives the wrappers of all environments what others have learnt.
+
+        Args:
+            is_frozen: it stays as it is from now on.
+
+        Raises:
+            ValueError: the environments are not in such wrappers.
+        """
+        for env in self.envs:
+            load_wrapper_state(env, state)
+            if is_frozen:
+                freeze(env)
+        self.frozen = state if is_frozen else None
+
+    def _keep_frozen(self, env) -> None:
+        """Called after each step and reset of an environment."""
+        if self.frozen:
+            load_wrapper_state(env, self.frozen)
+
+
+def _wrappers(env) -> Iterator[tuple[str, Any]]:
+    """Yields (number and class, wrapper), the outermost first."""
+    number = 0
+    while "env" in getattr(env, "__dict__", ()) and env.unwrapped is not env:
+        yield f"{number}.{type(env).__name__}", env
+        env, number = env.env, number + 1
+
+
+def _children(node) -> dict:
+    return node if isinstance(node, dict) else getattr(node, "__dict__", {})
+
+
+def _values(path, node, visited) -> Iterator[tuple[str, Any]]:
+    """Yields (path, value) of all below an object."""
+    if id(node) in visited:
+        return
+    visited.add(id(node))
+    for key, value in _children(node).items():
+        if not isinstance(key, str) or not key.isidentifier() or key in SKIPPED:
+            continue
+        if _is_value(value):
+            yield f"{path}.{key}", value
+        elif _has_values(value):
+            yield from _values(f"{path}.{key}", value, visited)
+
+
+def _is_value(value) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    if isinstance(value, SEQUENCES):
+        return all(isinstance(part, numbers.Real) for part in value)
+    return isinstance(value, (numbers.Real, np.bool_))
+
+
+def _has_values(value) -> bool:
+    """Returns whether a value may be a wrapper's own object: no environment, space or function."""
+    import gymnasium
+
+    others = gymnasium.Env, gymnasium.Space, types.ModuleType, type
+    is_object = hasattr(value, "__dict__") and not callable(value)
+    is_object = is_object and not hasattr(value, "possible_agents")
+    is_gymnasiums = type(value).__module__.startswith("gymnasium.envs")
+    return isinstance(value, dict) or (
+        is_object and not isinstance(value, others) and not is_gymnasiums
+    )
