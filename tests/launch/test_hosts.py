@@ -1,5 +1,5 @@
-"""Runs of two hosts with one torchrun each: what a broken network, another host's end and hosts that
-differ do to them.
+"""Runs of two hosts with one torchrun each, and what a broken network, a host that ends, and hosts
+that differ do to them.
 """
 
 import time
@@ -18,8 +18,8 @@ pytestmark = pytest.mark.usefixtures("here")
 TINY = [*tiny.TINY, "log_every=1", "folder=run", "checkpoint_seconds=0.5"]
 CONTINUE = "Its last checkpoint is intact. To continue: python train.py resume=run\n"
 
-#: Trains with deadlines that a test can wait for, once ranks have started, which takes long on a busy
-#: machine. Ranks write down the sums of their weights' bits.
+#: Trains with deadlines that a test can wait for, once ranks have started, which takes long on a
+#: busy machine. Ranks write down the sums of their weights' bits.
 HASTY = """
 import os, sys
 from megastep.agents.cli import train
