@@ -2,6 +2,7 @@
 own, and a cable between them that tests cut, delay and make lose packets. Needs root.
 """
 
+import concurrent.futures
 import contextlib
 import ctypes
 import fcntl
@@ -47,31 +48,17 @@ class Hosts:
     """Two hosts, `hosta` at 10.77.0.1 and fd77::1, and `hostb` at .2 and ::2. A context.
 
     Attributes:
-        delay: seconds that a frame takes from one to the other.
-        loss: fraction of frames that are lost; 1 cuts the cable.
+        cable: the `Cable` between them.
     """
 
-    def __init__(self):
-        self.delay = self.loss = 0.0
-        self.stack = contextlib.ExitStack()
-
     def __enter__(self):
-        with self.stack as stack:
+        with contextlib.ExitStack() as stack:
             folder = stack.enter_context(tempfile.TemporaryDirectory())
             self.table = Path(folder, "hosts")
             names = dict(zip(ADDRESSES, NAMES), **{"127.0.0.1": "localhost"})
             self.table.write_text("".join(f"{one} {name}\n" for one, name in names.items()))
             self.holders = [self._hold(stack, name) for name in NAMES]
-            ends = [self._plug_in(number) for number in range(2)]
-            for end in ends:
-                stack.callback(os.close, end)
-            has_ended = threading.Event()
-            cables = [threading.Thread(target=self._carry, args=(*ends, has_ended))]
-            cables.append(threading.Thread(target=self._carry, args=(*ends[::-1], has_ended)))
-            for cable in cables:
-                stack.callback(cable.join)
-                cable.start()
-            stack.callback(has_ended.set)
+            self.cable = stack.enter_context(Cable(self, INTERFACE, "10.77.0", "fd77:"))
             self.stack = stack.pop_all()
         return self
 
@@ -96,57 +83,10 @@ class Hosts:
             raise OSError("unshare failed")
         return holder.pid
 
-    def _plug_in(self, number):
-        """Makes a host's interface. Returns the file of its end of the cable."""
-        (end,) = self._inside(number, _open_tap)  # namespaces of networks are a thread's
-        for words in (
-            f"addr add {ADDRESSES[number]}/24 dev {INTERFACE}",
-            f"addr add fd77::{number + 1}/64 dev {INTERFACE} nodad",
-            f"link set {INTERFACE} up",
-        ):
-            self.run(number, "ip", *words.split())
-        return end
-
     def run(self, number, *words):
         """Runs a command on a host."""
         enters = ["nsenter", f"--target={self.holders[number]}", "--net", "--uts", "--mount"]
         subprocess.run([*enters, *words], check=True, capture_output=True)
-
-    def _inside(self, number, function):
-        """Calls a function in a thread that is in a host. Returns [what it returns]."""
-        results, errors = [], []
-
-        def call():
-            try:
-                enter(self.holders[number], ["net"])
-                results.append(function())
-            except Exception as error:
-                errors.append(error)
-
-        thread = threading.Thread(target=call)
-        thread.start()
-        thread.join()
-        if errors:
-            raise errors[0]
-        return results
-
-    def _carry(self, source, target, has_ended):
-        """Reads frames at one end and writes them at the other."""
-        waiting, draws = queue.SimpleQueue(), random.Random(1)
-        due = None
-        while not has_ended.is_set():
-            seconds = 0.05 if due is None else min(0.05, max(0.0, due[0] - time.monotonic()))
-            if select.select([source], [], [], seconds)[0]:
-                frame = os.read(source, 65536)
-                if draws.random() >= self.loss:
-                    waiting.put((time.monotonic() + self.delay, frame))
-            while due or not waiting.empty():
-                due = due or waiting.get()
-                if due[0] > time.monotonic():
-                    break
-                with contextlib.suppress(OSError):
-                    os.write(target, due[1])
-                due = None
 
     def forked(self, number, *words, cwd=None, **environment):
         """Starts `python *words` on a host, as a `Forked` process."""
@@ -172,6 +112,73 @@ class Hosts:
         return self.forked(number, *words, cwd=cwd, **environment)
 
 
+class Cable:
+    """Connects two hosts by an interface on each. A context.
+
+    Args:
+        hosts: the `Hosts`.
+        name: of the interfaces.
+        net, net6: first three numbers of their addresses, and what those of IPv6 begin with.
+
+    Attributes:
+        delay: seconds that a frame takes from one to the other.
+        loss: fraction of frames that are lost; 1 cuts the cable.
+    """
+
+    def __init__(self, hosts, name, net, net6):
+        self.hosts, self.name, self.nets = hosts, name, (net, net6)
+        self.delay = self.loss = 0.0
+        self.has_ended = threading.Event()
+
+    def __enter__(self):
+        with contextlib.ExitStack() as stack:
+            ends = [self._plug_in(stack, number) for number in range(2)]
+            for pair in (ends, ends[::-1]):
+                carrier = threading.Thread(target=self._carry, args=pair)
+                stack.callback(carrier.join)
+                carrier.start()
+            stack.callback(self.has_ended.set)
+            self.stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *error):
+        self.stack.close()
+
+    def _plug_in(self, stack, number):
+        """Makes a host's interface. Returns the file of its end of the cable."""
+        holder = self.hosts.holders[number]
+        # in a thread, of which a network namespace is
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            end = pool.submit(_open_tap, holder, self.name).result()
+        stack.callback(os.close, end)
+        net, net6 = self.nets
+        for words in (
+            f"addr add {net}.{number + 1}/24 dev {self.name}",
+            f"addr add {net6}:{number + 1}/64 dev {self.name} nodad",
+            f"link set {self.name} up",
+        ):
+            self.hosts.run(number, "ip", *words.split())
+        return end
+
+    def _carry(self, source, target):
+        """Reads frames at one end and writes them at the other."""
+        waiting, draws = queue.SimpleQueue(), random.Random(1)
+        due = None
+        while not self.has_ended.is_set():
+            seconds = 0.05 if due is None else min(0.05, max(0.0, due[0] - time.monotonic()))
+            if select.select([source], [], [], seconds)[0]:
+                frame = os.read(source, 65536)
+                if draws.random() >= self.loss:
+                    waiting.put((time.monotonic() + self.delay, frame))
+            while due or not waiting.empty():
+                due = due or waiting.get()
+                if due[0] > time.monotonic():
+                    break
+                with contextlib.suppress(OSError):
+                    os.write(target, due[1])
+                due = None
+
+
 def enter(holder, names=tuple(NAMESPACES)):
     """Moves this process, of one thread, to the host of a holder."""
     for name in names:
@@ -183,9 +190,10 @@ def enter(holder, names=tuple(NAMESPACES)):
             os.close(file)
 
 
-def _open_tap():
+def _open_tap(holder, name):
+    enter(holder, ["net"])
     end = os.open("/dev/net/tun", os.O_RDWR)
-    fcntl.ioctl(end, TUNSETIFF, struct.pack("16sH22x", INTERFACE.encode(), TAP))
+    fcntl.ioctl(end, TUNSETIFF, struct.pack("16sH22x", name.encode(), TAP))
     return end
 
 

@@ -95,11 +95,13 @@ def test_a_heartbeat_that_is_none_is_left_out(store, value, monkeypatch):
 def test_ranks_of_one_machine_listen_on_loopback_alone(tmp_path):
     words = [*tiny.TINY, "ranks=2", "folder=run", "log_every=1"]
     process = start("train", *words, cwd=tmp_path)
-    wait_until(lambda: (tmp_path / "run/metrics.jsonl").exists(), process)
-    tree = [process.pid, *map(int, children_of(process.pid))]
-    assert len(tree) >= 3 and listening(tree) == LOOPBACK
-    process.terminate()
-    process.communicate()
+    try:
+        wait_until(lambda: (tmp_path / "run/metrics.jsonl").exists(), process)
+        tree = [process.pid, *map(int, children_of(process.pid))]
+        assert len(tree) >= 3 and listening(tree) == LOOPBACK
+    finally:
+        process.terminate()
+        process.communicate()
     assert process.returncode == 143
 
 
