@@ -14,6 +14,7 @@ import faulthandler
 import functools
 import itertools
 import os
+import secrets
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
@@ -94,7 +95,7 @@ def start(seconds: float = START_SECONDS) -> None:
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # a new prefix: after a restart the store may still hold addresses of the ended ranks
-    name = f"ranks {token()} {info.attempt} {next(_STARTS)}"
+    name = f"ranks {token()} {meeting.name or info.attempt} {next(_STARTS)}"
     keys = _prefixed(name, _store())
     with waiting():
         distributed.init_process_group(
@@ -139,6 +140,42 @@ def store(name: str) -> Store:
 
 def _prefixed(name: str, keys: Store) -> Store:
     return distributed.PrefixStore(name, keys)  # pyright: ignore[reportPrivateImportUsage]
+
+
+class Meeting:
+    """Finds a name for this start of the ranks, the same on all of them and no earlier one's.
+
+    torchrun's count of restarts is none: each machine counts those that its own ranks caused.
+
+    Attributes:
+        name: the name, once it is known.
+    """
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+        self._own = secrets.token_hex(8)
+
+    def poll(self) -> str | None:
+        """Returns the name, or None if rank 0 has not started. Rank 0 calls this until all have."""
+        info = rank_info()
+        assert info is not None
+        keys = _prefixed(f"megastep {token()} meeting", _store())
+        if self.name is None:
+            keys.set(f"{info.rank}", self._own)
+        if info.rank == 0:
+            # the store may hold what ended ranks have left; those that start replace it
+            names = (f"{rank}" for rank in range(info.n_ranks))
+            everyones = [keys.get(name).decode() if keys.check([name]) else "" for name in names]
+            keys.set("everyone", " ".join(one or "-" for one in everyones))
+            self.name = self._own
+        elif self.name is None and keys.check(["everyone"]):
+            first, *others = keys.get("everyone").decode().split(" ")
+            if others[info.rank - 1 : info.rank] == [self._own]:
+                self.name = first
+        return self.name
+
+
+meeting = Meeting()
 
 
 def stop() -> None:

@@ -108,11 +108,11 @@ class Team:
 
     def earlier_folder(self) -> Path | None:
         """Returns the run folder of the previous attempt if torchrun restarted the ranks."""
-        info = environment.rank_info()
-        assert info is not None
-        if info.attempt == 0:
-            return None
         if launcher.JOB in os.environ:  # a folder that is this user's alone
+            info = environment.rank_info()
+            assert info is not None
+            if info.attempt == 0:
+                return None
             path = Path(os.environ[launcher.JOB], launcher.RUN)
             return Path(path.read_text()) if path.exists() else None
         return started.proven_folder(self.store)

@@ -164,20 +164,26 @@ class Watch:
         assert info is not None
         self.on_lost, self.on_silence, self.may_be_silent = on_lost, on_silence, may_be_silent
         self.is_broken = self.is_gone = self.has_left = False
-        self.rank, self.n_ranks, self.attempt = info.rank, info.n_ranks, info.attempt
+        self.rank, self.n_ranks = info.rank, info.n_ranks
         self.number = self.n_answers = 0
         self._leaves_by = math.inf
         self._wakes = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        self.store = process_group.store(f"watch {self.attempt} {next(NUMBERS)}")
+        """Ends this rank if the store falls silent. The others are monitored once they start."""
         threading.Thread(target=self._guard, daemon=True).start()
-        self._beat()
-        self._thread.start()
 
     def missing(self) -> list[int]:
-        """Returns the ranks that have not started yet."""
+        """Returns the ranks that have not started yet. Each rank calls this until all have."""
+        name = process_group.meeting.poll()
+        self.n_answers += 1
+        if name is None:
+            return [0]
+        if self._thread.ident is None:
+            self.store = process_group.store(f"watch {name} {next(NUMBERS)}")
+            self._beat()
+            self._thread.start()
         ranks = range(self.n_ranks)
         if self.store.check([_key(rank) for rank in ranks]):
             return []
@@ -189,7 +195,7 @@ class Watch:
         def is_first() -> bool:
             return self.store.compare_set("end", "", f"{self.rank}").decode() == f"{self.rank}"
 
-        # if the store is gone, no other rank can report
+        # if the store is gone, or has not been opened, no other rank can report
         return within(CALL_SECONDS, is_first, True)
 
     def await_verdict(self) -> None:

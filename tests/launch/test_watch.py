@@ -104,17 +104,17 @@ def test_rank_that_the_store_does_not_answer_ends(two, monkeypatch):
     """Although the thread that asks it, and whoever else does, is blocked for ever."""
 
     class Silent:
-        def set(self, *arguments):
+        def compare_set(self, *arguments):
             threading.Event().wait()
-
-        compare_set = set
 
     monkeypatch.setattr(watch, "SILENT_SECONDS", 0.2)
     monkeypatch.setattr(watch, "CALL_SECONDS", 0.01)
-    monkeypatch.setattr(watch.process_group, "store", lambda name: Silent())
+    monkeypatch.setattr(watch.process_group.meeting, "poll", threading.Event().wait)
+    two.store = Silent()
     has_ended, seconds = threading.Event(), []
     two.on_silence = lambda silent: (seconds.append(silent), has_ended.set())
-    threading.Thread(target=two.start, daemon=True).start()
+    two.start()
+    threading.Thread(target=two.missing, daemon=True).start()
     assert has_ended.wait(60) and 0.2 < seconds[0] < 0.3
     assert two.claim()  # as no other rank can
     two._thread = threading.Thread(target=threading.Event().wait, daemon=True)
@@ -138,3 +138,22 @@ def test_calls_have_a_deadline():
     began = time.monotonic()
     assert watch.within(0.01, threading.Event().wait, "default") == "default"
     assert time.monotonic() - began < 30
+
+
+def test_ranks_that_start_again_find_one_name(monkeypatch):
+    """Although the store still holds what the ranks of an earlier start have left."""
+    store, names = distributed.HashStore(), []
+    monkeypatch.setattr(watch.process_group, "_store", lambda: store)
+    for starts_first in 0, 1, 1:
+        meetings = [watch.process_group.Meeting() for _ in range(2)]
+
+        def poll(rank, meetings=meetings):
+            for name, text in dict(RANK=f"{rank}", WORLD_SIZE="2", LOCAL_RANK="0").items():
+                monkeypatch.setenv(name, text)
+            return meetings[rank].poll()
+
+        first = poll(starts_first)
+        assert first is None if starts_first else first not in names
+        names.append(poll(1 - starts_first) or poll(0) and poll(1))
+        assert poll(0) == poll(1) == names[-1]
+    assert len({*names}) == 3
