@@ -135,14 +135,16 @@ class Team:
         is_ours = launcher.JOB in os.environ
         os._exit(launcher.LOST if problem or not is_ours else 0)
 
-    def end_in_silence(self, seconds: float) -> NoReturn:
-        """Exits at once, because the store has not answered for so many seconds. One rank of this
-        machine reports it, as the others may be out of reach.
+    def end_in_silence(self, seconds: float | None = None) -> NoReturn:
+        """Exits at once, because the store has not answered for so many seconds, or has closed the
+        connection. One rank of this machine reports it, as the others may be out of reach.
         """
+        silence = (
+            "closed the connection" if seconds is None else f"not answered for {seconds:.0f} s"
+        )
         problem = (
-            f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, has not "
-            f"answered for {seconds:.0f} s: torchrun has ended there, or that machine or the "
-            "network is down"
+            f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, has "
+            f"{silence}: torchrun has ended there, or that machine or the network is down"
         )
         self.end(problem if is_first_here() else None)
 
@@ -200,6 +202,8 @@ def joined() -> Iterator[Team | None]:
         if loss := _cause(error, process_group.RankLost):
             with signals.handled(lambda number: None):  # ignores torchrun's SIGTERM
                 team.watch.await_verdict()  # which ends this process
+            if team.watch.is_gone:
+                team.end_in_silence()
             team.end(f"A rank is lost: {loss}" if team.watch.claim() else None)
         is_signal = isinstance(error, signals.Interrupted)
         reports = info.rank == 0 and team.watch.claim()

@@ -241,7 +241,8 @@ class Watch:
         except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
             self.is_gone = True
             if not self.has_left:
-                os.kill(os.getpid(), signal.SIGTERM)
+                # saves, as SIGTERM would, but bears one of torchrun's after it
+                os.kill(os.getpid(), signal.SIGUSR1)
 
     def _guard(self) -> None:
         # counts polls, as a suspended job may go on later

@@ -176,7 +176,7 @@ def test_slow_cable_goes_on(here, hosts, capsys):
     """50 ms and 1 % of frames lost: each operation between the hosts takes so long."""
     with training(hosts, here, *TINY, f"samples={100 * UPDATE}", "folder=fast") as processes:
         assert [code for code, *_ in finished(processes)] == [0, 0]
-    hosts.delay, hosts.cable.loss = 0.05, 0.01
+    hosts.cable.delay, hosts.cable.loss = 0.05, 0.01
     with training(hosts, here, *TINY, f"samples={100 * UPDATE}") as processes:
         assert [code for code, *_ in finished(processes)] == [0, 0]
     assert (here / "run/metrics.jsonl").read_bytes() == (here / "fast/metrics.jsonl").read_bytes()
