@@ -31,7 +31,7 @@ from megastep.agents.runs import checkpoint, folders, typed_json
 JOB = "MEGASTEP_JOB"
 #: Files of the job folder: settings; a mark that the user stopped the job; the run folder's path.
 SETTINGS, STOPPED, RUN = "settings.json", "stopped", "run"
-#: Exit code if a rank was killed or hangs.
+#: Exit code if a rank was killed, hangs or cannot be reached.
 LOST = 3
 #: Code that runs a rank. Modules in the current folder must not shadow Python's own.
 RANK = """import sys
