@@ -284,7 +284,7 @@ class Watch:
         if not self.store.check([_key(rank)]):
             return None
         try:
-            return HEARTBEAT.validate_json(self.store.get(name))
+            return HEARTBEAT.validate_json(self.store.get(_key(rank)))
         except ValueError:  # written by something other than a rank
             return None
 
