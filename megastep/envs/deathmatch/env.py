@@ -317,19 +317,19 @@ class Deathmatch(SceneryEnv):
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
         each agent to its target, and each agent's health, RGB and depth.
         """
-        title = f"step {state.age.max()}, {state.kills.sum():.3g} kills"
-        figure, plan, rows = plotting.panels_beside(len(state.health), 2, title=title)
+        title = f"step {state.age.max()} · {state.kills.sum():.3g} kills"
+        columns = min(len(state.health), 2)
+        n_rows = -(-len(state.health) // columns)
+        figure, plan, strips = plotting.panels(2 * n_rows * columns, title=title, columns=columns)
         Core.plot_state(state.core, plan)
         for agent, target in enumerate(state.target):
             if target >= 0:
-                plan.plot(*state.core.positions[[agent, target]].T, color="r", linewidth=1)
-        for agent, (colour, depth) in enumerate(rows):
-            modules.RGB.plot_state(state.rgb[agent : agent + 1], [colour])
-            modules.Depth.plot_state(state.d[agent : agent + 1], [depth])
-            title = f"{agent}: health {state.health[agent]:.2f}, step {state.age[agent]}"
-            colour.set_title(title, fontsize="small", loc="left", pad=7)
-            depth.set_title("", loc="left")
-            for strip in (colour, depth):
-                strip.set(xlabel="", xticks=[], box_aspect=None)
-            plotting.plot_level(colour, state.health[agent])
+                positions, colour = state.core.positions, plotting.AGENTS[agent % 8]
+                plotting.plot_shot(plan, positions[agent], positions[target], colour)
+        above = [strips[2 * (agent - agent % columns) + agent % columns] for agent in range(len(state.health))]
+        below = [strips[strips.index(strip) + columns] for strip in above]
+        modules.RGB.plot_state(state.rgb, above)
+        modules.Depth.plot_state(state.d, below)
+        for strip, health in zip(above, state.health, strict=True):
+            plotting.plot_level(strip, health)
         return figure
