@@ -1,7 +1,7 @@
 """Core: scenery, agents and camera settings in one object."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -112,7 +112,7 @@ class Core:
     @staticmethod
     def plot_state(
         state: arrdict, ax: "Area | Axes | None" = None, seen: np.ndarray | None = None
-    ) -> "Area":
+    ) -> Any:
         """Draws a numpyified :meth:`state` from above: rooms, walls, objects, agents in their
         colours with what they see, and in films where they were.
 
@@ -123,21 +123,27 @@ class Core:
                 agent saw is hatched in films.
 
         Returns:
-            The area that it is drawn in.
+            What it is drawn on.
         """
         from megastep import plotting
 
         split = state.widths.cumsum()[:-1]
         trail, views = state.get("trail"), state.get("views")
-        area = plotting.plot_scenery(
+        ax = plotting.plot_scenery(
             state.lines,
             np.split(state.texels, split),
             state.lights,
             None if seen is None else np.split(seen, split),
             ax,
-            views.reshape(-1, *views.shape[-2:]) if seen is not None and views is not None else None,
+            views.reshape(-1, *views.shape[-2:])
+            if seen is not None and views is not None
+            else None,
         )
-        objects, names = state.get("objects", arrdict(shapes=())), {n: s for s, n in NUMBERS.items()}
+        area = plotting.Area.on(ax)
+        objects, names = (
+            state.get("objects", arrdict(shapes=())),
+            {n: s for s, n in NUMBERS.items()},
+        )
         for k, shape in enumerate(objects.shapes):
             pose = objects.positions[k], objects.angles[k], objects.sizes[k]
             plotting.plot_object(area, names[int(shape)], *pose, gamma_encode(objects.colours[k]))
@@ -153,4 +159,4 @@ class Core:
                 plotting.plot_trail(area, trail[:, a], colour)
             label = str(a) if n_agents > 1 else ""
             plotting.plot_agent(area, position, angle, AGENT_RADIUS, colour, label)
-        return area
+        return ax

@@ -405,7 +405,9 @@ def film(
         OSError: the file cannot be written.
         RuntimeError: naming the first frame that failed.
     """
-    return film_all([Player(env, policy, look.pop("title", None))], path, steps, greedy, seed, **look)
+    return film_all(
+        [Player(env, policy, look.pop("title", None))], path, steps, greedy, seed, **look
+    )
 
 
 @torch.no_grad()
@@ -527,7 +529,7 @@ def _moments(player, steps, greedy, seed, trail) -> Iterator[_Moment]:
 def _returns(returns) -> str:
     if len(returns) > MAX_RETURNS:
         return f"mean return {returns.mean():.1f}"
-    return "return " + ", ".join(f"{x:.1f}".replace("-", "−") for x in returns)
+    return "return " + ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in returns)
 
 
 class _Past:

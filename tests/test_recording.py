@@ -327,7 +327,7 @@ def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
         patched.setattr(recording.os, "replace", fail)
         encoder.save(tmp_path / "video.mp4")
     assert os.listdir(tmp_path) == ["video.mp4"] and (tmp_path / "video.mp4").read_text() == "old"
-    with pytest.raises(ValueError, match="use video.mp4"):
+    with pytest.raises(ValueError, match="format mp4.*use video.mp4"):
         encoder.save(tmp_path / "video.gif")
 
 

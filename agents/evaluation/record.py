@@ -80,7 +80,9 @@ def _home(homes, index, split) -> list[dict]:
         UserError: there is no such home.
     """
     if index >= max(len(homes), 1):
-        have = f"split={split} has {len(homes)}, from home=0" if homes else "the environment has none"
+        have = (
+            f"split={split} has {len(homes)}, from home=0" if homes else "the environment has none"
+        )
         raise UserError(f"There is no home {index}: {have}")
     return homes[index : index + 1]
 

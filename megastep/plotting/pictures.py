@@ -1,4 +1,4 @@
-"""Figures that are fast to draw: areas for a floor plan, strips and text, without matplotlib's axes.
+"""Figures that are fast to draw: areas for a plan, strips and text, without matplotlib's axes.
 
 Making and drawing an ``Axes`` takes 10 to 20 ms, too long for a film. An :class:`Area` is one
 artist that calls the renderer itself, so that the same drawing goes into pixels, SVG and PDF.
@@ -29,7 +29,7 @@ WIDTH, HEIGHT = 6.4, 7.2  # inches: 720 lines at 100 pixels per inch
 MARGIN = 0.16
 STRIP = 0.3  # height of a strip's row of pixels
 GAP = 0.12  # between strips
-LABEL = 0.62  # width of a strip's label
+LABEL, DEGREES = 0.62, 0.25  # width of a strip's label, and of cameras' yaws in it
 LEAST_PLAN = 3.6  # height of a plan above many strips
 HEAD, TITLE = 0.42, 0.34  # height of the line of numbers, and of a title above it
 
@@ -39,7 +39,7 @@ class Picture(Figure):
     know it, so it need not be closed.
     """
 
-    def __init__(self, *args, **settings):
+    def __init__(self, *args, **settings) -> None:
         super().__init__(*args, **settings)
         self.style = current()
 
@@ -74,12 +74,14 @@ class Area(Artist):
         """Returns ``ax`` itself, or what draws on matplotlib's axes in their data coordinates."""
         if isinstance(ax, Area):
             return ax
+        for artist in ax.artists:
+            if isinstance(artist, Area):
+                return artist
         area = cls.__new__(cls)
         Artist.__init__(area)
         area._place(ax.figure, ax.bbox)
         area._overlay, area.transform = ax, ax.transData
         ax.add_artist(area)
-        area.set_clip_path(None)
         return area
 
     def _place(self, figure, bbox) -> None:
@@ -122,7 +124,9 @@ class Area(Artist):
     def _set_limits(self) -> None:
         assert self._overlay is not None and self._low is not None
         self._overlay.set(
-            xlim=(self._low[0], self._high[0]), ylim=(self._low[1], self._high[1]), autoscale_on=False
+            xlim=(self._low[0], self._high[0]),
+            ylim=(self._low[1], self._high[1]),
+            autoscale_on=False,
         )
 
     # ---- Things to draw ----
@@ -134,7 +138,9 @@ class Area(Artist):
     def polygon(self, points, z=0.0, *, fill=None, edge=None, width=0.0, alpha=1.0) -> None:
         """Draws a closed polygon, (n, 2); the edge's ``width`` is in points."""
         points = np.asarray(points, float)
-        self.path(Path(np.concatenate([points, points[:1]]), closed=True), z, fill, edge, width, alpha)
+        self.path(
+            Path(np.concatenate([points, points[:1]]), closed=True), z, fill, edge, width, alpha
+        )
 
     def line(self, points, z=0.0, *, colour, width=1.0, alpha=1.0) -> None:
         """Draws a line through points, (n, 2)."""
@@ -143,7 +149,7 @@ class Area(Artist):
     def path(self, path, z, fill=None, edge=None, width=0.0, alpha=1.0, hatch=None) -> None:
         """Draws a matplotlib path."""
 
-        def draw(renderer):
+        def draw(renderer) -> None:
             self.draw_path(renderer, path, self.transform, fill, edge, width, alpha, hatch)
 
         self.add(draw, z)
@@ -170,7 +176,7 @@ class Area(Artist):
     ) -> None:
         """Draws a disc whose radius is ``radius`` units, or ``least`` points if that is more."""
 
-        def draw(renderer):
+        def draw(renderer) -> None:
             matrix = self.transform.get_matrix()
             pixels = max(matrix[0, 0] * radius, renderer.points_to_pixels(least))
             x, y = self.transform.transform(np.asarray(centre, float))
@@ -191,7 +197,7 @@ class Area(Artist):
         """
         colour = self.style.colours.text if colour is None else colour
 
-        def draw(renderer):
+        def draw(renderer) -> None:
             x, y = (self._inches if inches else self.transform).transform(np.asarray(point, float))
             y -= 0.36 * renderer.points_to_pixels(size)  # half the height of a capital
             shift = {"left": 0, "centre": 0.5, "right": 1}[align]
@@ -218,7 +224,7 @@ class Area(Artist):
     def image(self, pixels: np.ndarray, z: float = 0) -> None:
         """Fills the area with an image, (H, W, 3) floats in [0, 1] or uint8, each pixel a block."""
 
-        def draw(renderer):
+        def draw(renderer) -> None:
             left, bottom, width, height = self.bbox.bounds
             scale = renderer.get_image_magnification()
             n_columns, n_rows = max(round(width * scale), 1), max(round(height * scale), 1)
@@ -249,11 +255,12 @@ def _font(size, bold) -> FontProperties:
 
 @functools.lru_cache(1024)
 def _word(word, size, bold, colour, dpi) -> tuple[np.ndarray, float, int]:
-    """Returns a word as an image, its lowest row first, its width, and the rows below the letters."""
+    """Returns a word as an image, lowest row first, its width, and the rows below letters."""
     font = _font(size, bold)
-    width, height, descent = RendererAgg(1, 1, dpi).get_text_width_height_descent(word, font, False)
-    below = int(np.ceil(descent)) + 1
-    renderer = RendererAgg(int(np.ceil(width)) + 2, int(np.ceil(height)) + below + 2, dpi)
+    width, _, _ = RendererAgg(1, 1, dpi).get_text_width_height_descent(word, font, False)
+    letters = size * dpi / 72
+    below = int(np.ceil(0.3 * letters))
+    renderer = RendererAgg(int(np.ceil(width)) + 2, int(np.ceil(letters)) + below, dpi)
     gc = renderer.new_gc()
     gc.set_foreground(to_rgba(colour), isRGBA=True)
     renderer.draw_text(gc, 0, renderer.height - below, word, font, 0)
@@ -297,12 +304,13 @@ def panels(
         picture, MARGIN + left, below + MARGIN / 2 + under, width - 2 * MARGIN - left, tall - under
     )
     cell = (width - 2 * MARGIN - (columns - 1) * MARGIN) / columns
+    label = LABEL + DEGREES * (n_cameras > 1)
     strips = []
     for i in range(n_strips):
         row, column = divmod(i, columns)
         x, y = MARGIN + column * (cell + MARGIN), below - (row + 1) * (strip + GAP) + GAP / 2
-        strips.append(Area(picture, x + LABEL, y, cell - LABEL, strip))
-        strips[-1].strip_label = Area(picture, x, y, LABEL, strip)
+        strips.append(Area(picture, x + label, y, cell - label, strip))
+        strips[-1].strip_label = Area(picture, x, y, label, strip)
     return picture, plan, strips
 
 
@@ -331,14 +339,14 @@ def _write_head(picture, height, numbers) -> None:
 
 
 def plot_level(area: Area, level: float) -> None:
-    """Draws a level in [0, 1], such as health, as a bar above a strip, from red (0) to green (1)."""
+    """Draws a level in [0, 1], such as health, as a bar above a strip, red (0) to green (1)."""
     colour = (0.85 * (1 - level) + 0.1, 0.25 + 0.45 * level, 0.2)
     bottom, top = area.height + 0.02, area.height + 0.07
     for right, fill in (1, area.style.colours.outside), (level, colour):
         corners = [(0, bottom), (right * area.width, bottom), (right * area.width, top), (0, top)]
         bar = Path(np.array([*corners, corners[0]], float), closed=True)
 
-        def draw(renderer, bar=bar, fill=fill):
+        def draw(renderer, bar=bar, fill=fill) -> None:
             gc = renderer.new_gc()
             gc.set_linewidth(0)
             renderer.draw_path(gc, bar, area._inches, to_rgba(fill))

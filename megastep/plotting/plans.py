@@ -34,9 +34,9 @@ def plot_scenery(
     seen: Sequence[ArrayLike] | None = None,
     ax: Area | Axes | None = None,
     views: np.ndarray | None = None,
-) -> Area:
+) -> Any:
     """Draws the floor plan of one environment: rooms, walls in their colours, a scale bar. Returns
-    the area that it is drawn in.
+    what it is drawn on.
 
     Args:
         lines: (L, 2, 2) endpoints of walls in metres.
@@ -69,7 +69,7 @@ def plot_scenery(
         overlay.set_xlabel("x, m", color=area.style.colours.faint, fontsize=8, labelpad=1)
         overlay.set_ylabel("y, m", color=area.style.colours.faint, fontsize=8, labelpad=1)
         overlay.tick_params(colors=area.style.colours.faint, labelsize=8)
-    return area
+    return ax
 
 
 class Plan:
@@ -79,7 +79,7 @@ class Plan:
     memory for each of the last plans.
     """
 
-    def __init__(self, area, lines, colours, lights, seen, views):
+    def __init__(self, area, lines, colours, lights, seen, views) -> None:
         self.area, self.lines, self.lights, self.views = area, lines, lights, views
         self.widths = np.array([len(np.asarray(texels)) for texels in colours], int)
         if len(self.widths) != len(lines):
@@ -195,7 +195,11 @@ class _Pixels:
 
     def _forget(self, plan) -> None:
         self._floor[:], self._walls[:] = self._start
-        self._joined, self._views, self._seen = None, np.zeros((0, 0, 2)), np.zeros(len(plan.texels), bool)
+        self._joined, self._views, self._seen = (
+            None,
+            np.zeros((0, 0, 2)),
+            np.zeros(len(plan.texels), bool),
+        )
 
     def update(self, plan: Plan) -> np.ndarray:
         """Draws what was seen since the last call. Returns the image, (H, W, 4)."""
@@ -226,8 +230,8 @@ def _joined(parts, dtype, empty) -> np.ndarray:
 
 
 def _points(lights) -> np.ndarray:
-    lights = np.zeros((0, 2)) if lights is None else np.asarray(lights)
-    return np.ascontiguousarray(lights.reshape(len(lights), -1)[:, :2], np.float32)
+    points = np.zeros((0, 2)) if lights is None or not len(lights) else np.asarray(lights)[:, :2]
+    return np.ascontiguousarray(points, np.float32)
 
 
 def _rgb(colour: str) -> np.ndarray:
@@ -235,7 +239,7 @@ def _rgb(colour: str) -> np.ndarray:
 
 
 def texel_segments(lines: ArrayLike, widths: ArrayLike) -> np.ndarray:
-    """Returns the endpoints of texels, (T, 2, 2), of lines (L, 2, 2) with ``widths`` texels each."""
+    """Returns the endpoints of texels, (T, 2, 2), of lines (L, 2, 2) of ``widths`` texels."""
     lines, widths = np.asarray(lines, np.float32), np.asarray(widths, int)
     line = np.repeat(np.arange(len(lines)), widths)
     texel = np.arange(len(line)) - (widths.cumsum() - widths)[line]
@@ -255,7 +259,7 @@ def wall_colours(texels: ArrayLike, least: float = 0.5, greatest: float = 1.0) -
 
 
 @functools.lru_cache(MAX_KEPT)
-def _rooms(lines_bytes: bytes, lights_bytes: bytes):
+def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     """Returns the outline of the rooms, a matplotlib path: the floor that is connected with a
     light. If walls do not close it, it is the rectangle around them.
     """
@@ -312,7 +316,7 @@ def _scale_bar(area, plan) -> None:
     metres = next((m for m in (1, 2, 5, 10, 20, 50, 100) if m * per_metre > 0.5 * inch), 200)
     x, y = area.width - 0.14, 0.1
 
-    def draw(renderer):
+    def draw(renderer) -> None:
         from matplotlib.path import Path
 
         right, left = x, x - metres * per_metre / inch
@@ -383,7 +387,7 @@ def plot_agent(
     ahead = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
     aside = np.array([-ahead[1], ahead[0]])
 
-    def beak(renderer):
+    def beak(renderer) -> None:
         from matplotlib.path import Path
         from matplotlib.transforms import IdentityTransform
 
@@ -413,7 +417,13 @@ def plot_trail(ax: Area | Axes, points: ArrayLike, colour: str = AGENTS[0]) -> N
         if len(part) and len(points) > 1:
             stretch = points[part[0] : part[-1] + 2]
             strength = (i + 1) / len(parts)
-            area.line(stretch, TRAIL, colour=colour, width=1.4 + 1.2 * strength, alpha=0.15 + 0.75 * strength)
+            area.line(
+                stretch,
+                TRAIL,
+                colour=colour,
+                width=1.4 + 1.2 * strength,
+                alpha=0.15 + 0.75 * strength,
+            )
 
 
 def plot_goal(ax: Area | Axes, position: ArrayLike, radius: float) -> None:

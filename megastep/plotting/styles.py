@@ -79,12 +79,12 @@ class Style:
         return THEMES[self.theme]
 
 
-_STYLE = ContextVar("style", default=Style())
+_STYLE: ContextVar[Style | None] = ContextVar("style", default=None)
 
 
 def current() -> Style:
     """Returns the style of pictures that are made here."""
-    return _STYLE.get()
+    return _STYLE.get() or Style()
 
 
 @contextlib.contextmanager

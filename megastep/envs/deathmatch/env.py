@@ -318,18 +318,16 @@ class Deathmatch(SceneryEnv):
         each agent to its target, and each agent's health, RGB and depth.
         """
         title = f"step {state.age.max()} · {state.kills.sum():.3g} kills"
-        columns = min(len(state.health), 2)
-        n_rows = -(-len(state.health) // columns)
-        figure, plan, strips = plotting.panels(2 * n_rows * columns, title=title, columns=columns)
+        agents = range(len(state.health))
+        figure, plan, strips = plotting.panels(4 * -(-len(agents) // 2), title=title, columns=2)
         Core.plot_state(state.core, plan)
+        colours, positions = plotting.camera_colours(len(agents)), state.core.positions
         for agent, target in enumerate(state.target):
             if target >= 0:
-                positions, colour = state.core.positions, plotting.AGENTS[agent % 8]
-                plotting.plot_shot(plan, positions[agent], positions[target], colour)
-        above = [strips[2 * (agent - agent % columns) + agent % columns] for agent in range(len(state.health))]
-        below = [strips[strips.index(strip) + columns] for strip in above]
+                plotting.plot_shot(plan, positions[agent], positions[target], colours[agent])
+        above = [strips[2 * agent - agent % 2] for agent in agents]  # two agents in two rows
         modules.RGB.plot_state(state.rgb, above)
-        modules.Depth.plot_state(state.d, below)
+        modules.Depth.plot_state(state.d, [strips[2 * agent - agent % 2 + 2] for agent in agents])
         for strip, health in zip(above, state.health, strict=True):
             plotting.plot_level(strip, health)
         return figure

@@ -196,7 +196,7 @@ class Explorer(SceneryEnv):
         )
 
     def _visible_bits(self, e) -> torch.Tensor:
-        """(n_words,) int32: the texels that ``coverage`` counts, or all if there is no such metric."""
+        """(n_words,) int32: texels that ``coverage`` counts, or all without metrics."""
         return self.visible[self.layout[e]] if self.runs else torch.full_like(self.seen[e, 0], -1)
 
     def _texels(self, words, e) -> torch.Tensor:
