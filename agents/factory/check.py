@@ -70,7 +70,8 @@ def as_tree(chosen: Any, prefix: str = "") -> Tree:
     while True:
         try:
             again = settings.as_typed(kind, tree)
-            changed = [n for n in fields if repr(getattr(again, n)) != repr(getattr(chosen, n))]
+            pairs = {n: (getattr(again, n), getattr(chosen, n)) for n in fields}
+            changed = [n for n in fields if not _are_equal(*pairs[n], fields[n].annotation)]
         except ValidationError as error:
             changed = [*dict.fromkeys(str(line["loc"][0]) for line in error.errors())]
         if not changed:
@@ -82,6 +83,17 @@ def as_tree(chosen: Any, prefix: str = "") -> Tree:
                 text = f"{value!r} cannot be kept in a checkpoint; use numbers, words and lists"
                 raise ConfigErrors([(prefix + name, text)])
             del tree[name]
+
+
+def _are_equal(one, other, annotation) -> bool:
+    """Returns whether two values are equal and of equal types. A list is a tuple where the
+    annotation takes both.
+    """
+    if dataclasses.is_dataclass(other):
+        return repr(as_tree(one)) == repr(as_tree(other))
+    if annotation is not Any and isinstance(other, tuple):
+        one, other = [*one], [*other]
+    return repr(one) == repr(other)
 
 
 def _plain(value, prefix="") -> Any:

@@ -329,7 +329,7 @@ REPLAY = ["learner=vtrace", "learner.buffer=replay"]
             ["learner=vtrace", "learner.lag=1", "opponents.past=0.5"],
             "learner.lag=0",
         ),
-        ([*REPLAY, "learner.replay.capacity=40_000_000_000"], "on cpu: at most"),
+        ([*REPLAY, "learner.replay.capacity=40_000_000_000"], "on cpu may be used: at most"),
         ([*REPLAY, "learner.replay.capacity=40"], "at least 64"),
         ([*REPLAY, "learner.replay.burn_in=9", "learner.replay.length=9"], "replay.burn_in=9"),
         ([*REPLAY, "learner.replay.capcity=9"], "did you mean learner.replay.capacity?"),

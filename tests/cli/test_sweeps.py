@@ -268,7 +268,7 @@ def test_optuna_maximises_and_skips_failed_trials(here):
     assert set(best["best_params"]) == {"env.pay", "env.mood"}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_submitit_job_of_two_ranks(here):
     """One rank of a job fails: the other jobs and the table stand."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
@@ -283,7 +283,7 @@ def test_submitit_job_of_two_ranks(here):
     assert list((here / "mine/.submitit").rglob("*_log.out"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_preempted_submitit_job_continues_its_checkpoint(here):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     total = f"samples={400 * UPDATE}"
@@ -318,8 +318,14 @@ def children(process):
     return [int(pid) for pid in text.split()]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
+@pytest.mark.parametrize(
+    "victim",
+    [
+        pytest.param("worker", marks=pytest.mark.nightly),
+        pytest.param("job", marks=pytest.mark.slow),
+        pytest.param("sweep", marks=pytest.mark.nightly),
+    ],
+)
 def test_kill_9(here, victim):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = "seconds=8", "checkpoint_seconds=1", "env.mood=slow", "-m", "seed=1,2,3"

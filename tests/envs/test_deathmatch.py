@@ -632,7 +632,7 @@ def test_train_evaluate_and_record_in_self_play(tmp_path, monkeypatch):
     assert train.main(["env=deathmatch", *small, "device=cpu"]) == 0
     assert evaluate.main(["run=run", "episodes=12", "device=cpu"]) == 0
     for row in rows_of("run"):
-        assert set(row["metrics"]) == set(METRICS) and row["lanes"] == 36
+        assert set(row["metrics"]) == set(METRICS) and row["lanes"] == 12
     assert record.main(["run=run", "steps=2", "device=cpu"]) == 0
     assert Path("run/video.mp4").exists()
 

@@ -95,7 +95,7 @@ def test_deathmatch_runs_are_trained_side_by_side_and_duel(monkeypatch):
     assert len(rows) == 4 and all(0 <= row["value"] <= 1 for row in rows)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
     asynchronous = training_benchmarks.ASYNC  # skipped outside of Explorer
     titles = "PPO", "R2D2", asynchronous
@@ -116,7 +116,7 @@ def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
     assert "PPO" in figure and "R2D2" in figure
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_curricula_are_compared_by_source_and_worst_homes(monkeypatch):
     small = "env=pointgoal", "env.n_envs=32", "env.res=16", "env.subsample=1"
     homes = "geometry=mixed", "geometry.parts={homes:8,mazes:{source:maze,n:4}}", "log_every=1"
