@@ -16,6 +16,7 @@ import base64
 import collections
 import contextlib
 import functools
+import importlib
 import inspect
 import itertools
 import os
@@ -365,6 +366,16 @@ def _write(path: Film, content: bytes) -> Film:
     return path
 
 
+def _check_packages(*names: str) -> None:
+    """Raises ImportError if a package that films need cannot be imported, saying why."""
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # also of a backend that MPLBACKEND names
+            reason = next(iter(str(error).splitlines()), "")
+            raise ImportError(f"drawing needs {name}, which fails: {reason}") from error
+
+
 def check_path(path: str | os.PathLike) -> None:
     """Raises ValueError if no film or picture can have this name."""
     if pathlib.Path(path).suffix not in ENDINGS:
@@ -444,6 +455,7 @@ def film_all(
         raise ValueError(f"{path} is a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
+    _check_packages("matplotlib", *["av"] * (path.suffix[1:] in WRITERS))
     moments = zip(*(_moments(player, steps, greedy, seed, trail) for player in players))
     with plotting.styled(theme=theme, dpi=dpi, axes=axes):
         if path.suffix[1:] in WRITERS:
