@@ -129,7 +129,7 @@ class Core:
 
         split = state.widths.cumsum()[:-1]
         trail, views = state.get("trail"), state.get("views")
-        ax = plotting.plot_scenery(
+        drawn_on = plotting.plot_scenery(
             state.lines,
             np.split(state.texels, split),
             state.lights,
@@ -139,7 +139,7 @@ class Core:
             if seen is not None and views is not None
             else None,
         )
-        area = plotting.Area.on(ax)
+        area = plotting.Area.on(drawn_on)
         objects, names = (
             state.get("objects", arrdict(shapes=())),
             {n: s for s, n in NUMBERS.items()},
@@ -159,4 +159,4 @@ class Core:
                 plotting.plot_trail(area, trail[:, a], colour)
             label = str(a) if n_agents > 1 else ""
             plotting.plot_agent(area, position, angle, AGENT_RADIUS, colour, label)
-        return ax
+        return drawn_on

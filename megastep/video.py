@@ -12,7 +12,7 @@ __all__ = ["GifWriter", "Mp4Writer", "as_image"]
 
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"
-EXACT_COLOURS = 96  # of a GIF's palette
+EXACT_COLOURS, GREYS = 64, 32  # of a GIF's palette
 
 
 class Mp4Writer:
@@ -28,7 +28,7 @@ class Mp4Writer:
     def __init__(self, fps: float):
         import av  # which is needed for no other output
 
-        self._from_array = av.VideoFrame.from_ndarray
+        self._from_array: Any = av.VideoFrame.from_ndarray
         self._buffer = io.BytesIO()
         self._container = av.open(self._buffer, "w", format=self.container)
         self._stream: Any = self._container.add_stream(
@@ -84,7 +84,7 @@ class GifWriter(Mp4Writer):
     def _add(self, image) -> None:
         height, width = self._stream.height, self._stream.width
         padding = [(0, height - len(image)), (0, width - image.shape[1]), (0, 0)]
-        self._frames.append(zlib.compress(np.pad(image, padding, mode="edge"), 1))
+        self._frames.append(zlib.compress(np.pad(image, padding, mode="edge").tobytes(), 1))
 
     def close(self) -> bytes:
         """Returns the finished file, empty if there were no frames."""
@@ -123,9 +123,10 @@ def _palette(image) -> np.ndarray:
     colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], 1).astype(np.uint8)
     exact, rare = np.split(colours, [EXACT_COLOURS])
     if len(rare):
-        fitted = Image.fromarray(rare[None]).quantize(256 - EXACT_COLOURS)
+        fitted = Image.fromarray(rare[None]).quantize(256 - EXACT_COLOURS - GREYS)
         rare = np.array(fitted.getpalette(), np.uint8).reshape(-1, 3)
-    return np.concatenate([exact, rare, np.zeros((256, 3), np.uint8)])[:256]
+    greys = np.linspace(0, 255, GREYS).astype(np.uint8)[:, None].repeat(3, 1)  # of depth
+    return np.concatenate([exact, greys, rare, np.zeros((256, 3), np.uint8)])[:256]
 
 
 def _packed(image) -> np.ndarray:

@@ -49,7 +49,7 @@ def run(cfg: settings.Record) -> Path:
             policy, title = _player(cfg, loaded, runs, env_settings, env), cfg.title
             if cfg.homes is not None:
                 title = f"home {home}" if title is None else f"{title}, home {home}"
-            elif cfg.runs is not None:
+            elif loaded is not None and len(runs) > 1:
                 name = folders.name_of(loaded.path)
                 title = name if title is None else f"{title}, {name}"
             players.append(recording.Player(env, policy, title))

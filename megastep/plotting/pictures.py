@@ -86,7 +86,8 @@ class Area(Artist):
 
     def _place(self, figure, bbox) -> None:
         self.bbox, self._overlay, self._things, self.style = bbox, None, [], current()
-        self._low = self._high = None
+        self._low: Any = None
+        self._high: Any = None
         self.set_figure(figure)
 
     def __getattr__(self, name: str) -> Any:
@@ -359,7 +360,7 @@ def rasterise(figure: Figure) -> np.ndarray:
     """Renders a figure with Agg, whatever its canvas. Returns (H, W, 3) uint8."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    image = Image.frombuffer("RGBA", canvas.get_width_height(physical=True), canvas.buffer_rgba())
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba()))
     return np.array(image.convert("RGB"))  # faster than numpy's slices
 
 

@@ -149,7 +149,7 @@ class Plan:
                 renderer, Path(view, closed=False), self.area.transform, floor, floor, 0.5
             )
 
-    def _walls(self, renderer, is_seen, only=slice(None)) -> None:
+    def _walls(self, renderer, is_seen, only: Any = slice(None)) -> None:
         """Draws texels, all or some: grey where they are not seen."""
         from matplotlib.collections import LineCollection
 
@@ -274,7 +274,7 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     n_columns, n_rows = (np.ceil((high - low) / CELL).astype(int) + 1).tolist()
     image = Image.new("1", (n_columns, n_rows))
     pen = ImageDraw.Draw(image)
-    for line in (lines - low) / CELL:
+    for line in np.round((lines - low) / CELL):
         pen.line([*line.ravel().tolist()], fill=1)
     wall = np.array(image, bool)
     points = np.frombuffer(lights_bytes, np.float32).reshape(-1, 2)
@@ -285,12 +285,9 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     if not room.any() or room[0, 0]:
         (x0, y0), (x1, y1) = lines.min((0, 1)), lines.max((0, 1))
         return Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
-    for axis in (0, 1):  # to the middle of the walls
-        room = room | np.roll(room, 1, axis) | np.roll(room, -1, axis)
     x, y = (low[a] + CELL * np.arange(n) for a, n in ((0, n_columns), (1, n_rows)))
-    polygons, codes = contour_generator(x, y, room.astype(float), fill_type="OuterCode").filled(
-        0.5, 2
-    )
+    contours: Any = contour_generator(x, y, room.astype(float), fill_type="OuterCode")
+    polygons, codes = contours.filled(0.02, 2)  # to the middle of the walls
     return Path(np.concatenate(polygons), np.concatenate(codes))
 
 

@@ -317,7 +317,7 @@ class Deathmatch(SceneryEnv):
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
         each agent to its target, and each agent's health, RGB and depth.
         """
-        title = f"step {state.age.max()} · {state.kills.sum():.3g} kills"
+        title = f"step {state.age.max()} · kills {state.kills.sum():.3g}"
         agents = range(len(state.health))
         figure, plan, strips = plotting.panels(4 * -(-len(agents) // 2), title=title, columns=2)
         Core.plot_state(state.core, plan)

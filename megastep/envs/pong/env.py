@@ -183,7 +183,12 @@ class Pong(DisplayedEnv):
         figure, court, _ = plotting.panels(title=f"step {state.age} · {left} : {right}")
         court.fit(np.array([0, 0]), np.array([COLUMNS, ROWS]))
         theme = court.style.colours
-        court.polygon([(0, 0), (COLUMNS, 0), (COLUMNS, ROWS), (0, ROWS)], fill=theme.floor)
+        court.polygon(
+            [(0, 0), (COLUMNS, 0), (COLUMNS, ROWS), (0, ROWS)],
+            fill=theme.floor,
+            edge=theme.faint,
+            width=1,
+        )
         middle = [(COLUMNS / 2, 0), (COLUMNS / 2, ROWS)]
         court.line(middle, colour=theme.hatch, width=2)
         for side, top in enumerate(state.paddles):
