@@ -233,14 +233,19 @@ The most common words:
   steps=400        frames
   against=RUN      its duel with another run's agent, a bot, or an import path, in one home
   home=3           another of the unseen homes; split=training: one it was trained in
-  file=out.mp4     this file, overwritten if it exists; out.png: the last frame only. Otherwise
-                   video.mp4 in the run folder, or video-2.mp4, ... if there is one"""
+  homes=[1,2,3,4]  several homes in a grid
+  runs=[A,B]       several runs side by side, in one home from the same spawn
+  theme=dark       also title=, dpi=200, speed=2, trail=0, axes=true
+  file=out.mp4     this file, overwritten if it exists; out.gif: the same as a GIF; out.png, out.svg
+                   or out.pdf: the last frame only. Otherwise video.mp4 in the run folder, or
+                   video-2.mp4, ... if there is one"""
 
 
 def check_run(cfg: settings.Evaluate | settings.Record) -> None:
-    """Raises UserError if the run does not exist."""
-    if cfg.run is not None:
-        folders.find(cfg.run)
+    """Raises UserError if a run does not exist."""
+    for run in (cfg.run, *(getattr(cfg, "runs", None) or ())):
+        if run is not None:
+            folders.find(run)
 
 
 def without_training(tree: Tree, typed: list[str]) -> Tree:

@@ -75,6 +75,7 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]
 Samples = Annotated[int, Field(ge=1, le=10**18)]
 Split = Literal["training", "test", "all"]
+FILMS = ".mp4", ".gif", ".png", ".svg", ".pdf"  # endings of what record.py can write
 
 
 # ---- Groups ----
@@ -412,24 +413,41 @@ class Evaluate(Played):
     ratings: bool = False
 
 
+Home = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
 @frozen
 class Record(Played):
     run: str | None
+    runs: Annotated[tuple[str, ...], Field(min_length=2, max_length=9)] | None = None
     steps: Steps
-    home: Annotated[int, Field(ge=0, le=1_000_000)]
+    home: Home
+    homes: Annotated[tuple[Home, ...], Field(min_length=1, max_length=16)] | None = None
     against: str | None = None
     file: str | None
+    title: str | None = None
+    theme: Literal["light", "dark"] = "light"
+    dpi: Annotated[float, Field(ge=20, le=400)] = 100.0
+    speed: Annotated[float, Field(gt=0, le=100)] = 1.0
+    trail: Annotated[int, Field(ge=0, le=10_000)] = 60
+    axes: bool = False
 
     def errors(self) -> dict[str, object]:
-        has_run, has_env = self.run is not None, self.env is not None
+        has_run, has_env = self.run is not None or self.runs is not None, self.env is not None
         return {
             "run": not (has_run or has_env)
             and "is missing; without a run, env=explorer records random actions",
+            "runs": self.runs is not None
+            and (
+                (self.run is not None and "cannot be combined with run; list all runs in runs")
+                or (self.homes is not None and "cannot be combined with homes; choose one home=")
+            ),
             "env": has_run and has_env and "cannot be combined with run, which has its own",
             "file": self.file is not None
-            and not self.file.endswith((".mp4", ".png"))
-            and f"{self.file!r} is neither a video, .mp4, nor its last frame, .png",
-            "against": has_env
-            and self.against is not None
+            and not self.file.endswith(FILMS)
+            and f"{self.file!r} is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or "
+            ".pdf",
+            "against": self.against is not None
+            and self.run is None
             and "needs run=, the agent that plays against it",
         }
