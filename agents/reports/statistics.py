@@ -72,7 +72,7 @@ def band(
     start = max(np.min(x) for x, _ in curves)
     end = max(start, min(np.max(x) for x, _ in curves))
     x = np.linspace(start, end, n_points)
-    values = np.stack([np.interp(x, *map(np.asarray, curve)) for curve in curves])
+    values = np.stack([np.interp(x, np.asarray(at), np.asarray(y)) for at, y in curves])
     draws = np.random.default_rng(seed).integers(len(curves), size=(n_resamples, len(curves)))
     means = values[draws].mean(1)
     lower, upper = np.quantile(means, [(1 - level) / 2, (1 + level) / 2], axis=0)
