@@ -1,8 +1,9 @@
-"""An environment in unseen homes, where the agent of a run meets others."""
+"""Environments in unseen homes, where the agent of a run plays alone or meets others."""
 
 import functools
 import itertools
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,7 +13,7 @@ from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import duels, ratings, statistics, suite, tables
+from megastep.agents.evaluation import duels, playing, ratings, statistics, suite, tables
 from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
@@ -82,6 +83,50 @@ def find_player(
         assert env_settings is not None
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
+
+
+class Stage:
+    """An environment in which each home is played equally often, each environment in one home.
+
+    Args:
+        env: settings of the environment.
+        homes: geometries; none if the environment takes none.
+        episodes: number of episodes, one per lane. If there are fewer environments than homes, they
+            are in evenly spaced ones; if more, their number is rounded up to a multiple of homes.
+        seed: of spawns.
+        device: a name of PyTorch.
+
+    Attributes:
+        env, sample: the environment, with this rank's share of all lanes, and a small one.
+        settings: those of `env`.
+        homes: the geometries played in.
+        numbers: the index of each in the list that was given.
+        shard: this rank's share.
+    """
+
+    def __init__(
+        self,
+        env: settings.Env,
+        homes: Sequence,
+        episodes: int,
+        seed: int = 1,
+        device: torch.device | str = "cpu",
+    ):
+        self.seed = rank_seed(seed, process_group.rank())
+        self.sample = factory.make_sample(env, [*homes], seed=self.seed, device=device)
+        n_envs = -(-episodes // optional(self.sample, "n_agents"))
+        n_envs += -n_envs % len(homes) if n_envs > len(homes) > 0 else 0
+        self.homes = factory.spread([*homes], n_envs)
+        self.numbers = factory.spread([*range(len(homes))], n_envs)
+        self.shard = Shard.of_this_rank(n_envs, len(self.homes))
+        self.settings = settings.changed(env, n_envs=len(self.shard.envs), resample=False)
+        where = dict(geometries=[self.homes[home] for home in self.shard.homes], device=device)
+        self.env: Env = factory.construct(self.settings, seed=self.seed, **where)
+
+    def play(self, policy: PolicyLike, greedy: bool, max_steps: int | None = None) -> "arrdict":
+        """Returns the first episodes of all lanes, see `playing.first_episodes`, of all ranks."""
+        played = playing.first_episodes(self.env, policy, self.seed, greedy, max_steps)
+        return self.shard.with_others(played)
 
 
 def check_duels(env: Env) -> None:

@@ -97,7 +97,7 @@ def play(
     """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the rows of the
     table, and those of the episodes.
     """
-    stage = episodes.Stage(env_settings, homes, cfg.episodes, cfg.seed, device)
+    stage = arena.Stage(env_settings, homes, cfg.episodes, cfg.seed, device)
     env, roles = stage.env, optional(stage.env, "roles")
     sources = factory.sources_of(stage.homes)
     rows, single = [], []
@@ -122,7 +122,7 @@ def play(
 
 
 def players_of(
-    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, stage: episodes.Stage
+    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, stage: arena.Stage
 ) -> list[tuple[arena.Player, bool]]:
     """Returns who plays, the run's agent and each of `cfg.baseline`, and whether it is greedy."""
     policy = factory.make_policy(factory.config_of(loaded).agent, stage.env)
