@@ -1,7 +1,7 @@
 """Core: scenery, agents and camera settings in one object."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -112,7 +112,7 @@ class Core:
     @staticmethod
     def plot_state(
         state: arrdict, ax: "Area | Axes | None" = None, seen: np.ndarray | None = None
-    ) -> Any:
+    ) -> "Area | Axes":
         """Draws a numpyified :meth:`state` from above: rooms, walls, objects, agents in their
         colours with what they see, and in films where they were.
 

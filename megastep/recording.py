@@ -302,7 +302,7 @@ def draw(plot_state: Callable, state: Tree) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _drawn(plot_state, state) -> Iterator[Any]:
+def _drawn(plot_state, state) -> Iterator:
     """What ``plot_state`` draws: a figure, or an image (H, W, 3) uint8."""
     drawing = plot_state(state)
     if isinstance(drawing, np.ndarray):
@@ -402,7 +402,7 @@ def film(
     steps: int,
     greedy: bool = False,
     seed: int = 1,
-    **look: Any,
+    **look,
 ) -> Film:
     """Films environment 0 of `env` for some steps from its reset, each a frame. Returns the path,
     which a notebook shows as the film.
@@ -490,7 +490,7 @@ def _is_fast(player, moment) -> bool:
 
 
 @contextlib.contextmanager
-def _drawing(player, moment) -> Iterator[Any]:
+def _drawing(player, moment) -> Iterator:
     """The drawing of a moment, in the style of the film."""
     with plotting.styled(title=player.title, note=moment.note):
         with _drawn(player.env.plot_state, moment.state) as drawing:
@@ -555,7 +555,7 @@ class _Past:
     def __init__(self, trail: int):
         self._trail, self._views, self._n_views = collections.deque(maxlen=trail + 1), None, 0
 
-    def __call__(self, state: Any, starts: np.ndarray) -> Any:
+    def __call__(self, state: Tree, starts: np.ndarray) -> Any:
         """Returns the state; ``starts`` (A,) says whose episodes begin."""
         core = state.get("core") if isinstance(state, dict) else None
         if not isinstance(core, dict) or "distances" not in core:

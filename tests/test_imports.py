@@ -16,6 +16,7 @@ SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
+    ("types",),
     ("env_values", "global_generators", "wrapper_state"),
     (
         "cache",
@@ -24,7 +25,6 @@ SIMULATOR = (
         "read_only",
         "settings",
         "sync_envs",
-        "types",
         "video",
         "workers",
     ),

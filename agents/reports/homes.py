@@ -4,7 +4,6 @@ import html
 import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -52,7 +51,7 @@ def section(run: runs.Run) -> list[str]:
     return []
 
 
-def score_by_home(episodes: Mapping[str, Sequence[Any]]) -> tuple[str, dict[int, float]]:
+def score_by_home(episodes: Mapping[str, Sequence]) -> tuple[str, dict[int, float]]:
     """Returns the first of `SCORES` that episodes have, and its mean in each home, of the first
     agent of a table.
     """
@@ -64,7 +63,7 @@ def score_by_home(episodes: Mapping[str, Sequence[Any]]) -> tuple[str, dict[int,
     return name, {home: float(np.mean(some)) for home, some in values.items()}
 
 
-def plans_of(run: runs.Run, table: Mapping[str, Any]) -> list:
+def plans_of(run: runs.Run, table: Mapping) -> list:
     """Returns the geometries of the split that a table is about.
 
     Raises:
@@ -82,7 +81,7 @@ def plans_of(run: runs.Run, table: Mapping[str, Any]) -> list:
     return factory.homes(trained.env, kept, str(chosen["split"]))
 
 
-def figure(number: int, plan: Mapping[str, Any], value: float, span: tuple[float, float]) -> str:
+def figure(number: int, plan: Mapping, value: float, span: tuple[float, float]) -> str:
     """Returns a home from above, its floor coloured by a value between the bounds of `span`."""
     walls = np.asarray(plan["walls"], float)
     low, high = walls.min((0, 1)), walls.max((0, 1))

@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from megastep.agents.runs import checkpoint
 from megastep.agents.runs.atomic_files import write_atomically
 
 if TYPE_CHECKING:
-    pass
+    from megastep.agents.types import Row
 
 HERE = Path(__file__).parent
 #: Most points of a curve.
@@ -43,7 +43,7 @@ def write(paths: Sequence[Path], file: Path) -> Path:
         UserError: a folder is no run, runs share no metric, or the file cannot be written.
     """
     every = [*map(runs.read, paths)]
-    charts: list[dict[str, Any]] = []
+    charts: list[Row] = []
     body = _one(every[0], charts, file) if len(every) == 1 else _several(every, charts)
     title = every[0].folder.name if len(every) == 1 else f"{len(every)} runs"
     parts = {
@@ -96,7 +96,7 @@ def _facts(run: runs.Run) -> str:
     return _table([], [[key, str(value)] for key, value in facts.items()], heads=True)
 
 
-def typed(run: runs.Run) -> dict[str, Any]:
+def typed(run: runs.Run) -> "Row":
     """Returns the settings that the command of a run's first start named, as the run has them."""
     words = str(run.provenance[0].get("command", "")).split() if run.provenance else []
     keys = {word.lstrip("-+").partition("=")[0] for word in words if "=" in word}

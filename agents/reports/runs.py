@@ -4,7 +4,7 @@ import contextlib
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import yaml
 
@@ -37,7 +37,7 @@ class Run(NamedTuple):
     metrics: "list[Row]"
     perf: "list[Row]"
     provenance: "list[Row]"
-    evaluations: list[dict[str, Any]]
+    evaluations: "list[Row]"
 
     @property
     def task(self) -> str:
@@ -45,7 +45,7 @@ class Run(NamedTuple):
         names = [self.config[group] for group in ("env", "geometry") if group in self.config]
         return ", ".join(label(str(group.get("name"))) for group in names)
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> "Row":
         """Returns {dotted key: value} of all settings but those of a seed."""
         return {k: v for k, v in leaves(self.config) if k.split(".")[0] not in OF_A_SEED}
 
@@ -93,7 +93,7 @@ def _config(folder: Path) -> "Config":
     return config
 
 
-def _evaluation(path: Path) -> dict[str, Any] | None:
+def _evaluation(path: Path) -> "Row | None":
     with contextlib.suppress(OSError, ValueError, RecursionError):
         table = json.loads(strange_files.read_bytes(path, MAX_BYTES))
         if isinstance(table, dict) and isinstance(table.get("rows"), list) and table["rows"]:

@@ -132,7 +132,7 @@ class Area(Artist):
 
     # ---- Things to draw ----
 
-    def add(self, thing: Callable[[Any], None], z: float = 0) -> None:
+    def add(self, thing: Callable, z: float = 0) -> None:
         """Adds a function that draws with a renderer."""
         self._things.append((z, thing))
 
@@ -240,7 +240,7 @@ class Area(Artist):
 
         self.add(draw, z)
 
-    def draw(self, renderer: Any) -> None:
+    def draw(self, renderer) -> None:
         """Draws all things, the lowest first."""
         if not self.get_visible():
             return

@@ -34,7 +34,7 @@ def plot_scenery(
     seen: Sequence[ArrayLike] | None = None,
     ax: Area | Axes | None = None,
     views: np.ndarray | None = None,
-) -> Any:
+) -> Area | Axes:
     """Draws the floor plan of one environment: rooms, walls in their colours, a scale bar. Returns
     what it is drawn on.
 
@@ -92,7 +92,7 @@ class Plan:
         points = lines.reshape(-1, 2) if len(lines) else np.array([[0.0, 0.0], [1.0, 1.0]])
         self.low, self.high = points.min(0), points.max(0)
 
-    def draw(self, renderer: Any) -> None:
+    def draw(self, renderer) -> None:
         """Draws floor and walls."""
         from matplotlib.backends.backend_agg import RendererAgg
 
@@ -149,7 +149,7 @@ class Plan:
                 renderer, Path(view, closed=False), self.area.transform, floor, floor, 0.5
             )
 
-    def _walls(self, renderer, is_seen, only: Any = slice(None)) -> None:
+    def _walls(self, renderer, is_seen, only: slice | np.ndarray = slice(None)) -> None:
         """Draws texels, all or some: grey where they are not seen."""
         from matplotlib.collections import LineCollection
 
