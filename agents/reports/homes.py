@@ -45,7 +45,7 @@ def section(run: runs.Run) -> list[str]:
         shown = [figure(home, plans[home], by_home[home], span) for home in worst[:N_WORST] + best]
         return [
             "<h2>Homes, worst first</h2>",
-            f"<p>{html.escape(text)} <code>record.py home=N</code> films one.</p>",
+            f"<p>{html.escape(text)} <code>record.py home=N</code> films one of this split.</p>",
             f'<div class="plans">{"".join(shown)}</div>',
         ]
     return []
