@@ -95,6 +95,8 @@ class Stage:
             are in evenly spaced ones; if more, their number is rounded up to a multiple of homes.
         seed: of spawns.
         device: a name of PyTorch.
+        rank: (number, ranks) whose share of the environments is made. Default: this process's.
+        options: other arguments of the environment, such as `films`.
 
     Attributes:
         env, sample: the environment, with this rank's share of all lanes, and a small one.
@@ -111,21 +113,33 @@ class Stage:
         episodes: int,
         seed: int = 1,
         device: torch.device | str = "cpu",
+        rank: tuple[int, int] | None = None,
+        **options,
     ):
-        self.seed = rank_seed(seed, process_group.rank())
+        self.seed = rank_seed(seed, process_group.rank() if rank is None else rank[0])
         self.sample = factory.make_sample(env, [*homes], seed=self.seed, device=device)
         n_envs = -(-episodes // optional(self.sample, "n_agents"))
         n_envs += -n_envs % len(homes) if n_envs > len(homes) > 0 else 0
         self.homes = factory.spread([*homes], n_envs)
         self.numbers = factory.spread([*range(len(homes))], n_envs)
-        self.shard = Shard.of_this_rank(n_envs, len(self.homes))
+        self.shard = (
+            Shard.of_this_rank(n_envs, len(self.homes))
+            if rank is None
+            else Shard(n_envs, len(self.homes), *rank)
+        )
         self.settings = settings.changed(env, n_envs=len(self.shard.envs), resample=False)
         where = dict(geometries=[self.homes[home] for home in self.shard.homes], device=device)
-        self.env: Env = factory.construct(self.settings, seed=self.seed, **where)
+        self.env: Env = factory.construct(self.settings, seed=self.seed, **where, **options)
 
-    def play(self, policy: PolicyLike, greedy: bool, max_steps: int | None = None) -> "arrdict":
+    def play(
+        self,
+        policy: PolicyLike,
+        greedy: bool,
+        max_steps: int | None = None,
+        recorder: playing.Recorder | None = None,
+    ) -> "arrdict":
         """Returns the first episodes of all lanes, see `playing.first_episodes`, of all ranks."""
-        played = playing.first_episodes(self.env, policy, self.seed, greedy, max_steps)
+        played = playing.first_episodes(self.env, policy, self.seed, greedy, max_steps, recorder)
         return self.shard.with_others(played)
 
 

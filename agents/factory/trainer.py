@@ -47,6 +47,7 @@ def make_trainer(
     device: torch.device,
     token: str = "",
     on_log: Callable[[Trainer], None] = lambda trainer: None,
+    make_evaluator: Callable | None = None,
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
@@ -56,6 +57,8 @@ def make_trainer(
     Args:
         token: a name that all ranks of this start have, and no other start.
         on_log: called with the trainer after each report.
+        make_evaluator: returns what measures the policy every `cfg.evaluate_every`, for `cfg`, the
+            environment of the training and the device, such as `evaluation.in_training.Evaluator`.
     """
     number, n_ranks = process_group.rank(), process_group.n_ranks()
     seed = rank_seed(cfg.seed, number)
@@ -90,6 +93,13 @@ def make_trainer(
                     raise ValueError(f"learner.{name} has a NaN or an infinity")
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
+    measured = {}
+    if cfg.evaluate_every is not None and make_evaluator is not None:
+        measured = dict(
+            evaluator=make_evaluator(cfg, env, device),
+            evaluate_every=settings.every(cfg.evaluate_every),
+            stop=cfg.stop,
+        )
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
@@ -132,6 +142,7 @@ def make_trainer(
             make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
             layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
             repeat_hint=functools.partial(repeat.hint, is_resumed=cfg.resume is not None),
+            **measured,
             **writers,
         )
         if cfg.resume:

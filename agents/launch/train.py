@@ -24,7 +24,7 @@ from megastep.agents.errors import (
     memory_problem,
     user_errors,
 )
-from megastep.agents.evaluation import evaluate_run, record
+from megastep.agents.evaluation import evaluate_run, in_training, record
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, dry_run, launcher, rank, rank_checks, signals
@@ -92,7 +92,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     if cfg.resume == again.AUTO:
         start = together(lambda: again.automatic(cfg))
         if start.is_done:
-            console.say(f"The run in {start.folder} has already used up its budget.")
+            why = "reached its stop" if start.is_reached else "used up its budget"
+            console.say(f"The run in {start.folder} has already {why}.")
             return start.folder
         cfg = start.cfg
     is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(str(cfg.folder)))
@@ -111,7 +112,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             try:
                 trainer = together(
                     env_failures.told(cfg.env, folder, rank=process_group.rank())(
-                        lambda: make_trainer(cfg, folder, device, token, show)
+                        lambda: make_trainer(
+                            cfg, folder, device, token, show, in_training.Evaluator
+                        )
                     )
                 )
             except EnvFailed:
@@ -181,7 +184,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 )
         if cfg.finish.record and is_first:
             with console.warned():
-                record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
+                record.run(settings.Record(steps=cfg.finish.steps, home=None, file=None, **common))
         if cfg.finish.report and is_first:
             from megastep.agents.reports import report
 
@@ -200,6 +203,12 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
 def result_of(trainer: Trainer) -> str:
     """Returns what a run came to: samples, seconds, and the return of its last episodes."""
     text = f"Trained {trainer.samples:,} samples in {console.duration(trainer.clock.seconds)}"
+    if trainer.is_reached:
+        goals = ", ".join(
+            f"{name} {trainer.evaluation[name]:.4g} (stop.{name}={goal:g})"
+            for name, goal in trainer.stop.items()
+        )
+        return f"{text}, when an evaluation had {goals}"
     latest = trainer.latest_stats
     if "episode/return" not in latest:
         return f"{text}; no episode ended since the last report"
