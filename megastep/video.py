@@ -1,6 +1,8 @@
 """Writers of mp4 and GIF, and the images they take."""
 
 import io
+import itertools
+import os
 import zlib
 from fractions import Fraction
 from typing import Any
@@ -69,6 +71,28 @@ class Mp4Writer:
         self._container.mux(self._stream.encode(None))
         self._container.close()
         return self._buffer.getvalue()
+
+
+def small_gif(path: str | os.PathLike, height: int, n_frames: int) -> tuple[bytes, tuple[int, int]]:
+    """Returns a film as a GIF, and its height and width in pixels.
+
+    Args:
+        path: of an mp4 or GIF.
+        height: the most pixels that its images are high.
+        n_frames: the most frames, evenly spaced over the film, which takes as long as before.
+    """
+    import av
+
+    with av.open(os.fspath(path)) as film:
+        stream = film.streams.video[0]
+        height = min(height, stream.height)
+        size = height, max(1, round(stream.width * height / stream.height))
+        every = max(1, -(-stream.frames // n_frames))
+        writer = GifWriter(float(stream.average_rate or 10) / every)
+        for frame in itertools.islice(film.decode(video=0), None, None, every):
+            small = frame.reformat(width=size[1], height=size[0], format="rgb24")
+            writer.add(small.to_ndarray())
+    return writer.close(), size
 
 
 class GifWriter(Mp4Writer):

@@ -24,10 +24,10 @@ def run(cfg: settings.Evaluate) -> Path:
     run's folder.
 
     Writes .json, .md, .csv, which has a row per episode, and .npz, from which `record.py worst=3`
-    plays episodes again, into the run's folder `evaluations`, one of each per source of geometries (per environment where it has none), split and checkpoint.
-    Of `geometry=suite` plays as many episodes in each source, and adds the worst source and the
-    worst dense homes. With `cfg.against` plays duels instead; with `cfg.ratings` writes
-    ratings.csv and ratings.svg.
+    plays episodes again, into the run's folder `evaluations`, one of each per source of geometries
+    (per environment where it has none), split and checkpoint. Of `geometry=suite` plays as many
+    episodes in each source, and adds the worst source and the worst dense homes. With `cfg.against`
+    plays duels instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)

@@ -153,7 +153,11 @@ class Table(NamedTuple):
             rows = [row for row in rows if row.get("home") == home]
             if not rows:
                 homes = sorted({row["home"] for row in self.rows if "home" in row})
-                have = f"it has {len(homes)} homes, {homes[0]} to {homes[-1]}" if homes else "it has none"
+                have = (
+                    f"it has {len(homes)} homes, {homes[0]} to {homes[-1]}"
+                    if homes
+                    else "it has none"
+                )
                 raise UserError(f"{self.path} has no episode in home {home}: {have}")
         if episode is not None:
             if not (rows := [row for row in rows if row["episode"] == episode]):

@@ -114,12 +114,7 @@ def make_trainer(
         rank_files = RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
             step = had["samples_at_report"]
-            facts = dict(folder=folder, step=step, run_name=folder.name, config=config["train"])
-            makers = {
-                label: functools.partial(factory.construct, one, **facts)
-                for label, one in cfg.logger.items()
-            }
-            logger = loggers.Loggers(folder, step, makers)
+            logger = make_loggers(cfg, folder, step)
             snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
             writers = dict(
                 on_log=on_log,
@@ -150,6 +145,16 @@ def make_trainer(
                 trainer.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
             trainer.lost += differing(loaded.made_with, made_with)
     return trainer
+
+
+def make_loggers(cfg: settings.Train, folder: Path, step: int) -> loggers.Loggers:
+    """Returns the loggers of a run that starts, resumes or ends at `step`."""
+    facts = dict(folder=folder, step=step, run_name=folder.name, config=check.as_tree(cfg))
+    makers = {
+        label: functools.partial(factory.construct, one, **facts)
+        for label, one in cfg.logger.items()
+    }
+    return loggers.Loggers(folder, step, makers)
 
 
 @contextlib.contextmanager

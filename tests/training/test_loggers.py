@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import io
 import json
 import os
 import pathlib
@@ -9,7 +10,9 @@ import subprocess
 import sys
 import types
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from megastep.agents.runs import json_lines
 from megastep.agents.training import loggers
@@ -18,6 +21,8 @@ from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.loggers.csv import CSV
 from megastep.agents.training.loggers.tensorboard import TensorBoard
 from megastep.agents.training.loggers.wandb import Wandb
+from megastep.agents.types import RunResult
+from megastep.video import Mp4Writer
 from tests.helpers import faults
 from tests.helpers.processes import HUNG
 
@@ -208,7 +213,7 @@ def fake_wandb(monkeypatch, key="key", init=None, log=None):
     logged = []
     namespace = types.SimpleNamespace
     log = log or (lambda values, step: logged.append((step, values)))
-    run = namespace(log=log, finish=lambda: None)
+    run = namespace(log=log, finish=lambda: None, summary={})
 
     def started(**options):
         module.options.append(options)
@@ -216,6 +221,9 @@ def fake_wandb(monkeypatch, key="key", init=None, log=None):
         return run
 
     module = namespace(login=lambda prompt: key is not None, Settings=dict, init=init or started)
+    module.Video = lambda path, format: ("video", path, format)
+    module.Table = lambda columns, data: ("table", columns, data)
+    module.run = run
     module.options = []
     monkeypatch.setitem(sys.modules, "wandb", module)
     return logged
@@ -239,12 +247,59 @@ def test_wandb_logs_metrics_and_perf(tmp_path, monkeypatch):
 
 def test_resumed_run_continues_its_wandb_run(tmp_path, monkeypatch):
     fake_wandb(monkeypatch)
-    for folder, step in ((tmp_path / "a", 0), (tmp_path / "b", 0), (tmp_path / "a", 5)):
-        folder.mkdir(exist_ok=True)
-        with_wandb(folder, step).close()
+    for name, step in (("a", 0), ("b", 0), ("a", 5), ("a", 9)):
+        (tmp_path / name).mkdir(exist_ok=True)
+        with_wandb(tmp_path / name, step).close()
     started = sys.modules["wandb"].options
-    assert [options["id"] for options in started] == [None, None, "id1"]
-    assert [options["resume"] for options in started] == ["allow"] * 3
+    assert [options["id"] for options in started] == [None, None, "id1", "id1"]
+    assert [options["resume"] for options in started] == ["allow"] * 4
+    assert {options["job_type"] for options in started} == {"train"}
+    assert started[0]["config"].keys() == {"commit"}
+
+
+RESULT = RunResult({"score": 3.5}, None, [{"agent": "trained", "return": "3.5"}])
+
+
+def test_wandb_has_the_result_of_a_run(tmp_path, monkeypatch):
+    logged = fake_wandb(monkeypatch)
+    run_loggers = with_wandb(tmp_path, 5)
+    run_loggers.finish(5, RESULT._replace(film=tmp_path / "video.mp4"))
+    run_loggers.close()
+    film = "video", str(tmp_path / "video.mp4"), "mp4"
+    table = "table", ["agent", "return"], [["trained", "3.5"]]
+    assert logged == [(5, {"samples": 5, "film": film, "evaluation": table})]
+    assert sys.modules["wandb"].run.summary == {"final/score": 3.5}
+
+
+def test_tensorboard_has_the_result_of_a_run(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    film, config = tmp_path / "video.mp4", {"seed": 1, "learner": {"lr": 0.1, "names": [1, 2]}}
+    writer = Mp4Writer(10)
+    for number in range(8):
+        writer.add(np.full((720, 640, 3), 30 * number, np.uint8))
+    film.write_bytes(writer.close())
+    made = []
+
+    def make():
+        made.append(TensorBoard(tmp_path, 5, config))
+        return made[-1]
+
+    run_loggers = Loggers(tmp_path, 5, {"tensorboard": make, "csv": lambda: CSV(tmp_path, 5)})
+    run_loggers.finish(5, RESULT._replace(film=film))
+    assert [*run_loggers.others] == ["tensorboard"], "a table has no use for it"
+    run_loggers.close()
+    assert made[0].error is None
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [(e.step, e.value) for e in events.Scalars("final/score")] == [(5, 3.5)]
+    (text,) = events.Tensors("evaluation/text_summary")
+    assert b"| trained" in text.tensor_proto.string_val[0]
+    (image,) = events.Images("film")
+    assert (image.height, image.width) == (360, 320)
+    with Image.open(io.BytesIO(image.encoded_image_string)) as gif:
+        assert gif.n_frames == 8 and gif.size == (320, 360)
+    hparams = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    assert b"learner.lr" in hparams and b"learner.names" in hparams
 
 
 @pytest.mark.parametrize(
