@@ -402,7 +402,7 @@ def report(folder: Path, rows: "list[Row]") -> None:
 
 
 def write_table(folder: Path, rows: "list[Row]") -> None:
-    """Writes sweep.md, the tables as they are printed, and sweep.csv, with all digits and folders."""
+    """Writes sweep.md, the tables as printed, and sweep.csv, with all digits and folders."""
     tables = filter(None, [_cells(rows), _pooled(rows)])
     texts = [console.table(*table, is_markdown=True) for table in tables]
     write_atomically(folder / "sweep.md", "\n\n".join(texts).encode())
