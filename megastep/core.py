@@ -4,6 +4,7 @@ import copy
 import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -22,6 +23,12 @@ if TYPE_CHECKING:
     from megastep.plotting import Area
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]
+
+
+#: What moves of agents.
+STATE = "positions", "angles", "velocity", "angvelocity"
+#: The copies that `Core.alone` returns, outside of the cores, whose state is saved.
+_ALONE: "WeakKeyDictionary[Core, Core]" = WeakKeyDictionary()
 
 
 class Core:
@@ -74,27 +81,39 @@ class Core:
 
     def alone(self, e: int) -> "Core":
         """Returns a copy of environment ``e`` as the only one of a core, whose layouts are shared
-        with this one. Takes the same time however many environments there are.
+        with this one. The next call changes it. Takes the same time however many environments there
+        are.
         """
-        shared, agents = self.scenery, self.agents
+        one = _ALONE.get(self)
+        if one is None or (one.scenery.objects is None) != (self.scenery.objects is None):
+            one = _ALONE[self] = self._one()
+        pairs = [(one.agents, self.agents, name) for name in STATE]
+        pairs.append((one.scenery, self.scenery, "layout"))
+        if self.scenery.objects is not None:
+            objects = one.scenery.objects, self.scenery.objects
+            pairs += [(*objects, name) for name in ("records", "lines", "texels")]
+        for own, shared, name in pairs:
+            getattr(own, name).copy_(getattr(shared, name)[[e]])
+        return one
+
+    def _one(self) -> "Core":
+        shared = self.scenery
         widths = shared.model_texels.tolist()
         scenery = engine.Scenery.of_layouts(
             self.n_agents,
             shared.layouts,
             shared.model,
             [end - start for start, end in itertools.pairwise(widths)],
-            shared.layout[[e]],
+            shared.layout[:1],
         )
         if shared.objects is not None:
             objects = copy.copy(shared.objects)
-            own = {name: getattr(objects, name)[[e]] for name in ("records", "lines", "texels")}
+            names = "records", "lines", "texels"
+            own = {name: getattr(objects, name)[:1].clone() for name in names}
             vars(objects).update(own, n_envs=1)
             vars(objects).pop("_packed", None)  # the addresses of all environments'
             scenery.objects = objects
-        core = Core(scenery, self.res, self.fov, self.fps, agents.yaws.tolist(), self.seed)
-        for name in ("positions", "angles", "velocity", "angvelocity"):
-            getattr(core.agents, name).copy_(getattr(agents, name)[[e]])
-        return core
+        return Core(scenery, self.res, self.fov, self.fps, self.agents.yaws.tolist(), self.seed)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`: walls and their lit texels, lights,
@@ -117,9 +136,9 @@ class Core:
             texels=torch.cat([colours[0][:0], *colours[n_moving:]]),
             widths=torch.tensor([len(texels) for texels in colours[n_moving:]], dtype=torch.int64),
             lights=lights,
-            positions=agents.positions[0],
-            angles=agents.angles[0],
-            yaws=agents.yaws,
+            positions=agents.positions[0].clone(),
+            angles=agents.angles[0].clone(),
+            yaws=agents.yaws.clone(),
             fov=torch.tensor(agents.fov),
             distances=(AGENT_RADIUS + 10 * (1 - depth[0].float())).view(
                 self.n_agents, len(agents.yaws), -1

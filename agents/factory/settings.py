@@ -75,7 +75,8 @@ def _every(given: int | float | str) -> int | str:
     seconds, samples = (quantity(given, kind) for kind in UNITS)
     if isinstance(given, str) and re.fullmatch(r"[\d.]+ *m", given):
         raise ValueError(f"{given!r} may be minutes or millions: write min or M")
-    if isinstance(given, str) and not isinstance(seconds, str):
+    is_samples = isinstance(given, str) and given.endswith("M")
+    if isinstance(given, str) and not isinstance(seconds, str) and not is_samples:
         if not 0 < seconds < 1e9:
             raise ValueError(f"{given!r} is no time")
         return f"{seconds}s"

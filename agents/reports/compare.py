@@ -21,11 +21,12 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
     beside it, a .csv of its lines. Returns the plot's path.
 
     Raises:
-        UserError: a folder is no run, a run has not reported the metric, or a file cannot be
-            written.
+        UserError: a folder is no run, a run has not reported the metric, matplotlib fails, or a
+            file cannot be written.
     """
-    from matplotlib.figure import Figure  # which takes a while
-    from matplotlib.ticker import EngFormatter
+    with user_errors("drawing needs matplotlib, which fails: ", (ImportError, ValueError)):
+        from matplotlib.figure import Figure  # which takes a while
+        from matplotlib.ticker import EngFormatter
 
     if file.suffix not in FORMATS:
         raise UserError(f"file={file} is no plot; its name ends with {', '.join(FORMATS)}")

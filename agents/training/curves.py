@@ -32,12 +32,12 @@ def plot_curves(folder: Path | str) -> None:
 
     Lines are means over a twentieth of the reports, in a band of a standard deviation.
 
-    Warns if a file cannot be read, or the disk is full.
+    Warns if a file cannot be read, the disk is full, or matplotlib fails.
     """
-    from matplotlib.figure import Figure  # which takes a while
-
     folder = Path(folder)
     try:
+        from matplotlib.figure import Figure  # which takes a while
+
         rows = [json_lines.read(folder / name) for name in ("metrics.jsonl", "perf.jsonl")]
         panels = panels_of(*rows)
         if not panels:
@@ -62,8 +62,9 @@ def plot_curves(folder: Path | str) -> None:
         figure.supxlabel("samples", fontsize="medium")
         figure.savefig(image := io.BytesIO(), dpi=80)
         write_atomically(folder / "curves.png", image.getvalue())
-    except OSError as error:
-        warnings.warn(f"curves.png cannot be drawn ({error.strerror})", stacklevel=2)
+    except (OSError, ImportError, ValueError) as error:  # also a backend that MPLBACKEND names
+        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
+        warnings.warn(f"curves.png cannot be drawn ({reason})", stacklevel=2)
 
 
 def places_of(n: int) -> list[tuple[slice, slice]]:

@@ -344,7 +344,7 @@ class Trainer:
             stats |= self.opponents.pop_win_rates(sum_over_ranks)
         of_curriculum = {} if self.curriculum is None else self.curriculum.stats()
         evaluation = {}
-        if any_rank(self._evaluation_is_due()):
+        if self.evaluate_every is None or any_rank(self._evaluation_is_due()):
             with unhurried(), self.clock.paused():
                 evaluation = self.evaluator(self.policy)
         evaluation = {f"eval/{name}": value for name, value in evaluation.items()}
@@ -387,8 +387,7 @@ class Trainer:
         self.on_log(self)
 
     def _evaluation_is_due(self) -> bool:
-        if self.evaluate_every is None:
-            return True
+        assert self.evaluate_every is not None
         every, unit = self.evaluate_every
         now = {"samples": self.samples, "seconds": self.clock.seconds}
         return now[unit] // every > self.last_report[unit] // every

@@ -107,13 +107,25 @@ def test_sweep_folders_and_table(here, capsys):
     assert lines[3].split()[1:16:2] == ["1", "1", "3", "done", "12.0", "12.0", "12.0", "12.0"]
     config = yaml.safe_load((here / "mine" / names[0] / "config.yaml").read_text())
     assert config["folder"] == f"mine/{names[0]}"
-    assert "sweep.md" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "sweep.md" in said and "IQM of episode/return" in "\n".join(lines)
+    (pooled,) = [line for line in said.splitlines() if "env.pay=3 " in line]
+    assert pooled.split()[1::2] == ["env.pay=3", "2", "12", "12", "12"], "of two seeds"
     assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
 @pytest.mark.parametrize(
     "more", [[], pytest.param(["hydra.sweeper.max_batch_size=1"], marks=pytest.mark.slow)]
 )
+def test_score_of_a_run_has_its_last_evaluation(here):
+    (here / "run/evaluations").mkdir(parents=True)
+    for number, name in enumerate("ba"):
+        path = here / f"run/evaluations/{name}.json"
+        path.write_text(json.dumps({"rows": [{"return": number, "lower": 0, "upper": 1}]}))
+        os.utime(path, (number, number))
+    assert scores.outcome(here / "run")["evaluated"] == 1
+
+
 def test_failed_jobs(here, capsys, more):
     words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine", *more]
     assert train.main(words) == 1

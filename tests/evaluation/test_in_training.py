@@ -72,7 +72,7 @@ def test_run_ends_when_an_evaluation_reaches_its_stop(here, capsys):
         (["evaluate_every=often"], "is neither samples, such as 1M, nor a time, such as 60s"),
         (["evaluate_every=0"], "is neither samples"),
         ([*EVERY, "stop.returns=1"], "stop.returns: no evaluation here measures it; did you mean"),
-        ([*EVERY, "stop.return=high"], "stop.return"),
+        ([*EVERY, "stop.return=high"], "stop: expected a number, got 'high'"),
     ],
 )
 def test_stop_that_cannot_be(here, capsys, words, text):

@@ -16,7 +16,7 @@ from PIL import Image
 
 from megastep.agents.runs import json_lines
 from megastep.agents.training import loggers
-from megastep.agents.training.curves import panels_of, plot_curves
+from megastep.agents.training.curves import panels_of, places_of, plot_curves, smoothed
 from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.loggers.csv import CSV
 from megastep.agents.training.loggers.tensorboard import TensorBoard
@@ -351,6 +351,37 @@ def test_curves_are_drawn_from_the_files(tmp_path):
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     plot_curves(tmp_path)
     assert imread(tmp_path / "curves.png").shape[1] > 200
+
+
+def test_training_ends_without_curves_where_matplotlib_fails(tmp_path, monkeypatch):
+    (tmp_path / "metrics.jsonl").write_text('{"samples": 1, "episode/return": 1.0}\n')
+    (tmp_path / "perf.jsonl").write_text("")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)  # as a bad MPLBACKEND does
+    with pytest.warns(UserWarning, match="curves.png cannot be drawn .*matplotlib.figure"):
+        plot_curves(tmp_path)
+
+
+def test_curves_are_means_in_a_band():
+    values = np.r_[np.zeros(40), np.ones(40)]
+    mean, deviation = smoothed(values)  # of two on either side
+    assert mean[:38].tolist() == [0] * 38 and mean[[0, -1]].tolist() == [0, 1]
+    assert mean[38:42] == pytest.approx([0.2, 0.4, 0.6, 0.8])
+    assert deviation[39] == pytest.approx(0.24**0.5) and deviation[0] == pytest.approx(0, abs=1e-7)
+    large, *small = places_of(9)
+    cells = {(i, j) for i in range(4) for j in range(4)}
+    taken = [{(i, j) for i in range(4)[rows] for j in range(4)[columns]}
+             for rows, columns in (large, *small)]  # fmt: skip
+    assert len(taken[0]) == 4 and all(len(one) == 1 for one in taken[1:])
+    assert len(set.union(*taken)) == 12 and set.union(*taken) < cells, "none lies on another"
+
+
+def test_curves_leave_out_what_never_changes():
+    rows = [{"samples": n, "episode/return": n, "loss/kl": 0.0, "loss/td": n} for n in (1, 2)]
+    rows[1] |= {"eval/return": 5.0, "eval/coverage": 0.5}
+    panels = panels_of(rows, [])
+    assert [*panels] == ["return", "coverage", "loss/td"]
+    assert panels["return"] == {"all": [(1, 1), (2, 2)], "evaluated": [(2, 5.0)]}
+    assert [*panels_of([{"samples": n, "loss/kl": 0.0} for n in (1, 2)], [])] == ["loss/kl"]
 
 
 def test_curves_are_those_that_the_rows_have():
