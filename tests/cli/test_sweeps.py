@@ -114,9 +114,6 @@ def test_sweep_folders_and_table(here, capsys):
     assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
-@pytest.mark.parametrize(
-    "more", [[], pytest.param(["hydra.sweeper.max_batch_size=1"], marks=pytest.mark.slow)]
-)
 def test_score_of_a_run_has_its_last_evaluation(here):
     (here / "run/evaluations").mkdir(parents=True)
     for number, name in enumerate("ba"):
@@ -126,6 +123,9 @@ def test_score_of_a_run_has_its_last_evaluation(here):
     assert scores.outcome(here / "run")["evaluated"] == 1
 
 
+@pytest.mark.parametrize(
+    "more", [[], pytest.param(["hydra.sweeper.max_batch_size=1"], marks=pytest.mark.slow)]
+)
 def test_failed_jobs(here, capsys, more):
     words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine", *more]
     assert train.main(words) == 1
