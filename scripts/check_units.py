@@ -9,24 +9,24 @@ each row they should lie in the spread of the first row, the environment as it i
 """
 
 import argparse
+import contextlib
 import dataclasses
+import io
 import itertools
-import os
-import subprocess
-import sys
+import multiprocessing
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
 
 from megastep import spaces
 from megastep.agents import console
+from megastep.agents.cli import train as cli
 from megastep.agents.runs import json_lines
 from megastep.arrdict import arrdict
 from megastep.envs import Explorer
 
-ROOT = Path(__file__).resolve().parents[1]
 #: Factors of observations and rewards.
 UNITS = (1, 1), (1e-6, 1), (1e6, 1), (1, 1e-5), (1, 1e5), (1e-6, 1e5), (1e6, 1e-5)
 #: Overrides of `train.py` by task.
@@ -95,13 +95,8 @@ def train(task, units, seed, words):
     with tempfile.TemporaryDirectory() as folder:
         words = [*TASKS[task].split(), *factors.split(), f"seed={seed}", *words]
         words += [f"folder={folder}/run", "logger={}", "checkpoint_seconds=1e6"]
-        path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-        subprocess.run(
-            [sys.executable, ROOT / "train.py", *words],
-            check=True,
-            stdout=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": path},
-        )
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert cli.main(words) == 0
         rows = json_lines.read(Path(folder, "run", "metrics.jsonl"))
     return [row for row in rows if "episode/return" in row][-1]["episode/return"] / units[1]
 
@@ -118,7 +113,8 @@ def main():
     for task in options.tasks:
         words = options.set if task == "explorer" else ["device=cpu", *options.set]
         cases = [(task, *case, words) for case in itertools.product(UNITS, options.seeds)]
-        with ThreadPoolExecutor(options.jobs) as pool:
+        context = multiprocessing.get_context("fork")  # before anything is on a GPU
+        with ProcessPoolExecutor(options.jobs, context) as pool:
             returns = iter([*pool.map(train, *zip(*cases))])
         for units in UNITS:
             values = [next(returns) for _ in options.seeds]
