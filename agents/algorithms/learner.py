@@ -172,13 +172,8 @@ class GradientLearner:
             policy_generator=self.policy.generator.state_dict(),
         )
 
-    def load_state_dict(self, state: StateDict) -> None:
-        """Continues from a `state_dict`, which may come from another device.
-
-        Raises:
-            ValueError: if the state belongs to another class of learner, or to a version of
-                megastep that normalised observations and returns otherwise.
-        """
+    def check_state(self, state: StateDict) -> None:
+        """Raises ValueError if a `state_dict` is not one that `load_state_dict` continues from."""
         name = type(self).__name__
         saved_name = state.get("learner", name)
         if saved_name != name:
@@ -192,6 +187,15 @@ class GradientLearner:
                 "this run: continue it with the version that began it, or start from its weights "
                 "(init=RUN)"
             )
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Continues from a `state_dict`, which may come from another device.
+
+        Raises:
+            ValueError: if the state belongs to another class of learner, or to a version of
+                megastep that normalised observations and returns otherwise.
+        """
+        self.check_state(state)
         self.steps.load_state_dict(state)
         self.generator.load_state_dict(state["generator"], self.device)
         self.policy.generator.load_state_dict(state["policy_generator"], self.device)
