@@ -15,15 +15,15 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-slow test-nightly test-gpu lint docs wheel setup lock clean
+.PHONY: train test test-slow test-nightly test-gpu lint docs pictures wheel setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
 
-test: $(SETUP)             ## run the fast tests: 4 minutes on two cores
+test: $(SETUP)             ## run the fast tests: 4 to 11 minutes on two cores
 	$(PYTEST)
 
-test-slow: $(SETUP)        ## run the thorough tests: 10 minutes; .ci/run runs them as well
+test-slow: $(SETUP)        ## run the thorough tests: 6 to 14 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 
 test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour; SEED=2 makes others
@@ -39,6 +39,9 @@ lint: $(SETUP)             ## check style, formatting and types of Python, and t
 	$(PYTHON) -m ruff format --check .
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(PYTHON) -m pyright --pythonpath $(PYTHON)
 	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
+
+pictures: $(SETUP)         ## draw the pictures of README and docs again, from packaged agents
+	$(PYTHON) scripts/pictures.py
 
 docs: $(SETUP)             ## build the site in docs/_build; warnings are errors
 	$(PYTHON) -m sphinx -W --keep-going -q docs docs/_build

@@ -5,6 +5,7 @@ a full disk or a closed pipe, never ends the work.
 import contextlib
 import os
 import re
+import shutil
 import sys
 import textwrap
 import threading
@@ -105,8 +106,25 @@ def is_unicode() -> bool:
     return (sys.stdout.encoding or "").lower().startswith("utf")
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool = False) -> str:
-    """Returns a table as text: in Markdown, or in characters that stdout can show."""
+def table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    is_markdown: bool = False,
+    width: int | None = None,
+) -> str:
+    """Returns a table as text: in Markdown, or in characters that stdout can show.
+
+    Args:
+        width: in characters. The last columns are left out until it fits, and a line below names
+            them. The first two stay.
+    """
+    if width:
+        n = len(head)
+        while n > 2 and _width(table(head[:n], [row[:n] for row in rows])) > width:
+            n -= 1
+        if n < len(head):
+            shown = table(head[:n], [row[:n] for row in rows], is_markdown)
+            return f"{shown}\nToo wide for this terminal, but in the file: {', '.join(head[n:])}"
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -118,6 +136,15 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool 
     plain: dict = dict(markup=False, emoji=False, color_system=None)
     Console(file=text, width=10_000, force_terminal=False, **plain).print(grid)
     return text.getvalue().strip()
+
+
+def _width(text) -> int:
+    return max(map(len, text.splitlines()))
+
+
+def terminal_width() -> int | None:
+    """Returns the columns of the terminal, None if stdout is none."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def restore() -> None:

@@ -11,10 +11,13 @@ from megastep.arrdict import arrdict
 from megastep.colour import gamma_decode, gamma_encode
 from megastep.engine import checks
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH
+from megastep.engine.objects import NUMBERS
 from megastep.scene import TEXEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from megastep.plotting import Area
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]
 
@@ -68,67 +71,92 @@ class Core:
         return torch.full((self.n_envs,), value, device=self.device)
 
     def state(self, e: int = 0) -> arrdict:
-        """Returns environment ``e`` for :meth:`plot_state`: lines of agents, objects and walls, lit
-        texels, lights, agents' poses.
+        """Returns environment ``e`` for :meth:`plot_state`: walls and their lit texels, lights,
+        agents' poses and how far their cameras see, objects.
+
+        A film adds ``trail``, (T, A, 2), and ``views``, (T, A, C, R + 1, 2), where agents were in
+        this episode and what they saw; see :func:`megastep.recording.film`.
         """
-        engine.update_agent_geometry(self.scenery, self.agents)
         engine.update_objects(self.scenery, self.agents)
         lines, colours, lights = self.scenery.env(e)
         agents, n_moving = self.agents, self.scenery.agent_lines.shape[1]
-        if self.scenery.objects is not None:  # without those that are not there
-            n_agent_lines, n_moving = n_moving, n_moving + self.scenery.objects.lines.shape[1]
-            kept = (lines[:, 0] != lines[:, 1]).any(-1).tolist()
-            kept = [
-                k for k, is_long in enumerate(kept) if is_long or not n_agent_lines <= k < n_moving
-            ]
-            n_moving -= len(lines) - len(kept)
-            lines, colours = lines[kept], [colours[k] for k in kept]
-        return arrdict(
-            lines=lines,
-            texels=torch.cat(colours),
-            widths=torch.tensor([len(texels) for texels in colours]),
+        objects = self.scenery.objects
+        if objects is not None:
+            n_moving += objects.lines.shape[1]
+        depth = engine.observe(self.scenery, agents, rgb=False).depth
+        assert depth is not None
+        state = arrdict(
+            lines=lines[n_moving:],
+            texels=torch.cat([colours[0][:0], *colours[n_moving:]]),
+            widths=torch.tensor([len(texels) for texels in colours[n_moving:]], dtype=torch.int64),
             lights=lights,
-            n_moving_lines=torch.tensor(n_moving),
             positions=agents.positions[e].clone(),
             angles=agents.angles[e].clone(),
             yaws=agents.yaws.clone(),
             fov=torch.tensor(agents.fov),
+            distances=(AGENT_RADIUS + 10 * (1 - depth[e].float())).view(
+                self.n_agents, len(agents.yaws), -1
+            ),
         )
+        if objects is not None:
+            there = objects.visible[e] & ~objects.open[e]
+            state["objects"] = arrdict(
+                shapes=objects.shapes[there],
+                positions=objects.positions[e][there],
+                angles=objects.angles[e][there],
+                sizes=objects.sizes[e][there],
+                colours=objects.palette[objects.colours[e][there].long()],
+            )
+        return state
 
     @staticmethod
     def plot_state(
-        state: arrdict,
-        ax: "Axes | None" = None,
-        seen: np.ndarray | None = None,
-        distances: np.ndarray | None = None,
-    ) -> "Axes":
-        """Draws a numpyified :meth:`state` from above, with each camera's field of view.
+        state: arrdict, ax: "Area | Axes | None" = None, seen: np.ndarray | None = None
+    ) -> "Area | Axes":
+        """Draws a numpyified :meth:`state` from above: rooms, walls, objects, agents in their
+        colours with what they see, and in films where they were.
 
         Args:
             state: from :meth:`state`, as numpy arrays.
-            ax: matplotlib axes to draw on. Default: new ones.
-            seen: (T,) bool; static texels that are False are dimmed.
-            distances: (A, C, R) metres; draws what each camera sees instead of a wedge.
+            ax: an area of :func:`megastep.plotting.panels`, or matplotlib axes. Default: new axes.
+            seen: (T,) bool, wall texels that count as seen. The others are grey, and floor that no
+                agent saw is hatched in films.
 
         Returns:
-            The axes.
+            What it is drawn on.
         """
         from megastep import plotting
 
-        ends = state.widths.cumsum()
-        colours = np.split(state.texels, ends[:-1])
-        parts = None
-        if seen is not None:
-            n_moving = int(state.widths[: int(state.n_moving_lines)].sum())
-            parts = np.split(np.concatenate([np.ones(n_moving, bool), seen]), ends[:-1])
-        ax = plotting.plot_scenery(state.lines, colours, state.lights, seen=parts, ax=ax)
-        marks = plotting.camera_colours(len(state.yaws))
+        split = state.widths.cumsum()[:-1]
+        trail, views = state.get("trail"), state.get("views")
+        drawn_on = plotting.plot_scenery(
+            state.lines,
+            np.split(state.texels, split),
+            state.lights,
+            None if seen is None else np.split(seen, split),
+            ax,
+            views.reshape(-1, *views.shape[-2:])
+            if seen is not None and views is not None
+            else None,
+        )
+        area = plotting.Area.on(drawn_on)
+        objects, names = (
+            state.get("objects", arrdict(shapes=())),
+            {n: s for s, n in NUMBERS.items()},
+        )
+        for k, shape in enumerate(objects.shapes):
+            pose = objects.positions[k], objects.angles[k], objects.sizes[k]
+            plotting.plot_object(area, names[int(shape)], *pose, gamma_encode(objects.colours[k]))
+        n_agents, n_cameras = len(state.positions), len(state.yaws)
         for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):
-            for c, (yaw, mark) in enumerate(zip(state.yaws, marks, strict=True)):
-                in_view = None if distances is None else distances[a, c]
+            colour = plotting.AGENTS[a % len(plotting.AGENTS)]
+            of_cameras = [colour] if n_cameras == 1 else plotting.camera_colours(n_cameras)
+            for c, (yaw, mark) in enumerate(zip(state.yaws, of_cameras, strict=True)):
                 plotting.plot_view(
-                    ax, position, angle + yaw, float(state.fov), in_view, colour=mark
+                    area, position, angle + yaw, state.fov, state.distances[a, c], colour=mark
                 )
-            if len(state.positions) > 1:
-                ax.annotate(str(a), position, (4, 4), textcoords="offset points", color="w")
-        return ax
+            if trail is not None:
+                plotting.plot_trail(area, trail[:, a], colour)
+            label = str(a) if n_agents > 1 else ""
+            plotting.plot_agent(area, position, angle, AGENT_RADIUS, colour, label)
+        return drawn_on

@@ -7,7 +7,7 @@ import copy
 import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Probe(NamedTuple):
     learnt: tuple[str, ...] = ()
 
 
-def play(env: Any, seed: int) -> Iterator[tuple[float, bool, Any]]:
+def play(env, seed: int) -> Iterator[tuple]:
     """Takes random actions in an environment of Gymnasium. Yields reward, whether the episode is
     over, and info, for each step.
     """
@@ -47,7 +47,7 @@ def play(env: Any, seed: int) -> Iterator[tuple[float, bool, Any]]:
         yield reward, terminated or truncated, info
 
 
-def play_parallel(env: Any, seed: int) -> Iterator[tuple[float, bool, Any]]:
+def play_parallel(env, seed: int) -> Iterator[tuple]:
     """As `play`, in a parallel environment of PettingZoo, without rewards and info."""
     spaces = {agent: copy.deepcopy(env.action_space(agent)) for agent in env.possible_agents}
     for space in spaces.values():
@@ -58,7 +58,7 @@ def play_parallel(env: Any, seed: int) -> Iterator[tuple[float, bool, Any]]:
         yield 0.0, not env.agents or all(ended.values()) or ended.get("__all__", False), {}
 
 
-def probe(make: Callable[[], Any], seed: int = 0, play: Callable = play) -> Probe:
+def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
     """Makes an environment, plays an episode of at most `MAX_STEPS` and `MAX_SECONDS`, and closes
     it. Leaves the global generators as they were.
 

@@ -5,9 +5,10 @@ PyTorch.
 import numbers
 import re
 from collections.abc import Collection, Iterator, Mapping
-from typing import Any
 
 import numpy as np
+
+from megastep.types import Space, Tree
 
 __all__ = ["beyond_bounds", "problem_of_error", "problem_of_observation", "problem_of_result"]
 
@@ -18,7 +19,7 @@ FORMS = {
 
 
 def problem_of_result(
-    method: str, result: Any, space: Any, agents: Collection[str] = ()
+    method: str, result: Tree, space: Space, agents: Collection[str] = ()
 ) -> str | None:
     """Returns what is wrong with the result of `reset` or `step`, as a clause, None if nothing is.
 
@@ -69,7 +70,7 @@ def problem_of_error(method: str, error: Exception) -> str | None:
     return f"{method}() must return {FORMS[method]}, and returned something else ({error})"
 
 
-def beyond_bounds(space: Any, batch: Any, path: str = "it") -> Iterator[tuple[str, bool]]:
+def beyond_bounds(space: Space, batch: Tree, path: str = "it") -> Iterator[tuple[str, bool]]:
     """Yields which observations of a batch are beyond the bounds of their space, as clauses, and
     whether the space is a Box, by whose bounds nothing is scaled.
 
@@ -101,7 +102,7 @@ def beyond_bounds(space: Any, batch: Any, path: str = "it") -> Iterator[tuple[st
         yield f"{path} has {batch[(lane, *place)]} in lane {lane}, and the space is {space}", is_box
 
 
-def problem_of_observation(space: Any, value: Any, path: str = "it") -> str | None:
+def problem_of_observation(space: Space, value: Tree, path: str = "it") -> str | None:
     """Returns why a value is not in a space of Gymnasium's, as a clause, None if it is.
 
     Leaves numbers beyond the bounds of a Box to `beyond_bounds`, and lets their dtype be.
@@ -112,7 +113,7 @@ def problem_of_observation(space: Any, value: Any, path: str = "it") -> str | No
         is_dict = isinstance(space, spaces.Dict)
         if not isinstance(value, Mapping if is_dict else (tuple, list)):
             return f"{path} must be a {'dict' if is_dict else 'tuple'}, not {_shown(value)}"
-        trees: tuple[Any, Any] = space.spaces, value
+        trees: tuple = space.spaces, value
         parts, values = (tree if is_dict else dict(enumerate(tree)) for tree in trees)
         if parts.keys() != values.keys():
             return f"{path} must have {[*parts]}, not {[*values]}"

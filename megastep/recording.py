@@ -16,24 +16,26 @@ import base64
 import collections
 import contextlib
 import functools
+import importlib
 import inspect
+import itertools
 import os
 import pathlib
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from megastep import workers
+from megastep import plotting, workers
 from megastep.arrdict import clone, numpyify
 from megastep.types import Tree, n_lanes, optional
-from megastep.video import Mp4Writer, as_image
+from megastep.video import GifWriter, Mp4Writer, as_image
 
 if TYPE_CHECKING:
     from IPython.display import HTML  # pyright: ignore[reportMissingImports]
@@ -42,9 +44,20 @@ if TYPE_CHECKING:
 
     from megastep.types import Env, PolicyLike
 
-__all__ = ["ParallelEncoder", "draw"]
+__all__ = ["Film", "ParallelEncoder", "Player", "draw", "film", "film_all"]
 
 MAX_WORKERS = 8  # about 80 figures per second; each imports torch, about half a gigabyte of memory
+
+WRITERS = {"mp4": Mp4Writer, "gif": GifWriter}
+VIDEO, IMAGE = "<video controls autoplay loop muted {}></video>", "<img {}>"
+ENDINGS = {  # of films and pictures: their types, and how pages show them
+    ".mp4": ("video/mp4", VIDEO),
+    ".gif": ("image/gif", IMAGE),
+    ".png": ("image/png", IMAGE),
+    ".svg": ("image/svg+xml", IMAGE),
+    ".pdf": ("application/pdf", '<embed width="100%" height="720" {}>'),
+}
+MAX_RETURNS = 4  # of as many agents, one by one
 
 
 class ParallelEncoder:
@@ -60,19 +73,29 @@ class ParallelEncoder:
             sent to the workers.
         fps: frames per second of the video.
         n_workers: number of worker processes; by default one per core, at most 8.
+        format: mp4 or gif.
 
     Raises:
         RuntimeError: a frame could not be drawn; names the first such frame. Raised by any method.
     """
 
-    def __init__(self, plot_state: Callable, fps: float = 20, n_workers: int | None = None):
+    def __init__(
+        self,
+        plot_state: Callable,
+        fps: float = 20,
+        n_workers: int | None = None,
+        format: str = "mp4",
+    ):
         if not 0 < fps <= 1000:
             raise ValueError(
                 f"fps must be more than 0 and at most 1000 frames per second, but {fps} was given"
             )
         if n_workers is not None and n_workers < 1:
             raise ValueError(f"n_workers must be at least 1, but {n_workers} was given")
+        if format not in WRITERS:
+            raise ValueError(f"format must be {' or '.join(WRITERS)}, but {format!r} was given")
         self._plot_state, self._pickled_plot_state = plot_state, _pickled(plot_state)
+        self._format, self._style = format, plotting.current()
         self._fps, self._n_workers = fps, n_workers
         self._pool: ProcessPoolExecutor | None = None
         self._writer: Mp4Writer | None = None
@@ -80,7 +103,8 @@ class ParallelEncoder:
         self._pending = collections.deque()  # (frame number, image or future), oldest first
 
     def __enter__(self) -> ParallelEncoder:
-        self._writer, self._bytes, self._n_frames = Mp4Writer(self._fps), None, 0
+        writer = WRITERS[self._format](self._fps)
+        self._writer, self._bytes, self._n_frames = writer, None, 0
         return self
 
     def __call__(self, state: Tree) -> None:
@@ -92,7 +116,9 @@ class ParallelEncoder:
                 self._add(draw(self._plot_state, state))
         else:
             with workers.terminal_signals_blocked():
-                future = self._workers().submit(_draw_pickled, self._pickled_plot_state, state)
+                future = self._workers().submit(
+                    _draw_pickled, self._pickled_plot_state, state, plotting.current()
+                )
             self._add(future)
 
     def frame(self, array: ArrayLike) -> None:
@@ -119,34 +145,22 @@ class ParallelEncoder:
         assert self._writer is not None
         self._bytes = self._writer.close()
 
-    def save(self, path: str | os.PathLike) -> pathlib.Path:
-        """Writes the video to ``path``, an mp4, and returns the path.
+    def save(self, path: str | os.PathLike) -> Film:
+        """Writes the video to ``path``, an mp4 or GIF as ``format`` says, and returns the path.
 
         Writes atomically: if it fails, an existing file is unchanged. Creates missing folders.
         """
-        video, path = self._finished(), pathlib.Path(path)
-        if path.suffix != ".mp4":
+        video, path = self._finished(), Film(path)
+        if path.suffix != f".{self._format}":
             raise ValueError(
-                f"videos are mp4 files, but '{path}' was given: use {path.with_suffix('.mp4').name}"
+                f"this video is of format {self._format}, but '{path}' was given: use "
+                f"{path.with_suffix('.' + self._format).name}"
             )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f".{path.stem}-", suffix=".tmp", delete=False
-        ) as file:
-            try:
-                file.write(video)
-                file.flush()
-                os.fsync(file.fileno())
-                os.chmod(file.name, 0o644)  # temporary files are readable by their owner only
-                os.replace(file.name, path)
-            except BaseException:
-                os.unlink(file.name)
-                raise
-        return path
+        return _write(path, video)
 
     def notebook(self) -> HTML:
-        """Returns the video as an object that notebooks display."""
-        video = self._finished()
+        """Returns the video as an object that notebooks display. The encoder itself is one, too."""
+        html = self._repr_html_()
         try:
             from IPython.display import HTML  # pyright: ignore[reportMissingImports]
         except ImportError:
@@ -154,10 +168,10 @@ class ParallelEncoder:
                 "showing a video in a notebook needs IPython, which is not installed: pip install "
                 "ipython, or save the video instead"
             ) from None
-        return HTML(
-            '<video controls autoplay loop muted src="data:video/mp4;base64,'
-            f'{base64.b64encode(video).decode()}"></video>'
-        )
+        return HTML(html)
+
+    def _repr_html_(self) -> str:
+        return _html(self._finished(), f".{self._format}")
 
     def _check_open(self) -> None:
         if self._writer is None:
@@ -271,84 +285,304 @@ def _unpickled(pickled: bytes) -> Callable:
     return cloudpickle.loads(pickled)
 
 
-def _draw_pickled(pickled: bytes, state: Tree) -> np.ndarray:
+def _draw_pickled(pickled: bytes, state: Tree, style: plotting.Style) -> np.ndarray:
     """Draws a state in a worker process."""
-    return draw(_unpickled(pickled), state)
+    with plotting.styled(**vars(style)):
+        return draw(_unpickled(pickled), state)
 
 
 def draw(plot_state: Callable, state: Tree) -> np.ndarray:
     """Returns what ``plot_state`` draws of a numpyified state, as (H, W, 3) uint8.
 
-    Closes the figure if pyplot knows it.
+    Closes the figure if pyplot knows it. Below the note and the title of the current
+    :class:`megastep.plotting.Style`, if there are any.
     """
+    with _drawn(plot_state, state) as drawing:
+        return plotting.rasterise(drawing) if hasattr(drawing, "savefig") else drawing
+
+
+@contextlib.contextmanager
+def _drawn(plot_state, state) -> Iterator:
+    """What ``plot_state`` draws: a figure, or an image (H, W, 3) uint8."""
     drawing = plot_state(state)
     if isinstance(drawing, np.ndarray):
-        return as_image(drawing)
+        drawing = as_image(drawing)
+        yield _captioned(drawing)
+        return
     if not hasattr(drawing, "savefig"):
         raise TypeError(
             "plot_state must return a matplotlib figure or an array, but it returned a "
             f"{type(drawing).__name__}"
         )
-    from megastep import plotting
-
     try:
-        return plotting.rasterise(drawing)
+        if isinstance(drawing, plotting.Picture):
+            yield drawing
+        else:
+            yield _captioned(plotting.rasterise(drawing)) if _has_caption() else drawing
     finally:
         if "matplotlib.pyplot" in sys.modules:
             sys.modules["matplotlib.pyplot"].close(drawing)
 
 
-@torch.no_grad()
+def _has_caption() -> bool:
+    return bool(plotting.current().note or plotting.current().title)
+
+
+def _captioned(image) -> Any:
+    return plotting.captioned(image) if _has_caption() else image
+
+
+# ---- Files ----
+
+
+class Film(type(pathlib.Path())):
+    """The path of a film or a picture, which notebooks show."""
+
+    def _repr_html_(self) -> str:
+        return _html(self.read_bytes(), self.suffix)
+
+
+def _html(content: bytes, ending: str) -> str:
+    kind, tag = ENDINGS[ending]
+    source = f'src="data:{kind};base64,{base64.b64encode(content).decode()}"'
+    return tag.format(source)
+
+
+def _write(path: Film, content: bytes) -> Film:
+    """Writes a file atomically, in a folder that is made if it is missing. Returns the path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(
+        dir=path.parent, prefix=f".{path.stem}-", suffix=".tmp", delete=False
+    ) as file:
+        try:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            os.chmod(file.name, 0o644)  # temporary files are readable by their owner only
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise
+    return path
+
+
+def _check_packages(*names: str) -> None:
+    """Raises ImportError if a package that films need cannot be imported, saying why."""
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # also of a backend that MPLBACKEND names
+            reason = next(iter(str(error).splitlines()), "")
+            raise ImportError(f"drawing needs {name}, which fails: {reason}") from error
+
+
+def check_path(path: str | os.PathLike) -> None:
+    """Raises ValueError if no film or picture can have this name."""
+    if pathlib.Path(path).suffix not in ENDINGS:
+        raise ValueError(
+            f"'{path}' is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or .pdf"
+        )
+
+
+# ---- Films ----
+
+
+class Player(NamedTuple):
+    """What is filmed: environment 0 of ``env``, played by ``policy``."""
+
+    env: Env
+    policy: PolicyLike
+    title: str | None = None
+
+
 def film(
     env: Env,
     policy: PolicyLike,
-    path: str | pathlib.Path,
+    path: str | os.PathLike,
     steps: int,
     greedy: bool = False,
     seed: int = 1,
-) -> pathlib.Path:
-    """Films environment 0 of `env` for some steps from its reset, each a frame, at the
-    environment's own frames per second. Returns the path.
+    **look,
+) -> Film:
+    """Films environment 0 of `env` for some steps from its reset, each a frame. Returns the path,
+    which a notebook shows as the film.
 
     Args:
-        path: an .mp4, or a .png, which is the last frame.
+        path: an .mp4 or .gif, or a .png, .svg or .pdf, which is the last frame.
+        look: theme, dpi, title, speed, trail and axes as in :func:`film_all`.
 
     Raises:
         ValueError: for another kind of file, or an environment that cannot be drawn.
         OSError: the file cannot be written.
         RuntimeError: naming the first frame that failed.
     """
-    plot_state = getattr(env, "plot_state", None)
-    if plot_state is None or not hasattr(env, "state"):
-        raise ValueError(
-            f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
-            "plot_state(state), which docs/new-environment.md shows"
-        )
-    path = pathlib.Path(path)
-    if path.suffix not in (".mp4", ".png"):
-        raise ValueError(f"'{path}' is neither a video, .mp4, nor its last frame, .png")
+    return film_all(
+        [Player(env, policy, look.pop("title", None))], path, steps, greedy, seed, **look
+    )
+
+
+@torch.no_grad()
+def film_all(
+    players: Sequence[Player],
+    path: str | os.PathLike,
+    steps: int,
+    greedy: bool = False,
+    seed: int = 1,
+    theme: str = "light",
+    dpi: float = 100,
+    speed: float = 1.0,
+    trail: int = 60,
+    axes: bool = False,
+) -> Film:
+    """Films several environments at once, in a grid; otherwise as :func:`film`.
+
+    Args:
+        theme: light or dark.
+        dpi: pixels per inch; an environment's picture has 720 lines at 100.
+        speed: how much faster than the environment's own frames per second.
+        trail: steps of the agents' trails.
+        axes: draw axes in metres.
+    """
+    path = Film(path)
+    check_path(path)
+    for env, _, _ in players:
+        if getattr(env, "plot_state", None) is None or not hasattr(env, "state"):
+            raise ValueError(
+                f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
+                "plot_state(state), which docs/new-environment.md shows"
+            )
     if path.is_dir():
         raise ValueError(f"{path} is a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
-    states = _states(env, policy, steps, greedy, seed)
-    if path.suffix == ".png":
-        from matplotlib.image import imsave  # a third of a second, which train.py needs not wait
+    _check_packages("matplotlib", *["av"] * (path.suffix[1:] in WRITERS))
+    moments = zip(*(_moments(player, steps, greedy, seed, trail) for player in players))
+    with plotting.styled(theme=theme, dpi=dpi, axes=axes):
+        if path.suffix[1:] in WRITERS:
+            fps = optional(players[0].env, "fps") * speed
+            return _film(players, moments, fps, path)
+        (last,) = collections.deque(moments, maxlen=1)
+        return _write(path, _still(players, last, path.suffix[1:]))
 
-        (last,) = collections.deque(states, maxlen=1)
-        imsave(path, draw(plot_state, numpyify(last)))
-        return path
-    with ParallelEncoder(plot_state, fps=optional(env, "fps")) as encoder:
-        for state in states:
-            encoder(state)
+
+def _film(players, moments, fps, path) -> Film:
+    """Draws pictures and images, which are fast, in this process, others in worker processes."""
+    format, plot_state = path.suffix[1:], players[0].env.plot_state
+    first = next(moments)
+    with _frame_errors(0):
+        in_workers = len(players) == 1 and not _is_fast(players[0], first[0])
+    # the encoder draws nothing itself if it is given images
+    with ParallelEncoder(plot_state if in_workers else _frame_errors, fps, None, format) as encoder:
+        for number, moment in enumerate(itertools.chain([first], moments)):
+            if in_workers:
+                with plotting.styled(title=players[0].title, note=moment[0].note):
+                    encoder(moment[0].state)
+            else:
+                with _frame_errors(number):
+                    image = _image(players, moment)
+                encoder.frame(image)
     return encoder.save(path)
 
 
-def _states(env: Any, policy, steps, greedy, seed) -> Iterator[dict]:
+def _is_fast(player, moment) -> bool:
+    with _drawing(player, moment) as drawing:
+        return isinstance(drawing, (np.ndarray, plotting.Picture))
+
+
+@contextlib.contextmanager
+def _drawing(player, moment) -> Iterator:
+    """The drawing of a moment, in the style of the film."""
+    with plotting.styled(title=player.title, note=moment.note):
+        with _drawn(player.env.plot_state, moment.state) as drawing:
+            yield drawing
+
+
+def _image(players, moments) -> np.ndarray:
+    images = []
+    for player, moment in zip(players, moments, strict=True):
+        with plotting.styled(title=player.title, note=moment.note):
+            images.append(draw(player.env.plot_state, moment.state))
+    return images[0] if len(images) == 1 else plotting.side_by_side(images)
+
+
+def _still(players, moments, format) -> bytes:
+    """Returns a picture of the moments as a file of that format."""
+    with _drawing(players[0], moments[0]) as drawing:
+        if len(players) > 1 or not hasattr(drawing, "savefig"):
+            drawing = plotting.framed(_image(players, moments))
+        return plotting.encoded(drawing, format)
+
+
+class _Moment(NamedTuple):
+    """A frame to be: a numpyified state, and the return so far."""
+
+    state: Tree
+    note: str
+
+
+def _moments(player, steps, greedy, seed, trail) -> Iterator[_Moment]:
+    env: Any = player.env
+    policy, n_agents, past = player.policy, optional(env, "n_agents"), _Past(trail)
     world, hidden = env.reset(), policy.initial(n_lanes(env), env.device)
     generator = torch.Generator(env.device).manual_seed(seed)
-    yield env.state(0)
-    for _ in range(steps - 1):
-        decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
-        world = env.step(decision)
-        yield env.state(0)
+    returns = np.zeros(n_agents)
+    for step in range(steps):
+        if step:
+            decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
+            world = env.step(decision)
+        rewards, starts = (
+            world[key][:n_agents].cpu().numpy().reshape(n_agents) for key in ("reward", "reset")
+        )
+        returns = np.where(starts, 0, returns + rewards)
+        state = past(numpyify(clone(env.state(0))), starts)
+        yield _Moment(state, _returns(returns))
+
+
+def _returns(returns) -> str:
+    if len(returns) > MAX_RETURNS:
+        return f"mean return {returns.mean():.1f}"
+    return "return " + ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in returns)
+
+
+class _Past:
+    """Adds to states, where ``state["core"]`` is a core's, where agents were in this episode and
+    what they saw: see :meth:`megastep.core.Core.state`.
+
+    Args:
+        trail: number of steps.
+    """
+
+    def __init__(self, trail: int):
+        self._trail, self._views, self._n_views = collections.deque(maxlen=trail + 1), None, 0
+
+    def __call__(self, state: Tree, starts: np.ndarray) -> Any:
+        """Returns the state; ``starts`` (A,) says whose episodes begin."""
+        core = state.get("core") if isinstance(state, dict) else None
+        if not isinstance(core, dict) or "distances" not in core:
+            return state
+        for positions in self._trail:
+            positions[starts] = np.nan
+        self._trail.append(np.array(core["positions"], float))
+        core["trail"] = np.stack(self._trail)
+        views = [
+            [
+                plotting.view_polygon(position, angle + yaw, core["fov"], distances)
+                for yaw, distances in zip(core["yaws"], of_agent, strict=True)
+            ]
+            for position, angle, of_agent in zip(
+                core["positions"], core["angles"], core["distances"], strict=True
+            )
+        ]
+        core["views"] = self._with(np.array(views, np.float32), starts.all())
+        return state
+
+    def _with(self, views, is_start) -> np.ndarray:
+        """Returns the views of this episode, the last included: part of an array that grows."""
+        self._n_views = 0 if is_start else self._n_views
+        if self._views is None or is_start:
+            self._views = np.empty((64, *views.shape), np.float32)
+        if self._n_views == len(self._views):
+            self._views = np.concatenate([self._views, np.empty_like(self._views)])
+        self._views[self._n_views] = views
+        self._n_views += 1
+        return self._views[: self._n_views]

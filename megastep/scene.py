@@ -15,6 +15,8 @@ from megastep.ragged import Ragged
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from megastep.plotting import Area
+
 __all__ = ["TEXEL", "agent_model", "display", "scenery", "spread", "texel_widths", "wall_textures"]
 
 TEXEL = 0.05  # metres per texel
@@ -220,10 +222,10 @@ def scenery(
     return result
 
 
-def display(scenery: Scenery, e: int = 0, ax: "Axes | None" = None) -> "Axes":
+def display(scenery: Scenery, e: int = 0, ax: "Area | Axes | None" = None) -> "Area | Axes":
     """Draws environment ``e`` in its lit colours, with its lights and agents.
 
-    Returns the matplotlib axes.
+    Returns what it is drawn on.
     """
     from megastep import plotting
 

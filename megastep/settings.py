@@ -97,9 +97,9 @@ RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and bel
 def settings_of(
     constructor: Callable,
     reserved: Sequence[str] = (),
-    missing: Mapping[str, Any] | None = None,
+    missing: Mapping | None = None,
     is_finite: bool = True,
-    **more: Any,
+    **more,
 ) -> type:
     """Returns a frozen dataclass of the arguments of a class or function: types, bounds, defaults.
 
@@ -118,8 +118,8 @@ def settings_of(
 def arguments_of(
     constructor: Callable,
     reserved: Sequence[str] = (),
-    missing: Mapping[str, Any] | None = None,
-    **more: Any,
+    missing: Mapping | None = None,
+    **more,
 ) -> tuple[str, dict[str, tuple]]:
     """Returns the name of a class or function, and its arguments: {name: (type, default)}, or
     (type,) without a default.

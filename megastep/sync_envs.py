@@ -17,6 +17,7 @@ import numpy as np
 
 from megastep.env_values import problem_of_error, problem_of_result
 from megastep.global_generators import KINDS, GlobalGenerators
+from megastep.types import Tree
 from megastep.wrapper_state import WrappedEnvs, load_wrapper_state, wrapper_state
 
 if TYPE_CHECKING:
@@ -76,9 +77,7 @@ def one_line(error: BaseException) -> str:
     return ": ".join(filter(None, [type(error).__name__, line[:300]]))
 
 
-def make_env(
-    spec: "EnvSpec", wrappers: Sequence[Callable], settings: Mapping[str, Any]
-) -> "gymnasium.Env":
+def make_env(spec: "EnvSpec", wrappers: Sequence[Callable], settings: Mapping) -> "gymnasium.Env":
     """Returns an environment of Gymnasium by its specification, inside wrappers."""
     import gymnasium
 
@@ -117,12 +116,12 @@ class RewardRecorder:
         return Recorder
 
     @classmethod
-    def around(cls, env: Any) -> Any:
+    def around(cls, env) -> Any:
         """Returns a wrapper around an environment that keeps its last `recorded_reward`."""
         return cls._wrapper()(env)
 
     @classmethod
-    def inside(cls, env: Any) -> Any:
+    def inside(cls, env) -> Any:
         """Returns the wrapper of `around` in other wrappers, None if there is none."""
         while env is not None and not isinstance(env, cls):
             env = vars(env).get("env")
@@ -201,7 +200,7 @@ class SyncEnvs(WrappedEnvs):
             [*map(RewardRecorder.inside, self.envs)] if TRUE_RETURN in self.names else []
         )
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Any, dict]:
+    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
         """Resets every environment. Returns (observations, news), see `step`."""
         if seed is not None:
             self.seeds[:] = seed
@@ -210,7 +209,7 @@ class SyncEnvs(WrappedEnvs):
         self.rewards[:], self.terminated[:], self.truncated[:] = 0.0, False, False
         return self._observations(latest), self._news({})
 
-    def step(self, actions: Any) -> tuple[Any, ...]:
+    def step(self, actions: Tree) -> tuple:
         """Takes one step. Returns (observations, rewards, terminated, truncated, news), valid until
         the next call. News are a dict, empty in most steps, of
 

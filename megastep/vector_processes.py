@@ -10,7 +10,7 @@ import signal
 import sys
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from megastep import global_generators, workers
 from megastep.env_probe import Probe, probe
 from megastep.sync_envs import EnvError, SyncEnvs
+from megastep.types import Tree
 
 __all__ = ["VectorProcesses", "start_rendering"]
 
@@ -81,14 +82,14 @@ class VectorProcesses:
         self.names, self.learnt, self.latest_state = found.names, found.learnt, {}
         self._ask("use", [found for _ in self.pipes])
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Any, dict]:
+    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
         """Resets every environment. Returns (observations, news), see `step`."""
         answers = self._ask("reset", [seed and list(seed[rows]) for rows in self.rows])
         for rows, (obs, _) in zip(self.rows, answers):
             _write(self.observations, rows, obs)
         return self.observations, self._news([news for _, news in answers])
 
-    def step(self, actions: Any) -> tuple[Any, ...]:
+    def step(self, actions: Tree) -> tuple:
         """Takes one step. Returns (observations, rewards, terminated, truncated, news), which are
         valid until the next call. News are those of :class:`~megastep.sync_envs.SyncEnvs`.
         """
@@ -102,7 +103,7 @@ class VectorProcesses:
         """Returns a frame of every environment."""
         return [frame for frames in self._ask("render", self.rows) for frame in frames]
 
-    def wrapper_state(self) -> dict[str, Any]:
+    def wrapper_state(self) -> Tree:
         """Returns what the wrappers of the first environment have learnt, by path; of a process
         that has ended, what it was at the last call.
         """
@@ -114,7 +115,7 @@ class VectorProcesses:
                     self.latest_state = answer
         return self.latest_state
 
-    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
+    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
         """As :meth:`SyncEnvs.load_wrapper_state`."""
         self._ask("load_wrapper_state", [(state, is_frozen) for _ in self.pipes])
 
@@ -187,7 +188,7 @@ class VectorProcesses:
         return {key: value for key, value in news.items() if value}
 
 
-def start_rendering(vector: Any) -> None:
+def start_rendering(vector) -> None:
     """Sets the render mode of environments to rgb_array, if they have it and no other was chosen.
 
     Called before the first frame and not earlier: with a render mode, LunarLander simulates the

@@ -1,15 +1,18 @@
-"""An mp4 writer, and the images it takes."""
+"""Writers of mp4 and GIF, and the images they take."""
 
 import io
+import zlib
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["Mp4Writer", "as_image"]
+__all__ = ["GifWriter", "Mp4Writer", "as_image"]
 
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"
+EXACT_COLOURS, GREYS = 64, 32  # of a GIF's palette
 
 
 class Mp4Writer:
@@ -19,17 +22,20 @@ class Mp4Writer:
         fps: frames per second.
     """
 
+    container, codec, pixels = "mp4", "libx264", "yuv420p"
+    options = {"crf": QUALITY, "preset": "veryfast"}
+
     def __init__(self, fps: float):
         import av  # which is needed for no other output
 
-        self._from_array = av.VideoFrame.from_ndarray
+        self._from_array: Any = av.VideoFrame.from_ndarray
         self._buffer = io.BytesIO()
-        self._container = av.open(self._buffer, "w", format="mp4")
-        self._stream = self._container.add_stream(
-            "libx264", rate=Fraction(fps).limit_denominator(1000)
+        self._container = av.open(self._buffer, "w", format=self.container)
+        self._stream: Any = self._container.add_stream(
+            self.codec, rate=Fraction(fps).limit_denominator(1000)
         )
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"crf": QUALITY, "preset": "veryfast"}
+        self._stream.pix_fmt = self.pixels
+        self._stream.options = self.options
         self._shape = None
 
     def add(self, image: np.ndarray) -> None:
@@ -46,9 +52,15 @@ class Mp4Writer:
                 "all frames must have the size of the first, {1} x {0} pixels, "
                 "but this one has {3} x {2}".format(*self._shape[:2], *image.shape[:2])
             )
+        self._add(image)
+
+    def _add(self, image) -> None:
         padding = [(0, size % 2) for size in image.shape[:2]]  # yuv420p halves both sides
         padded = np.pad(image, [*padding, (0, 0)], mode="edge")
-        self._container.mux(self._stream.encode(self._from_array(padded, format="rgb24")))
+        self._encode(self._from_array(padded, format="rgb24"))
+
+    def _encode(self, frame) -> None:
+        self._container.mux(self._stream.encode(frame))
 
     def close(self) -> bytes:
         """Returns the finished file, empty if there were no frames."""
@@ -57,6 +69,70 @@ class Mp4Writer:
         self._container.mux(self._stream.encode(None))
         self._container.close()
         return self._buffer.getvalue()
+
+
+class GifWriter(Mp4Writer):
+    """Encodes images into a GIF in memory, with one palette of 256 colours."""
+
+    container, codec, pixels = "gif", "gif", "pal8"
+    options = {}
+
+    def __init__(self, fps: float):
+        super().__init__(fps)
+        self._frames: list[bytes] = []  # compressed: the palette is known when all are there
+
+    def _add(self, image) -> None:
+        height, width = self._stream.height, self._stream.width
+        padding = [(0, height - len(image)), (0, width - image.shape[1]), (0, 0)]
+        self._frames.append(zlib.compress(np.pad(image, padding, mode="edge").tobytes(), 1))
+
+    def close(self) -> bytes:
+        """Returns the finished file, empty if there were no frames."""
+        from PIL import Image
+
+        if self._frames:
+            sample = [self._image(i) for i in np.linspace(0, len(self._frames) - 1, 12).astype(int)]
+            colours = _palette(np.concatenate(sample))
+            palette = Image.new("P", (1, 1))
+            palette.putpalette(colours.ravel().tolist())
+            argb = np.concatenate([np.full((256, 1), 255, np.uint8), colours], 1)
+            exact = _packed(colours[:EXACT_COLOURS])
+            order = np.argsort(exact)
+            for i in range(len(self._frames)):
+                image, packed = self._image(i), _packed(self._image(i))
+                close = Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
+                # Pillow takes a colour nearby even where there is the exact one
+                nearest = order[np.searchsorted(exact[order], packed).clip(max=len(exact) - 1)]
+                indices = np.where(exact[nearest] == packed, nearest, np.array(close))
+                self._encode(self._from_array((indices.astype(np.uint8), argb), format="pal8"))
+        return super().close()
+
+    def _image(self, i) -> np.ndarray:
+        content = np.frombuffer(zlib.decompress(self._frames[i]), np.uint8)
+        return content.reshape(self._stream.height, self._stream.width, 3)
+
+
+def _palette(image) -> np.ndarray:
+    """Returns 256 colours, (256, 3) uint8: the most frequent ones of an image exactly, and what
+    fits the others best.
+    """
+    from PIL import Image
+
+    packed, counts = np.unique(_packed(image), return_counts=True)
+    packed = packed[np.argsort(-counts)]
+    colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], 1).astype(np.uint8)
+    exact, rare = np.split(colours, [EXACT_COLOURS])
+    if len(rare):
+        fitted = Image.fromarray(rare[None]).quantize(256 - EXACT_COLOURS - GREYS)
+        rare = np.array(fitted.getpalette(), np.uint8).reshape(-1, 3)
+    greys = np.linspace(0, 255, GREYS).astype(np.uint8)[:, None].repeat(3, 1)  # of depth
+    return np.concatenate([exact, greys, rare, np.zeros((256, 3), np.uint8)])[:256]
+
+
+def _packed(image) -> np.ndarray:
+    """Returns a number for each colour."""
+    red, green, blue = np.moveaxis(image.astype(np.int32), -1, 0)
+    return (red << 16) + (green << 8) + blue
 
 
 def as_image(array: ArrayLike) -> np.ndarray:

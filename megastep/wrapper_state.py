@@ -7,10 +7,11 @@ import collections
 import copy
 import numbers
 import types
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
+
+from megastep.types import Tree
 
 __all__ = ["WrappedEnvs", "freeze", "load_wrapper_state", "wrapper_state"]
 
@@ -19,7 +20,7 @@ SKIPPED = "env", "metadata", "spec", "_np_random", "recorded_reward"
 SEQUENCES = list, tuple, collections.deque
 
 
-def wrapper_state(env: Any, paths: Collection[str] | None = None) -> dict[str, Any]:
+def wrapper_state(env, paths: Collection[str] | None = None) -> Tree:
     """Returns copies of the numbers, the arrays and the lists of numbers in wrappers by path, such
     as `0.NormalizeObservation.obs_rms.mean`; wrapper 0 is the outermost.
 
@@ -36,7 +37,7 @@ def wrapper_state(env: Any, paths: Collection[str] | None = None) -> dict[str, A
     return state
 
 
-def load_wrapper_state(env: Any, state: Mapping[str, Any]) -> None:
+def load_wrapper_state(env, state: Tree) -> None:
     """Puts a `wrapper_state` into the wrappers of another environment.
 
     Raises:
@@ -83,7 +84,7 @@ def _are_numbers(value) -> bool:
     return all(map(_are_numbers, value)) if is_nested else _is_value(value)
 
 
-def freeze(env: Any) -> None:
+def freeze(env) -> None:
     """Stops the running statistics of Gymnasium's own wrappers."""
     for _, wrapper in _wrappers(env):
         if hasattr(type(wrapper), "update_running_mean"):
@@ -99,15 +100,15 @@ class WrappedEnvs:
         frozen: what stays as it is, None if nothing does.
     """
 
-    envs: list[Any]
+    envs: list
     learnt: Sequence[str] = ()
-    frozen: Mapping[str, Any] | None = None
+    frozen: Tree = None
 
-    def wrapper_state(self) -> dict[str, Any]:
+    def wrapper_state(self) -> Tree:
         """Returns what the wrappers of the first environment have learnt, by path."""
         return wrapper_state(self.envs[0], self.learnt) if self.learnt else {}
 
-    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
+    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
         """Gives the wrappers of all environments what others have learnt.
 
         Args:
@@ -128,7 +129,7 @@ class WrappedEnvs:
             load_wrapper_state(env, self.frozen)
 
 
-def _wrappers(env) -> Iterator[tuple[str, Any]]:
+def _wrappers(env) -> Iterator[tuple]:
     """Yields (number and class, wrapper), the outermost first."""
     number = 0
     while "env" in getattr(env, "__dict__", ()) and env.unwrapped is not env:
@@ -140,7 +141,7 @@ def _children(node) -> dict:
     return node if isinstance(node, dict) else getattr(node, "__dict__", {})
 
 
-def _values(path, node, visited) -> Iterator[tuple[str, Any]]:
+def _values(path, node, visited) -> Iterator[tuple]:
     """Yields (path, value) of all below an object."""
     if id(node) in visited:
         return

@@ -16,6 +16,7 @@ SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
+    ("types",),
     ("env_values", "global_generators", "wrapper_state"),
     (
         "cache",
@@ -24,7 +25,6 @@ SIMULATOR = (
         "read_only",
         "settings",
         "sync_envs",
-        "types",
         "video",
         "workers",
     ),
@@ -55,6 +55,7 @@ AGENTS = (
     ("selfplay",),
     ("factory",),
     ("evaluation", "pretrained"),
+    ("reports",),
     ("launch",),
     ("cli",),
 )
@@ -81,7 +82,7 @@ SHARED_WITH_BOTS = SHARED | {
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
 # environments, writes videos and starts processes.
-UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained")
+UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",

@@ -12,7 +12,7 @@ import torch
 from matplotlib import pyplot as plt
 from test_original_concepts import session
 
-from megastep import arrdict, core, cuda, modules, recording
+from megastep import arrdict, core, cuda, modules, plotting, recording
 
 PAGE = Path(__file__).parent / "data" / "a_minimal_env.md"
 CELLS = dict(re.findall(r"^# ([\w' ]+)\n\n```python\n(.*?)```", PAGE.read_text(), re.S | re.M))
@@ -60,10 +60,17 @@ def test_all_cells_are_found():
 def test_scenery_is_displayed():
     names = notebook("scenery")
     scenery, ax = names["scenery"], plt.gca()
-    lines = [lines for lines in ax.collections if hasattr(lines, "get_segments")]
-    segments = np.concatenate([np.reshape(line.get_segments(), (-1, 2)) for line in lines])
-    assert segments.max(0).tolist() == [6, 6]  # the walls
-    assert np.abs(segments).sum(1).min() < 0.1  # a model of an agent at the origin
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    assert left < -0.1 and bottom < -0.1 and right > 6 and top > 6, "agents stand at the origin"
+    image, area = plotting.rasterise(ax.figure), plotting.Area.on(ax)
+
+    def drawn(point):
+        column, row = area.transform.transform(point).astype(int)
+        return image[len(image) - 1 - row - 4 : len(image) - row + 4, column - 4 : column + 5]
+
+    for point in (1, 3), (6, 3), (0.1, 0):  # walls, and an agent's side
+        assert np.ptp(drawn(point), axis=(0, 1)).max() > 20, point
+    assert np.ptp(drawn((3, 3)), axis=(0, 1)).max() == 0
     first_walls = [int(scenery.lines.starts[e]) + len(scenery.model) for e in (125, 126)]
     colours = [scenery.textures[wall] for wall in first_walls]
     assert not torch.equal(*colours), "each environment has random colours"

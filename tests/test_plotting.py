@@ -1,16 +1,18 @@
 """Plots: the sRGB curve, images, floor plans, figures."""
 
+import io
 import subprocess
 import sys
 
 import matplotlib
+import matplotlib.image
 import numpy as np
 import pytest
 import torch
 
 from megastep import core, modules, plotting, scene, toys
 from megastep.arrdict import numpyify
-from megastep.plotting import gamma_decode, gamma_encode
+from megastep.plotting import gamma_decode, gamma_encode, plans
 
 matplotlib.use("Agg")
 
@@ -101,10 +103,33 @@ def test_images_are_drawn_on_given_axes():
     axes = plotting.plot_images(
         {"rgb": np.zeros((1, 3, 1, 8)), "d": np.zeros((1, 1, 1, 8), np.float16)}, axes=strips
     )
-    assert list(axes[:, 0]) == strips and all(ax.figure is figure for ax in strips)
+    assert list(axes[:, 0]) == strips and all(ax.get_figure() is figure for ax in strips)
 
 
-def test_panels_per_agent_and_rows_per_camera():
+@pytest.fixture
+def words(monkeypatch):
+    """Collects what is written: (area, words, colour)."""
+    written, text = [], plotting.Area.text
+
+    def spy(area, point, words, *args, **options):
+        written.append((area, words, options.get("colour")))
+        text(area, point, words, *args, **options)
+
+    monkeypatch.setattr(plotting.Area, "text", spy)
+    return written
+
+
+def pixel(image, area, point):
+    """Returns the colour of an image of the area's figure at a point of its data, in [0, 1]."""
+    column, row = area.transform.transform(point)
+    return image[len(image) - 1 - int(row), int(column)] / 255
+
+
+def rgb_of(colour):
+    return np.array(matplotlib.colors.to_rgb(colour))
+
+
+def test_panels_per_agent_and_rows_per_camera(words, monkeypatch):
     """Three agents with two cameras: one strip per agent, one row of pixels per camera. A row's
     label has the colour of the camera's view on the plan, where agents are numbered.
     """
@@ -113,34 +138,42 @@ def test_panels_per_agent_and_rows_per_camera():
     c.agents.positions[:] = torch.tensor([[2.0, 2.0], [5.0, 2.0], [2.0, 5.0]])
     figure, plan, strips = plotting.panels(3, n_cameras=2)
     state, rgb = numpyify(c.state(0)), modules.RGB(c).state(0).numpy()
-    core.Core.plot_state(state, plan)
+    views = []
+
+    def plot_view(ax, *where, colour):
+        views.append((ax, plotting.view_polygon(*where), colour))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(plotting, "plot_view", plot_view)
+        core.Core.plot_state(state, plan)
     modules.RGB.plot_state(rgb, strips, state.yaws)
-    assert [ax.get_title("left") for ax in strips] == ["rgb 0", "rgb 1", "rgb 2"]
-    for strip, image in zip(strips, rgb, strict=True):
-        pixels = strip.images[0].get_array()
-        assert np.allclose(pixels, gamma_encode(image.transpose(1, 2, 0)), atol=1e-6)
-        assert [label.get_text() for label in strip.get_yticklabels()] == ["0°", "180°"]
-        assert strip.get_box_aspect() == 2 * plotting.STRIP
+    ahead, behind = plotting.camera_colours(2)
+    for a, (strip, view) in enumerate(zip(strips, rgb, strict=True)):
+        labels = [(text, colour) for area, text, colour in words if area is strip.strip_label]
+        assert [text for text, _ in labels] == [f"{a}", "rgb", "0°", "180°"]
+        assert [colour for _, colour in labels[2:]] == [ahead, behind] and ahead != behind
+        x0, y0, x1, y1 = np.round(strip.bbox.extents).astype(int)
+        image = plotting.rasterise(figure)
+        shown = image[len(image) - y1 : len(image) - y0, x0:x1] / 255
+        for row, colours in enumerate(np.moveaxis(gamma_encode(view), 0, -1)):
+            middles = shown[
+                int((row + 0.5) / 2 * len(shown)),
+                ((np.arange(16) + 0.5) / 16 * shown.shape[1]).astype(int),
+            ]
+            assert np.allclose(middles, colours, atol=0.003)
     assert np.ptp(rgb, axis=(0, 2)).min() > 0.01, "agents see different walls"
-    assert [(note.get_text(), list(note.xy)) for note in plan.texts] == [
-        ("0", [2, 2]),
-        ("1", [5, 2]),
-        ("2", [2, 5]),
-    ]
-    views = [matplotlib.colors.to_rgb(patch.get_facecolor()) for patch in plan.patches]
-    ahead, behind = (patch.get_xy()[:, 0] for patch in plan.patches[:2])  # of an agent at (2, 2)
-    assert ahead.min() >= 1.99 and behind.max() <= 2.01
-    labels = [matplotlib.colors.to_rgb(t.get_color()) for t in strips[0].get_yticklabels()]
-    assert views == 3 * labels and labels[0] != labels[1]
+    assert [text for area, text, _ in words if area is plan][-3:] == ["0", "1", "2"]
+    (_, ahead_view, colour_ahead), (_, behind_view, colour_behind) = views[:2]
+    assert ahead_view[:, 0].min() >= 1.99 and behind_view[:, 0].max() <= 2.01  # of one at (2, 2)
+    assert (colour_ahead, colour_behind) == (ahead, behind) and len(views) == 6
 
 
-def test_single_camera_has_no_label_and_single_agent_no_number():
+def test_single_camera_has_no_label_and_single_agent_no_number(words):
     c = core.Core(scene.scenery([toys.box()], 1, device="cpu"), res=8)
     figure, plan, strips = plotting.panels(1)
     core.Core.plot_state(numpyify(c.state(0)), plan)
     modules.Depth.plot_state(modules.Depth(c).state(0).numpy(), strips, c.agents.yaws)
-    assert not plan.texts and not strips[0].get_yticklabels()
-    assert strips[0].get_box_aspect() == plotting.STRIP
+    assert [text for _, text, _ in words] == ["", "1 m", "depth"]
 
 
 @pytest.mark.parametrize(
@@ -164,10 +197,16 @@ LINES = np.array([[[1, 1], [3, 1]], [[3, 1], [3, 5]]], np.float32)
 COLOURS = [np.array([[0.1, 0, 0], [0, 0.2, 0]]), np.array([[0, 0, 0.3]])]
 
 
-def test_lines_are_drawn_texel_by_texel_in_lit_colours(ax):
-    drawn = plotting.plot_lines(ax, LINES, COLOURS, exposure=2.0)
-    assert np.allclose(drawn.get_segments(), [[[1, 1], [2, 1]], [[2, 1], [3, 1]], [[3, 1], [3, 5]]])
-    assert np.allclose(drawn.get_colors()[:, :3], gamma_encode(2 * np.concatenate(COLOURS)))
+def test_texels_divide_their_lines():
+    segments = plotting.texel_segments(LINES, [2, 1])
+    assert np.allclose(segments, [[[1, 1], [2, 1]], [[2, 1], [3, 1]], [[3, 1], [3, 5]]])
+    assert len(plotting.texel_segments(np.zeros((0, 2, 2)), [])) == 0
+
+
+def test_walls_keep_their_hue_and_are_never_dark():
+    dark, grey, red = plotting.wall_colours([[0, 0, 0.001], [0.2, 0.2, 0.2], [1, 0, 0]], 0.5, 1.0)
+    assert dark[2] >= 0.5 and dark[0] == dark[1] == 0
+    assert grey[0] == grey[1] == grey[2] and np.allclose(red, [1, 0, 0])
 
 
 def test_bars_are_grouped_by_name(ax):
@@ -178,58 +217,130 @@ def test_bars_are_grouped_by_name(ax):
     assert plotting.plot_bars(("turn",), [0.5]).figure is not ax.figure
 
 
-def test_unseen_texels_are_faint(ax):
-    drawn = plotting.plot_lines(ax, LINES, COLOURS, seen=[[True, False], [True]])
-    full = plotting.plot_lines(ax, LINES, COLOURS)
-    contrast = np.abs(
-        np.array([lines.get_colors()[:, :3] - plotting.BACKGROUND for lines in (drawn, full)])
-    )
-    assert np.allclose(contrast[0] / contrast[1], np.array([1, plotting.UNSEEN, 1])[:, None])
+SQUARE = np.array([[[1, 1], [5, 1]], [[5, 1], [5, 5]], [[5, 5], [1, 5]], [[1, 5], [1, 1]]], float)
+LIT = [np.ones((80, 3)) * [1.0, 0, 0] for _ in SQUARE]
 
 
-def test_no_lines(ax):
-    assert len(plotting.plot_lines(ax, np.zeros((0, 2, 2)), []).get_segments()) == 0
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_floor_is_lighter_than_outside_and_walls_are_coloured(theme):
+    with plotting.styled(theme=theme):
+        figure, plan, _ = plotting.panels()
+    plotting.plot_scenery(SQUARE, LIT, [[3, 3, 1]], ax=plan)
+    image = plotting.rasterise(figure)
+    inside, outside = (pixel(image, plan, point) for point in ((3, 3), (0.85, 3)))
+    assert np.allclose(inside, rgb_of(plan.style.colours.floor), atol=0.003)
+    assert (inside > outside + 0.05).all()
+    wall = pixel(image, plan, (3, 1))
+    assert wall[0] > 0.7 and wall[1] < 0.05
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_what_is_seen_later_is_drawn_over_what_is_kept(theme):
+    """Frames of an episode, drawn one by one, equal those of a process that draws only the last."""
+
+    def draw(n_seen, n_views):
+        seen = [np.arange(80) < n_seen for _ in SQUARE]
+        views = np.array([[[3, 3], [5, 3 + k], [5, 4 + k]] for k in (-2, -1, 0)], float)[:n_views]
+        with plotting.styled(theme=theme):
+            figure, plan, _ = plotting.panels()
+        plotting.plot_scenery(SQUARE, LIT, [[3, 3, 1]], seen, plan, views)
+        return plotting.rasterise(figure), plan
+
+    plans._KEPT.clear()
+    frames = [draw(10, 1), draw(10, 2), draw(60, 3), draw(5, 1)]
+    assert len(plans._KEPT) == 1
+    for (image, _), arguments in zip(frames, [(10, 1), (10, 2), (60, 3), (5, 1)]):
+        plans._KEPT.clear()
+        assert (draw(*arguments)[0] == image).all(), arguments
+    image, plan = frames[2]
+    theme = plan.style.colours
+    assert np.allclose(pixel(image, plan, (4.5, 3.3)), rgb_of(theme.floor), atol=0.003)
+    hatched = [pixel(image, plan, (1.5, y)) for y in np.linspace(2, 4, 200)]
+    kinds = {tuple(np.round(colour, 2)) for colour in hatched}
+    assert tuple(np.round(rgb_of(theme.unseen), 2)) in kinds and len(kinds) > 1
+    assert np.allclose(pixel(image, plan, (4.9, 1)), rgb_of(theme.unseen_wall), atol=0.02)
+    assert pixel(image, plan, (1.5, 1))[0] > 0.7
+
+
+def test_walls_without_a_room_stand_on_their_rectangle():
+    figure, plan, _ = plotting.panels()
+    plotting.plot_scenery(LINES, COLOURS, [[2, 3, 1]], ax=plan)
+    image = plotting.rasterise(figure)
+    assert np.allclose(pixel(image, plan, (2, 3)), rgb_of(plan.style.colours.floor), atol=0.003)
+
+
+def test_no_lines():
+    figure, plan, _ = plotting.panels()
+    assert plotting.plot_scenery(np.zeros((0, 2, 2)), [], ax=plan) is plan
+    plotting.rasterise(figure)
 
 
 def test_lines_without_colours_are_refused(ax):
     with pytest.raises(ValueError, match="2 lines and 1 arrays"):
-        plotting.plot_lines(ax, LINES, COLOURS[:1])
+        plotting.plot_scenery(LINES, COLOURS[:1], ax=ax)
 
 
-def test_plan_is_to_scale_and_shows_everything():
-    ax = plotting.plot_scenery(LINES, COLOURS, lights=np.array([[2.0, 3.0, 1.0]]))
-    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_aspect()) == ("x, m", "y, m", 1)
+def test_axes_show_everything_to_scale():
+    ax = plotting.plot_scenery(SQUARE, LIT, lights=np.array([[2.0, 3.0, 1.0]]))
     ax.figure.canvas.draw()
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    assert left < 1 and right > 3 and bottom < 1 and top > 5
-    assert [2, 3] in [list(offset) for part in ax.collections for offset in part.get_offsets()]
+    assert ax.get_aspect() == 1 and left < 1 and right > 5 and bottom < 1 and top > 5
+    image = plotting.rasterise(ax.figure)
+    area = plotting.Area.on(ax)
+    assert area is plotting.Area.on(ax) and pixel(image, area, (3, 1))[1] < 0.05
 
 
-def test_pixels_have_the_colour_of_their_wall():
+def test_axes_in_metres_are_drawn_if_asked_for():
+    with plotting.styled(axes=True):
+        _, plan, _ = plotting.panels()
+    plotting.plot_scenery(SQUARE, LIT, ax=plan)
+    assert plan.overlay().get_xlabel() == "x, m" and len(plan.overlay().get_xticks())
+    low, high = (plan.transform.transform(point) for point in ((1, 1), (5, 5)))
+    assert np.allclose(plan.overlay().transData.transform([(1, 1), (5, 5)]), [low, high], atol=1)
+
+
+def test_methods_of_axes_draw_over_an_area():
     figure, plan, _ = plotting.panels()
-    plotting.plot_scenery(LINES, [np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]])], ax=plan)
-    image = plotting.rasterise(figure)
-
-    def pixel(x, y):
-        column, row = plan.transData.transform((x, y))
-        return image[len(image) - 1 - int(row), int(column)].tolist()
-
-    assert pixel(2, 1) == [255, 0, 0] and pixel(3, 3) == [0, 255, 0]
-    assert pixel(2, 3) == 3 * [round(255 * plotting.BACKGROUND)]
+    plotting.plot_scenery(SQUARE, LIT, ax=plan)
+    plan.plot([2, 4], [2, 2], color="b", linewidth=3)
+    assert pixel(plotting.rasterise(figure), plan, (3, 2))[2] > 0.9
+    with pytest.raises(AttributeError, match="no attribute 'plt'"):
+        plan.plt()
 
 
-def test_view_reaches_each_hit_leftmost_ray_first(ax):
+def test_view_reaches_each_hit_leftmost_ray_first():
     # Two rays, 90 degrees, facing +y: in the camera frame they point along (1, 1/2) and (1, -1/2),
     # and left of +y is -x.
-    patch = plotting.plot_view(ax, (1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
-    assert np.allclose(patch.get_xy()[:3], [[1, 1], [0, 3], [3, 5]])
+    view = plotting.view_polygon((1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
+    assert np.allclose(view, [[1, 1], [0, 3], [3, 5]])
 
 
-def test_view_without_distances_is_a_wedge(ax):
-    rim = plotting.plot_view(ax, (0, 0), 0, 60, reach=2.0).get_xy()[1:-1]
+def test_view_without_distances_is_a_wedge():
+    rim = plotting.view_polygon((0, 0), 0, 60, reach=2.0)[1:]
     assert np.allclose(np.linalg.norm(rim, axis=1), 2)
     degrees = np.degrees(np.arctan2(rim[:, 1], rim[:, 0]))
     assert 28 < degrees[0] < 30 and -30 < degrees[-1] < -28 and (np.diff(degrees) < 0).all()
+
+
+def test_agents_are_at_least_12_pixels_wide_in_their_colour():
+    figure, plan, _ = plotting.panels()
+    plan.fit(np.array([0.0, 0.0]), np.array([100.0, 100.0]))  # an agent would be a pixel wide
+    plotting.plot_agent(plan, (50, 50), 0, 0.1, "#ff0000")
+    image = plotting.rasterise(figure)
+    column, row = plan.transform.transform((50, 50)).astype(int)
+    across = image[len(image) - 1 - row - 8 : len(image) - 1 - row + 9, column]
+    assert ((across[:, 0] > 200) & (across[:, 1] < 60)).sum() >= 12
+
+
+def test_trails_fade_and_are_cut_where_nothing_is_known():
+    figure, plan, _ = plotting.panels()
+    plan.fit(np.array([0.0, 0.0]), np.array([10.0, 10.0]))
+    points = np.stack([np.linspace(0, 10, 40), np.full(40, 5.0)], 1)
+    points[:8] = np.nan
+    plotting.plot_trail(plan, points, "#0000ff")
+    image = plotting.rasterise(figure)
+    unknown, early, late = (pixel(image, plan, (x, 5))[0] for x in (1, 3, 9.5))
+    assert unknown == 1 and unknown > early > late
 
 
 # ---- Figures ----
@@ -238,14 +349,32 @@ def test_view_without_distances_is_a_wedge(ax):
 def test_panels_do_not_overlap_and_are_unknown_to_pyplot():
     from matplotlib import pyplot
 
-    figure, plan, strips = plotting.panels(3, title="a title")
-    assert pyplot.get_fignums() == [] and len(strips) == 3 and plan.get_title() == "a title"
-    bottoms = [ax.get_position().y0 for ax in (plan, *strips)]
-    tops = [ax.get_position().y1 for ax in (plan, *strips)]
+    figure, plan, strips = plotting.panels(3, title="step 3")
+    assert pyplot.get_fignums() == [] and len(strips) == 3
+    bottoms = [ax.bbox.y0 for ax in (plan, *strips)]
+    tops = [ax.bbox.y1 for ax in (plan, *strips)]
     assert all(top < bottom for top, bottom in zip(tops[1:], bottoms)) and bottoms[-1] > 0
-    assert tops[0] < 1
-    height, width, channels = plotting.rasterise(figure).shape
-    assert (width, channels) == (600, 3) and abs(height - 100 * figure.get_figheight()) < 1
+    assert tops[0] < 720 and plotting.rasterise(figure).shape == (720, 640, 3)
+
+
+def test_pictures_show_themselves_and_are_equal_files_each_time():
+    with plotting.styled(dpi=50, title="Title"):
+        figure, plan, _ = plotting.panels(title="step 3")
+        plotting.plot_scenery(SQUARE, LIT, ax=plan)
+    png = figure._repr_png_()
+    shown = matplotlib.image.imread(io.BytesIO(png))
+    assert shown.shape[:2] == (360, 320)
+    assert np.abs(255 * shown[..., :3] - plotting.rasterise(figure)).max() < 1
+    for ending, start in ("svg", b"<?xml"), ("pdf", b"%PDF"):
+        content = plotting.encoded(figure, ending)
+        assert content.startswith(start) and content == plotting.encoded(figure, ending)
+    assert b"step 3" in plotting.encoded(figure, "svg"), "text stays text"
+
+
+def test_theme_that_is_none():
+    with pytest.raises(ValueError, match="light or dark, but 'blue'"):
+        with plotting.styled(theme="blue"):
+            pass
 
 
 def test_rasterise_keeps_a_pyplot_figure_open():

@@ -327,7 +327,7 @@ def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
         patched.setattr(recording.os, "replace", fail)
         encoder.save(tmp_path / "video.mp4")
     assert os.listdir(tmp_path) == ["video.mp4"] and (tmp_path / "video.mp4").read_text() == "old"
-    with pytest.raises(ValueError, match="use video.mp4"):
+    with pytest.raises(ValueError, match="format mp4.*use video.mp4"):
         encoder.save(tmp_path / "video.gif")
 
 
@@ -411,3 +411,56 @@ def test_workers_end_with_a_killed_parent(tmp_path):
     while any(is_running(pid) for pid in os.listdir(tmp_path)):
         assert time.monotonic() < deadline
         time.sleep(0.1)
+
+
+# ---- Films ----
+
+
+class Stranger:
+    """Counts its steps. Drawn as a flat image, or as a matplotlib figure."""
+
+    n_envs, fps, device = 1, 10.0, torch.device("cpu")
+
+    def reset(self):
+        self.age = 0
+        return self.world(True)
+
+    def step(self, decision):
+        self.age += 1
+        return self.world(self.age == 3)
+
+    def world(self, reset):
+        return arrdict(reward=torch.tensor([2.0 * (not reset)]), reset=torch.tensor([reset]))
+
+    def state(self, e):
+        return arrdict(grey=torch.tensor(10 * self.age))
+
+    plot_state = staticmethod(Env.plot_static)
+
+
+class Still:
+    def initial(self, n_lanes, device):
+        return None
+
+    def __call__(self, world, hidden, sample=True, generator=None):
+        return arrdict(), None
+
+
+def test_films_of_strangers_have_a_caption_and_show_themselves(tmp_path, monkeypatch):
+    notes, styled = [], recording.plotting.captioned
+
+    def captioned(image):
+        notes.append(recording.plotting.current().note)
+        return styled(image)
+
+    monkeypatch.setattr(recording.plotting, "captioned", captioned)
+    film = recording.film(Stranger(), Still(), tmp_path / "film.mp4", steps=5, title="A title")
+    assert notes[-5:] == [f"return {earned}.0" for earned in (0, 2, 4, 0, 2)]
+    shown = frames(film)
+    assert shown.shape[0] == 5 and shown.shape[1] > 640, "enlarged"
+    assert np.abs(shown[-1, -10, 10].astype(int) - 40).max() < TOLERANCE
+    assert film == tmp_path / "film.mp4" and "video/mp4;base64,AAAA" in film._repr_html_()
+    assert (
+        "image/png;base64"
+        in recording.film(Stranger(), Still(), tmp_path / "film.png", steps=2)._repr_html_()
+    )

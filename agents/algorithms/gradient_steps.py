@@ -1,7 +1,6 @@
 """The gradient steps of an update. Non-finite steps are skipped and counted."""
 
 from collections.abc import Iterable
-from typing import Any
 
 import torch
 
@@ -45,7 +44,7 @@ class GradientSteps:
         lr: float,
         max_grad_norm: float,
         device: torch.device,
-        **options: Any,
+        **options,
     ):
         self.max_grad_norm = max_grad_norm
         self._lr = torch.tensor(lr, device=device)

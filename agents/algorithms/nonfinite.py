@@ -22,7 +22,7 @@ MAX_NAMED = 8
 
 
 class NonFiniteError(RuntimeError):
-    """Training cannot continue because of non-finite numbers. The message names the first one and
+    """Training cannot continue because of a NaN or an infinity. The message names the first one and
     the likely cure.
 
     Args:
@@ -42,8 +42,8 @@ class NonFiniteValue:
     Attributes:
         name: name of the tensor, such as `obs.rgb` or `reward`.
         lane: lane of the rollout.
-        step: step since the environment's `reset` that returned the number, or that an action was
-            chosen for, from 1; 0 for the world that `reset` returned.
+        step: environment step since `reset`, from 1: the one that returned the number or, if the
+            policy produced it, the one that it chose an action for. 0 if `reset` returned it.
         size: magnitude of the number.
         rollout: number of the rollout, from 1.
         others: the same for up to `MAX_NAMED - 1` other lanes of the rollout.
@@ -71,10 +71,10 @@ class NonFiniteValue:
         return self.name.split(".")[0] in ("obs", "privileged", "reward")
 
     def in_env(self, lanes: Sequence[int], n_agents: int) -> "NonFiniteValue":
-        """Returns a copy whose lanes are those of the environment instead of the rollout.
+        """Returns a copy that numbers lanes as the environment does instead of as the rollout does.
 
         Args:
-            lanes: environment lane of each lane of the rollout.
+            lanes: the environment's lane for each lane of the rollout.
             n_agents: lanes per environment.
         """
         return dataclasses.replace(
@@ -105,10 +105,13 @@ class NonFiniteCheck:
     """
 
     def __init__(self, device: torch.device):
-        # [rollouts checked, updates skipped in a row; of the first rollout with non-finite numbers:
-        #  its number (from 1; 0: none), the number of lanes with some, and of the first `MAX_NAMED`
-        #  such lanes the index in `_sizes` of the lane's first number, then their magnitudes, with
-        #  NaN as -1 and infinity as 1.8e308]
+        # [0] rollouts checked
+        # [1] updates skipped in a row
+        # The rest describes the first rollout with non-finite numbers:
+        # [2] its number, from 1; 0 if there is none
+        # [3] how many of its lanes have a non-finite number
+        # [4:12] of the first `MAX_NAMED` such lanes, the index in `_sizes` of the lane's first one
+        # [12:] the magnitudes of these: -1 for NaN, 1.8e308 for infinity
         self.record = torch.zeros(4 + 2 * MAX_NAMED, dtype=torch.float64, device=device)
 
     @property
@@ -194,7 +197,7 @@ class NonFiniteCheck:
         self.record.zero_()[:2] = counts.to(self.record)
 
     def count(self, is_skipped: torch.Tensor) -> None:
-        """Counts an update. `is_skipped` is () bool; an applied update resets the count to 0."""
+        """Counts the updates skipped in a row. `is_skipped`, () bool: whether this one was."""
         self.record[1].add_(1).mul_(is_skipped)
 
     def read(self, floats: dict[str, torch.Tensor]) -> tuple[NonFiniteValue | None, int]:
@@ -221,7 +224,7 @@ class NonFiniteCheck:
 
 
 def _is_fused(floats) -> bool:
-    """Returns True if the kernels can check these tensors."""
+    """Returns True if kernels can check these tensors."""
     tensors = list(floats.values())
     return len(tensors) <= LIBRARY.constants["CHECKED_TENSORS"] and all(
         tensor.is_cuda
@@ -260,7 +263,7 @@ def _largest(values) -> torch.Tensor:
 
 
 def _value_at(floats, rollout, index, size) -> NonFiniteValue:
-    """Returns the number at an index of `_sizes`."""
+    """Describes the number at an index of `_sizes`."""
     n_steps, n_lanes = min(map(len, floats.values())), next(iter(floats.values())).shape[1]
     row, lane = divmod(index, n_lanes)
     row, i = divmod(row, len(floats))

@@ -5,7 +5,7 @@ over valid steps: those that the environment took, of lanes that learn. An updat
 synchronises: conditions are bool tensors on the device.
 """
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -21,9 +21,6 @@ from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
-
-if TYPE_CHECKING:
-    pass
 
 _PARTS = "starts", "actions", "logprobs"  # of a rollout, that a minibatch copies
 
@@ -111,7 +108,7 @@ class PPO(GradientLearner):
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""
-        # A minibatch has its share of the rollout and of the activations. Values are computed from
+        # A minibatch holds its part of the rollout and of the activations. Values are computed from
         # the features of the whole rollout, 4 bytes per unit.
         rollout = bytes_per_step(env, self.policy)
         minibatch = (rollout + self.policy.activation_bytes) / self.n_minibatches

@@ -201,7 +201,7 @@ class Composer:
         groups = []
         with suppress(*HYDRA_ERRORS):  # in files, which are named when they are composed
             groups = [group for group, members in self.groups().items() if word in members]
-        keys = ["file"] * word.endswith((".mp4", ".png"))
+        keys = ["file"] * word.endswith(settings.FILMS)
         keys += ["against"] * (word in ("bot", *BOTS) or ":" in word)
         keys += ["run"]
         keys += ["resume"] * (word == "latest" or "/" in word)

@@ -16,6 +16,8 @@ COMMANDS = {
     "train": "trains a policy; --help says more",
     "evaluate": "measures a trained policy; --help says more",
     "record": "films a trained policy; --help says more",
+    "report": "writes a page about a run or several: curves, evaluations, homes; --help says more",
+    "compare": "draws a metric of several runs, averaged over seeds; --help says more",
     "reproduce": "lists the results in docs/lab; makes one again; --help says more",
     "inspect": "verifies a run's checkpoints and prints what is in them",
     "rerun": "repeats a run and compares its metrics, byte for byte",

@@ -11,7 +11,7 @@ main = functools.partial(command.run_command, scripts.EVALUATE)
 
 
 def run(cfg: settings.Evaluate) -> Path:
-    """Evaluates a run; see `megastep.agents.evaluation.evaluate.run`."""
-    from megastep.agents.evaluation import evaluate  # with PyTorch
+    """Evaluates a run; see `megastep.agents.evaluation.evaluate_run.run`."""
+    from megastep.agents.evaluation import evaluate_run  # with PyTorch
 
-    return evaluate.run(cfg)
+    return evaluate_run.run(cfg)

@@ -162,7 +162,7 @@ def reproduce(row: Row) -> int:
 
 
 def value_of(rows: list[dict], metric: str) -> float:
-    """Returns a number of an evaluation's table: the share of duels won against the opponent of
+    """Returns a number of an evaluation's table: the fraction of duels won against the opponent of
     this name, else the mean return or a metric's mean.
     """
     if "against" in rows[0]:

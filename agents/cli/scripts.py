@@ -44,7 +44,8 @@ TRAIN_HELP = """Trains a policy in an environment.
 The most common words:
   experiment=quickstart        the recipe of `make train`: train, evaluate on unseen homes, film
   env=minimal geometry=box     another environment, other homes
-  seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
+  seconds=1h samples=10M       when to stop, whichever comes first, also seconds=60 samples=1e7;
+                               Ctrl-C stops too, and saves
   env.n_envs=256 device=cpu    another size, another device
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
@@ -85,6 +86,11 @@ REPEATABLE = (
     "logger",
     "finish",
 )
+#: The keys that may be written with units, and their kind.
+QUANTITIES = {
+    **dict.fromkeys(("seconds", "more_seconds", "checkpoint_seconds"), "seconds"),
+    **dict.fromkeys(("samples", "more_samples"), "samples"),
+}
 #: The keys that take a run, each with what is said of a key that cannot go with it.
 CURES = {
     "resume": "cannot change when a run is resumed; init=RUN starts a new one from its weights",
@@ -103,6 +109,9 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     """
     set_ranks(tree, typed)
     tree.setdefault("logger", {})  # as it is with logger=none
+    for key, kind in QUANTITIES.items():
+        if key in tree:
+            tree[key] = settings.quantity(tree[key], kind)
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if tree.get("resume") == AUTO and "rerun" not in given:
         given.remove("resume")  # what there is to resume is looked up when training begins
@@ -211,7 +220,8 @@ The most common words:
   env=pong             another environment with the same spaces: after self-play, the tracker
   greedy=true          the most likely actions instead of sampled ones
   episodes=256         fewer episodes
-  baseline=false       no row for random actions
+  baseline=random,bot  further rows for others in its homes: random, bot, explorer, hunter, walker,
+                       an import path, another run; none for none
   against=RUN,bot      duels instead: with other runs or checkpoints, the environment's bot, hunter,
                        explorer, walker, random, or an import path
   ratings=true         ratings of the run's snapshots, by duels of each with each"""
@@ -223,14 +233,19 @@ The most common words:
   steps=400        frames
   against=RUN      its duel with another run's agent, a bot, or an import path, in one home
   home=3           another of the unseen homes; split=training: one it was trained in
-  file=out.mp4     this file, overwritten if it exists; out.png: the last frame only. Otherwise
-                   video.mp4 in the run folder, or video-2.mp4, ... if there is one"""
+  homes=[1,2,3,4]  several homes in a grid
+  runs=[A,B]       several runs side by side, in one home from the same spawn
+  theme=dark       also title=, dpi=200, speed=2, trail=0, axes=true
+  file=out.mp4     this file, overwritten if it exists; out.gif: the same as a GIF; out.png, out.svg
+                   or out.pdf: the last frame only. Otherwise video.mp4 in the run folder, or
+                   video-2.mp4, ... if there is one"""
 
 
 def check_run(cfg: settings.Evaluate | settings.Record) -> None:
-    """Raises UserError if the run does not exist."""
-    if cfg.run is not None:
-        folders.find(cfg.run)
+    """Raises UserError if a run does not exist."""
+    for run in (cfg.run, *(getattr(cfg, "runs", None) or ())):
+        if run is not None:
+            folders.find(run)
 
 
 def without_training(tree: Tree, typed: list[str]) -> Tree:
@@ -242,8 +257,10 @@ def without_training(tree: Tree, typed: list[str]) -> Tree:
 
 
 def names_in_list(word: str) -> str:
-    """Returns `against=a,b` as the list that it means here, not the sweep that it is to Hydra."""
-    return re.sub(r"^against=(?!\[|null$)(.*)", r"against=[\1]", word)
+    """Returns `against=a,b` as the list that it means here, not the sweep that it is to Hydra; and
+    `baseline=a,b`.
+    """
+    return re.sub(r"^(against|baseline)=(?!\[|(?:null|none|true|false)$)(.*)", r"\1=[\2]", word)
 
 
 TRAIN = Script("train", settings.Train, TRAIN_HELP, check_training, prepare_training)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import torch
 
 from megastep.agents.distributed.pooling import all_gather
-from megastep.agents.distributed.process_group import gather_objects, n_ranks
+from megastep.agents.distributed.process_group import gather_objects, n_ranks, waiting
 
 #: Integer dtype of each item size, to view the bits of floats.
 INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
@@ -27,8 +27,9 @@ def first_difference(policy: torch.nn.Module) -> str | None:
     if n_ranks() == 1:
         return None
     tensors = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
-    rows = all_gather(checksums(tensors.values()))
-    for name, sums in zip(tensors, rows.T.tolist(), strict=True):
+    with waiting():
+        rows = all_gather(checksums(tensors.values())).T.tolist()
+    for name, sums in zip(tensors, rows, strict=True):
         if different := [rank for rank, value in enumerate(sums) if value != sums[0]]:
             return f"policy.{name} differs on {_ranks(different)}"
     return None

@@ -17,8 +17,8 @@ class RankInfo(NamedTuple):
     Attributes:
         rank: 0 to `n_ranks` - 1.
         n_ranks: number of ranks on all machines.
-        local_rank: number among the ranks of this machine.
-        attempt: how often torchrun has restarted the ranks.
+        local_rank: index among the ranks of this machine.
+        attempt: number of times that torchrun has restarted the ranks.
     """
 
     rank: int
@@ -47,8 +47,8 @@ def rank_info() -> RankInfo | None:
 
 
 def token() -> str:
-    """Returns the name of this job, by which its keys in a store begin: random where `ranks=`
-    started it, and otherwise torchrun's `--rdzv-id`.
+    """Returns the prefix of this job's keys in a store: torchrun's `--rdzv-id`, or a random name if
+    `ranks=` started the job.
     """
     return os.environ.get("TORCHELASTIC_RUN_ID", "")
 

@@ -11,7 +11,7 @@ class Plan(NamedTuple):
     Attributes:
         goes_on: there is another update.
         saves: save a checkpoint before it.
-        lr_fraction: factor of its learning rate.
+        lr_fraction: its learning rate as a fraction of the initial one.
     """
 
     goes_on: bool
@@ -27,7 +27,7 @@ def agree(plan: Plan, is_stopped: bool, is_behind: bool) -> Plan:
     Args:
         plan: this rank's plan.
         is_stopped: this rank got a signal; all ranks stop.
-        is_behind: this rank is still writing its part of the last checkpoint; none is saved.
+        is_behind: this rank is still writing the last checkpoint, so no rank saves another.
     """
     counts.n_updates += 1
     rows = exchange([*plan, is_stopped, is_behind])

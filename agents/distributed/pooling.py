@@ -49,7 +49,7 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     Takes one collective operation, however many moments there are.
 
     Args:
-        moments: this rank's, each of any shape, the same on all ranks.
+        moments: this rank's moments. Shapes may differ among them, but not among ranks.
 
     Returns:
         The moments over the entries of all ranks.
@@ -103,7 +103,7 @@ def average_gradients(
     """Averages gradients over the ranks, in place, weighted by the number of valid entries of each
     rank's loss. A learner calls this after `backward()` and before it clips gradients.
 
-    All ranks must call it equally often, with the same parameters. A no-op in a single process.
+    All ranks must make the same calls, with the same parameters. A no-op in a single process.
 
     Args:
         parameters: parameters with float32 gradients; those without a gradient are skipped.
@@ -111,7 +111,7 @@ def average_gradients(
         means: tensors () to average with the same weights, such as metrics.
 
     Returns:
-        n_valid of all ranks together, and the averaged means.
+        The sum of n_valid over the ranks, and the averaged means.
     """
     means = [value.detach() for value in means]
     if n_ranks() == 1:

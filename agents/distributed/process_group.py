@@ -1,4 +1,4 @@
-"""The process group: its ranks, and their communication on the host.
+"""Joins the process group, and exchanges values between its ranks on the host.
 
 torchrun, or `ranks=` on the command line, starts the ranks and sets their environment variables.
 
@@ -10,9 +10,11 @@ from __future__ import annotations
 import atexit
 import contextlib
 import datetime
+import faulthandler
 import functools
 import itertools
 import os
+import secrets
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
@@ -26,8 +28,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-#: Seconds within which all ranks must have started.
-START_SECONDS = 300.0
+#: Seconds within which all ranks must have started, the store must answer if torchrun has started
+#: it, and a rank must have left.
+START_SECONDS, CONNECT_SECONDS, STOP_SECONDS = 300.0, 50.0, 30.0
 
 
 class RankLost(RuntimeError):
@@ -40,11 +43,12 @@ class Counts:
     Attributes:
         n_operations: collective operations started.
         n_updates: updates that the ranks have agreed to start.
-        is_exempt: the others wait for this rank however long it takes.
+        is_exempt: True while the others wait for this rank without limit.
+        is_waiting: True while it waits for the others.
     """
 
     n_operations = n_updates = 0
-    is_exempt = False
+    is_exempt = is_waiting = False
 
 
 counts = Counts()
@@ -52,9 +56,9 @@ counts = Counts()
 
 @contextlib.contextmanager
 def unhurried() -> Iterator[None]:
-    """Lets the other ranks wait for this one without limit, as for an evaluation or for files.
+    """Lets the other ranks wait for this one without limit, for example while it evaluates.
 
-    Otherwise a rank counts as hung when others have waited `watch.LOST_SECONDS` for it.
+    Otherwise a rank counts as hung once the others have waited `watch.LOST_SECONDS` for it.
     """
     counts.is_exempt, before = True, counts.is_exempt
     try:
@@ -63,9 +67,21 @@ def unhurried() -> Iterator[None]:
         counts.is_exempt = before
 
 
+@contextlib.contextmanager
+def waiting() -> Iterator[None]:
+    """Wraps a wait for other ranks. If all ranks wait for `watch.STALLED_SECONDS` in the same
+    operation, they cannot reach each other.
+    """
+    counts.is_waiting, before = True, counts.is_waiting
+    try:
+        yield
+    finally:
+        counts.is_waiting = before
+
+
 def start(seconds: float = START_SECONDS) -> None:
     """Joins the ranks that torchrun started; returns when all have joined. A no-op in a single
-    process, or if it has joined.
+    process, or if this one has joined already.
 
     Args:
         seconds: time limit.
@@ -79,11 +95,12 @@ def start(seconds: float = START_SECONDS) -> None:
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     wait = datetime.timedelta(seconds=seconds)
     # a new prefix: after a restart the store may still hold addresses of the ended ranks
-    name = f"ranks {token()} {info.attempt} {next(_STARTS)}"
+    name = f"ranks {token()} {meeting.name or info.attempt} {next(_STARTS)}"
     keys = _prefixed(name, _store())
-    distributed.init_process_group(
-        backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
-    )
+    with waiting():
+        distributed.init_process_group(
+            backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
+        )
     atexit.register(stop)  # gloo threads must not outlive the interpreter
 
 
@@ -93,9 +110,12 @@ _STARTS = itertools.count()
 @functools.cache
 def _store() -> Store:
     """Returns the ranks' key-value store, which torchrun's agent hosts, or else rank 0."""
-    info, has_agent = rank_info(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-    is_master = info is not None and info.rank == 0 and not has_agent
-    return _connection(is_master)
+    info = rank_info()
+    return _connection(info is not None and info.rank == 0 and not _has_agent())
+
+
+def _has_agent() -> bool:
+    return os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
 
 
 def _connection(is_master=False) -> TCPStore:
@@ -103,7 +123,7 @@ def _connection(is_master=False) -> TCPStore:
         os.environ["MASTER_ADDR"],
         int(os.environ["MASTER_PORT"]),
         is_master=is_master,
-        timeout=datetime.timedelta(seconds=START_SECONDS),
+        timeout=datetime.timedelta(seconds=CONNECT_SECONDS if _has_agent() else START_SECONDS),
         wait_for_workers=False,
     )
 
@@ -114,6 +134,7 @@ def store(name: str) -> Store:
     Args:
         name: prefix of its keys.
     """
+    _store()  # where rank 0 hosts it, it must do so first
     return _prefixed(f"megastep {token()} {name}", _connection())
 
 
@@ -121,10 +142,51 @@ def _prefixed(name: str, keys: Store) -> Store:
     return distributed.PrefixStore(name, keys)  # pyright: ignore[reportPrivateImportUsage]
 
 
+class Meeting:
+    """Finds a name for this start of the ranks, the same on all of them and no earlier one's.
+
+    torchrun's count of restarts is none: each machine counts those that its own ranks caused.
+
+    Attributes:
+        name: the name, once it is known.
+    """
+
+    def __init__(self) -> None:
+        self.name: str | None = None
+        self._own = secrets.token_hex(8)
+
+    def poll(self) -> str | None:
+        """Returns the name, or None if rank 0 has not started. Rank 0 calls this until all have."""
+        info = rank_info()
+        assert info is not None
+        keys = _prefixed(f"megastep {token()} meeting", _store())
+        if self.name is None:
+            keys.set(f"{info.rank}", self._own)
+        if info.rank == 0:
+            # the store may hold what ended ranks have left; those that start replace it
+            names = (f"{rank}" for rank in range(info.n_ranks))
+            everyones = [keys.get(name).decode() if keys.check([name]) else "" for name in names]
+            keys.set("everyone", " ".join(one or "-" for one in everyones))
+            self.name = self._own
+        elif self.name is None and keys.check(["everyone"]):
+            first, *others = keys.get("everyone").decode().split(" ")
+            if others[info.rank - 1 : info.rank] == [self._own]:
+                self.name = first
+        return self.name
+
+
+meeting = Meeting()
+
+
 def stop() -> None:
-    """Leaves the process group."""
+    """Leaves the process group. If that takes longer than `STOP_SECONDS`, the process ends with
+    exit code 1, whatever blocks it: there is nothing left to save.
+    """
     if distributed.is_initialized():
-        distributed.destroy_process_group()
+        with open(os.devnull, "w") as nowhere:
+            faulthandler.dump_traceback_later(STOP_SECONDS, file=nowhere, exit=True)
+            distributed.destroy_process_group()
+            faulthandler.cancel_dump_traceback_later()
 
 
 def rank() -> int:
@@ -138,7 +200,7 @@ def n_ranks() -> int:
 
 
 def local_rank() -> int | None:
-    """Returns this rank's number on its machine, that of its GPU; None without torchrun."""
+    """Returns this rank's index on its machine, which is its GPU's too; None without torchrun."""
     info = rank_info()
     return info and info.local_rank
 
@@ -153,7 +215,8 @@ def communicating() -> Iterator[None]:
     """Wraps a collective operation: counts it, and turns PyTorch's errors into `RankLost`."""
     counts.n_operations += 1
     try:
-        yield
+        with waiting():
+            yield
     except RuntimeError as error:
         raise RankLost(str(error).partition("\n")[0]) from error
 
@@ -162,7 +225,7 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     """Returns the numbers of every rank, by rank. Waits for the other ranks; does not use the GPU.
 
     Args:
-        numbers: equally many on every rank.
+        numbers: the same count on every rank.
     """
     row = torch.tensor(numbers, dtype=torch.float64)
     if n_ranks() == 1:

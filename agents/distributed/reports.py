@@ -1,4 +1,4 @@
-"""Numbers of all ranks for a report, on the host. Each function waits for the other ranks.
+"""Combines the ranks' numbers for a report, on the host. Each function waits for the other ranks.
 
 Tensors are exchanged on their device: between GPUs this is ten times as fast as on the host, and
 training waits for reports.
@@ -12,14 +12,15 @@ from typing import TypeVar
 import torch
 
 from megastep.agents.distributed.pooling import all_gather, on_all_ranks
-from megastep.agents.distributed.process_group import gather_objects, n_ranks
+from megastep.agents.distributed.process_group import gather_objects, n_ranks, waiting
 
 T = TypeVar("T")
 
 
 def sum_over_ranks(values: torch.Tensor) -> torch.Tensor:
     """Returns the sum of the ranks' tensors, float64 on the host. Synchronises."""
-    return all_gather(values.double()).sum(0).cpu()
+    with waiting():
+        return all_gather(values.double()).sum(0).cpu()
 
 
 def mean_over_ranks(values: dict[str, float]) -> dict[str, float]:
@@ -43,6 +44,8 @@ def gather_if_any(value: T, is_needed: bool, device: torch.device) -> list[T]:
         is_needed: this rank needs the values.
         device: device on which the ranks exchange `is_needed`. Synchronises.
     """
-    if n_ranks() == 1 or on_all_ranks(torch.tensor(not is_needed, device=device)):
+    if n_ranks() == 1:
         return [value]
-    return gather_objects(value)
+    with waiting():
+        nobody_needs_them = bool(on_all_ranks(torch.tensor(not is_needed, device=device)))
+    return [value] if nobody_needs_them else gather_objects(value)

@@ -1,7 +1,7 @@
-"""A function recorded as several CUDA graphs, with collective operations between them.
+"""Records a function as several CUDA graphs, with collective operations between them.
 
 NCCL collectives inside CUDA graphs can deadlock, since graphs of different processes may start in
-different orders on a GPU's queues. So they are called between graphs.
+different orders on a GPU's queues. So the collectives are called between graphs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _recording: SegmentedGraph | None = None
 
 
 def between_graphs(call: Callable[[], object]) -> None:
-    """Calls a function. While a `SegmentedGraph` records, each replay will call it at this point.
+    """Calls a function; while a `SegmentedGraph` records, has each replay call it at this point.
 
     Args:
         call: changes tensors in place. Not called during the recording.
@@ -61,7 +61,7 @@ class SegmentedGraph:
                 self._begin()
                 try:
                     self.output = function()
-                finally:  # which raises, too, after a failure
+                finally:  # raises a second error if the function failed
                     self._end()
         except RuntimeError as error:
             end_failed_recording()
@@ -87,6 +87,6 @@ class SegmentedGraph:
         self._begin()
 
     def replay(self) -> None:
-        """Runs the function again."""
+        """Runs the recorded graphs and the calls between them."""
         for part in self.parts:
             part()

@@ -1,8 +1,9 @@
-"""An environment in unseen homes, where the agent of a run meets others."""
+"""Environments in unseen homes, where the agent of a run plays alone or meets others."""
 
 import functools
 import itertools
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,7 +13,7 @@ from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import duels, ratings, statistics, suite, tables
+from megastep.agents.evaluation import duels, playing, ratings, statistics, suite, tables
 from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
@@ -65,7 +66,7 @@ def _of_wrappers(loaded) -> dict:
 def find_player(
     name: str, run: checkpoint.Checkpoint, env_settings: settings.Env | None, env: Env, trust: bool
 ) -> Player:
-    """Returns who is to meet the agent of `run` in `env`.
+    """Returns who is to meet the agent of `run` in `env`, or to be compared with it there.
 
     Args:
         name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
@@ -74,19 +75,67 @@ def find_player(
         trust: import what a run that another user made names.
 
     Raises:
-        UserError: if nobody can be met there, or this player cannot play there.
+        UserError: if this player cannot play there.
     """
-    if optional(env, "n_agents") < 2:
-        raise UserError(
-            f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
-            "one here; choose another with env= and its settings"
-        )
     if name == "bot":
         name = factory.config_of(run).opponents.bot_class or name
     if name in ("bot", *BOTS) or (":" in name and not Path(name).exists()):
         assert env_settings is not None
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
+
+
+class Stage:
+    """An environment in which each home is played equally often, each environment in one home.
+
+    Args:
+        env: settings of the environment.
+        homes: geometries; none if the environment takes none.
+        episodes: number of episodes, one per lane. If there are fewer environments than homes, they
+            are in evenly spaced ones; if more, their number is rounded up to a multiple of homes.
+        seed: of spawns.
+        device: a name of PyTorch.
+
+    Attributes:
+        env, sample: the environment, with this rank's share of all lanes, and a small one.
+        settings: those of `env`.
+        homes: the geometries played in.
+        numbers: the index of each in the list that was given.
+        shard: this rank's share.
+    """
+
+    def __init__(
+        self,
+        env: settings.Env,
+        homes: Sequence,
+        episodes: int,
+        seed: int = 1,
+        device: torch.device | str = "cpu",
+    ):
+        self.seed = rank_seed(seed, process_group.rank())
+        self.sample = factory.make_sample(env, [*homes], seed=self.seed, device=device)
+        n_envs = -(-episodes // optional(self.sample, "n_agents"))
+        n_envs += -n_envs % len(homes) if n_envs > len(homes) > 0 else 0
+        self.homes = factory.spread([*homes], n_envs)
+        self.numbers = factory.spread([*range(len(homes))], n_envs)
+        self.shard = Shard.of_this_rank(n_envs, len(self.homes))
+        self.settings = settings.changed(env, n_envs=len(self.shard.envs), resample=False)
+        where = dict(geometries=[self.homes[home] for home in self.shard.homes], device=device)
+        self.env: Env = factory.construct(self.settings, seed=self.seed, **where)
+
+    def play(self, policy: PolicyLike, greedy: bool, max_steps: int | None = None) -> "arrdict":
+        """Returns the first episodes of all lanes, see `playing.first_episodes`, of all ranks."""
+        played = playing.first_episodes(self.env, policy, self.seed, greedy, max_steps)
+        return self.shard.with_others(played)
+
+
+def check_duels(env: Env) -> None:
+    """Raises UserError if nobody can be met in an environment."""
+    if optional(env, "n_agents") < 2:
+        raise UserError(
+            f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
+            "one here; choose another with env= and its settings"
+        )
 
 
 class Arena:
@@ -108,6 +157,7 @@ class Arena:
         self.cfg, self.run, env = cfg, run, settings.changed(env, **FOR_TWO)
         where = dict(seed=cfg.seed, device=device)
         sample = factory.make_sample(env, homes, **where)
+        check_duels(sample)
         self.others = [find_player(name, run, env, sample, cfg.trust) for name in cfg.against or ()]
         self.agent = load_player(run, sample, run)
         n_agents = optional(sample, "n_agents")

@@ -104,8 +104,8 @@ def summaries(
     """Returns table rows for the result of `play`: one overall, then one per role and one per
     source of homes.
 
-    `won` is the share of duels won, a draw counting half; `lower` and `upper` are its 95 % interval
-    over homes, or over duels if there are no homes.
+    `won` is the fraction of duels won, a draw counting half; `lower` and `upper` are its 95 %
+    interval over homes, or over duels if there are no homes.
 
     Args:
         roles: the role of each agent slot. A role's row has the duels in which `policy` played it.

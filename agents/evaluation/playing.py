@@ -102,7 +102,10 @@ def first_episodes(
         An arrdict on the environment's device:
 
         - returns, lengths: (B,) float32; lengths in steps
-        - done: (B,) bool, true if the episode ended, or is not played
+        - done, terminal: (B,) bool, true if the episode ended or is not played, and if it was not
+          truncated
+        - starts: (B, 3) float32, where each agent was put: x and y in metres, degrees; only of
+          environments with a `core`
         - learns: (B,) bool, from the first world; all true if worlds have no `learns`
         - metrics: name -> (B,) float32, from the last world of the episode; nan if unfinished
         - envs: (B,) int64, the lane's environment
@@ -115,8 +118,10 @@ def first_episodes(
     layout = optional(env, "layout")
     envs = torch.arange(env.n_envs, device=device).repeat_interleave(n_agents)
     homes = {} if layout is None else {"homes": layout.repeat_interleave(n_agents)}
+    agents = getattr(getattr(env, "core", None), "agents", None)
+    starts = {} if agents is None else {"starts": _poses(agents)}
     returns, lengths = (torch.zeros(n_lanes(env), device=device) for _ in range(2))
-    done = torch.zeros(n_lanes(env), dtype=torch.bool, device=device)
+    done, terminal = torch.zeros(2, n_lanes(env), dtype=torch.bool, device=device)
     learns = torch.ones_like(done) if "learns" not in world else world["learns"].clone()
     if learns.any():  # the others are not counted, and may be of agents that are not there
         done |= ~learns
@@ -133,17 +138,26 @@ def first_episodes(
         for name, values in metrics.items():
             values.copy_(torch.where(ends, world["metrics"][name], values))
         done.logical_or_(ends)
+        terminal.logical_or_(world.terminal & ends)
         return world, state
 
-    changed = draws, returns, lengths, metrics
+    changed = draws, returns, lengths, metrics, terminal
     most: int = optional(env, "max_episode_steps") if max_steps is None else max_steps
     step_until(done, step, world, state, env, (policy,), changed, most)
     return arrdict(
         returns=returns,
         lengths=lengths,
         done=done,
+        terminal=terminal,
         learns=learns,
         metrics=metrics,
         envs=envs,
         **homes,
+        **starts,
     )
+
+
+def _poses(agents) -> torch.Tensor:
+    """Returns (B, 3): x and y in metres, degrees."""
+    poses = torch.cat([agents.positions, agents.angles[..., None]], -1)
+    return poses.flatten(0, 1).float().clone()

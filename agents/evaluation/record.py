@@ -9,7 +9,7 @@ import torch
 
 from megastep import recording
 from megastep.agents import console, factory
-from megastep.agents.errors import user_errors
+from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import arena, duels
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import folders
@@ -22,34 +22,37 @@ HOMES = "megastep.geometries.sources:homes"
 
 
 def run(cfg: settings.Record) -> Path:
-    """Films a run's agent, or random actions. Returns the path of the video: `cfg.file`, or the
+    """Films agents of runs, or random actions. Returns the path of the video: `cfg.file`, or the
     first free name of `video.mp4`, `video-2.mp4`, ...
     """
     folder, device = Path(), factory.make_device(cfg.device)
     env_settings, geometry = cfg.env, cfg.geometry
-    if cfg.run is not None:
-        loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
-        trained = factory.config_of(loaded)
+    names = (cfg.run,) if cfg.run is not None else cfg.runs or ()
+    runs = [folders.load_checkpoint(folders.find(name), cfg.trust, device) for name in names]
+    if runs:
+        trained = factory.config_of(runs[0])
         env_settings = trained.env
         geometry = factory.typed_or(trained.geometry, geometry, env_settings)
-        folder = folders.folder_of(loaded.path)
+        folder = folders.folder_of(runs[0].path)
     if cfg.against is not None:
         env_settings = settings.changed(env_settings, **arena.FOR_TWO)
     geometry = geometry or settings.kind_of("geometry", HOMES)(name=HOMES)
     homes = factory.homes(env_settings, geometry, cfg.split)
-    homes = [homes[cfg.home % len(homes)]] if homes else []
     env_settings = settings.changed(env_settings, n_envs=1)
-    env = factory.make_sample(env_settings, homes, seed=cfg.seed, device=device, films=True)
-    random = RandomActions(env.action_space)
-    policy: PolicyLike = random
-    if cfg.run:
-        policy = arena.load_player(loaded, env, loaded).policy
-        factory.load_wrappers(env, loaded)
-    if cfg.against is not None:
-        opponent = arena.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
-        console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
-        seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
-        policy = duels.duel_policy(policy, opponent.policy, seat, optional(env, "n_agents"))
+    players = []
+    for home in (cfg.home,) if cfg.homes is None else cfg.homes:
+        for loaded in runs or [None]:
+            home_alone = _home(homes, home, cfg.split)
+            env = factory.make_sample(
+                env_settings, home_alone, seed=cfg.seed, device=device, films=True
+            )
+            policy, title = _player(cfg, loaded, runs, env_settings, env), cfg.title
+            if cfg.homes is not None:
+                title = f"home {home}" if title is None else f"{title}, home {home}"
+            elif loaded is not None and len(runs) > 1:
+                name = folders.name_of(loaded.path)
+                title = name if title is None else f"{title}, {name}"
+            players.append(recording.Player(env, policy, title))
     with contextlib.ExitStack() as undo:
         path = Path(cfg.file) if cfg.file else take_free_name(folder / "video.mp4")
         if not cfg.file:
@@ -59,14 +62,44 @@ def run(cfg: settings.Record) -> Path:
                 undo.callback(remove_folders, make_folders(path.parent))
         # a video is the last thing that a run should fail for
         problem = f"The video {path} could not be made: "
+        look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail", "axes")}
         with (
             env_failures.told(cast("settings.Env", env_settings), folder),
             user_errors(problem, (Exception,)),
         ):
-            recording.film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
+            recording.film_all(players, path, cfg.steps, cfg.greedy, cfg.seed, **look)
         undo.pop_all()
     console.say(f"Filmed {cfg.steps} steps: {path}")
     return path
+
+
+def _home(homes, index, split) -> list[dict]:
+    """Returns the home as a list, empty for environments without homes.
+
+    Raises:
+        UserError: there is no such home.
+    """
+    if index >= max(len(homes), 1):
+        have = (
+            f"split={split} has {len(homes)}, from home=0" if homes else "the environment has none"
+        )
+        raise UserError(f"There is no home {index}: {have}")
+    return homes[index : index + 1]
+
+
+def _player(cfg, loaded, runs, env_settings, env) -> PolicyLike:
+    """Returns what plays: the agent of `loaded`, the duel with `cfg.against`, or random actions."""
+    if loaded is None:
+        return RandomActions(env.action_space)
+    policy = arena.load_player(loaded, env, runs[0]).policy
+    factory.load_wrappers(env, loaded)
+    if cfg.against is None:
+        return policy
+    arena.check_duels(env)
+    opponent = arena.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
+    console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
+    seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
+    return duels.duel_policy(policy, opponent.policy, seat, optional(env, "n_agents"))
 
 
 def take_free_name(path: Path) -> Path:

@@ -1,6 +1,9 @@
 """Tables of evaluations: where they were made, and the files that hold them."""
 
+import csv
+import io
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,9 +61,13 @@ def write_table(
     title: str,
     rows: list,
     cells: list[dict],
+    episodes: Sequence[Mapping] = (),
 ) -> Path:
     """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
     and `rows` for programs, .json. Returns the latter's path.
+
+    Args:
+        episodes: a row per episode, for the .csv and, by column, the .json.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
     folder, name = folder_of(loaded.path) / "evaluations", for_file("-".join(names))
@@ -72,15 +79,35 @@ def write_table(
         evaluation=encoded(as_tree(cfg)),
         rows=rows,
     )
-    console.say(f"{title}\n{console.table(head, lines)}")
+    text = json.dumps(result, indent=2)
+    if columns := columns_of(episodes):
+        text = f'{text[:-2]},\n  "episodes": {json.dumps(columns)}\n}}'
+    console.say(f"{title}\n{console.table(head, lines, width=console.terminal_width())}")
     with user_errors(f"{folder} cannot be written: "):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(
             folder / f"{name[:200]}.md",
             f"{title}\n\n{console.table(head, lines, is_markdown=True)}\n".encode(),
         )
-        write_atomically(folder / f"{name[:200]}.json", json.dumps(result, indent=2).encode())
+        if columns:
+            write_atomically(folder / f"{name[:200]}.csv", as_csv(episodes, [*columns]).encode())
+        write_atomically(folder / f"{name[:200]}.json", text.encode())
     return folder / f"{name[:200]}.json"
+
+
+def columns_of(rows: Sequence[Mapping]) -> dict[str, list]:
+    """Returns {name: the values of all rows}, None where a row has none."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name) for row in rows] for name in names}
+
+
+def as_csv(rows: Sequence[Mapping], columns: list[str]) -> str:
+    """Returns rows as CSV; what is None is empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 #: Columns of a table of duels, and of one of ratings, as templates.

@@ -135,12 +135,28 @@ def leaves(tree: Tree, prefix: str = "") -> list[tuple[str, Any]]:
     return [leaf for key, below in tree.items() for leaf in leaves(below, f"{prefix}.{key}")]
 
 
+#: Ratio of equal letters from which two keys are near.
+NEAR = 0.75
+
+
 def closest_key(key: str, keys: Iterable[str]) -> str:
+    """Returns a hint that names the key nearest to one that there is not, or lists those of its
+    group if none is near.
+    """
     # by the whole key or its last part: `lr` and `learner.lrr` find `learner.lr`
-    keys = {name.rpartition(".")[2]: name for name in keys} | {name: name for name in keys}
-    near = difflib.get_close_matches(key, keys, n=1, cutoff=0.6)
-    near = near or difflib.get_close_matches(key.rpartition(".")[2], keys, n=1, cutoff=0.5)
-    return f"did you mean {keys[near[0]]}?" if near else "--cfg job prints all keys"
+    names = [*keys]
+    named = {name.rpartition(".")[2]: name for name in names} | {name: name for name in names}
+    near = difflib.get_close_matches(key, named, n=1, cutoff=NEAR)
+    near = near or difflib.get_close_matches(key.rpartition(".")[2], named, n=1, cutoff=NEAR)
+    if near:
+        return f"did you mean {named[near[0]]}?"
+    group = f"{key.rpartition('.')[0]}."
+    inside = {
+        name.removeprefix(group).partition(".")[0] for name in names if name.startswith(group)
+    }
+    if not inside:
+        group, inside = "", {name.partition(".")[0] for name in names if "/" not in name}
+    return f"{f'{group[:-1]} has' if group else 'there are'} {', '.join(sorted(inside))}"
 
 
 #: Keys of earlier versions, and what replaced them.

@@ -134,7 +134,7 @@ def spread(homes: list[dict], n_envs: int) -> list[dict]:
     return scene.spread(homes, n_envs) if homes else []
 
 
-def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> types.Env:
+def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
     """Returns a small environment of the same kind, which tells spaces and sizes.
 
     Raises:
@@ -150,7 +150,7 @@ def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> types.Env
 
 
 def check_memory(
-    env: Env, sample: types.Env, learner: object, geometries: list, **arguments: Any
+    env: Env, sample: types.Env, learner: object, geometries: list, **arguments
 ) -> None:
     """Raises UserError with the number that fits, if there are too many environments, or too many
     observations in a replay buffer, for the memory.

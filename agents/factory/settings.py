@@ -49,11 +49,33 @@ def _ranks(n: int | str) -> int | str:
     return n
 
 
+#: Units of seconds, and factors of counts.
+UNITS = {
+    "seconds": {"s": 1, "sec": 1, "m": 60, "min": 60, "h": 3600, "d": 86400},
+    "samples": {"k": 1_000, "m": 1_000_000, "g": 1_000_000_000, "b": 1_000_000_000},
+}
+
+
+def quantity(text: object, kind: str) -> object:
+    """Returns the number that people write as `100k` or `1h30min`; anything else as it is.
+
+    Args:
+        kind: a key of `UNITS`.
+    """
+    units = UNITS[kind]
+    part = rf"(\d+(?:\.\d+)?(?:e\+?\d+)?) *({'|'.join(sorted(units, key=len, reverse=True))})"
+    if not isinstance(text, str) or not re.fullmatch(rf"(?:{part} *)+", text.lower()):
+        return text
+    total = sum((float(n) * units[unit] for n, unit in re.findall(part, text.lower())), 0.0)
+    return int(total) if total.is_integer() else total
+
+
 Above0 = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]
 Samples = Annotated[int, Field(ge=1, le=10**18)]
 Split = Literal["training", "test", "all"]
+FILMS = ".mp4", ".gif", ".png", ".svg", ".pdf"  # endings of what record.py can write
 
 
 # ---- Groups ----
@@ -289,6 +311,7 @@ class Finish:
     episodes: Count
     record: bool
     steps: Steps
+    report: bool = False
 
 
 @frozen
@@ -372,34 +395,59 @@ def _given(run: T | None) -> T:
     return run
 
 
+def _players(names: object) -> object:
+    """Returns the names of `baseline=`: `true` is random actions; `false` and `none` are nobody."""
+    if isinstance(names, bool) or names in (None, "none"):
+        return ("random",) * (names is True)
+    names = [names] if isinstance(names, str) else names
+    return tuple(names) if isinstance(names, list) else names
+
+
 @frozen
 class Evaluate(Played):
     run: Annotated[str, BeforeValidator(_given)]
     episodes: Count
     max_steps: Count | None = None  # None: the environment's own limit
-    baseline: bool
+    baseline: Annotated[tuple[str, ...], BeforeValidator(_players)]
     against: tuple[str, ...] | None = None
     ratings: bool = False
+
+
+Home = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 @frozen
 class Record(Played):
     run: str | None
+    runs: Annotated[tuple[str, ...], Field(min_length=2, max_length=9)] | None = None
     steps: Steps
-    home: Annotated[int, Field(ge=0, le=1_000_000)]
+    home: Home
+    homes: Annotated[tuple[Home, ...], Field(min_length=1, max_length=16)] | None = None
     against: str | None = None
     file: str | None
+    title: str | None = None
+    theme: Literal["light", "dark"] = "light"
+    dpi: Annotated[float, Field(ge=20, le=400)] = 100.0
+    speed: Annotated[float, Field(gt=0, le=100)] = 1.0
+    trail: Annotated[int, Field(ge=0, le=10_000)] = 60
+    axes: bool = False
 
     def errors(self) -> dict[str, object]:
-        has_run, has_env = self.run is not None, self.env is not None
+        has_run, has_env = self.run is not None or self.runs is not None, self.env is not None
         return {
             "run": not (has_run or has_env)
             and "is missing; without a run, env=explorer records random actions",
+            "runs": self.runs is not None
+            and (
+                (self.run is not None and "cannot be combined with run; list all runs in runs")
+                or (self.homes is not None and "cannot be combined with homes; choose one home=")
+            ),
             "env": has_run and has_env and "cannot be combined with run, which has its own",
             "file": self.file is not None
-            and not self.file.endswith((".mp4", ".png"))
-            and f"{self.file!r} is neither a video, .mp4, nor its last frame, .png",
-            "against": has_env
-            and self.against is not None
+            and not self.file.endswith(FILMS)
+            and f"{self.file!r} is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or "
+            ".pdf",
+            "against": self.against is not None
+            and self.run is None
             and "needs run=, the agent that plays against it",
         }

@@ -1,7 +1,6 @@
-"""One command that starts a run or, when it is given again, continues it: `resume=auto`.
+"""`resume=auto`: one command that starts a run, and continues it when it is repeated.
 
-Clusters start a job again with the words that it had: after a preemption, a time limit or the loss
-of a machine.
+Clusters repeat a job's command after a preemption, a time limit or the loss of a machine.
 """
 
 import os
@@ -15,10 +14,10 @@ from megastep.agents.runs import checkpoint, folders
 
 #: The value of `resume` that continues the run in `folder`, if there is one.
 AUTO = "auto"
-#: The variable with the number that a job of Slurm's keeps when it is started again.
+#: Environment variable with the id of a Slurm job, which a requeued job keeps.
 SLURM_JOB = "SLURM_JOB_ID"
-#: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
-#: what it learns.
+#: Settings that may change when a run is resumed: where it runs, when it stops and which files it
+#: writes, but nothing that decides what it learns.
 RESUMABLE = (
     "resume",
     "samples",
@@ -44,12 +43,12 @@ RESUMABLE = (
 
 
 class Start(NamedTuple):
-    """How a run goes on.
+    """How to start or continue a run.
 
     Attributes:
-        cfg: the settings; `resume` is still `AUTO` if the run has saved nothing yet.
-        folder: the run's.
-        is_done: it has had its budget.
+        cfg: settings to train with; `resume` is still `AUTO` if the run has saved nothing yet.
+        folder: the run folder.
+        is_done: True if the run has used up its budget.
     """
 
     cfg: settings.Train
@@ -61,7 +60,7 @@ def folder_of(cfg: settings.Train) -> Path:
     """Returns the folder of the run to start or continue.
 
     Raises:
-        ConfigErrors: none is given, and this is no job of Slurm's.
+        ConfigErrors: `folder` is missing, and this is not a Slurm job.
     """
     if cfg.folder is not None:
         return Path(cfg.folder)
@@ -72,11 +71,12 @@ def folder_of(cfg: settings.Train) -> Path:
 
 
 def automatic(cfg: settings.Train) -> Start:
-    """Returns how a run with `resume=auto` goes on.
+    """Decides whether `resume=auto` starts a run, continues it or has nothing left to do.
 
     Raises:
-        ConfigErrors: settings differ from those of the run, or add to its budget.
-        UserError: its folder holds something else, or no checkpoint that can be used.
+        ConfigErrors: a setting outside `RESUMABLE` differs from the run's, or `more_samples` or
+            `more_seconds` is given.
+        UserError: the folder holds something other than a run, or no intact checkpoint.
     """
     for key in ("more_samples", "more_seconds"):
         if getattr(cfg, key) is not None:
@@ -103,9 +103,9 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def _differences(saved, typed) -> Iterator[tuple[str, str]]:
-    """Yields (key, sentence) of settings that are others than a run's and may not change."""
+    """Yields (key, error) for settings outside `RESUMABLE` that differ from the saved ones."""
     free = {*RESUMABLE, "folder", "init"}
-    if typed["learner"].get("anneal") == "auto":  # which a run decides when it begins
+    if typed["learner"].get("anneal") == "auto":  # decided when the run began
         free.add("learner.anneal")
     before = dict(check.leaves(saved))
     for key, value in check.leaves(typed):

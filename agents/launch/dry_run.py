@@ -12,7 +12,7 @@ def show(cfg: settings.Train) -> None:
     """Prints environments, lanes and batch sizes, per rank and in total. Writes no file."""
     n_ranks = launcher.n_ranks(cfg)
     device = factory.make_device(cfg.device)
-    names = ["", "a rank", "in total"] if n_ranks > 1 else ["", "in total"]
+    names = ["", "per rank", "in total"] if n_ranks > 1 else ["", "in total"]
     rows = [
         [name, *(f"{number * factor:,}" for factor in {1: None, n_ranks: None})]
         for name, number in sizes(cfg, device).items()
@@ -22,7 +22,7 @@ def show(cfg: settings.Train) -> None:
 
 
 def sizes(cfg: settings.Train, device) -> dict[str, int]:
-    """Returns the sizes of one rank by name, without those that the learner does not have."""
+    """Returns the sizes of one rank by name; omits those that the learner does not define."""
     geometries = factory.homes(cfg.env, cfg.geometry, "training")
     options = dict(seed=cfg.seed, device=device, privileged=cfg.agent.critic == "asymmetric")
     sample = factory.make_sample(cfg.env, geometries, **options)
@@ -34,9 +34,9 @@ def sizes(cfg: settings.Train, device) -> dict[str, int]:
         lanes -= n_opponents
         numbers["lanes that learn"] = lanes
     if learner.n_steps:
-        numbers["samples of an update"] = lanes * learner.n_steps
+        numbers["samples per update"] = lanes * learner.n_steps
     if learner.n_steps and learner.n_minibatches:
-        numbers["samples of a minibatch"] = lanes * learner.n_steps // learner.n_minibatches
+        numbers["samples per minibatch"] = lanes * learner.n_steps // learner.n_minibatches
     return numbers
 
 

@@ -59,7 +59,7 @@ def wake(device: str) -> None:
     driver works while Python imports modules.
 
     Args:
-        device: such as `cuda` or `cuda:1`; `cpu` does nothing.
+        device: such as `cuda` or `cuda:1`; nothing happens for `cpu`.
     """
     if device != "cpu":
         index = int(device.partition(":")[2] or 0)

@@ -1,7 +1,7 @@
-"""Assigns the GPUs of this machine to the jobs of a sweep. A *slot* is one GPU per rank of a job.
+"""Assigns the GPUs of this machine to the jobs of a sweep. A *slot* is a job's GPUs, one per rank.
 
-Jobs find each other through locks on temporary files, one per GPU and job on it. The system
-releases a lock when its process ends.
+Jobs may run in separate processes, so they count each other by lock files, one per GPU and job on
+it. The system releases a lock when its process ends.
 """
 
 import contextlib
@@ -38,7 +38,8 @@ def check(jobs: Sequence, hydra: Any) -> str | None:
         A sentence about idle GPUs; None if there are none.
 
     Raises:
-        ConfigErrors: a job has more ranks than GPUs, or its launcher would run it several times.
+        ConfigErrors: a job has more ranks than there are GPUs, or Hydra's launcher would run each
+            job several times.
     """
     kind, options = hydra.runtime.choices["hydra/launcher"], hydra.launcher
     for key in ("nodes", "tasks_per_node"):
@@ -123,7 +124,7 @@ def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
 
 
 def _names(n_gpus) -> list[str]:
-    # as in the variable, where GPUs may have other numbers or be UUIDs
+    # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
     if visible := os.environ.get(VISIBLE):
         return [name.strip() for name in visible.split(",")][:n_gpus]
     return [*map(str, range(n_gpus))]

@@ -1,11 +1,11 @@
 """Starts the ranks of `ranks=2` on this machine with torchrun's library and waits for them.
 
 This process composes and checks the settings once and writes them to a temporary *job folder*.
-Each rank reads them there, and writes its process id and how it ended. Only this process prints
-errors and forwards signals; its exit code is that of a run in one process.
+Each rank reads them there, and leaves its process id and its ending in the same folder. Only this
+process prints errors and forwards signals; its exit code is that of a run in one process.
 
-torchrun's agent runs in a thread, where it handles no signals: it would kill ranks that take more
-than 30 s to save.
+torchrun's agent runs in a thread, where it cannot handle signals itself: it would kill ranks that
+take more than 30 s to save.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ from megastep.agents.runs import checkpoint, folders, typed_json
 JOB = "MEGASTEP_JOB"
 #: Files of the job folder: settings; a mark that the user stopped the job; the run folder's path.
 SETTINGS, STOPPED, RUN = "settings.json", "stopped", "run"
-#: Exit code if a rank was killed or hangs.
+#: Exit code if a rank was killed, hangs or cannot be reached.
 LOST = 3
 #: Code that runs a rank. Modules in the current folder must not shadow Python's own.
 RANK = """import sys
@@ -67,7 +67,7 @@ def n_ranks(cfg: settings.Train) -> int:
 
 
 def is_needed(cfg: settings.Train) -> bool:
-    """Returns True if this process has to start others that train."""
+    """Returns True if this process has to start ranks instead of training itself."""
     return environment.rank_info() is None and (cfg.ranks != 1 or cfg.restarts > 0)
 
 
@@ -75,7 +75,7 @@ def run(cfg: settings.Train) -> Path:
     """Trains with several ranks. Returns the run folder.
 
     Raises:
-        UserError, Interrupted: as training in this process does.
+        UserError, Interrupted: as for training in this process.
     """
     cfg = settings.changed(cfg, ranks=n_ranks(cfg))
     with contextlib.ExitStack() as stack:
@@ -106,7 +106,7 @@ class Job:
 
     Attributes:
         attempt: how often torchrun has restarted the ranks.
-        cleared: attempts whose ranks have all been killed.
+        cleared: attempts whose remaining ranks were killed after a loss.
         error: the error of torchrun's agent, if any.
     """
 
@@ -147,8 +147,8 @@ class Job:
                 os.kill(int(path.read_text()), number)
 
     def poll(self) -> None:
-        """Kills the remaining ranks of an attempt that lost one (torchrun would give them 30 s).
-        Warns when torchrun restarts the ranks.
+        """Once a rank is lost, kills the others at once (torchrun would give them 30 s). Warns when
+        torchrun restarts the ranks.
         """
         ending = self.ending_of(self.attempt)
         if ending and ending.code == LOST and self.attempt not in self.cleared:
@@ -166,7 +166,7 @@ class Job:
         ending, failures = self.ending_of(self.attempt), getattr(self.error, "failures", None)
         is_stopped = (self.folder / STOPPED).exists()
         if ending and ending.code > 128 and failures and not is_stopped:
-            ending = None  # from torchrun's signal to the remaining ranks
+            ending = None  # it reports torchrun's signal to the remaining ranks, not the failure
         return ending or self.unknown_ending()
 
     def ending_of(self, attempt: int) -> Ending | None:
@@ -238,7 +238,7 @@ def variables(job: Path, n_ranks: int) -> dict[str, str]:
     if (package.ROOT / "train.py").exists():  # a checkout, which may not be installed
         paths = filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
         changes["PYTHONPATH"] = os.pathsep.join(paths)
-    # Slurm may allow a job only some of the cores
+    # a Slurm job may use only some of the machine's cores
     is_linux = hasattr(os, "sched_getaffinity")
     n_cores = len(os.sched_getaffinity(0)) if is_linux else os.cpu_count() or 1
     defaults = {

@@ -1,6 +1,7 @@
-"""The meeting place of ranks on one machine: a key-value store that no other machine can reach.
+"""torchrun's rendezvous for ranks on one machine, on the loopback interface alone.
 
-torchrun's own listens on all addresses, and whoever can write into it has the ranks do things.
+torchrun's own key-value store listens on all interfaces, and anyone who can write to it controls
+the ranks.
 """
 
 import datetime
@@ -10,21 +11,21 @@ from torch import distributed
 from torch.distributed.elastic.rendezvous import RendezvousHandler, rendezvous_handler_registry
 from torch.distributed.elastic.rendezvous.api import RendezvousInfo, RendezvousStoreInfo
 
-#: The name under which torchrun's library finds it, and the only address that it listens on.
+#: Name of this rendezvous in torchrun's library, and the address that its store listens on.
 BACKEND, ADDRESS = "megastep-loopback", "127.0.0.1"
-#: Seconds that a reader of the store waits for a key.
+#: Seconds that reading a key waits for it to be written.
 SECONDS = 300.0
 
 
 class Loopback(RendezvousHandler):
-    """One machine's meeting place.
+    """Lets the ranks of one machine find each other through a key-value store.
 
     Args:
-        run_id: the start's token, which begins the names of all keys.
+        run_id: prefix of all keys, unique to this launch.
     """
 
     def __init__(self, run_id: str):
-        self.run_id, self.n_meetings, self.has_closed = run_id, 0, False
+        self.run_id, self.n_rounds, self.has_closed = run_id, 0, False
         listener = socket.create_server((ADDRESS, 0))
         self.port = listener.getsockname()[1]
         self.store = distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
@@ -41,8 +42,8 @@ class Loopback(RendezvousHandler):
         return True
 
     def next_rendezvous(self) -> RendezvousInfo:
-        self.n_meetings += 1
-        name = f"{self.run_id} {self.n_meetings}"
+        self.n_rounds += 1
+        name = f"{self.run_id} {self.n_rounds}"
         keys = distributed.PrefixStore(name, self.store)  # pyright: ignore[reportPrivateImportUsage]
         return RendezvousInfo(keys, 0, 1, RendezvousStoreInfo(ADDRESS, self.port))
 
@@ -66,7 +67,7 @@ class Loopback(RendezvousHandler):
 
 
 def register() -> None:
-    """Makes it known to torchrun's library."""
+    """Registers this rendezvous with torchrun's library."""
     rendezvous_handler_registry.register(BACKEND, _make)
 
 

@@ -1,10 +1,12 @@
-"""One rank of a training run, started by `launcher` or torchrun: it joins the other ranks, and ends
-with them. Each error is reported by one rank.
+"""One rank of a training run, started by `launcher` or torchrun: it joins the other ranks and ends
+with them. Only one rank reports an error.
 """
 
 import contextlib
+import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn, TypeVar
@@ -14,8 +16,10 @@ from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.launch import endings, launcher, signals, started
 
-#: Seconds that a rank waits for rank 0 to end after an error, and after a signal (it saves).
+#: Seconds that a rank waits for rank 0 to end: after an error; and after a signal, as rank 0 saves.
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
+#: Seconds after which ranks that have not started yet are named.
+NOTICE_SECONDS = 30.0
 #: The team that this process has joined.
 _team = None
 T = TypeVar("T")
@@ -51,6 +55,12 @@ def report_ending(ending: endings.Ending) -> None:
         console.say(f"{package.command('train')}: {ending.text}", sys.stderr)
 
 
+def is_first_here() -> bool:
+    """Returns whether this is the first rank of its machine."""
+    info = environment.rank_info()
+    return info is not None and info.local_rank == 0
+
+
 class Team:
     """The ranks of a training run, as one of them sees them.
 
@@ -65,8 +75,27 @@ class Team:
 
         self.folder = None
         self.store = process_group.store("job")
-        self.watch = watch.Watch(self.end)
+        # where `launcher` is, which Ctrl-Z suspends
+        is_ours = launcher.JOB in os.environ
+        self.watch = watch.Watch(self.end, self.end_in_silence, may_be_silent=is_ours)
         self.watch.start()
+
+    def await_all(self) -> None:
+        """Waits until all ranks have started. Raises UserError if some have not in time."""
+        from megastep.agents.distributed import process_group
+
+        began, warns_at = time.monotonic(), NOTICE_SECONDS
+        while missing := self.watch.missing():
+            names = f"{'rank' if len(missing) == 1 else 'ranks'} {', '.join(map(str, missing))}"
+            problem = f"{names} of {self.watch.n_ranks} did not start within {{:.0f}} s"
+            cure = "see what torchrun printed on the other machines"
+            seconds = time.monotonic() - began
+            if seconds > process_group.START_SECONDS:
+                raise UserError(f"{problem.format(process_group.START_SECONDS)}; {cure}")
+            if seconds > warns_at and is_first_here():
+                console.warn(f"{problem.format(warns_at)}; {cure}. Waiting on")
+                warns_at = math.inf
+            time.sleep(0.1)
 
     def set_folder(self, folder: Path) -> None:
         """Publishes the run folder to the launcher and to restarted ranks."""
@@ -79,11 +108,11 @@ class Team:
 
     def earlier_folder(self) -> Path | None:
         """Returns the run folder of the previous attempt if torchrun restarted the ranks."""
-        info = environment.rank_info()
-        assert info is not None
-        if info.attempt == 0:
-            return None
-        if launcher.JOB in os.environ:  # a folder that is this user's alone
+        if launcher.JOB in os.environ:  # the job folder, to which only this user can write
+            info = environment.rank_info()
+            assert info is not None
+            if info.attempt == 0:
+                return None
             path = Path(os.environ[launcher.JOB], launcher.RUN)
             return Path(path.read_text()) if path.exists() else None
         return started.proven_folder(self.store)
@@ -92,13 +121,32 @@ class Team:
         """Exits at once, because a rank was lost.
 
         Args:
-            problem: to report; None if another rank reports it.
+            problem: what to report; None if another rank reports it.
         """
+        from megastep.agents.launch.watch import CALL_SECONDS, within
+
+        # a folder on a machine that is gone blocks whoever reads it, and so may a pipe
         if problem:
-            report_ending(endings.Ending(launcher.LOST, f"{problem}. {launcher.hint(self.folder)}"))
-        console.restore()
+            unknown = "Its run folder does not answer, so what is saved is not known"
+            hint = within(CALL_SECONDS, lambda: launcher.hint(self.folder), unknown)
+            ending = endings.Ending(launcher.LOST, f"{problem}. {hint}")
+            within(CALL_SECONDS, lambda: report_ending(ending), None)
+        within(CALL_SECONDS, console.restore, None)
         is_ours = launcher.JOB in os.environ
         os._exit(launcher.LOST if problem or not is_ours else 0)
+
+    def end_in_silence(self, seconds: float | None = None) -> NoReturn:
+        """Exits at once, because the store has not answered for so many seconds, or has closed the
+        connection. One rank of this machine reports it, as the others may be out of reach.
+        """
+        silence = (
+            "closed the connection" if seconds is None else f"not answered for {seconds:.0f} s"
+        )
+        problem = (
+            f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, has "
+            f"{silence}: torchrun has ended there, or that machine or the network is down"
+        )
+        self.end(problem if is_first_here() else None)
 
     def leave(self, seconds: float = 0.0) -> None:
         """Leaves the team; the other ranks no longer expect heartbeats from this one.
@@ -109,7 +157,7 @@ class Team:
         self.watch.leave(seconds)
 
     def finish(self) -> None:
-        """Forgets the run, which is done."""
+        """Removes the proof by which restarted ranks would find the run, which is done."""
         if environment.rank() == 0 and self.folder is not None:
             started.remove_proof(self.folder)
 
@@ -139,15 +187,23 @@ def joined() -> Iterator[Team | None]:
     address = f"{os.environ.get('MASTER_ADDR')}:{os.environ.get('MASTER_PORT')}"
     problem = f"The ranks cannot connect to {address}; is the port in use, or closed? "
     with user_errors(problem, (RuntimeError, ValueError)):
-        has_joined = process_group.n_ranks() == 1
-        process_group.start()
-    _team = team = Team()
+        _team = team = Team()
+    has_joined = process_group.n_ranks() == 1
     try:
+        team.await_all()
+        problem = (
+            "The ranks cannot connect to each other; set GLOO_SOCKET_IFNAME to the interface that "
+            "connects their machines. "
+        )
+        with user_errors(problem, (RuntimeError, ValueError)):
+            process_group.start()
         yield team
     except (Exception, signals.Interrupted) as error:
         if loss := _cause(error, process_group.RankLost):
             with signals.handled(lambda number: None):  # ignores torchrun's SIGTERM
                 team.watch.await_verdict()  # which ends this process
+            if team.watch.is_gone:
+                team.end_in_silence()
             team.end(f"A rank is lost: {loss}" if team.watch.claim() else None)
         is_signal = isinstance(error, signals.Interrupted)
         reports = info.rank == 0 and team.watch.claim()

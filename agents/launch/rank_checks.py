@@ -77,7 +77,7 @@ def check_shared(folder: Path) -> str:
     """Checks that all ranks see the run folder of rank 0.
 
     Returns:
-        A random name, the same on all ranks of this start.
+        A random name of this launch, the same on all ranks.
 
     Raises:
         UserError: on all ranks, if one of them does not see the folder.
@@ -110,7 +110,7 @@ def check_shared(folder: Path) -> str:
 
 def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:
     """Returns the settings for this attempt. After a restart by torchrun, they resume the run from
-    its last checkpoint, or start it anew if there is none.
+    its last checkpoint, or start again if there is none.
     """
     folder = from_rank_0(lambda: team and team.earlier_folder())
     if folder is None:

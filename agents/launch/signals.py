@@ -1,6 +1,6 @@
-"""Ctrl-C, SIGTERM and SIGHUP, and SIGUSR1 and SIGUSR2, with which clusters announce a job's end.
-The first signal stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit code is 128
-plus the signal's number.
+"""Handles Ctrl-C, SIGTERM and SIGHUP, and SIGUSR1 and SIGUSR2, which clusters send before a job's
+time is up. The first signal stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit
+code is 128 plus the signal's number.
 """
 
 import contextlib
@@ -17,11 +17,11 @@ from megastep.agents.distributed import environment
 
 #: Signals that end a script at once when they are repeated.
 QUITTING = (signal.SIGINT, signal.SIGTERM)
-#: Signals of clusters, which SIGTERM often follows.
+#: Signals by which clusters announce that SIGTERM will follow.
 ANNOUNCING = (signal.SIGUSR1, signal.SIGUSR2)
 SIGNALS = (*QUITTING, *ANNOUNCING, signal.SIGHUP)
-#: Seconds within which a second signal counts as the first one: `timeout` and a closing terminal
-#: send two.
+#: Seconds within which a second signal counts as a repetition of the first: `timeout` and a closing
+#: terminal send two.
 SAME = 0.3
 
 
@@ -43,8 +43,8 @@ def interrupt(number: int) -> NoReturn:
 
 
 def exit_on_signals(script: str) -> None:
-    """From this call on, a signal ends the process at once with one line. For imports and
-    interpreter shutdown, when there is nothing to save.
+    """Makes signals end the process at once, with one line. For imports and interpreter shutdown,
+    when there is nothing to save.
     """
 
     def exit_at_once(number, frame) -> NoReturn:
@@ -63,8 +63,8 @@ def handled(
 ) -> Iterator[list[int]]:
     """Handles signals for the duration of the context.
 
-    A second Ctrl-C or SIGTERM ends the process at once; one that follows SIGUSR1 or SIGUSR2 is the
-    first. That is safe: checkpoints are written to a temporary folder and renamed.
+    A second Ctrl-C or SIGTERM ends the process at once; after SIGUSR1 or SIGUSR2 it counts as the
+    first. Ending at once is safe: checkpoints are written to a temporary folder and renamed.
 
     Args:
         on_first: called with the number of the first signal.
@@ -99,8 +99,8 @@ def handled(
 def interrupting(on_first: Callable[[int], None] = interrupt) -> Iterator[None]:
     """Like `handled`, for an `on_first` that raises Interrupted.
 
-    After a signal the block always ends with Interrupted, even if a library swallows it, or fails
-    while it cleans up or on a partly imported module.
+    After a signal the block always ends with Interrupted, even if a library swallows the exception,
+    or raises another one while it cleans up or because a module was imported only in part.
     """
     with handled(on_first) as numbers:
         try:
@@ -125,9 +125,9 @@ def deferred() -> Iterator[None]:
 
 
 def stop(process: int) -> None:
-    """Stops another process gracefully, even if a terminal's Ctrl-C has reached it, too.
+    """Stops another process gracefully, even if it has already received the terminal's Ctrl-C.
 
-    Sends SIGHUP where possible, since as a second signal it does not end the process at once.
+    Sends SIGHUP unless it is ignored: even as the second signal, it does not end a process at once.
     """
     is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):

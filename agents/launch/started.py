@@ -1,7 +1,8 @@
-"""Which run torchrun's ranks trained before they were started again.
+"""Finds the run that torchrun's ranks trained before a restart.
 
-torchrun's store keeps the name of its folder, and whoever reaches the store can write another name.
-So the folder proves itself: it holds a token that this start made.
+torchrun's key-value store keeps the path of the run folder, but anyone who can reach the store may
+write another path. So rank 0 also writes a random token into the folder and into the store, and a
+folder is accepted only if it holds the token.
 """
 
 import contextlib
@@ -23,15 +24,15 @@ FILE, KEY = ".started", "run"
 
 
 def leave_proof(store: "Store", folder: Path) -> None:
-    """Leaves a token in a run's folder, and both in the store."""
+    """Writes a token into a run folder, and the folder's path and the token into the store."""
     token = secrets.token_hex()
-    with contextlib.suppress(OSError):  # without it, a restart is another run
+    with contextlib.suppress(OSError):  # without a token, a restart begins another run
         write_atomically(folder / FILE, token.encode())
         store.set(KEY, json.dumps([str(folder), token]))
 
 
 def proven_folder(store: "Store") -> Path | None:
-    """Returns the folder that the store names, if it has the token and is this user's."""
+    """Returns the run folder in the store if it holds the token and is this user's, else None."""
     if not store.check([KEY]):
         return None
     with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
@@ -45,6 +46,6 @@ def proven_folder(store: "Store") -> Path | None:
 
 
 def remove_proof(folder: Path) -> None:
-    """Removes the token of a run that is done."""
+    """Removes the token of a finished run."""
     with contextlib.suppress(OSError):
         (folder / FILE).unlink()

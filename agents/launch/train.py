@@ -1,4 +1,4 @@
-"""Training, in this process or with several ranks in processes of their own."""
+"""Trains, in this process or with several ranks in processes of their own."""
 
 import contextlib
 import functools
@@ -24,7 +24,7 @@ from megastep.agents.errors import (
     memory_problem,
     user_errors,
 )
-from megastep.agents.evaluation import evaluate, record
+from megastep.agents.evaluation import evaluate_run, record
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, dry_run, launcher, rank, rank_checks, signals
@@ -65,8 +65,8 @@ def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path,
 def run(cfg: settings.Train) -> Path | None:
     """Trains. Returns the run folder, None for a dry run.
 
-    If torchrun started this process, it trains as one of the ranks, of which rank 0 writes the run
-    folder. With `cfg.ranks` or `cfg.restarts`, this process starts the ranks.
+    If torchrun started this process, it trains as one of the ranks; rank 0 writes the run folder.
+    With `cfg.ranks` or `cfg.restarts`, this process starts the ranks and waits for them.
 
     Raises:
         Interrupted: a signal came; the run was saved.
@@ -92,7 +92,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     if cfg.resume == again.AUTO:
         start = together(lambda: again.automatic(cfg))
         if start.is_done:
-            console.say(f"The run in {start.folder} has had its budget.")
+            console.say(f"The run in {start.folder} has already used up its budget.")
             return start.folder
         cfg = start.cfg
     is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(str(cfg.folder)))
@@ -157,7 +157,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                     curves.plot_curves(folder)
         if trainer.profiler and trainer.profiler.path:
             console.say(f"Profile: {trainer.profiler.path}, and a trace beside it")
-        # a signal on one rank stops all, and so does a checkpoint that one cannot save
+        # all ranks stop if one got a signal or could not save a checkpoint
         ends = process_group.gather_objects((numbers[:1], trainer.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
@@ -167,6 +167,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
         nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
+        result = result_of(trainer)
         del trainer, saved  # frees GPU memory for the evaluation
         common: dict = dict(
             run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device
@@ -175,20 +176,48 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if cfg.finish.evaluate:
             with process_group.unhurried():
                 episodes = cfg.finish.episodes
-                evaluate.run(settings.Evaluate(episodes=episodes, baseline=True, **common))
+                evaluate_run.run(
+                    settings.Evaluate(episodes=episodes, baseline=("random",), **common)
+                )
         if cfg.finish.record and is_first:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
+        if cfg.finish.report and is_first:
+            from megastep.agents.reports import report
+
+            with console.warned():
+                console.say(f"Report: {report.write([folder], folder / 'report.html')}")
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All other rollouts were used; the run is in {folder}"
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
         if cfg.rerun and is_first:
             compare(folder, folders.folder_of(folders.find(cfg.rerun)))
+        if is_first:
+            console.say(f"{result}. The run is in {folder}\n{next_command(cfg, folder)}")
     return folder
 
 
+def result_of(trainer: Trainer) -> str:
+    """Returns what a run came to: samples, seconds, and the return of its last episodes."""
+    text = f"Trained {trainer.samples:,} samples in {console.duration(trainer.clock.seconds)}"
+    latest = trainer.latest_stats
+    if "episode/return" not in latest:
+        return f"{text}; no episode ended since the last report"
+    n_episodes = f"{latest['episode/window']:,.0f}"
+    return f"{text}; mean return {latest['episode/return']:.4g} of the last {n_episodes} episodes"
+
+
+def next_command(cfg: settings.Train, folder: Path) -> str:
+    """Returns what people do next with a run that has ended: evaluate it, film it, or continue."""
+    if not cfg.finish.evaluate:
+        return f"To evaluate it: {folders.command_of('evaluate', 'run', folder)}"
+    if not cfg.finish.record:
+        return f"To film it: {folders.command_of('record', 'run', folder)}"
+    return f"To train it further: {folders.resume_command(folder)} more_seconds=10min"
+
+
 def saved_by(trainer: Trainer, folder: Path) -> str:
-    """Returns what is saved of a training run that an error ended, and how to resume it."""
+    """Returns how much of a run that ended with an error is saved, and how to resume it."""
     text = trainer.saver.error or "The latest updates could not be saved"
     text = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else text
     return f"{text}. {folders.to_continue(folder)}"

@@ -3,8 +3,10 @@
 Every rank writes a heartbeat to torchrun's key-value store. Each rank monitors one neighbour, the
 next rank; the first to detect a loss tells all others through the store.
 
-A rank is lost if its heartbeat stops (it was killed or suspended), or if it hangs: its neighbour
-has waited too long for it in a collective operation.
+A rank is lost if its heartbeat stops (it was killed or suspended, or is cut off), or if it hangs:
+its neighbour has waited too long for it in a collective operation. If all wait for each other in
+the same operation, they cannot reach each other. A second thread, which never touches the store,
+ends a rank that the store no longer answers, whatever its other threads are blocked in.
 """
 
 from __future__ import annotations
@@ -12,12 +14,13 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from pydantic import TypeAdapter
 
@@ -25,17 +28,25 @@ from megastep.agents.distributed import environment, process_group
 
 #: Seconds between heartbeats.
 PERIOD = 2.0
-#: Seconds without a heartbeat, or behind the neighbour, after which a rank is lost; and seconds
-#: without a heartbeat if a connection has broken.
-LOST_SECONDS, BROKEN_SECONDS = 20.0, 5.0
-#: Seconds that a rank may be behind in the first two updates, which compile kernels and graphs.
+#: A rank is lost after this many seconds without a heartbeat, or while its neighbour waits for it.
+LOST_SECONDS = 20.0
+#: The same for heartbeats, once a connection has broken.
+BROKEN_SECONDS = 5.0
+#: Seconds to wait for a rank in the first two updates, which compile kernels and graphs.
 FIRST_SECONDS = 300.0
-#: A rank may be behind for this many times the longest wait so far that ended well.
+#: A wait may last this many times the longest earlier wait, if that is more.
 PATIENCE = 5
-#: Seconds that a rank may still take to save and end after the store is gone.
-LAST_SECONDS = 60.0
+#: Seconds that all ranks may wait for each other in the same operation.
+STALLED_SECONDS = 40.0
+#: Seconds without an answer of the store after which a rank ends. Together with the seconds of its
+#: last words, below a minute.
+SILENT_SECONDS = 45.0
+#: Seconds for one call that something lost may block for ever.
+CALL_SECONDS = 4.0
 
-#: Counts the watches of this process, in step on all ranks: each watch has its own keys.
+T = TypeVar("T")
+
+#: Numbers the watches of this process, equally on all ranks, so that each has its own keys.
 NUMBERS = itertools.count()
 
 
@@ -46,8 +57,9 @@ class Heartbeat(NamedTuple):
         number: counts heartbeats.
         n_operations: collective operations started.
         n_updates: updates started.
-        is_exempt: the others wait for it however long it takes, as for an evaluation.
-        has_left: it is done.
+        is_exempt: True while the others wait for it without limit, as during an evaluation.
+        is_waiting: True while it waits for the other ranks.
+        has_left: True once it is done and no longer monitored.
         host: name of its machine.
     """
 
@@ -55,6 +67,7 @@ class Heartbeat(NamedTuple):
     n_operations: int
     n_updates: int
     is_exempt: bool
+    is_waiting: bool
     has_left: bool
     host: str
 
@@ -63,14 +76,14 @@ HEARTBEAT = TypeAdapter(Heartbeat)
 
 
 class LossDetector:
-    """Decides from the heartbeats of two ranks whether the other one is lost.
+    """Decides whether the neighbouring rank is lost, from its heartbeats and this rank's.
 
-    Time is counted in polls, so that a machine may sleep for an hour without losing a rank.
+    Time is counted in polls, so no rank is lost when a machine wakes up after an hour of sleep.
     """
 
     def __init__(self) -> None:
         self.last = None
-        self.n_silent = self.n_ahead = self.longest = 0
+        self.n_silent = self.n_ahead = self.n_stalled = self.longest = 0
 
     def poll(self, ours: Heartbeat, theirs: Heartbeat, is_broken: bool) -> str | None:
         """Compares two heartbeats, once every `PERIOD` seconds.
@@ -88,7 +101,13 @@ class LossDetector:
             return None
         self.n_silent = self.n_silent + 1 if theirs == before else 0
         if self.n_silent * PERIOD > (BROKEN_SECONDS if is_broken else LOST_SECONDS):
-            return "does not answer: it was killed or suspended, or the system ran out of memory"
+            return (
+                "does not answer: it was killed or suspended, the system ran out of memory, or its "
+                "network is down"
+            )
+        is_stalled = ours.is_waiting and theirs.is_waiting and before.is_waiting
+        is_stalled &= ours.n_operations == theirs.n_operations == before.n_operations
+        self.n_stalled = self.n_stalled + 1 if is_stalled else 0
         is_ahead = ours.n_operations > theirs.n_operations and not theirs.is_exempt
         if is_ahead and theirs.n_operations == before.n_operations:
             self.n_ahead += 1
@@ -105,41 +124,82 @@ class LossDetector:
         return None
 
 
+def within(seconds: float, function: Callable[[], T], default: T) -> T:
+    """Returns what a function returns, or a default if that takes longer or fails.
+
+    Calls it in a thread, which is left behind if it is blocked.
+    """
+    values = [default]
+
+    def call() -> None:
+        with contextlib.suppress(Exception):
+            values.append(function())
+
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return values[-1]
+
+
 class Watch:
-    """Monitors the ranks of this process group, from `start` to `leave`.
+    """Monitors the ranks of this job, from `start` to `leave`.
 
     Args:
-        on_lost: called in the watch's thread when a rank is lost; must end this process. Its
+        on_lost: called in a thread of the watch when a rank is lost; must end this process. Its
             argument is `rank 1 on node-7 hangs: ...` on the rank that reports the loss, None on the
             others.
+        on_silence: called, as `on_lost`, when the store has not answered for so many seconds.
+        may_be_silent: the process with the store may be suspended, but ends this one if it is gone.
     """
 
-    def __init__(self, on_lost: Callable[[str | None], None]):
-        self.on_lost = on_lost
-        self.is_broken = self.has_left = False
-        self.rank, self.n_ranks = process_group.rank(), process_group.n_ranks()
-        self.number = 0
+    def __init__(
+        self,
+        on_lost: Callable[[str | None], None],
+        on_silence: Callable[[float], None] = lambda seconds: None,
+        may_be_silent: bool = False,
+    ):
+        info = environment.rank_info()
+        assert info is not None
+        self.on_lost, self.on_silence, self.may_be_silent = on_lost, on_silence, may_be_silent
+        self.is_broken = self.is_gone = self.has_left = False
+        self.rank, self.n_ranks = info.rank, info.n_ranks
+        self.number = self.n_answers = 0
+        self._leaves_by = math.inf
         self._wakes = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        info = environment.rank_info()
-        assert info is not None
-        self.store = process_group.store(f"watch {info.attempt} {next(NUMBERS)}")
-        self._beat()
-        self._thread.start()
+        """Ends this rank if the store falls silent. The others are monitored once they start."""
+        threading.Thread(target=self._guard, daemon=True).start()
+
+    def missing(self) -> list[int]:
+        """Returns the ranks that have not started yet. Each rank calls this until all have."""
+        name = process_group.meeting.poll()
+        self.n_answers += 1
+        if name is None:
+            return [0]
+        if self._thread.ident is None:
+            self.store = process_group.store(f"watch {name} {next(NUMBERS)}")
+            self._beat()
+            self._thread.start()
+        ranks = range(self.n_ranks)
+        if self.store.check([_key(rank) for rank in ranks]):
+            return []
+        return [rank for rank in ranks if not self.store.check([_key(rank)])]
 
     def claim(self) -> bool:
         """Returns True on the first rank that calls this: it reports the error, the others end."""
-        with contextlib.suppress(RuntimeError):  # the store is gone, so no other rank can report
+
+        def is_first() -> bool:
             return self.store.compare_set("end", "", f"{self.rank}").decode() == f"{self.rank}"
-        return True
+
+        # if the store is gone, or has not been opened, no other rank can report
+        return within(CALL_SECONDS, is_first, True)
 
     def await_verdict(self) -> None:
         """Waits after a broken connection until the lost rank is found, which ends this process."""
         self.is_broken = True
-        with contextlib.suppress(RuntimeError):
-            self.store.set("broken", "1")
+        within(CALL_SECONDS, lambda: self.store.set("broken", "1"), None)
         self._thread.join(LOST_SECONDS + 2 * PERIOD)
 
     def leave(self, seconds: float = 0.0) -> None:
@@ -148,25 +208,16 @@ class Watch:
         Args:
             seconds: how long to wait for rank 0 to leave, too.
         """
+        self._leaves_by = time.monotonic() + seconds
         self.has_left = True
         self._wakes.set()
         if self._thread.is_alive():
-            self._thread.join(PERIOD)
-        with contextlib.suppress(RuntimeError):  # the store is gone
-            self._beat()
-            deadline = time.monotonic() + seconds
-            while self.rank > 0 and time.monotonic() < deadline:
-                if (first := self._heartbeat_of(0)) is None or first.has_left:
-                    break
-                time.sleep(0.1)
+            self._thread.join(seconds + CALL_SECONDS)
 
     def _run(self) -> None:
         detector, other = LossDetector(), (self.rank + 1) % self.n_ranks
-        while not self.has_left:
-            self._wakes.wait(PERIOD)
-            if self.has_left:
-                return
-            try:
+        try:
+            while not self._wakes.wait(PERIOD):
                 ours = self._beat()
                 if self.store.check(["end"]):
                     return self.on_lost(None)
@@ -176,10 +227,44 @@ class Watch:
                 if theirs and problem and not self.has_left:
                     label = f"rank {other} on {theirs.host}"
                     return self.on_lost(f"{label} {problem}" if self.claim() else None)
-            except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
-                os.kill(os.getpid(), signal.SIGTERM)
-                self._wakes.wait(LAST_SECONDS)
-                return None if self.has_left else self.on_lost(None)
+                if detector.n_stalled * PERIOD > STALLED_SECONDS and self.rank == 0:
+                    if problem := self._stall(ours):
+                        return self.on_lost(problem if self.claim() else None)
+                self.n_answers += 1
+            self._beat()
+            while self.rank > 0 and time.monotonic() < self._leaves_by:
+                if (first := self._heartbeat_of(0)) is None or first.has_left:
+                    break
+                time.sleep(0.1)
+        except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
+            self.is_gone = True
+            if not self.has_left:
+                # saves, as SIGTERM would, but bears one of torchrun's after it
+                os.kill(os.getpid(), signal.SIGUSR1)
+
+    def _guard(self) -> None:
+        # counts polls, as a suspended job may go on later
+        n_silent, n_answers = 0, 0
+        while not self._wakes.wait(PERIOD):
+            may_be_silent = self.may_be_silent and not self.is_gone
+            n_silent = n_silent + 1 if self.n_answers == n_answers and not may_be_silent else 0
+            n_answers = self.n_answers
+            if n_silent * PERIOD > SILENT_SECONDS:
+                return self.on_silence(n_silent * PERIOD)
+
+    def _stall(self, ours: Heartbeat) -> str | None:
+        """Returns what is wrong if all ranks wait in the same operation; None otherwise."""
+        hosts = {}
+        for rank in range(self.n_ranks):
+            theirs = self._heartbeat_of(rank)
+            if not (theirs and theirs.is_waiting and theirs.n_operations == ours.n_operations):
+                return None
+            hosts[theirs.host] = None
+        return (
+            f"The ranks on {', '.join(hosts)} reach torchrun's store, but not each other, and have "
+            f"waited for {STALLED_SECONDS:.0f} s: a network is down, or NCCL_SOCKET_IFNAME and "
+            "GLOO_SOCKET_IFNAME name another interface than the one that connects them"
+        )
 
     def _beat(self) -> Heartbeat:
         self.number += 1
@@ -188,17 +273,21 @@ class Watch:
             process_group.counts.n_operations,
             process_group.counts.n_updates,
             process_group.counts.is_exempt,
+            process_group.counts.is_waiting,
             self.has_left,
             process_group.hostname(),
         )
-        self.store.set(f"heartbeat {self.rank}", json.dumps(heartbeat))
+        self.store.set(_key(self.rank), json.dumps(heartbeat))
         return heartbeat
 
     def _heartbeat_of(self, rank) -> Heartbeat | None:
-        name = f"heartbeat {rank}"
-        if not self.store.check([name]):
+        if not self.store.check([_key(rank)]):
             return None
         try:
-            return HEARTBEAT.validate_json(self.store.get(name))
-        except ValueError:  # which no rank has written
+            return HEARTBEAT.validate_json(self.store.get(_key(rank)))
+        except ValueError:  # written by something other than a rank
             return None
+
+
+def _key(rank) -> str:
+    return f"heartbeat {rank}"

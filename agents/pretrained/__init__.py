@@ -62,7 +62,7 @@ def make_env(
     n_envs: int = 128,
     seed: int = 1,
     device: str = "auto",
-    **changes: Any,
+    **changes,
 ) -> Any:
     """Returns an environment with the settings that an agent was trained with, and with what
     wrappers had learnt then.

@@ -91,7 +91,7 @@ def write(
 
 
 def sealed(content: bytes) -> bytes:
-    """Returns the bytes of a file with its SHA-256 in place of the one in its header."""
+    """Returns a file's bytes with the SHA-256 in its header recomputed."""
     match = _SEAL.search(content)
     assert match is not None
     start, end = match.span(1)
@@ -143,11 +143,11 @@ def read_metadata(path: Path) -> Row:
 def _read(path) -> tuple[Row, Row]:
     """Returns the result of `read_metadata`, and dtype, shape and bytes of each tensor by name."""
     try:
-        # a typed path may be a link, as in caches of downloaded files
+        # the given path may be a link, as in caches of downloaded files
         content = strange_files.read_bytes(path.resolve(), _MAX_BYTES)
     except OSError as error:
         raise DamagedCheckpoint(f"{path} cannot be read ({error.strerror})") from None
-    import numpy as np  # not where commands only look for a run
+    import numpy as np  # not for commands that only look for a run
 
     header, data = _split(content)
     try:

@@ -1,4 +1,4 @@
-"""The annealing record: the learning rate's factor in each update, one float64 each.
+"""The annealing record: the learning rate's factor (1 at first) in each update, as one float64.
 
 With `seconds=` the factors depend on the clock; the record lets `megastep rerun` repeat such a run.
 """
@@ -12,16 +12,16 @@ from megastep.agents.runs import strange_files
 from megastep.agents.runs.atomic_files import AppendedFile
 
 FILE, MAX_BYTES = "annealing.f64", 2**32
-#: Updates of earlier versions, at most, that are not recorded.
+#: Most updates that may lack a record, because an earlier version made them.
 MAX_MISSING = 10**7
 
 
 def read(folder: Path | str) -> array:
-    """Returns the factor of each update of a run; empty without a record. NaN marks updates by
-    versions that recorded none.
+    """Returns the factor of each update of a run; empty without a record. NaN marks updates made by
+    versions that kept no record.
 
     Raises:
-        ValueError: there is another number than NaN and those from 0 to 1.
+        ValueError: a factor is neither NaN nor from 0 to 1.
     """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
@@ -42,7 +42,7 @@ class AnnealingRecord:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: there is another record, or a forged number of updates.
+        ValueError: the record is damaged, or `n_updates` is far more than it holds.
     """
 
     def __init__(self, folder: Path | str, n_updates: int = 0):

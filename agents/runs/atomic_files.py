@@ -16,7 +16,7 @@ from megastep.agents.runs import strange_files
 #: Age in seconds at which temporary files of other machines are deleted, whose processes cannot be
 #: checked from here.
 ABANDONED = 24 * 3600
-#: As long as the longest name of a file or folder of a run.
+#: A name as long as the longest of a run's files and folders.
 ROOM = 120 * "x"
 _NAME = re.compile(r".*\.tmp-(?P<machine>.+)-(?P<pid>\d+)-(?P<token>\w+)-\d+")
 #: The token distinguishes this process from an earlier one with the same id.
@@ -26,8 +26,8 @@ _TOKEN, _COUNT = secrets.token_hex(4), itertools.count()
 def write_atomically(path: Path, data: bytes) -> None:
     """Writes a temporary file and renames it to `path`.
 
-    Readers see either the old or the new content, even if the process is killed. Of several
-    writers, the last wins. Deletes temporary files that killed writers left in the folder.
+    Readers see either the old or the new content, even if the process is killed. The last of
+    several writers wins. Deletes temporary files that killed writers left in the folder.
 
     Raises:
         OSError: the disk is full or not writable. The old file is unchanged.
@@ -44,11 +44,11 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def make_folders(path: Path) -> list[Path]:
-    """Makes a folder and those above it, all or none of them. Returns those that it made, the
-    innermost first.
+    """Creates a folder and its missing parents. Returns the folders created, innermost first.
 
     Raises:
-        OSError: they cannot be made, or their path leaves no room for the files of a run.
+        OSError: one cannot be created, or the path is too long for the files of a run. No folder is
+            left behind.
     """
     check_room(path)
     absent = [one for one in (path, *path.parents) if not os.path.lexists(one)]
@@ -61,13 +61,13 @@ def make_folders(path: Path) -> list[Path]:
 
 
 def check_room(path: Path) -> None:
-    """Raises OSError if a folder's path is so long that files of a run below it have none."""
+    """Raises OSError if a folder's path is too long for the files of a run in it."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
         os.lstat(path.absolute() / ROOM / ROOM)
 
 
 def remove_folders(paths: Iterable[Path]) -> None:
-    """Removes what `make_folders` made, as far as it is empty."""
+    """Removes the folders that `make_folders` created; stops at the first that is not empty."""
     with contextlib.suppress(OSError):
         for path in paths:
             if os.path.lexists(path):
@@ -85,7 +85,7 @@ def write_synced(path: Path, data: bytes) -> None:
 def temporary_path(path: Path) -> Path:
     """Returns an unused path beside `path` for a temporary file or folder of this process."""
     owner = f"{_machine()}-{os.getpid()}-{_TOKEN}-{next(_COUNT)}"
-    return path.with_name(f"{path.name[:40]}.tmp-{owner}")  # of at most 255 bytes
+    return path.with_name(f"{path.name[:40]}.tmp-{owner}")  # at most 255 bytes
 
 
 def delete_leftovers(folder: Path | str) -> None:
@@ -112,7 +112,7 @@ def _is_in_use(path, machine, pid, token) -> bool:
 def _is_alive(pid) -> bool:
     try:
         os.kill(pid, 0)  # sends no signal; not all systems have /proc
-    except PermissionError:  # it is another user's
+    except PermissionError:  # the process is another user's
         return True
     except (ProcessLookupError, OverflowError):
         return False
@@ -148,7 +148,7 @@ class AppendedFile:
         n_bytes: length to truncate it to first; None keeps all.
 
     Raises:
-        OSError: the file cannot be opened or cut, or is a link.
+        OSError: the file cannot be opened or truncated, or is a link.
 
     Attributes:
         unwritten: bytes still to write.

@@ -1,4 +1,4 @@
-"""The checkpoints of a run: a folder `step_<N>` for each, after N environment steps.
+"""Saves, lists and loads the checkpoints of a run. Each is a folder `step_<N>`, after N steps.
 
 A checkpoint is written to a temporary folder, flushed to disk, verified and renamed, so a reader
 sees a complete checkpoint or none. Damage is detected (:mod:`checkpoint_format`). A second
@@ -65,7 +65,7 @@ def save(
         keep_checkpoints: number of latest steps to keep, besides the one with the highest score.
         score: such as the mean return, higher is better; None if unknown.
         made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
-        replay_seconds: leaves out a replay buffer that takes longer to write; None for no limit.
+        replay_seconds: a replay buffer that takes longer to write is left out; None: no limit.
         add_files: as for `checkpoint_format.write`.
 
     Raises:
@@ -81,7 +81,7 @@ def save(
         checkpoint_format.write(
             temporary, step, state, config, score, made_with, replay_seconds, add_files
         )
-        # verify before deleting any old one
+        # verify it before deleting older ones
         manifest = checkpoint_format.read_manifest(temporary)
         with checkpoint_format.verified(temporary, manifest, manifest["files"]):
             pass
@@ -125,7 +125,7 @@ def load_latest(
         path = paths.pop()
         try:
             checkpoint = checkpoint_format.read(path, device, is_whole, rank)
-        except GoneCheckpoint:  # its run has saved another
+        except GoneCheckpoint:  # deleted, as its run has saved another
             paths, messages = list_checkpoints(folder), []
             continue
         except DamagedCheckpoint as error:
@@ -140,11 +140,11 @@ def load_latest(
 
 
 def set_aside_after(folder: Path | str, step: int) -> None:
-    """Renames checkpoints after `step` to `step_<N>.aside`, when a run resumes from `step`.
+    """Renames checkpoints later than `step` to `step_<N>.aside`, as a run resumes from `step`.
 
     `save` deletes them once the run reaches their step again.
     """
-    for path in list_checkpoints(folder):  # the newest last, so that it stays the latest meanwhile
+    for path in list_checkpoints(folder):  # newest last, so it is the latest until then
         if step_of(path) > step:
             aside = path.with_name(f"{path.name}.aside")
             _delete(aside)

@@ -2,8 +2,8 @@
 
     manifest.json  size and SHA-256 of every file and of itself, to detect damage; format, step,
                    score, versions and device, and the counters of the state, such as samples
-    config.json    the run's configuration; infinity is {"$float": "inf"}, and a dict whose keys are
-                   no strings {"$dict": [[0, 1.0]]}
+    config.json    the run's configuration; infinity is written as {"$float": "inf"}, and a dict
+                   with keys other than strings as {"$dict": [[0, 1.0]]}
     state.pt       weights, optimizer, statistics and everything else that is small
     world.pt       environments and the actor state (observations and hidden states)
     replay.pt      the replay buffer, if it was saved
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 
     from megastep.agents.types import Config, Row, StateDict
 
-#: The format number. Increase it if older readers would misread a checkpoint, or this version an
-#: older one, and add the last commit of the replaced format to `READERS`.
+#: The format number. Increase it if an earlier version would misread these checkpoints, or this
+#: version earlier ones; then add the last commit of the old format to `READERS`.
 FORMAT = 7
 #: Commits that read the older formats. `MIGRATED` is read here, see `_migrated`.
 READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db", 5: "916221d"}
@@ -61,7 +61,7 @@ class DamagedCheckpoint(CheckpointError):
 
 
 class GoneCheckpoint(CheckpointError):
-    """A checkpoint was deleted before all of it was open, as its run has saved later ones."""
+    """A checkpoint was deleted before all its files were open, because its run saved later ones."""
 
     def __init__(self, path: Path):
         super().__init__(
@@ -117,7 +117,7 @@ def write(
 
     Args:
         path, step, state, config, score, made_with: as for `checkpoint.save`.
-        replay_seconds: leaves out `replay.pt` if it takes longer to write; None for no limit.
+        replay_seconds: `replay.pt` is left out if it takes longer to write; None: no limit.
         add_files: puts the files of other ranks into the folder; returns their manifest entries by
             name.
     """
@@ -154,7 +154,7 @@ def write_state(path: Path, state: StateDict, replay_seconds: float | None = Non
     """Writes a rank's state into one file and flushes it to disk. Returns its manifest entry.
 
     Args:
-        replay_seconds: leaves out the replay buffer if the file takes longer; None for no limit.
+        replay_seconds: the replay buffer is left out if the file takes longer; None: no limit.
     """
     import torch
 
@@ -202,7 +202,7 @@ class _HashedFile:
     """A file that counts and hashes the bytes written to it.
 
     Attributes:
-        error: the first error. Not raised, since `torch.save` would replace it by another.
+        error: the first error; kept, because `torch.save` would replace a raised one by its own.
     """
 
     def __init__(self, file: BinaryIO, deadline: float | None):
@@ -251,14 +251,14 @@ def sealed(manifest: Row) -> bytes:
 def read(
     path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
 ) -> Checkpoint:
-    """Loads a checkpoint. Opens all files before it reads any, so that it can read them to their
-    end if the run deletes them meanwhile.
+    """Loads a checkpoint. Opens all files before it reads any, so it can still read them if the run
+    deletes them meanwhile.
 
     Args:
         path: the checkpoint's folder.
         device: device of the tensors in `state.pt`; None verifies all files and loads no state.
         is_whole: also loads the rank's other files, to the CPU; rank 0 verifies all files.
-        rank: the rank whose state is loaded; without a file of its own, only rank 0's `state.pt`.
+        rank: the rank whose state is loaded. If it has no file, only rank 0's `state.pt` is read.
 
     Raises:
         DamagedCheckpoint: a file is missing, damaged, or could run code when loaded.
@@ -309,14 +309,14 @@ def _load(path, file, device) -> Any:
         file.seek(0)
         state = torch.load(file, map_location=device, weights_only=True)
         if not isinstance(state, dict):
-            raise ValueError("it is no dict")
+            raise ValueError("it is not a dict")
         return state
     except pickle.UnpicklingError:
         raise DamagedCheckpoint(
             f"Checkpoint {path.parent} is refused: {path.name} holds more than tensors and "
             "numbers, so loading it could run code"
         ) from None
-    except Exception as error:  # of a planted file, there is no end to what unpickling raises
+    except Exception as error:  # unpickling a forged file may raise anything
         if memory_problem(error):
             raise
         raise DamagedCheckpoint(
@@ -325,8 +325,8 @@ def _load(path, file, device) -> Any:
 
 
 def _check_zip(file) -> None:
-    """Raises ValueError for a zip file whose parts are compressed, which `torch.save` never does: a
-    small one may unpack to more than there is memory.
+    """Raises ValueError for a zip file with compressed parts: a small one may unpack to more than
+    fits in memory, and `torch.save` never compresses.
     """
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:
@@ -335,7 +335,7 @@ def _check_zip(file) -> None:
 
 
 def _migrated(state, manifest) -> dict:
-    """Returns a state of format `MIGRATED` or `FORMAT` in `FORMAT`."""
+    """Converts a state of format `MIGRATED` to `FORMAT`; returns one of `FORMAT` as it is."""
     import torch
     from torch.nn.functional import pad
 
@@ -343,7 +343,7 @@ def _migrated(state, manifest) -> dict:
         return state
     if "learner" in state and "optimizer" in state["learner"]:
         state["learner"].setdefault("check", torch.zeros(2, dtype=torch.float64))
-    if stats := state.get("episode_stats"):  # which counted no episodes left out of a metric
+    if stats := state.get("episode_stats"):  # format 6 did not count episodes left out of a metric
         n_metrics = len(stats["sums"]) - 4
         stats["sums"] = pad(stats["sums"], (0, 0, 0, n_metrics))
         stats["windows"] = [
@@ -353,8 +353,8 @@ def _migrated(state, manifest) -> dict:
 
 
 def with_loggers(config: Config) -> Config:
-    """Returns a configuration with loggers by label. In older ones, `train.logger` is W&B or none,
-    and TensorBoard is implied.
+    """Returns a configuration whose `train.logger` has the loggers by label. In older ones, it is
+    W&B or none, and TensorBoard is implied.
     """
     match config:
         case {"train": {"logger": {"name": "none" | "wandb" as name, **keys}} as train}:
@@ -415,8 +415,8 @@ def read_manifest(path: Path) -> Row:
     """Returns a checkpoint's manifest.
 
     Raises:
-        DamagedCheckpoint: it is not, byte for byte, what `sealed` writes.
-        GoneCheckpoint: there is no such checkpoint any more.
+        DamagedCheckpoint: its bytes are not those that `sealed` writes.
+        GoneCheckpoint: the checkpoint no longer exists.
         CheckpointError: it has an unknown format.
     """
     try:

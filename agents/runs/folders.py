@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import torch
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
-#: The folder of each start of a run, one per line.
+#: File with the run folder of each start, one per line.
 STARTED = RUNS / "started.txt"
 #: Settings in older runs that no longer exist and had no effect on learning.
 REMOVED = ("nonfinite_replay",)
@@ -82,7 +82,7 @@ def check_free(name: str | None, is_again: bool = False) -> None:
     """Raises UserError if the folder of a new run is not empty or cannot be read.
 
     Args:
-        is_again: it may be that of a run which ended before it saved anything.
+        is_again: also allows the folder of a run that ended before it saved anything.
     """
     folder = Path(name or "")
     if os.path.islink(folder) and not os.path.exists(folder):
@@ -105,16 +105,16 @@ def check_free(name: str | None, is_again: bool = False) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Locks a run folder, so that no other process trains in it.
+    """Locks a run folder for the duration of the context, so that no other process trains in it.
 
     The system releases the lock when this process ends, even by kill -9, so locks are never stale.
 
     Raises:
-        UserError: another process, which is named, trains there; or the folder cannot be written.
+        UserError: another process, which the message names, trains in it; or it cannot be written.
     """
     import filelock  # slow to import
 
-    # the timeout is for a last owner that is just deleting it
+    # the timeout is for a previous owner that is just deleting the file
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
         lock.acquire()
@@ -122,7 +122,7 @@ def locked(folder: Path) -> Iterator[None]:
             file.write(str(os.getpid()))
     except filelock.Timeout:
         with user_errors(f"The run folder {folder} is in use, or was just now: "):
-            pid = path.read_text()  # fails if the last owner has just deleted it
+            pid = path.read_text()  # fails if the previous owner has just deleted it
         raise UserError(
             f"The run folder {folder} is in use by process {pid}; wait for it, or stop it: "
             f"kill {pid}"
@@ -153,8 +153,8 @@ def record_start(folder: Path) -> None:
 
 
 def known() -> list[Path]:
-    """Returns the folders of all runs in or started from the current folder, ordered by when they
-    were last started or resumed.
+    """Returns the folders of all runs in the current folder or started from it, in the order of
+    their last start or resumption.
     """
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
@@ -176,8 +176,8 @@ def find(name: str) -> Path:
         name: a path, `latest`, or the name of a pretrained agent; an existing path has priority.
 
     Raises:
-        UserError: nothing is found. Names the most similar run and pretrained agent. Or a link in a
-            run leaves its folder, or something in it is no file.
+        UserError: nothing is found (the message has the most similar names), or the run holds a
+            link that leads out of it, or something that is neither a file nor a folder.
     """
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
@@ -230,7 +230,7 @@ def load_checkpoint(
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
     config = loaded.config
-    with user_errors(f"The configuration in {loaded.path} is no run's: "):
+    with user_errors(f"The configuration in {loaded.path} is not a run's: "):
         formats.check(formats.Config, config)
     for key in REMOVED:
         config["train"].pop(key, None)
@@ -245,22 +245,27 @@ def load_checkpoint(
 
 def resume_command(folder: Path, key: str = "resume") -> str:
     """Returns the command that resumes a run, or with the key `rerun` repeats it."""
+    return command_of("train", key, folder)
+
+
+def command_of(script: str, key: str, folder: Path) -> str:
+    """Returns the command that does something with a run, such as `python evaluate.py run=RUN`."""
     # quoted for the shell and for Hydra where needed
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
-    return f"{package.command('train', 'python ')} {shlex.quote(f'{key}={name}')}"
+    return f"{package.command(script, 'python ')} {shlex.quote(f'{key}={name}')}"
 
 
 def to_continue(folder: Path) -> str:
-    """Returns a sentence on how a run that has ended goes on."""
+    """Returns a sentence with the command that continues a run, or why it cannot be continued."""
     if not checkpoint.list_checkpoints(folder / "checkpoints"):
         return "It has no checkpoint, so it cannot be continued"
     return f"To continue: {resume_command(folder)}"
 
 
 def checkpoints_of(path: Path) -> Path:
-    """Returns the `checkpoints` folder of a run; a checkpoint, which its run may have deleted, is
-    returned as it is.
+    """Returns the `checkpoints` folder of a run. A checkpoint's path is returned unchanged, even if
+    the checkpoint was deleted.
     """
     return path / "checkpoints" if (path / "checkpoints").exists() else path
 

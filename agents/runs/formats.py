@@ -1,7 +1,7 @@
-"""What files of a run have to hold before anything reads them, as models of pydantic.
+"""Pydantic models of the files of a run, which are checked before anything uses their values.
 
-A file may come from a stranger whose SHA-256 is right. More keys than these are left alone, since
-later versions may write them.
+A matching SHA-256 does not prove that a file is what megastep wrote: strangers can compute it, too.
+Keys that a model does not list are ignored, since later versions may write them.
 """
 
 from typing import Annotated, Any, NoReturn
@@ -27,7 +27,7 @@ class File(_Model):
 
 
 class Numbers(_Model):
-    """The numbers at the top of a state; none in a snapshot."""
+    """The numbers at the top level of a state. Snapshots have none."""
 
     __pydantic_extra__: dict[str, bool | int | float]
     samples: _Count = 0
@@ -36,7 +36,7 @@ class Numbers(_Model):
 
 
 class Progress(_Model):
-    """The numbers at the top of the state of a run, as its manifest repeats them."""
+    """The numbers that the manifest of a run's checkpoint repeats from its state."""
 
     samples: _Count
     seconds: _Number
@@ -69,7 +69,7 @@ class _Member(_Model):
 
 
 class Trained(_Model):
-    """The settings of a run, which are checked one by one when they are used."""
+    """The structure of a run's settings. Each value is checked when it is used."""
 
     env: _Member
     geometry: _Member
@@ -90,7 +90,7 @@ class Config(_Model):
 
 
 class Facts(_Model):
-    """What made an agent."""
+    """How an agent was trained."""
 
     __pydantic_extra__: dict[str, str | int | float | None | list[str]]
     samples: _Count
@@ -114,7 +114,7 @@ class Row(_Model):
 
 
 def check(model: type[pydantic.BaseModel], value: Any) -> None:
-    """Raises ValueError, naming the first key, if a value is not what a model describes."""
+    """Raises ValueError that names the first wrong key if a value does not fit a model."""
     try:
         model.model_validate(value)
     except pydantic.ValidationError as error:

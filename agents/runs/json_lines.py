@@ -1,4 +1,4 @@
-"""JSON Lines files: one object per line, with the environment steps so far as `samples`.
+"""JSON Lines files: one object per line, whose `samples` are the environment steps so far.
 
 A killed run loses no complete line, and a damaged line does not affect others.
 """

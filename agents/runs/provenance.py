@@ -54,8 +54,8 @@ def record(
 
 
 def made_with(device: torch.device, version: str, n_ranks: int = 1) -> dict[str, str | int]:
-    """Returns versions, device, threads and ranks. If they, code and configuration are equal, equal
-    seeds give bit-identical runs.
+    """Returns versions, device, threads and ranks. Runs that agree in these, in code and in
+    configuration, the seed included, are bit-identical.
 
     Args:
         device: device that trains.
@@ -79,7 +79,7 @@ def commit(folder: Path) -> str | None:
 
     def git(*words) -> str:
         command = ["git", "-C", str(folder), *words]
-        # ignore the variables of a git hook that starts this; take no lock in the user's checkout
+        # ignore a git hook's variables, if one starts this; take no lock in the user's checkout
         env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
         env["GIT_OPTIONAL_LOCKS"] = "0"
         options: dict = dict(stdin=subprocess.DEVNULL, timeout=GIT_TIMEOUT, env=env)

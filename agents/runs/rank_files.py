@@ -93,7 +93,7 @@ class RankFiles:
 
     @property
     def is_given_up(self) -> bool:
-        """True if another rank has ended, so its files no longer come."""
+        """True if another rank has ended and will write no file."""
         return self._is_given_up.is_set()
 
     def give_up(self) -> None:

@@ -1,4 +1,4 @@
-"""Reproduces a run's NaN or infinity: keeps the last checkpoint before it, to resume from."""
+"""Makes a run's NaN or infinity reproducible: keeps the last checkpoint before it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import Config
 
-#: Folder inside the run folder that keeps the checkpoint, itself a run folder.
+#: Folder in the run folder for that checkpoint; itself a run folder.
 FOLDER = "nonfinite"
 #: Settings that a resumed run may have changed, and that affect how it continues.
 CHANGEABLE = "samples", "seconds", "device", "ranks"

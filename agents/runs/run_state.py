@@ -97,11 +97,12 @@ class RunState:
 
         Args:
             state: from `state_dict`.
-            is_new_rank: `state` is rank 0's, without episodes; this rank keeps its generators.
+            is_new_rank: True if the saved run did not have this rank: `state` is rank 0's, without
+                episodes, and this rank keeps its own generators.
 
         Returns:
-            A clause for each part that could not be restored and starts anew; if there are any, the
-            run does not continue bit for bit.
+            A clause for each part that could not be restored and starts anew. The run continues bit
+            for bit if there are none.
         """
         if is_new_rank:
             state = self._of_new_rank(state)
@@ -123,8 +124,8 @@ class RunState:
         return ["added ranks start new episodes"] if is_new_rank else lost
 
     def _of_new_rank(self, state) -> StateDict:
-        """Returns rank 0's state with this rank's generators, and with no episodes counted since
-        the last report.
+        """Returns rank 0's state with this rank's generators, and with no episodes since the last
+        report.
         """
         stats, own = state["episode_stats"], self.state_dict(has_episodes=False)
         pairs = ((name, state[name]) for name in ("learner", "opponents") if name in state)
@@ -132,7 +133,7 @@ class RunState:
         return {**state, **parts, "episode_stats": stats | {"sums": 0 * stats["sums"]}}
 
     def _load_episodes(self, state) -> list[str]:
-        """Restores environment, actor state and episode statistics. Returns clauses."""
+        """Restores env, actor state and episode statistics; returns as `load_state_dict`."""
         lost = []
         if "env" not in state:
             lost.append("environments were not saved, so new episodes start")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import Config, Row, StateDict
 
-#: Bytes up to which a replay buffer is in every checkpoint.
+#: A replay buffer of up to this many bytes is in every checkpoint.
 SMALL_REPLAY = 2**28
 #: Seconds that a larger replay buffer may take to write when a run ends.
 REPLAY_SECONDS = 5.0
@@ -40,16 +40,16 @@ class Saver:
         config: the run's configuration, stored in each checkpoint.
         keep_checkpoints: number of checkpoints to keep, besides the one with the best score.
         made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
-        replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is in one of this many
-            checkpoints, and in the last one if it can be written in `REPLAY_SECONDS`.
-        rank_files: files of the other ranks. Each rank has a saver; rank 0's writes the
-            checkpoints, and the others hand in their states.
+        replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is saved once per
+            this many checkpoints, and with the last one if that takes `REPLAY_SECONDS` or less.
+        rank_files: passes the states of the other ranks to rank 0. Each rank has a saver, and rank
+            0's writes the checkpoints.
 
     Attributes:
-        error: why the last checkpoint could not be written, as a sentence; None if it was. Valid
-            after `wait`.
-        lacks_replay: True if the replay buffer was not due in the last checkpoint.
-        seconds: time that the thread took for the last checkpoint.
+        error: why the last checkpoint could not be written, as a sentence; None if it was
+            written. Valid after `wait`.
+        lacks_replay: True if the last call left out the replay buffer.
+        seconds: time that writing the last checkpoint took.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Saver:
         self._number += 1
         state, seconds = self._with_replay(state, is_last)
         state = self._host_copy(state)
-        # infinities are fine in environments, not in weights
+        # environments may hold infinities, weights may not
         learnt = {name: state[name] for name in ("policy", "learner") if name in state}
         if path := nonfinite_leaf(learnt):
             raise NonFiniteError(
@@ -170,7 +170,7 @@ class Saver:
             return
         if not isinstance(failure[-1], (OSError, checkpoint.DamagedCheckpoint)):
             raise failure[-1]
-        self._n_since_replay = self.replay_every  # so that the next one has it
+        self._n_since_replay = self.replay_every  # so that the next checkpoint includes it
         has_warned = self.error is not None or self.rank_files.is_given_up
         self.error = self._message(*failure)
         if not has_warned:

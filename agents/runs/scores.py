@@ -29,7 +29,7 @@ def mean_return(rows: "list[Row]", n_reports: int = 10) -> float | None:
             total += n_in_mean * rows[end - 1]["episode/return"]
             n_episodes += n_in_mean
         end, n_before = end - 1, n_in_mean - rows[end - 1].get("episode/count", 0)
-        while end > 0 and n_before > 0:  # these reports are part of that window
+        while end > 0 and n_before > 0:  # their episodes are part of that window
             end, n_before = end - 1, n_before - rows[end - 1].get("episode/count", 0)
     return total / n_episodes if n_episodes else None
 
@@ -41,9 +41,9 @@ def outcome(result: Path) -> dict[str, float | None]:
         result: the job's run folder, or the .json file of an evaluation.
 
     Returns:
-        `score`: `mean_return` of a run; of an evaluation, the return or the fraction of duels won
-        against the first opponent. `evaluated`, `lower` and `upper`: the same of an evaluation, or
-        of a run's first evaluation, with its 95 % interval. None if unknown.
+        `evaluated`: the return in an evaluation (for a run, its first), or the fraction of duels
+        won against the first opponent; `lower` and `upper`: its 95 % interval. `score`: a run's
+        `mean_return`; for an evaluation, the same as `evaluated`. Each is None if unknown.
     """
     files, rows = [result], []
     if is_run := result.is_dir():

@@ -1,6 +1,6 @@
-"""Files that strangers may have made: opened without following links or waiting, read with limits.
+"""Opens and reads files that may come from strangers: follows no links, never blocks, limits sizes.
 
-A downloaded run may hold links to files of the user, and a FIFO or a device that never ends.
+A downloaded run may hold links to the user's files, or a FIFO or device that can be read forever.
 """
 
 import errno
@@ -10,17 +10,17 @@ from pathlib import Path
 
 from megastep.agents.errors import UserError, shortened
 
-#: Entries of a run's folder that are looked at.
+#: Most entries that a run folder may have.
 MAX_ENTRIES = 1_000_000
 _FLAGS = sum(getattr(os, f"O_{name}", 0) for name in ("NOFOLLOW", "NONBLOCK", "CLOEXEC"))
 _NO_FILE = "It is a link, a device or no file at all"
 
 
 def opener(path: str | Path, flags: int) -> int:
-    """Opens a regular file, as the argument `opener` of `open`. A link is not followed.
+    """Opens a regular file without following a link. Use it as `open(path, opener=opener)`.
 
     Raises:
-        OSError: there is no file, or it is something else than a regular file.
+        OSError: the file cannot be opened or is not a regular file.
     """
     if os.path.lexists(path) and not stat.S_ISREG(os.lstat(path).st_mode):
         raise OSError(errno.EINVAL, _NO_FILE, str(path))
@@ -35,7 +35,7 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
     """Returns the content of a regular file.
 
     Raises:
-        OSError: there is none that can be read, or it has more bytes.
+        OSError: it cannot be read, is not a regular file, or has more than `max_bytes`.
     """
     with open(path, "rb", opener=opener) as file:
         content = file.read(max_bytes + 1)
@@ -45,19 +45,19 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
 
 
 def check_folder(folder: Path) -> None:
-    """Checks that nothing below a folder leads out of it, or is neither a file nor a folder.
+    """Checks that a folder holds only files, folders, and links that stay inside it.
 
     The folder itself may be a link.
 
     Raises:
-        UserError: naming what does.
+        UserError: naming the first entry that is something else.
     """
     root, n_entries = os.path.realpath(folder), 0
     folders = [root]
     while folders:
         try:
             entries = [*os.scandir(folders.pop())]
-        except OSError:  # which whoever reads it tells
+        except OSError:  # reported when it is read
             continue
         n_entries += len(entries)
         for entry in entries:

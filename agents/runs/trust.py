@@ -29,7 +29,7 @@ OWN = re.compile(
 def sign(config: bytes) -> str | None:
     """Returns the signature of a `config.json`; None if it names no modules outside megastep.
 
-    Creates the user's key at the first use; if that fails, warns and returns None.
+    Creates the user's key on first use; if that fails, warns and returns None.
     """
     if not foreign_names(config):
         return None

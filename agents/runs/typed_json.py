@@ -1,9 +1,9 @@
-"""JSON that keeps what settings are: infinity, NaN, and keys that are no strings.
+"""JSON that can also hold infinity, NaN, and dicts with keys other than strings.
 
     {"cap": inf, "prices": {0: 1.0}}
     {"cap": {"$float": "inf"}, "prices": {"$dict": [[0, 1.0]]}}
 
-All else is plain JSON, so what earlier versions wrote is read as it is.
+Everything else is plain JSON, so files of earlier versions can be read.
 """
 
 import json
@@ -19,12 +19,12 @@ def dumps(value: Any, indent: int | None = None) -> str:
 
 
 def loads(text: str | bytes) -> Any:
-    """The inverse of `dumps`. Raises ValueError if the text is none of its."""
+    """The inverse of `dumps`. Raises ValueError if `dumps` cannot have written the text."""
     return json.loads(text, object_hook=_decoded)
 
 
 def encoded(value: Any) -> Any:
-    """Returns a value as what plain JSON keeps."""
+    """Replaces what plain JSON cannot hold by `{FLOAT: ...}` and `{DICT: ...}`."""
     if isinstance(value, float) and not math.isfinite(value):
         return {FLOAT: str(value)}
     if isinstance(value, (list, tuple)):

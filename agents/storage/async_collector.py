@@ -3,8 +3,8 @@
     call n:    waits for rollout n, returns it, and starts collecting rollout n + lag
     rollout n: collected with the weights after update n - 1 - lag, or the initial weights
 
-On a GPU, a second stream collects while the learner updates on the current stream. A CPU collects
-in the same order, but not at the same time; the numbers are equal.
+On a GPU, a second stream collects while the learner updates on the current stream. On a CPU the two
+take turns, in the same order.
 """
 
 import copy
@@ -46,7 +46,7 @@ class AsyncCollector:
     """Collects `lag` rollouts in advance. Each call copies the next one into `rollout`, returns it,
     and starts another.
 
-    Rollouts do not store values, since those of old weights are not used.
+    Rollouts do not store values: learners with a lag compute them with their latest weights.
 
     Args:
         env: environment without opponents.
@@ -70,12 +70,12 @@ class AsyncCollector:
         actor_state = initial_actor_state(env, policy, rollout)
         self.slots = [_Slot(env, policy, rollout, actor_state) for _ in range(lag)]
         self.actor_state = actor_state
-        self.n_returned = 0  # rollouts; the next is of slot n_returned % lag
+        self.n_returned = 0  # rollouts; slot n_returned % lag holds the next one
         self.is_ahead = False  # True once every slot is collecting
 
     @property
     def graph(self) -> Callable | None:
-        """The CUDA graph that collects, or None."""
+        """The CUDA graph that collects; None before the second rollout and without graphs."""
         return self.slots[0].collect.graph
 
     def __call__(self) -> Rollout:
@@ -108,8 +108,8 @@ class AsyncCollector:
             slot.collect()
             slot.end = self.stream.record_event()
         if not isinstance(slot.collect.graph, Graph):
-            # An eager environment may free memory that belongs to the current stream, which must
-            # not reuse it before these steps are done.
+            # An eager environment may free memory that was allocated on the current stream, which
+            # must not reuse it before these steps are done.
             current.wait_event(slot.end)
 
     def wait(self) -> None:

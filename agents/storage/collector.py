@@ -92,7 +92,7 @@ def capture_with(
         env: the environment.
         policies: a policy or a tuple of policies.
         function, args, warmup: as for `capture`.
-        roots: other objects whose tensors the function changes.
+        roots: other objects with tensors that the function changes.
 
     Returns:
         The graph; or `function` itself, with a warning, if it cannot be recorded, for example
@@ -110,8 +110,8 @@ def capture_with(
 class Collector:
     """Collects T steps per call into one rollout, which is overwritten and returned.
 
-    The first call runs eagerly, since libraries initialise themselves then. Later calls on a GPU
-    replay a CUDA graph, unless the environment steps on the host.
+    The first call runs eagerly, so that libraries are initialised before anything is recorded.
+    Later calls on a GPU replay a CUDA graph, unless the environment steps on the host.
 
     Args:
         env: environment.

@@ -1,12 +1,12 @@
 """The replay buffer: sequences of past experience on the device, drawn by priority.
 
-T steps of a rollout, B lanes, K stored rollouts, L steps of a sequence, M sequences of a sample.
+T steps per rollout, B lanes, K stored rollouts, L steps per sequence, M sequences per sample.
 
-The buffer is a ring in time with rows (K T, B, ...). Each observation is stored once, and the
-newest rollout overwrites the oldest. A sequence is a window of L + 1 rows of one lane. It starts
-where a rollout starts, because there the hidden state is stored, and may extend over the following
-rollouts. Its last row is the observation to bootstrap from. A sequence can be drawn from when that
-row arrives until its first row is overwritten.
+The buffer is a ring of rows, one per time step: (K T, B, ...). Each observation is stored once,
+and the newest rollout overwrites the oldest. A sequence is a window of L + 1 rows of one lane. It
+starts where a rollout starts, because only there the hidden state is stored, and may extend over
+the following rollouts. Its last row is the observation to bootstrap from. A sequence can be drawn
+once its last row has been stored, and until its first row is overwritten.
 """
 
 import torch
@@ -28,24 +28,24 @@ from megastep.types import Env, Space, Tree
 _FLAGS = "starts", "learns", "terminal", "truncated"
 #: Tensors of which a sequence has L + 1 rows instead of L.
 _WITH_LAST = "obs", "privileged", "starts", "learns"
-#: Smallest priority before the exponent, so that sequences without error can still be drawn.
+#: Smallest priority before it is raised to alpha, so that sequences of zero error can be drawn.
 _MIN_PRIORITY = 1e-6
 
 
 class ReplayBuffer:
-    """Stores rollouts and samples sequences of them. Nothing synchronises, and no shape depends on
-    what is stored, so adding and sampling can be part of a CUDA graph.
+    """Stores rollouts and samples sequences from them. Nothing synchronises, and no shape depends
+    on what is stored, so CUDA graphs can record adding and sampling.
 
     Args:
-        rollout: a rollout like those to store; only sizes are read. On the device "meta" the buffer
-            takes no memory but has all its sizes.
-        obs_space: the environment's.
-        action_space: the environment's.
+        rollout: an example of the rollouts to store; only its shapes, dtypes and device are used.
+            With the device "meta", the buffer has its sizes but takes no memory.
+        obs_space: the environment's observation space.
+        action_space: the environment's action space.
         settings: capacity, sequence length, priorities.
         logprobs: whether to store log-probabilities.
 
     Raises:
-        ValueError: if no sequence fits, or a sequence has no steps to learn from.
+        ValueError: if the capacity is too small for a sequence, or a sequence is all burn-in.
     """
 
     def __init__(
@@ -86,17 +86,17 @@ class ReplayBuffer:
         self.is_finite = torch.zeros(self.n_rollouts, dtype=torch.bool, device=device)
         self.n_added = torch.zeros(1, dtype=torch.int64, device=device)  # rollouts, in total
         self.n_available = torch.zeros((), dtype=torch.int64, device=device)  # sequences
-        # priority of new sequences: the largest of the last sample
+        # priority of new sequences: the largest one that `set_priorities` last set
         self.new_priority = torch.ones((), dtype=torch.float64, device=device)
 
     @property
     def capacity(self) -> int:
-        """Observations that fit."""
+        """Number of observations that the buffer can hold."""
         return self.n_rollouts * self.n_steps * self.n_lanes
 
     @property
     def bytes(self) -> int:
-        """Bytes allocated."""
+        """Size in bytes."""
         columns = [*leaves(self.columns), *leaves(self.state), self.flags]
         tensors = self.is_finite, self.n_added, self.n_available, self.new_priority
         return (
@@ -107,22 +107,22 @@ class ReplayBuffer:
 
     @property
     def is_ready(self) -> torch.Tensor:
-        """() bool, whether a sequence can be drawn and `start` samples were collected."""
+        """() bool, True once `start` samples were collected and a sequence can be drawn."""
         n_collected = self.n_added[0] * (self.n_steps * self.n_lanes)
         return (self.n_available > 0) & (n_collected >= self.settings.start)
 
     @torch.no_grad()
     def add(self, rollout: Rollout, is_finite: torch.Tensor | bool = True) -> None:
-        """Stores a rollout in place of the oldest.
+        """Stores a rollout, in place of the oldest if the buffer is full.
 
         Args:
-            rollout: the rollout that followed the one added last.
-            is_finite: () bool. If false, no sequence with a row of this rollout is drawn, and its
-                rows are stored as zeros, since `sample` returns some of them while nothing can be
-                drawn.
+            rollout: the rollout collected right after the one added last.
+            is_finite: () bool. If false, no sequence that contains part of this rollout is ever
+                drawn. Its rows are stored as zeros, because `sample` returns arbitrary rows while
+                no sequence can be drawn.
 
         Raises:
-            ValueError: if the rollout has another number of steps or lanes than the buffer's.
+            ValueError: if the rollout differs from the buffer's in number of steps or lanes.
         """
         if (rollout.n_steps, rollout.n_lanes) != (self.n_steps, self.n_lanes):
             raise ValueError(
@@ -146,7 +146,7 @@ class ReplayBuffer:
         self.n_added += 1
 
         self.tree.set(slot * self.n_lanes + lanes, torch.zeros_like(lanes))
-        # The latest sequences whose last row, the next observation, has just arrived
+        # The latest sequences that are complete: their last row has just been stored
         n_touched = self.settings.rollouts_per_sequence(self.n_steps)
         offsets = torch.arange(n_touched, device=slot.device)
         first = self.n_added - n_touched
@@ -158,16 +158,16 @@ class ReplayBuffer:
 
     @torch.no_grad()
     def sample(self, n: int, generator: torch.Generator | None = None) -> arrdict:
-        """Draws M = n sequences. While none can be drawn, all numbers are finite but meaningless.
+        """Draws M = n sequences. While `n_available` is 0, all numbers are finite but meaningless.
 
         Returns:
-            an arrdict like that of `Rollout.sequences`, with leaves (L+1, M, ...) or (L, M, ...),
-            and per sequence, (M,):
+            An arrdict as from `Rollout.sequences`, with leaves (L+1, M, ...) or (L, M, ...), and
+            per sequence, (M,):
 
             index: int64, for `set_priorities`
-            probability: float64, its priority divided by the sum of all priorities
+            probability: float64, priority divided by the sum of all priorities
             weight: float32 importance weight for the loss, at most 1 (Schaul et al. 2016, sec. 3.4)
-            age: int64, number of rollouts added since the one that it starts in
+            age: int64, number of rollouts added since the one in which it starts
         """
         index, probability = self.tree.draw(n, generator)
         batch = self._read_on_gpu(index, probability)
@@ -195,7 +195,7 @@ class ReplayBuffer:
         return batch
 
     def _read_on_gpu(self, index, probability) -> arrdict | None:
-        """Does the same in one kernel; None where that is not possible."""
+        """Does the same as `_read` in one kernel; returns None where the kernel does not apply."""
         tree = arrdict(self.columns, state=self.state)
         columns, spec = tree_flatten(tree)
         n_rows = {name: self.length + (name in _WITH_LAST) for name in self.columns}
@@ -216,10 +216,10 @@ class ReplayBuffer:
 
     @torch.no_grad()
     def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
-        """Sets the priorities of sequences of the last sample to values (M,) to the power alpha.
+        """Sets the priorities of the last sample's sequences to `values`, (M,), to the power alpha.
 
-        Non-finite values change nothing. Does nothing if alpha is 0, or until `is_ready`, because
-        nothing is learned from earlier samples.
+        Skips non-finite values. Does nothing if alpha is 0, or before `is_ready`, because learners
+        do not use samples drawn before that.
         """
         if index.shape != values.shape:
             raise ValueError(
@@ -243,13 +243,14 @@ class ReplayBuffer:
             return
         old = self.tree.priorities.index_select(0, index)
         new = values.double().clamp(min=_MIN_PRIORITY) ** self.settings.alpha
-        is_set = self.is_ready & (old > 0) & new.isfinite()  # old is 0 if it cannot be drawn
+        # old is 0 where the sequence cannot be drawn
+        is_set = self.is_ready & (old > 0) & new.isfinite()
         self.tree.set(index, torch.where(is_set, new, old))
         largest = torch.where(is_set, new, 0.0).amax()
         self.new_priority.copy_(torch.where(largest > 0, largest, self.new_priority))
 
     def state_dict(self) -> dict[str, Tree]:
-        """Returns all that is stored, with its priorities. Synchronises."""
+        """Returns the stored rollouts, priorities and counts. Synchronises."""
         n_filled = min(int(self.n_added), self.n_rollouts)
         stored = self._rows(n_filled)
         levels = {str(i): level for i, level in enumerate(self.tree.levels)}
@@ -257,12 +258,12 @@ class ReplayBuffer:
         return dict(stored=stored, tree=levels, **{name: getattr(self, name) for name in names})
 
     def load_state_dict(self, state: dict[str, Tree]) -> None:
-        """Copies a `state_dict` of a buffer with the same settings. It may be on another device."""
+        """Restores a `state_dict` of a buffer with the same settings, from any device."""
         self.n_added.copy_(state["n_added"])
         copy_tree(self.state_dict(), state)
 
     def _rows(self, n_rollouts) -> dict[str, object]:
-        """Returns the first rollouts of every column, as views."""
+        """Returns the first `n_rollouts` rollouts of every column, as views."""
         rows = mapping(lambda column: column.rows[: n_rollouts * self.n_steps])
         state = mapping(lambda column: column.rows[:n_rollouts])(self.state)
         return dict(rows(self.columns), flags=rows(self.flags), state=state)
@@ -271,7 +272,7 @@ class ReplayBuffer:
 def bytes_per_observation(
     env: Env, policy: Policy, n_steps: int, settings: ReplaySettings, logprobs: bool = True
 ) -> float:
-    """Returns the bytes that a replay buffer takes per observation, everything included."""
+    """Returns the size in bytes of a replay buffer per observation, everything included."""
     meta = torch.device("meta")
     env_spaces = env.obs_space, env.action_space
     state = policy.initial(1, meta)

@@ -1,9 +1,9 @@
-"""A sum tree on the device, which samples in proportion to priorities (Schaul et al. 2016).
+"""A sum tree on the device: samples indices in proportion to priorities (Schaul et al. 2016).
 
 N priorities, M indices, F children per node. Level 0 holds the priorities in blocks of F. The sums
-of its blocks are the entries of level 1, and so on, up to a level of one block. Sums are float64,
-since float32 would lose the smallest of a million priorities. A parent is always summed from its
-children, never updated by differences, so errors do not accumulate.
+of its blocks are the entries of level 1, and so on, up to a level with a single block. Sums are
+float64, since float32 would lose the smallest of a million priorities. A parent is always summed
+from its children, never updated by differences, so rounding errors do not accumulate.
 """
 
 import itertools
@@ -15,14 +15,14 @@ from megastep.agents.storage.copies import require_stored
 
 
 class SumTree:
-    """N priorities, initially 0. Nothing synchronises and shapes are fixed, so everything can be
-    part of a CUDA graph.
+    """Holds N priorities, initially 0. Nothing synchronises and shapes are fixed, so CUDA graphs
+    can record all methods.
 
     Args:
-        n: N.
+        n: N, number of priorities.
         device: device of the tree.
-        fan_out: F. Large, because a GPU reads a block of 32 as fast as one number; a million
-            priorities then take four levels.
+        fan_out: F, children per node. A GPU reads a block of 32 as fast as one number, and a
+            million priorities then take only four levels.
 
     Raises:
         ValueError: if n < 1 or fan_out < 2.
@@ -41,7 +41,7 @@ class SumTree:
 
     @property
     def priorities(self) -> torch.Tensor:
-        """(N,) float64, a view. Change priorities with `set` only."""
+        """(N,) float64, a view. Only `set` may change priorities."""
         return self.levels[0].view(-1)[: self.n]
 
     @property
@@ -51,14 +51,14 @@ class SumTree:
 
     @property
     def is_fused(self) -> bool:
-        """Whether kernels draw and set."""
+        """Whether kernels implement `draw` and `set`."""
         top = self.levels[-1]
         is_known = self.fan_out == kernels.FAN_OUT and len(self.levels) <= kernels.MAX_LEVELS
         return top.is_cuda and is_known
 
     @property
     def bytes(self) -> int:
-        """Bytes allocated."""
+        """Size in bytes."""
         return sum(level.nbytes for level in self.levels)
 
     def set(self, index: torch.Tensor, values: torch.Tensor) -> None:
@@ -69,7 +69,7 @@ class SumTree:
             values: (M,), finite and at least 0.
 
         Raises:
-            ValueError: if index and values are not of one shape (M,), or have no memory.
+            ValueError: if index and values do not both have shape (M,), or lack storage.
         """
         if index.ndim != 1 or index.shape != values.shape:
             raise ValueError(
@@ -94,7 +94,7 @@ class SumTree:
     def draw(
         self, n: int, generator: torch.Generator | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns `sample`'s indices and their `probability`, on a GPU in one kernel."""
+        """Returns indices as from `sample` and their `probability`; on a GPU, in one kernel."""
         if self.is_fused:
             return kernels.draw(self.levels, self._fractions(n, generator))
         index = self.sample(n, generator)
@@ -103,8 +103,8 @@ class SumTree:
     def sample(self, n: int, generator: torch.Generator | None = None) -> torch.Tensor:
         """Draws n indices in proportion to their priorities, (n,) int64 in ascending order.
 
-        Sampling is stratified: one index from each of n equal parts of the total. An index of
-        priority 0 is never drawn; only if all are 0, the result is index 0.
+        Sampling is stratified: one index is drawn from each of n equal parts of the total. Indices
+        of priority 0 are never drawn, unless all priorities are 0; then each result is index 0.
         """
         if self.is_fused:
             return self.draw(n, generator)[0]
@@ -116,8 +116,8 @@ class SumTree:
             block = level.index_select(0, index)
             sums = block.cumsum(-1)
             positive = block > 0
-            # The first child whose cumulative sum exceeds the rest. If rounding left a rest beyond
-            # the total, the last child that can be drawn.
+            # The first child whose cumulative sum exceeds the rest; if none does, because of
+            # rounding, the last child with a positive priority.
             first = torch.where(positive & (sums > rest[:, None]), children, self.fan_out).amin(-1)
             last = torch.where(positive, children, 0).amax(-1)
             child = torch.minimum(first, last)
@@ -132,7 +132,7 @@ class SumTree:
         return self.priorities.index_select(0, index) / self.total.clamp(min=tiny)
 
     def _fractions(self, n, generator) -> torch.Tensor:
-        """Returns where in its part of the total each sample is, (n,) float64 from 0 to 1."""
+        """Returns the position of each sample within its part, (n,) float64 from 0 to 1."""
         if n < 1:
             raise ValueError(f"n must be at least 1 index to draw, but {n} was given")
         device = self.levels[-1].device

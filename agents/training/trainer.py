@@ -45,7 +45,7 @@ class Trainer:
 
     Args:
         env: the environment.
-        policy: the policy that the learner improves.
+        policy: the policy that the learner trains.
         learner: such as `PPO`.
         logger: such as `loggers.Loggers`.
         saver: such as `saver.Saver`.

@@ -19,6 +19,7 @@ from megastep.envs.on_host.env import VectorizedEnv
 from megastep.imports import import_object
 from megastep.settings import checked
 from megastep.sync_envs import CHECKED_STEPS, BadValue, close_all
+from megastep.types import Tree
 from megastep.wrapper_state import WrappedEnvs, wrapper_state
 
 if TYPE_CHECKING:
@@ -146,12 +147,12 @@ class ParallelEnvs(WrappedEnvs):
                 )
         return space_of(first)
 
-    def reset(self, *, seed: list[int] | None = None) -> tuple[Any, dict]:
+    def reset(self, *, seed: list[int] | None = None) -> tuple[Tree, dict]:
         for e in range(len(self.envs)):
             self._begin(e, seed and seed[e])
         return self._observations(), {"present": self.present.ravel()}
 
-    def step(self, actions: Any) -> tuple[Any, ...]:
+    def step(self, actions: Tree) -> tuple:
         from gymnasium.vector.utils import iterate
 
         rows = iterate(self.actions, actions)

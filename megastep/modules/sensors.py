@@ -18,6 +18,8 @@ from megastep.modules.movement import to_local
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from megastep.plotting import Area
+
 
 def render(core: Core) -> engine.Render:
     """Renders the agents of a core with :func:`megastep.engine.render`."""
@@ -72,14 +74,15 @@ class RGB:
     @staticmethod
     def plot_state(
         state: np.ndarray,
-        axes: "Sequence[Axes] | np.ndarray | None" = None,
+        axes: "Sequence[Area | Axes] | np.ndarray | None" = None,
         yaws: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera.
 
         Args:
             state: (A, 3, C, R / subsample).
-            axes: matplotlib axes, one per agent. Default: those of a new figure.
+            axes: one per agent: strips of :func:`megastep.plotting.panels`, or matplotlib axes.
+                Default: those of a new figure.
             yaws: (C,) degrees, shown as the names of the rows.
 
         Returns:
@@ -121,7 +124,7 @@ class Depth:
     @staticmethod
     def plot_state(
         state: np.ndarray,
-        axes: "Sequence[Axes] | np.ndarray | None" = None,
+        axes: "Sequence[Area | Axes] | np.ndarray | None" = None,
         yaws: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draws a numpyified :meth:`state` in grey, bright where near. Arguments and result are

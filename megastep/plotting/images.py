@@ -1,4 +1,4 @@
-"""Plots of what agents observe: images, and named numbers as bars."""
+"""Pictures of what agents observe: images, and named numbers as bars."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from megastep.colour import gamma_encode
+from megastep.plotting.styles import AGENTS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from megastep.plotting.pictures import Area
+
+STRIP = 0.09  # height of a row of pixels on matplotlib's axes, over its width
 
 
 def plot_images(
     images: Mapping[str, ArrayLike],
     transpose: bool = False,
     aspect: float | None = None,
-    axes: Sequence[Axes] | np.ndarray | None = None,
+    axes: Sequence[Area | Axes] | np.ndarray | None = None,
     yaws: ArrayLike | None = None,
 ) -> np.ndarray:
     """Draws images side by side, one row of panels per name. Returns the axes, (names, images).
@@ -29,7 +34,7 @@ def plot_images(
             three count the images of that name.
         transpose: the arrays are (..., H, W, C) instead, like ``Render.screen``.
         aspect: height of a panel over its width; by default pixels are square.
-        axes: one per image, row by row.
+        axes: one per image, row by row: strips of :func:`panels`, or matplotlib's axes.
         yaws: degrees, the camera of each row of pixels, to label it with.
 
     Raises:
@@ -50,7 +55,9 @@ def plot_images(
     axes = np.asarray(axes, dtype=object).reshape(shape)
     for row, (name, stack) in zip(axes, stacks.items(), strict=True):
         for i, ax in enumerate(row):
-            if i < len(stack):
+            if i < len(stack) and hasattr(ax, "strip_label"):
+                _plot_strip(ax, stack[i], name, i if len(stack) > 1 else None, yaws)
+            elif i < len(stack):
                 _plot_image(ax, stack[i], name if len(stack) == 1 else f"{name} {i}", aspect, yaws)
             else:
                 ax.set_axis_off()
@@ -70,6 +77,19 @@ def _stack(name, image, transpose) -> np.ndarray:
         )
     image = np.clip(np.nan_to_num(image), 0, 1).reshape(-1, *image.shape[-3:])
     return gamma_encode(image) if image.shape[-1] == 3 else image
+
+
+def _plot_strip(area, image, name, agent, yaws) -> None:
+    area.image(np.broadcast_to(image, (*image.shape[:2], 3)))
+    label, theme, middle = area.strip_label, area.style.colours, area.height / 2
+    if agent is not None:
+        label.text((0, middle), f"{agent}", size=10, bold=True, colour=AGENTS[agent % len(AGENTS)])
+    n_rows = 1 if yaws is None else len(yaws)
+    label.text((0.16 * (agent is not None), middle), name, size=9, colour=theme.faint)
+    for row, colour in enumerate(camera_colours(n_rows) if n_rows > 1 else ()):
+        y = area.height * (1 - (row + 0.5) / n_rows)
+        degrees = f"{np.asarray(yaws)[row]:g}°"
+        label.text((label.width - 0.04, y), degrees, size=7, colour=colour, align="right")
 
 
 def _plot_image(ax, image, title, aspect, yaws) -> None:
@@ -92,10 +112,8 @@ def _plot_image(ax, image, title, aspect, yaws) -> None:
 
 
 def camera_colours(n_cameras: int) -> list[str]:
-    """Returns a colour per camera, for its view on the plan and its row of pixels: white if there
-    is only one.
-    """
-    return ["w"] if n_cameras == 1 else [f"C{camera}" for camera in range(n_cameras)]
+    """Returns a colour per camera, for its view on the plan and its row of pixels."""
+    return [AGENTS[camera % len(AGENTS)] for camera in range(n_cameras)]
 
 
 def plot_bars(names: Sequence[str], values: ArrayLike, ax: Axes | None = None) -> Axes:

@@ -1,25 +1,30 @@
-"""Floor plans: walls in their lit colours, lights, views of cameras, goals."""
+"""Floor plans: rooms, walls in their colours, goals, objects, trails, agents and what they see."""
 
 from __future__ import annotations
 
+import collections
+import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from megastep.colour import gamma_encode
+from megastep.plotting.styles import AGENTS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.collections import LineCollection
-    from matplotlib.patches import Circle, Polygon
 
-# grey of the plan, in sRGB: dark, because walls are drawn in the light that falls on them
-BACKGROUND = 0.12
-# plans are brighter than what cameras see: most walls get well under half of full light
-EXPOSURE = 2.5
-UNSEEN = 0.2  # contrast of unseen texels to the background, relative to seen ones
+    from megastep.plotting.pictures import Area
+
+CELL = 0.05  # metres: of the grid on which rooms are found
+WALL = 2.6  # points: width of walls
+BORDER = 0.25  # metres around a plan
+FOOT = 0.24  # inches below a plan, for the scale bar
+AGENT = 5.4  # points: radius at which an agent is drawn at least, 15 pixels across at 100 dpi
+VIEWS, TRAIL, GOAL, OBJECTS, SHOTS, MARKS = range(1, 7)  # above floor and walls
+MAX_KEPT = 16  # plans whose pixels are kept
 
 
 def plot_scenery(
@@ -27,105 +32,308 @@ def plot_scenery(
     colours: Sequence[ArrayLike],
     lights: ArrayLike | None = None,
     seen: Sequence[ArrayLike] | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draws one environment from above: its lines in their lit colours, and its lights. Returns
-    the axes.
+    ax: Area | Axes | None = None,
+    views: np.ndarray | None = None,
+) -> Area | Axes:
+    """Draws the floor plan of one environment: rooms, walls in their colours, a scale bar. Returns
+    what it is drawn on.
 
     Args:
-        lines, colours, seen: as in :func:`plot_lines`.
-        lights: (K, 2 or more), x and y first.
-    """
-    if ax is None:
-        from matplotlib import pyplot
-
-        ax = pyplot.subplots(figsize=(6, 6))[1]
-    ax.set_facecolor(str(BACKGROUND))
-    plot_lines(ax, lines, colours, seen)
-    points = np.asarray([] if lights is None else lights)
-    if len(points):
-        ax.scatter(
-            points[:, 0],
-            points[:, 1],
-            s=14,
-            c="gold",
-            marker="*",
-            linewidths=0,
-        )
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.margins(0.05)
-    ax.autoscale_view()
-    ax.set_xlabel("x, m", fontsize="small", labelpad=1)
-    ax.set_ylabel("y, m", fontsize="small", labelpad=1)
-    ax.tick_params(labelsize="x-small")
-    return ax
-
-
-def plot_lines(
-    ax: Axes,
-    lines: ArrayLike,
-    colours: Sequence[ArrayLike],
-    seen: Sequence[ArrayLike] | None = None,
-    exposure: float = EXPOSURE,
-    width: float = 2.5,
-) -> LineCollection:
-    """Draws lines texel by texel on ``ax``. Returns the matplotlib collection.
-
-    Args:
-        lines: (L, 2, 2) endpoints in metres.
-        colours: one (w, 3) array per line, its w lit texels in linear light.
-        seen: one (w,) array of bools per line; texels that are False are drawn faintly. By default
-            all are seen.
-        exposure: factor for the light.
-        width: of the lines, in points.
+        lines: (L, 2, 2) endpoints of walls in metres.
+        colours: one (w, 3) array per line, its w texels in linear light.
+        lights: (K, 2 or more), x and y first. Rooms are where their light gets to, around corners.
+        seen: one (w,) array of bools per line; texels that are False are grey. Default: all seen.
+        views: (n, R, 2), polygons that were seen, in order; the rest of the floor is hatched.
+        ax: an area of :func:`panels`, or matplotlib axes. Default: new axes of pyplot.
 
     Raises:
         ValueError: the numbers of lines and of colour arrays differ.
     """
-    from matplotlib.collections import LineCollection
+    from megastep.plotting.pictures import Area
 
-    lines = np.asarray(lines, np.float32).reshape(-1, 2, 2)
-    widths = np.array([len(np.asarray(texels)) for texels in colours], int)
-    if len(widths) != len(lines):
-        raise ValueError(
-            f"plot_lines needs one array of colours per line, but {len(lines)} lines and "
-            f"{len(widths)} arrays of colours were given"
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.subplots(figsize=(6, 6))[1]
+    area = Area.on(ax)
+    plan = Plan(area, np.asarray(lines, np.float32).reshape(-1, 2, 2), colours, lights, seen, views)
+    area.fit(plan.low - BORDER, plan.high + BORDER, FOOT)
+    area.add(plan.draw, 0)
+    _scale_bar(area, plan)
+    if area.style.axes:
+        from matplotlib.ticker import AutoLocator
+
+        overlay = area.overlay()
+        for axis in overlay.xaxis, overlay.yaxis:
+            axis.set_major_locator(AutoLocator())
+        overlay.set_xlabel("x, m", color=area.style.colours.faint, fontsize=8, labelpad=1)
+        overlay.set_ylabel("y, m", color=area.style.colours.faint, fontsize=8, labelpad=1)
+        overlay.tick_params(colors=area.style.colours.faint, labelsize=8)
+    return ax
+
+
+class Plan:
+    """The parts of a plan that seldom change: floor and walls.
+
+    In pixels they are drawn once, and later only what was seen since. What is drawn is kept in
+    memory for each of the last plans.
+    """
+
+    def __init__(self, area, lines, colours, lights, seen, views) -> None:
+        self.area, self.lines, self.lights, self.views = area, lines, lights, views
+        self.widths = np.array([len(np.asarray(texels)) for texels in colours], int)
+        if len(self.widths) != len(lines):
+            raise ValueError(
+                f"a plan needs one array of colours per line, but {len(lines)} lines and "
+                f"{len(self.widths)} arrays of colours were given"
+            )
+        self.texels = _joined(colours, np.float32, (0, 3))
+        self.seen = None if seen is None else _joined(seen, bool, (0,))
+        points = lines.reshape(-1, 2) if len(lines) else np.array([[0.0, 0.0], [1.0, 1.0]])
+        self.low, self.high = points.min(0), points.max(0)
+
+    def draw(self, renderer) -> None:
+        """Draws floor and walls."""
+        from matplotlib.backends.backend_agg import RendererAgg
+
+        if not isinstance(renderer, RendererAgg):
+            self._floor(renderer)
+            self._see_floor(renderer, 0)
+            self._walls(renderer, np.full(len(self.texels), self.seen is None))
+            if self.seen is not None:
+                self._walls(renderer, self.seen, self.seen)
+            return
+        pixels = self._pixels(renderer)
+        frame, shown = np.asarray(renderer.buffer_rgba()), pixels.update(self)
+        x0, y0, x1, y1 = np.round(self.area.bbox.extents).astype(int)
+        height = len(frame)
+        rows, columns = slice(max(height - y1, 0), height - y0), slice(max(x0, 0), x1)
+        frame[rows, columns] = shown[rows, columns]
+
+    def _pixels(self, renderer) -> _Pixels:
+        """Returns what is kept of this plan at this place and size."""
+        key = (
+            *(part.tobytes() for part in (self.lines, self.texels)),
+            self.area.transform.get_matrix().tobytes(),
+            (renderer.width, renderer.height, renderer.dpi),
+            (self.area.style.theme, self.seen is None, self.views is None),
         )
+        if key not in _KEPT:
+            _KEPT[key] = _Pixels(self, renderer)
+            if len(_KEPT) > MAX_KEPT:
+                _KEPT.popitem(last=False)
+        _KEPT.move_to_end(key)
+        return _KEPT[key]
+
+    def _floor(self, renderer) -> None:
+        """Draws the floor, hatched if it counts where agents looked."""
+        theme, area = self.area.style.colours, self.area
+        x0, y0, x1, y1 = area.bbox.extents
+        from matplotlib.path import Path
+        from matplotlib.transforms import IdentityTransform
+
+        page = Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
+        area.draw_path(renderer, page, IdentityTransform(), theme.outside)
+        rooms = _rooms(self.lines.tobytes(), _points(self.lights).tobytes())
+        if self.views is None:
+            area.draw_path(renderer, rooms, area.transform, theme.floor)
+        else:
+            area.draw_path(renderer, rooms, area.transform, theme.unseen, hatch=theme.hatch)
+
+    def _see_floor(self, renderer, first) -> None:
+        from matplotlib.path import Path
+
+        for view in () if self.views is None else self.views[first:]:
+            floor = self.area.style.colours.floor
+            self.area.draw_path(
+                renderer, Path(view, closed=False), self.area.transform, floor, floor, 0.5
+            )
+
+    def _walls(self, renderer, is_seen, only: slice | np.ndarray = slice(None)) -> None:
+        """Draws texels, all or some: grey where they are not seen."""
+        from matplotlib.collections import LineCollection
+
+        theme = self.area.style.colours
+        colours = np.where(
+            is_seen[:, None], wall_colours(self.texels, *theme.wall), _rgb(theme.unseen_wall)
+        )
+        # projecting caps overlap the neighbours; otherwise the background shows between texels
+        drawn = LineCollection(
+            [*texel_segments(self.lines, self.widths)[only]],
+            colors=colours[only],
+            linewidths=WALL,
+            capstyle="projecting",
+        )
+        drawn.set_figure(self.area.get_figure())
+        drawn.set_transform(self.area.transform)
+        drawn.set_clip_box(self.area.bbox)
+        drawn.draw(renderer)
+
+
+_KEPT: collections.OrderedDict[tuple, _Pixels] = collections.OrderedDict()
+
+
+class _Pixels:
+    """The pixels of a plan, with what has been seen so far."""
+
+    def __init__(self, plan: Plan, renderer):
+        from matplotlib.backends.backend_agg import RendererAgg
+
+        size = renderer.width, renderer.height, renderer.dpi
+        self.floor, self.walls = RendererAgg(*size), RendererAgg(*size)
+        plan._floor(self.floor)
+        plan._walls(self.walls, np.full(len(plan.texels), plan.seen is None))
+        self._floor, self._walls = (np.asarray(x.buffer_rgba()) for x in (self.floor, self.walls))
+        self._start = self._floor.copy(), self._walls.copy()
+        # walls are few of the pixels, and always the same ones
+        opacity = self._walls[..., 3].ravel()
+        self._solid = np.flatnonzero(opacity == 255)
+        self._edges = np.flatnonzero((opacity > 0) & (opacity < 255))
+        self._opacity = opacity[self._edges, None] / np.float32(255)
+        self._joined = None
+        self._forget(plan)
+
+    def _forget(self, plan) -> None:
+        self._floor[:], self._walls[:] = self._start
+        self._joined, self._views, self._seen = (
+            None,
+            np.zeros((0, 0, 2)),
+            np.zeros(len(plan.texels), bool),
+        )
+
+    def update(self, plan: Plan) -> np.ndarray:
+        """Draws what was seen since the last call. Returns the image, (H, W, 4)."""
+        seen, views, n = plan.seen, plan.views, len(self._views)
+        if (seen is not None and (self._seen & ~seen).any()) or (
+            views is not None and n and (n > len(views) or (views[n - 1] != self._views[-1]).any())
+        ):
+            self._forget(plan)  # another episode
+            n = 0
+        if views is not None and len(views) > n:
+            plan._see_floor(self.floor, n)
+            self._views, self._joined = views, None
+        if seen is not None and (seen & ~self._seen).any():
+            plan._walls(self.walls, seen, seen & ~self._seen)
+            self._seen, self._joined = seen, None
+        if self._joined is None:
+            self._joined = self._floor.copy()
+            joined, walls = (x.view(np.uint32).ravel() for x in (self._joined, self._walls))
+            joined[self._solid] = walls[self._solid]
+            joined, walls = (x.reshape(-1, 4) for x in (self._joined, self._walls))
+            below = joined[self._edges, :3].astype(np.float32)
+            joined[self._edges, :3] = below + self._opacity * (walls[self._edges, :3] - below)
+        return self._joined
+
+
+def _joined(parts, dtype, empty) -> np.ndarray:
+    return np.concatenate([np.zeros(empty, dtype), *(np.asarray(part, dtype) for part in parts)])
+
+
+def _points(lights) -> np.ndarray:
+    points = np.zeros((0, 2)) if lights is None or not len(lights) else np.asarray(lights)[:, :2]
+    return np.ascontiguousarray(points, np.float32)
+
+
+def _rgb(colour: str) -> np.ndarray:
+    return np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+
+
+def texel_segments(lines: ArrayLike, widths: ArrayLike) -> np.ndarray:
+    """Returns the endpoints of texels, (T, 2, 2), of lines (L, 2, 2) of ``widths`` texels."""
+    lines, widths = np.asarray(lines, np.float32), np.asarray(widths, int)
     line = np.repeat(np.arange(len(lines)), widths)
     texel = np.arange(len(line)) - (widths.cumsum() - widths)[line]
     fractions = np.stack([texel, texel + 1], 1) / np.maximum(widths[line], 1)[:, None]
     start, along = lines[line, 0], lines[line, 1] - lines[line, 0]
-    segments = start[:, None] + fractions[..., None] * along[:, None]
-
-    light = np.concatenate(
-        [np.zeros((0, 3)), *(np.asarray(texels, np.float32) for texels in colours)]
-    )
-    texel_colours = gamma_encode(np.clip(exposure * light, 0, 1))
-    if seen is not None:
-        is_seen = np.concatenate(
-            [np.zeros(0, bool), *(np.asarray(texels, bool) for texels in seen)]
-        )
-        faint = BACKGROUND + UNSEEN * (texel_colours - BACKGROUND)
-        texel_colours = np.where(is_seen[:, None], texel_colours, faint)
-    # projecting caps overlap the neighbours; otherwise the background shows between texels
-    collection = LineCollection(
-        [*segments], colors=texel_colours, linewidths=width, capstyle="projecting"
-    )
-    ax.add_collection(collection)
-    return collection
+    return start[:, None] + fractions[..., None] * along[:, None]
 
 
-def plot_view(
-    ax: Axes,
+def wall_colours(texels: ArrayLike, least: float = 0.5, greatest: float = 1.0) -> np.ndarray:
+    """Returns the sRGB colours of lit texels (T, 3): their hue in full, and a brightness between
+    ``least`` and ``greatest`` that shows the light and the texture.
+    """
+    texels = np.clip(np.asarray(texels, np.float32).reshape(-1, 3), 0, None)
+    peak = texels.max(1, keepdims=True, initial=0)
+    hue = gamma_encode(texels / np.maximum(peak, 1e-6))
+    return hue * (least + (greatest - least) * gamma_encode(np.clip(2.5 * peak, 0, 1)))
+
+
+@functools.lru_cache(MAX_KEPT)
+def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
+    """Returns the outline of the rooms, a matplotlib path: the floor that is connected with a
+    light. If walls do not close it, it is the rectangle around them.
+    """
+    from contourpy import contour_generator
+    from matplotlib.path import Path
+    from PIL import Image, ImageDraw
+
+    lines = np.frombuffer(lines_bytes, np.float32).reshape(-1, 2, 2)
+    if not len(lines):
+        return Path(np.zeros((0, 2)))
+    low, high = lines.min((0, 1)) - 3 * CELL, lines.max((0, 1)) + 3 * CELL
+    n_columns, n_rows = (np.ceil((high - low) / CELL).astype(int) + 1).tolist()
+    image = Image.new("1", (n_columns, n_rows))
+    pen = ImageDraw.Draw(image)
+    for line in np.round((lines - low) / CELL):
+        pen.line([*line.ravel().tolist()], fill=1)
+    wall = np.array(image, bool)
+    points = np.frombuffer(lights_bytes, np.float32).reshape(-1, 2)
+    columns, rows = np.clip(((points - low) / CELL).astype(int), 0, [n_columns - 1, n_rows - 1]).T
+    room = np.zeros_like(wall)
+    room[rows, columns] = True
+    room = _flooded(room & ~wall, wall)
+    if not room.any() or room[0, 0]:
+        (x0, y0), (x1, y1) = lines.min((0, 1)), lines.max((0, 1))
+        return Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
+    x, y = (low[a] + CELL * np.arange(n) for a, n in ((0, n_columns), (1, n_rows)))
+    contours: Any = contour_generator(x, y, room.astype(float), fill_type="OuterCode")
+    polygons, codes = contours.filled(0.02, 2)  # to the middle of the walls
+    return Path(np.concatenate(polygons), np.concatenate(codes))
+
+
+def _flooded(flood, wall) -> np.ndarray:
+    """Returns all cells that are connected with ``flood``, (H, W) bool, but by no ``wall``."""
+    while True:
+        before = flood.sum()
+        for _ in range(2):  # along rows, then along columns
+            run = wall.cumsum(1) + np.arange(len(wall))[:, None] * (wall.shape[1] + 1)
+            reached = np.bincount(run[flood], minlength=run.max() + 1) > 0
+            flood = (reached[run] & ~wall).T
+            wall = wall.T
+        if flood.sum() == before:
+            return flood
+
+
+def _scale_bar(area, plan) -> None:
+    """Draws a bar of a round number of metres in the plan's lower right corner."""
+    if not hasattr(area, "_inches") or not len(plan.lines):
+        return
+    theme, per_metre = area.style.colours, area.transform.get_matrix()[0, 0]
+    inch = area.get_figure().dpi
+    metres = next((m for m in (1, 2, 5, 10, 20, 50, 100) if m * per_metre > 0.5 * inch), 200)
+    x, y = area.width - 0.14, 0.1
+
+    def draw(renderer) -> None:
+        from matplotlib.path import Path
+
+        right, left = x, x - metres * per_metre / inch
+        bar = Path([(left, y + 0.05), (left, y), (right, y), (right, y + 0.05)])
+        area.draw_path(renderer, bar, area._inches, None, theme.faint, 1.2)
+
+    area.add(draw, 8)
+    beside = x - metres * per_metre / inch - 0.07, y + 0.03
+    area.text(beside, f"{metres} m", 8, size=8, colour=theme.faint, align="right", inches=True)
+
+
+def view_polygon(
     position: ArrayLike,
     angle: float,
     fov: float,
     distances: ArrayLike | None = None,
     reach: float = 1.0,
-    colour: str = "w",
-) -> Polygon:
-    """Draws a camera's field of view: a wedge, or with ``distances`` the area that it sees. Returns
-    the matplotlib patch.
+) -> np.ndarray:
+    """Returns the corners (R + 1, 2) of what a camera sees, itself first: a wedge, or as far as
+    ``distances`` say.
 
     Args:
         position: (2,) of the camera in metres.
@@ -135,8 +343,6 @@ def plot_view(
             misses may be infinite.
         reach: metres, the length of the wedge and of rays that miss.
     """
-    from matplotlib.patches import Polygon
-
     position = np.asarray(position, float)
     distances = np.full(33, reach) if distances is None else np.asarray(distances, float)
     distances = np.where(np.isfinite(distances), distances, reach)
@@ -144,23 +350,122 @@ def plot_view(
     tangents = np.tan(np.radians(fov / 2)) * (n_rays - 1 - 2 * np.arange(n_rays)) / n_rays
     angles = np.radians(angle) + np.arctan(tangents)
     rim = position + distances[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
-    ax.plot(*position, marker="o", markersize=4, color=colour)
-    corners = np.concatenate([position[None], rim])
-    polygon = Polygon(corners, facecolor=colour, alpha=0.15, linewidth=0)
-    ax.add_patch(polygon)
-    return polygon
+    return np.concatenate([position[None], rim])
 
 
-def plot_goal(ax: Axes, position: ArrayLike, radius: float) -> Circle:
-    """Draws a goal as a disc. Returns the matplotlib patch.
+def plot_view(
+    ax: Area | Axes,
+    position: ArrayLike,
+    angle: float,
+    fov: float,
+    distances: ArrayLike | None = None,
+    reach: float = 1.0,
+    colour: str = AGENTS[0],
+) -> None:
+    """Draws a camera's field of view; arguments as in :func:`view_polygon`."""
+    from megastep.plotting.pictures import Area
+
+    corners = view_polygon(position, angle, fov, distances, reach)
+    Area.on(ax).polygon(corners, VIEWS, fill=colour, alpha=0.22)
+
+
+def plot_agent(
+    ax: Area | Axes,
+    position: ArrayLike,
+    angle: float,
+    radius: float,
+    colour: str = AGENTS[0],
+    label: str = "",
+) -> None:
+    """Draws an agent as a disc, at least 15 pixels wide at 100 dpi, with a beak where it looks."""
+    from megastep.plotting.pictures import Area
+
+    area, position = Area.on(ax), np.asarray(position, float)
+    ahead = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    aside = np.array([-ahead[1], ahead[0]])
+
+    def beak(renderer) -> None:
+        from matplotlib.path import Path
+        from matplotlib.transforms import IdentityTransform
+
+        scale = area.transform.get_matrix()[0, 0]
+        size = max(radius * scale, renderer.points_to_pixels(AGENT))
+        centre = area.transform.transform(position)
+        corners = centre + size * np.array(
+            [0.75 * ahead + 0.75 * aside, 1.75 * ahead, 0.75 * ahead - 0.75 * aside]
+        )
+        path = Path(np.concatenate([corners, corners[:1]]), closed=True)
+        area.draw_path(renderer, path, IdentityTransform(), colour, "#ffffff", 0.8)
+
+    area.add(beak, MARKS)
+    area.disc(position, radius, MARKS, fill=colour, edge="#ffffff", width=1.0, least=AGENT)
+    if label:
+        area.text(position, label, MARKS, size=7, colour="#ffffff", bold=True, align="centre")
+
+
+def plot_trail(ax: Area | Axes, points: ArrayLike, colour: str = AGENTS[0]) -> None:
+    """Draws where an agent was, (T, 2) metres, the newest last, fading into the past."""
+    from megastep.plotting.pictures import Area
+
+    area, points = Area.on(ax), np.asarray(points, float)
+    points = points[np.isfinite(points).all(1)]
+    parts = np.array_split(np.arange(len(points)), min(12, max(len(points) // 2, 1)))
+    for i, part in enumerate(parts):
+        if len(part) and len(points) > 1:
+            stretch = points[part[0] : part[-1] + 2]
+            strength = (i + 1) / len(parts)
+            area.line(
+                stretch,
+                TRAIL,
+                colour=colour,
+                width=1.4 + 1.2 * strength,
+                alpha=0.15 + 0.75 * strength,
+            )
+
+
+def plot_goal(ax: Area | Axes, position: ArrayLike, radius: float) -> None:
+    """Draws a goal as a disc in a ring.
 
     Args:
         position: (2,) in metres.
         radius: metres within which the goal counts as reached.
     """
-    from matplotlib.patches import Circle
+    from megastep.plotting.pictures import Area
 
-    x, y = np.asarray(position, float)
-    disc = Circle((x, y), radius, facecolor="C2", edgecolor="w", linewidth=0.8, zorder=3)
-    ax.add_patch(disc)
-    return disc
+    area = Area.on(ax)
+    area.disc(position, 1.6 * radius, GOAL, fill="#1fa94c", alpha=0.25, least=9)
+    area.disc(position, radius, GOAL, fill="#1fa94c", edge="#ffffff", width=1.2, least=5)
+
+
+def plot_shot(ax: Area | Axes, start: ArrayLike, end: ArrayLike, colour: str) -> None:
+    """Draws a hit as a line from who hits to whom it hits, (2,) metres each."""
+    from megastep.plotting.pictures import Area
+
+    area = Area.on(ax)
+    area.line([start, end], SHOTS, colour=colour, width=3.2, alpha=0.35)
+    area.line([start, end], SHOTS, colour=colour, width=1.4)
+    area.disc(end, 0, SHOTS, fill="#ffffff", alpha=0.0, edge=colour, width=1.6, least=AGENT + 3)
+
+
+def plot_object(
+    ax: Area | Axes, shape: str, position: ArrayLike, angle: float, size: float, colour: ArrayLike
+) -> None:
+    """Draws a disc, a crate or a door, as :class:`megastep.engine.Objects` has them.
+
+    Args:
+        colour: (3,), sRGB.
+    """
+    from megastep.plotting.pictures import Area
+
+    area, position = Area.on(ax), np.asarray(position, float)
+    fill, edge = tuple(np.asarray(colour, float)), area.style.colours.text
+    ahead = size * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    aside = np.array([-ahead[1], ahead[0]])
+    if shape == "disc":
+        area.disc(position, size, OBJECTS, fill=fill, edge=edge, width=0.7, least=3)
+    elif shape == "crate":
+        corners = [ahead + aside, aside - ahead, -ahead - aside, ahead - aside]
+        area.polygon(position + np.array(corners), OBJECTS, fill=fill, edge=edge, width=0.7)
+    else:
+        area.line([position - ahead, position + ahead], OBJECTS, colour=edge, width=4.6)
+        area.line([position - ahead, position + ahead], OBJECTS, colour=fill, width=3.2)

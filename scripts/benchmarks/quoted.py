@@ -16,8 +16,11 @@ import paths
 import records
 import yaml
 
+from megastep.agents.runs import agent_file
+
 QUOTES = paths.LAB / "quoted.yaml"
 ROWS = paths.ROOT / "agents" / "cli" / "reproductions.yaml"
+AGENTS = paths.ROOT / "agents" / "pretrained"
 #: The pages that quote: all but the lab notes, which are the evidence.
 PAGES = [paths.ROOT / "README.md", *sorted((paths.ROOT / "docs").glob("*.md"))]
 MARKED = re.compile(r"(<!-- quote: ([\w-]+) -->)(.*?)(<!-- end -->)", re.S)
@@ -58,7 +61,16 @@ def text_of(name: str) -> str:
         return quote.get("as", quote["says"])
     if "rows" in quote:
         return _table(quote)
+    if "agent" in quote:
+        return quote["as"].format(**_results(quote["agent"], quote["source"]))
     return _formatted(quote["what"], quote["card"], quote["as"])
+
+
+def _results(agent, source):
+    """Returns the means of a trained agent in a source of homes, from its file."""
+    tables = agent_file.read_metadata(AGENTS / f"{agent}{agent_file.SUFFIX}")["tables"]
+    row = next(row for table in tables for row in table["rows"] if row["source"] == source)
+    return row | {name: metric["mean"] for name, metric in row.get("metrics", {}).items()}
 
 
 def _table(quote):

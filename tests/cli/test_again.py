@@ -47,7 +47,7 @@ def test_one_command_starts_continues_and_is_done(monkeypatch, capsys):
     assert metrics == Path("whole/metrics.jsonl").read_bytes()
     capsys.readouterr()
     assert train.main(AUTO) == 0
-    assert "has had its budget" in capsys.readouterr().out
+    assert "has already used up its budget" in capsys.readouterr().out
     assert metrics == Path("run/metrics.jsonl").read_bytes()
     longer = [f"samples={8 * UPDATE}" if "samples=" in word else word for word in AUTO]
     assert train.main(longer) == 0

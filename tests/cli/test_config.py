@@ -203,6 +203,30 @@ def test_values_follow_the_device(monkeypatch):
     assert compose("env.n_envs=7", "learner.n_minibatches=1").env.n_envs == 7
 
 
+@pytest.mark.parametrize(
+    "word, value",
+    [
+        ("samples=100k", 100_000),
+        ("samples=10M", 10**7),
+        ("samples=2.5e6", 2_500_000),
+        ("samples=1.5b", 1_500_000_000),
+        ("seconds=1h", 3600),
+        ("seconds=1h30min", 5400),
+        ("seconds=2.5m", 150),
+        ("checkpoint_seconds=90s", 90),
+    ],
+)
+def test_quantities_as_people_write_them(word, value):
+    key = word.partition("=")[0]
+    assert getattr(compose(word), key) == value
+
+
+@pytest.mark.parametrize("word", ["samples=1h", "seconds=10M5", "samples=k", "seconds=1.5x"])
+def test_quantities_that_are_none(word):
+    with pytest.raises(ConfigErrors, match=r"expected a|got '"):
+        compose(word)
+
+
 def test_key_of_another_member():
     messages = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.outer=false")
     assert messages["env.patience"] == "no such key here; env=explorer has it"
@@ -325,7 +349,17 @@ def test_contradicting_settings():
         ("++lr=1", "lr", "no such key; did you mean learner.lr?"),
         ("seed=[[1]]", "seed", "expected an integer, got [[1]]"),
         ("learner.lr={a:{b:1}}", "learner.lr", "expected a number, got {'a': {'b': 1}}"),
-        ("env={a:{b:1}}", "env.a", "no such key; did you mean env.name?"),
+        (
+            "env={a:{b:1}}",
+            "env.a",
+            "no such key; did you mean env.name?",
+        ),
+        (
+            "precision=high",
+            "precision",
+            "no such key; there are agent, checkpoint_s",
+        ),
+        ("learner.learning_rate=1", "learner.learning_rate", "no such key; learner has anneal, "),
         ("init=[a]", "init", "expected a word, got ['a']"),
         ("env.control=continuos", "env.control", "is unknown; did you mean continuous?"),
         ("env=null", "env", "None is unknown"),

@@ -305,14 +305,14 @@ def test_evaluate_ratings(here, capsys):
 def test_record_against(here, capsys, monkeypatch):
     drawn = []
 
-    def film(env, policy, place, steps, *rest):
-        drawn.append((env, policy))
+    def film(players, place, *rest, **look):
+        drawn.extend((player.env, player.policy) for player in players)
         return place
 
     words = "run=a", "steps=2", "file=c.png", "device=cpu"
     assert record.main([*words, "against=b"]) == 0
     assert (here / "c.png").exists()
-    monkeypatch.setattr(recording, "film", film)
+    monkeypatch.setattr(recording, "film_all", film)
     assert record.main([*words, f"against={HIGH}"]) == 0
     ((env, lineup),) = drawn
     assert env.n_envs == 1 and lineup.sizes == [1, 1] and lineup.lanes.tolist() == [0, 1]
@@ -370,9 +370,9 @@ def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
     (path,) = (here / "lone" / "evaluations").glob("duels-*bot.json")
     assert [row["duels"] for row in json.loads(path.read_text())["rows"]] == [8, 4, 4]
     players = []
-    monkeypatch.setattr(recording, "film", lambda env, both, path, *_: players.append((env, both)))
+    monkeypatch.setattr(recording, "film_all", lambda both, *_, **look: players.extend(both))
     assert record.main(["run=lone", "against=bot", "device=cpu"]) == 0
-    ((env, both),) = players
+    ((env, both, _),) = players
     assert env.n_agents == 2 and isinstance(both.policies[1], Tracker)
 
 

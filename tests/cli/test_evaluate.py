@@ -1,5 +1,7 @@
 """Evaluation: first episodes with known returns, intervals checked by hand, and the script."""
 
+import collections
+import csv
 import dataclasses
 import itertools
 import json
@@ -13,9 +15,10 @@ from megastep import envs, scene, spaces
 from megastep.agents import factory
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
-from megastep.agents.evaluation import evaluate as evaluation
+from megastep.agents.evaluation import evaluate as evaluate_episodes
+from megastep.agents.evaluation import evaluate_run as evaluation
 from megastep.agents.evaluation import playing, statistics, tables
-from megastep.agents.runs import checkpoint, scores
+from megastep.agents.runs import checkpoint, folders, scores
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from megastep.geometries import files, sample
@@ -331,7 +334,7 @@ def test_evaluate_is_reproducible(trained):
     evaluate.run(configured(run=str(trained), split="training", baseline=False))
     names = {path.name for path in (trained / "evaluations").iterdir()}
     tables = "box-test-32", "box-training-32", "bench-test-32-greedy"
-    assert names == {f"{name}.{kind}" for name in tables for kind in ("json", "md")}
+    assert names == {f"{name}.{kind}" for name in tables for kind in ("json", "md", "csv")}
 
 
 def test_evaluate_in_homes_from_a_file(trained, tmp_path):
@@ -466,12 +469,12 @@ def test_a_geometry_that_the_environment_does_not_take_is_refused(here, geometry
 
 
 def test_evaluate_keeps_lanes_in_one_home(here, played):
-    """Ten lanes in four homes: three, three, two and two."""
+    """Ten lanes in four homes: rounded up to three in each."""
     homes = ["geometry=bench", "geometry.n=4", "env.resample=true"]
     run = train.run(settings(*EXPLORER, *homes))
     evaluate.run(configured(run=str(run), split="all", episodes=10, baseline=False))
     ((env, episodes),) = played
-    assert episodes.homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
+    assert episodes.homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3]
     assert torch.equal(env.core.scenery.layout, episodes.homes)
 
 
@@ -534,3 +537,57 @@ def test_evaluate_refuses_another_environment(trained, tmp_path):
     checkpoint.save(tmp_path / "checkpoints", 32, loaded.state, loaded.config)
     with pytest.raises(UserError, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
         evaluate.run(configured(run=str(tmp_path)))
+
+
+# ---- Single episodes ----
+
+
+def test_episodes_are_written_one_by_one(explorer):
+    """The rows' means are those of the table, and each home has as many."""
+    bench = settings("run=x", "geometry=bench", "geometry.n=4", script="evaluate").geometry
+    bots = ["random", "explorer"]
+    written = evaluate.run(configured(run=str(explorer), geometry=bench, baseline=bots))
+    result = json.loads(written.read_text())
+    with open(written.with_suffix(".csv"), newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert [row["agent"] for row in result["rows"]] == ["trained", *bots]
+    for row in result["rows"]:
+        own = [each for each in rows if each["agent"] == row["agent"]]
+        assert row["lanes"] == len(own) == 8  # six, rounded up to as many in each of four homes
+        assert collections.Counter(each["home"] for each in own) == dict.fromkeys("0123", 2)
+        for name, mean in {
+            "return": row["return"],
+            "length": row["length"],
+            "coverage": row["metrics"]["coverage"]["mean"],
+        }.items():
+            assert np.mean([float(each[name]) for each in own]) == pytest.approx(mean)
+        assert {each["ended"] for each in own} <= {"terminal", "truncated"}
+        spots = {(each["start_x"], each["start_y"], each["start_angle"]) for each in own}
+        assert len(spots) == 8
+    columns = result["episodes"]
+    assert columns["return"] == [float(row["return"]) for row in rows]
+    assert columns["source"] == ["bench"] * 24 if "source" in columns else True
+
+
+def test_episodes_from_python(explorer):
+    """Of settings as many in each home; of an environment one per lane; equal to the command's."""
+    loaded = folders.load_checkpoint(folders.find(str(explorer)), False, "cpu")
+    cfg = factory.config_of(loaded)
+    homes = sample("bench", 3)
+    env = factory.construct(factory.settings.changed(cfg.env, n_envs=6), geometries=homes)
+    policy = factory.load_weights(factory.make_policy(cfg.agent, env), env, loaded)
+    result = evaluate_episodes(policy, cfg.env, 6, homes)
+    assert [row["home"] for row in result.rows] == [0, 1, 2] * 2
+    (summary,) = result.summary
+    assert summary["return"] == pytest.approx(np.mean([row["return"] for row in result.rows]))
+    assert len(evaluate_episodes(policy, cfg.env, geometries=homes).rows) == 3
+    assert len(evaluate_episodes(policy, env, max_steps=2).rows) == 6
+    assert {row["ended"] for row in evaluate_episodes(policy, env, max_steps=2).rows} == {"cut off"}
+    with pytest.raises(ValueError, match="as many episodes as lanes"):
+        evaluate_episodes(policy, env, 3)
+
+
+def test_duels_need_two_agents(explorer, capsys):
+    words = [f"run={explorer}", "against=random", "device=cpu", "episodes=2"]
+    assert evaluate.main(words) == 2
+    assert "A duel needs an environment with at least two agents" in capsys.readouterr().err

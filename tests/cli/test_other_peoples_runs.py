@@ -111,7 +111,8 @@ def test_odd_renderers_are_filmed(here, name, grey):
 
     words = ["env=gymnasium", env_id(name), "steps=2", "file=a.png", "device=cpu"]
     assert record.main(words) == 0
-    assert (255 * imread(here / "a.png")[..., :3]).round().tolist() == [[[grey] * 3] * 8] * 8
+    image = (255 * imread(here / "a.png")[..., :3]).round()
+    assert (image == grey).all(-1).sum() >= 64  # below a caption, at least the 8 x 8 pixels
 
 
 def test_space_that_is_too_large_is_refused_with_its_size(here, monkeypatch, capsys):

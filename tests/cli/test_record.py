@@ -1,15 +1,18 @@
 """Videos of trained agents."""
 
+import errno
+import io
 import os
 import re
 import shutil
 import signal
+import sys
 
 import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 
-from megastep import plotting, recording
+from megastep import recording
 from megastep.agents.cli import record, train
 from megastep.agents.runs import checkpoint
 from tests.helpers import tiny
@@ -41,13 +44,13 @@ def test_recordings_take_the_next_free_name(trained, tmp_path, monkeypatch, caps
     copy = shutil.copytree(trained, tmp_path / "copy", ignore=lambda *_: ["video.mp4"])
     filmed = []
 
-    def film(env, policy, path, *_):
+    def film(players, path, *_, **look):
         filmed.append(path.name)
         if len(filmed) == 3:
             raise RuntimeError("Frame 0 could not be drawn: by chance")
         path.write_text(str(len(filmed)))
 
-    monkeypatch.setattr(recording, "film", film)
+    monkeypatch.setattr(recording, "film_all", film)
     words = [f"run={copy}", "steps=1", "device=cpu"]
     assert [record.main(words) for _ in range(4)] == [0, 0, 2, 0]
     names = ["video.mp4", "video-2.mp4", "video-3.mp4"]
@@ -58,19 +61,111 @@ def test_recordings_take_the_next_free_name(trained, tmp_path, monkeypatch, caps
     assert (copy / "video.mp4").read_text() == "5", "a file that is named is overwritten"
 
 
-def test_png_is_the_last_frame(trained, tmp_path):
+@pytest.fixture(scope="module")
+def filmed(trained, tmp_path_factory):
+    """Returns the bytes of a film of four steps, by its ending."""
+    folder = tmp_path_factory.mktemp("filmed")
+
+    def film(ending, *words):
+        path = folder / "new" / f"film{ending}"
+        common = [f"run={trained}", "steps=4", "device=cpu", f"file={path}"]
+        assert record.main([*common, *words]) == 0
+        return path.read_bytes()
+
+    return film
+
+
+def frames_of(content):
     import av
 
-    video, still = tmp_path / "a.mp4", tmp_path / "folder" / "a.png"
-    common = [f"run={trained}", "steps=4", "device=cpu"]
-    assert record.main([*common, f"file={video}"]) == 0
-    with av.open(str(video)) as file:
-        *_, last = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
-    assert record.main([*common, f"file={still}"]) == 0
-    drawn = (255 * plt.imread(still)[..., :3]).round()
-    height, width = drawn.shape[:2]  # of the video, sizes are even
-    errors = np.abs(drawn - last[:height, :width])
-    assert drawn.std() > 10 and errors.mean() < 3, "compression loses as much"
+    with av.open(io.BytesIO(content)) as video:
+        return [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+
+
+def test_pictures_are_the_last_frame(filmed):
+    last = frames_of(filmed(".mp4"))[-1]
+    gif = frames_of(filmed(".gif"))
+    drawn = (255 * plt.imread(io.BytesIO(filmed(".png")))[..., :3]).round()
+    assert len(gif) == 4 and drawn.shape == last.shape == gif[-1].shape == (720, 640, 3)
+    assert drawn.std() > 10 and np.abs(drawn - last).mean() < 3, "compression loses as much"
+    assert np.abs(drawn - gif[-1]).mean() < 1 and (drawn == gif[-1]).all(-1).mean() > 0.9
+    svg, pdf = filmed(".svg"), filmed(".pdf")
+    assert b"step 3" in svg and pdf.startswith(b"%PDF")
+
+
+def test_look(filmed):
+    small = plt.imread(io.BytesIO(filmed(".png", "dpi=50", "theme=dark", "title=A title")))
+    assert small.shape[:2] == (360, 320) and small[0, 0, :3].max() < 0.15
+    fast = filmed(".mp4", "speed=2.5")
+    import av
+
+    with av.open(io.BytesIO(fast)) as video:
+        assert video.streams.video[0].average_rate == 25
+    svg = filmed(".svg", "axes=true", "title=A title")
+    assert b"x, m" in svg and b"A title" in svg and b"x, m" not in filmed(".svg")
+
+
+def test_homes_in_a_grid(filmed):
+    grid = frames_of(filmed(".gif", "homes=[0,2,1]", "geometry=homes"))[-1]
+    alone = frames_of(filmed(".gif", "home=2", "geometry=homes", "title='home 2'"))[-1]
+    assert grid.shape == (1440, 1280, 3)
+    assert np.abs(grid[:720, 640:].astype(int) - alone).mean() < 1, "the second of the first row"
+    assert len(np.unique(grid[720:, 640:].reshape(-1, 3), axis=0)) == 1, "an empty corner"
+
+
+def test_runs_side_by_side_begin_alike(trained, filmed, tmp_path):
+    path = tmp_path / "two.gif"
+    words = [f"runs=[{trained},{trained}]", "steps=3", "device=cpu", f"file={path}"]
+    assert record.main(words) == 0
+    for frame in frames_of(path.read_bytes()):
+        assert frame.shape == (720, 1280, 3) and (frame[:, :640] == frame[:, 640:]).all()
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["home=1000000"], r"There is no home 1000000: split=test has \d+, from home=0"),
+        (["homes=[0,1000000]"], "There is no home 1000000"),
+        (["theme=blue"], "theme"),
+        (["runs=[a,b]"], "runs: cannot be combined with run"),
+        (["file=a.webm"], r"'a.webm' is neither a film, .mp4 or .gif"),
+    ],
+)
+def test_film_that_cannot_be(trained, here, monkeypatch, capsys, words, text):
+    monkeypatch.setattr(recording, "_moments", lambda *_: pytest.fail("it is drawn"))
+    assert record.main([f"run={trained}", "steps=1", "device=cpu", *words]) == 2
+    assert re.search(text, capsys.readouterr().err) and not os.listdir()
+
+
+def test_environment_without_homes_has_one(here, capsys):
+    words = ["env=pong", "steps=2", "device=cpu"]
+    assert record.main([*words, "home=1"]) == 2
+    assert "There is no home 1: the environment has none" in capsys.readouterr().err
+    assert record.main([*words, "file=pong.gif"]) == 0 and os.listdir() == ["pong.gif"]
+
+
+def full_disk(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif", "png"])
+def test_full_disk(trained, here, monkeypatch, capsys, ending):
+    monkeypatch.setattr(recording.os, "fsync", full_disk)
+    file = f"new/film.{ending}"
+    assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
+    assert "No space left on device" in capsys.readouterr().err and not os.listdir()
+
+
+@pytest.mark.parametrize(
+    "name, value, text",
+    [("matplotlib", None, "needs matplotlib"), ("av", None, "needs av")],
+)
+def test_missing_package(trained, here, monkeypatch, capsys, name, value, text):
+    for module in [m for m in sys.modules if m.split(".")[0] == name or "plotting.pict" in m]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, name, value)
+    assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=film.mp4"]) == 2
+    assert text in capsys.readouterr().err and not os.listdir()
 
 
 @pytest.mark.parametrize("env", ["explorer", "pointgoal"])
@@ -81,23 +176,24 @@ def test_several_cameras(env, tmp_path):
         file = tmp_path / "a.png"
         assert record.main([*options[:2], cameras, *options[3:], f"file={file}"]) == 0
         heights.append(len(plt.imread(file)))
-    strip = 100 * plotting.STRIP * (6 - 2 * 0.55)
-    # two rows more in each of two strips
-    assert heights[0] - heights[1] == pytest.approx(2 * 2 * strip, abs=2)
+    assert heights == [720, 720], "the plan makes room for the rows"
 
 
 @pytest.mark.parametrize(
     "file, text",
     [
         ("/proc/video.mp4", "The video /proc/video.mp4 could not be made: "),
-        ("a/video.gif", "file: 'a/video.gif' is neither a video, .mp4, nor its last frame, .png"),
+        (
+            "a/video.avi",
+            "file: 'a/video.avi' is neither a film, .mp4 or .gif, nor its last frame, ",
+        ),
         ("folder.mp4", "The video folder.mp4 could not be made: folder.mp4 is a folder"),
         (f"{300 * 'longer/'}{300 * 'x'}.mp4", "File name too long"),
     ],
 )
 def test_video_that_cannot_be_made(trained, here, monkeypatch, capsys, file, text):
     (here / "folder.mp4").mkdir()
-    monkeypatch.setattr(recording, "_states", lambda *_: pytest.fail("it is drawn"))
+    monkeypatch.setattr(recording, "_moments", lambda *_: pytest.fail("it is drawn"))
     assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
     assert text in capsys.readouterr().err and os.listdir() == ["folder.mp4"]
 
@@ -142,7 +238,7 @@ def failing(*_, **__):
 
 def test_training_survives_a_failed_video(trained, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(recording.ParallelEncoder, "__call__", failing)
+    monkeypatch.setattr(recording, "_image", failing)
     assert train.main([*TINY, "finish.record=true"]) == 0
     assert "Frame 0 could not be drawn" in capsys.readouterr().err
     assert not list(tmp_path.glob("runs/*/*.mp4"))

@@ -224,6 +224,19 @@ def test_resume_after_a_signal(here, monkeypatch, capsys):
     assert checkpoint.load_latest(here / "r n ü" / "checkpoints").step == 3 * UPDATE
 
 
+def test_a_run_ends_with_its_result_and_the_next_command(here, capsys):
+    assert train.main([*TINY, "samples=100", "folder=run 1"]) == 0
+    *_, result, following = capsys.readouterr().out.splitlines()
+    last = json_lines.read(here / "run 1" / "metrics.jsonl")[-1]
+    text = r"Trained (\d+) samples in \d+ s; mean return (\S+) of the last (\d+) episodes. (.*)"
+    samples, mean, n_episodes, where = re.fullmatch(text, result).groups()
+    assert int(samples) == last["samples"] and int(n_episodes) == last["episode/window"]
+    assert float(mean) == pytest.approx(last["episode/return"], rel=1e-3)
+    assert where == "The run is in run 1"
+    words = shlex.split(following.removeprefix("To evaluate it: python evaluate.py "))
+    assert evaluate.main([*words, "episodes=2", "device=cpu"]) == 0
+
+
 def test_resume_refuses_a_spent_budget(here, capsys):
     folder = train.run(configured(f"samples={2 * UPDATE}", "seconds=600"))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}

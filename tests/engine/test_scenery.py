@@ -78,6 +78,7 @@ def test_views_join_agents_and_layouts(make, name):
     scenery.agent_light.copy_(torch.rand_like(scenery.agent_light))
     view, parts = getattr(scenery, name), expected(scenery)[name]
     assert isinstance(view, Ragged) and len(view) == len(parts)
+    assert view.device == view.vals.device
     assert view.widths.tolist() == [len(part) for part in parts]
     assert torch.equal(view.vals, torch.cat(parts))
     assert all(torch.equal(piece, part) for piece, part in zip(view, parts, strict=True))

@@ -561,15 +561,22 @@ def test_sixteen_agents_have_sixteen_colours():
 
 
 @pytest.mark.parametrize("n_agents", [2, 16])
-def test_display_draws_every_agent(n_agents):
+def test_display_draws_every_agent(n_agents, monkeypatch):
+    written, levels = [], []
+    text = plotting.Area.text
+    monkeypatch.setattr(
+        plotting.Area,
+        "text",
+        lambda self, at, w, *a, **k: (written.append(w), text(self, at, w, *a, **k)),
+    )
+    monkeypatch.setattr(plotting, "plot_level", lambda _, level: levels.append(float(level)))
     env = envs.Deathmatch(2, [toys.box()], n_agents=n_agents, device="cpu")
     env.reset()
     env.health[n_agents:] = torch.linspace(0, 1, n_agents)
     figure = env.display(1)
-    titles = [ax.get_title(loc="left") for ax in figure.axes]
-    for agent in range(n_agents):
-        assert any(t.startswith(f"{agent}: health {agent / (n_agents - 1):.2f}") for t in titles)
-    assert len(figure.axes) == 1 + 2 * n_agents
+    assert written.count("rgb") == written.count("depth") == n_agents
+    assert [written.count(str(agent)) for agent in range(n_agents)] == n_agents * [3]
+    assert levels == pytest.approx(torch.linspace(0, 1, n_agents).tolist())
     assert plotting.rasterise(figure).std() > 5
 
 

@@ -58,13 +58,14 @@ class Forked:
         argv: the script or, after "-m", a module, and its words.
         cwd: the folder to run it in.
         environment: all environment variables.
+        holder: number of a process, to run it on its host, see `hosts`; default: this one.
     """
 
-    def __init__(self, argv, cwd, environment):
+    def __init__(self, argv, cwd, environment, holder=None):
         self.args = [*map(str, argv)]
         self.outputs = [tempfile.NamedTemporaryFile("r") for _ in range(2)]
         names = [file.name for file in self.outputs]
-        arguments = self.args, str(cwd or os.getcwd()), environment, names
+        arguments = self.args, str(cwd or os.getcwd()), environment, names, holder
         self.process = FORKS.Process(target=_run, args=arguments)
         self.process.start()
         self.pid = self.process.pid
@@ -99,8 +100,12 @@ class Forked:
         self.process.kill()
 
 
-def _run(argv, folder, environment, outputs):
+def _run(argv, folder, environment, outputs, holder):
     os.setsid()
+    if holder is not None:
+        from tests.helpers import hosts
+
+        hosts.enter(holder)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     os.chdir(folder)
     os.environ.clear()

@@ -93,7 +93,7 @@ def test_dry_run(here, capsys):
     assert train.main([*TINY, "ranks=3", "dry_run=true"]) == 0
     text = capsys.readouterr().out
     assert "3 x cpu" in text and not any(here.iterdir())
-    numbers = {"environments": 4, "an update": 4 * 8, "a minibatch": 4 * 8 // 2}
+    numbers = {"environments": 4, "per update": 4 * 8, "per minibatch": 4 * 8 // 2}
     for name, number in numbers.items():
         (line,) = (line for line in text.splitlines() if name in line)
         assert {str(number), str(3 * number)} <= set(line.split())

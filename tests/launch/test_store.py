@@ -1,5 +1,6 @@
 """The store of ranks: who can reach it, and what a stranger in it can do."""
 
+import contextlib
 import json
 import os
 import socket
@@ -80,6 +81,8 @@ def test_only_a_folder_with_the_token_of_this_start_is_gone_on_with(store, tmp_p
 
 @pytest.mark.parametrize("value", [b"", b"\xff", b"3", b"[]", b'["a", 1, 2, 3, 4, "x"]'])
 def test_a_heartbeat_that_is_none_is_left_out(store, value, monkeypatch):
+    for name, text in dict(RANK="0", WORLD_SIZE="2", LOCAL_RANK="0").items():
+        monkeypatch.setenv(name, text)
     one = watch.Watch(lambda problem: None)
     one.store = distributed.PrefixStore("watch", store[0])
     one.store.set("heartbeat 1", value)
@@ -92,17 +95,20 @@ def test_a_heartbeat_that_is_none_is_left_out(store, value, monkeypatch):
 def test_ranks_of_one_machine_listen_on_loopback_alone(tmp_path):
     words = [*tiny.TINY, "ranks=2", "folder=run", "log_every=1"]
     process = start("train", *words, cwd=tmp_path)
-    wait_until(lambda: (tmp_path / "run/metrics.jsonl").exists(), process)
-    tree = [process.pid, *map(int, children_of(process.pid))]
-    assert len(tree) >= 3 and listening(tree) == LOOPBACK
-    process.terminate()
-    process.communicate()
+    try:
+        wait_until(lambda: (tmp_path / "run/metrics.jsonl").exists(), process)
+        tree = [process.pid, *map(int, children_of(process.pid))]
+        assert len(tree) >= 3 and listening(tree) == LOOPBACK
+    finally:
+        process.terminate()
+        process.communicate()
     assert process.returncode == 143
 
 
 def children_of(pid):
-    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split() or [
-        path.name
-        for path in Path("/proc").iterdir()
-        if path.name.isdecimal() and f" {pid} " in (path / "stat").read_text().rpartition(")")[2]
-    ]
+    """Returns the numbers of a process's children, whichever of its threads started them."""
+    children = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            children += (task / "children").read_text().split()
+    return children

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import capture, engine, modules, scene
+from megastep import capture, engine, modules, plotting, scene
 from megastep.arrdict import numpyify
+from megastep.colour import gamma_encode
 from megastep.core import Core
+from megastep.engine.objects import NUMBERS
 from megastep.geometries import sample, toys
 from megastep.geometry import mirror_image
 from megastep.modules import Crate, Disc, Door, Objects
@@ -173,13 +175,23 @@ def test_a_captured_step_with_objects_equals_one_that_is_not():
 
 def test_a_state_is_drawn_with_its_objects():
     core, _, objects = make({"key": 2, "crate": Crate(1), "door": Door()})
-    without = core.state(0)
+    assert not len(core.state(0).objects.shapes)
     objects["key"].place(everywhere(core))
-    state = core.state(0)
-    assert len(state.lines) == len(without.lines) + 12
-    assert int(state.n_moving_lines) == int(without.n_moving_lines) + 12
-    axes = Core.plot_state(numpyify(state), seen=np.ones(int(state.widths[28:].sum()), bool))
-    assert len(axes.collections[0].get_segments()) == int(state.widths.sum())
+    objects["crate"].place(everywhere(core))
+    objects["door"].place(everywhere(core))
+    objects["door"].open[:] = True
+    state = numpyify(core.state(0))
+    assert len(state.lines) == len(core.scenery.layouts.lines[int(core.scenery.layout[0])]), (
+        "walls alone"
+    )
+    assert state.objects.shapes.tolist() == [NUMBERS[s] for s in ("disc", "disc", "crate")]
+    figure, plan, _ = plotting.panels()
+    Core.plot_state(state, plan)
+    image = plotting.rasterise(figure)
+    for position, colour in zip(state.objects.positions, state.objects.colours, strict=True):
+        column, row = plan.transform.transform(position).astype(int)
+        shown = image[len(image) - 1 - row, column]
+        assert np.abs(shown - 255 * gamma_encode(colour)).max() < 2
 
 
 @pytest.mark.parametrize(

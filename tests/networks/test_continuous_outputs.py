@@ -118,6 +118,16 @@ def test_a_new_policy_is_nearly_the_same_everywhere(kind):
     assert (output.entropy(logits) > 6 * (math.log(2) - 0.35)).all()
 
 
+def test_standard_deviation_of_a_gaussian_is_about_one_and_bounded_below():
+    output = heads.output(SPACE, 8, continuous="gaussian")
+    _, log_std = output(torch.randn(5, 8)).chunk(2, -1)
+    assert ((0 <= log_std) & (log_std < 0.06)).all()
+    with torch.no_grad():
+        output.log_std.fill_(-100)
+    _, log_std = output(torch.randn(5, 8)).chunk(2, -1)
+    torch.testing.assert_close(log_std, torch.full_like(log_std, -3.0))
+
+
 def test_mixed_spaces_give_mixed_outputs():
     space = {"turn": spaces.MultiDiscrete(1, 3), "push": spaces.MultiContinuous(1, 2)}
     output = heads.output(space, 8)

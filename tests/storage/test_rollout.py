@@ -312,3 +312,15 @@ def test_lanes_that_are_not_stored_act_with_0():
 def test_empty_rollout_raises():
     with pytest.raises(ValueError, match="not 0 and 6"):
         Rollout(0, B, LabelledEnv.obs_space, LabelledEnv.action_space, arrdict())
+
+
+@pytest.mark.parametrize("privileged", [None, spaces.MultiVector(1, 3)])
+def test_world_of_a_time_has_what_the_critic_sees_if_it_is_stored(privileged):
+    spaces_of = LabelledEnv.obs_space, LabelledEnv.action_space
+    rollout = Rollout(T, B, *spaces_of, arrdict(), privileged_space=privileged)
+    if privileged is None:
+        assert {*rollout.world(2)} == {"obs", "reset"}
+        return
+    rollout.privileged.copy_(torch.rand_like(rollout.privileged))
+    for t in range(T):
+        assert torch.equal(rollout.world(t).privileged, rollout.privileged[t])

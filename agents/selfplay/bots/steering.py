@@ -131,9 +131,9 @@ class Steering:
         pose: Pose,
         aim: torch.Tensor,
         gaze: torch.Tensor,
-        turning: Any = 1.0,
-        slack: Any = SLACK,
-        horizon: Any = HORIZON,
+        turning: float | torch.Tensor = 1.0,
+        slack: float | torch.Tensor = SLACK,
+        horizon: float | torch.Tensor = HORIZON,
     ) -> arrdict:
         """Returns the decision that walks towards points and turns to others, (n, 2) each.
 

@@ -4,7 +4,7 @@ import importlib
 import os
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Literal
 
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training.loggers import first_line
@@ -34,7 +34,7 @@ class Wandb:
         self,
         folder: Path,
         run_name: str,
-        config: dict[str, Any],
+        config: dict,
         project: str = "megastep",
         mode: Literal["online", "offline"] = "online",
         group: str | None = None,

@@ -317,19 +317,17 @@ class Deathmatch(SceneryEnv):
         """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
         each agent to its target, and each agent's health, RGB and depth.
         """
-        title = f"step {state.age.max()}, {state.kills.sum():.3g} kills"
-        figure, plan, rows = plotting.panels_beside(len(state.health), 2, title=title)
+        title = f"step {state.age.max()} · kills {state.kills.sum():.3g}"
+        agents = range(len(state.health))
+        figure, plan, strips = plotting.panels(4 * -(-len(agents) // 2), title=title, columns=2)
         Core.plot_state(state.core, plan)
+        colours, positions = plotting.camera_colours(len(agents)), state.core.positions
         for agent, target in enumerate(state.target):
             if target >= 0:
-                plan.plot(*state.core.positions[[agent, target]].T, color="r", linewidth=1)
-        for agent, (colour, depth) in enumerate(rows):
-            modules.RGB.plot_state(state.rgb[agent : agent + 1], [colour])
-            modules.Depth.plot_state(state.d[agent : agent + 1], [depth])
-            title = f"{agent}: health {state.health[agent]:.2f}, step {state.age[agent]}"
-            colour.set_title(title, fontsize="small", loc="left", pad=7)
-            depth.set_title("", loc="left")
-            for strip in (colour, depth):
-                strip.set(xlabel="", xticks=[], box_aspect=None)
-            plotting.plot_level(colour, state.health[agent])
+                plotting.plot_shot(plan, positions[agent], positions[target], colours[agent])
+        above = [strips[2 * agent - agent % 2] for agent in agents]  # two agents in two rows
+        modules.RGB.plot_state(state.rgb, above)
+        modules.Depth.plot_state(state.d, [strips[2 * agent - agent % 2 + 2] for agent in agents])
+        for strip, health in zip(above, state.health, strict=True):
+            plotting.plot_level(strip, health)
         return figure

@@ -189,31 +189,33 @@ class Explorer(SceneryEnv):
         return arrdict(
             core=self.core.state(e),
             obs=self._observation()[0][e],
-            seen=self._seen_texels(e),
+            seen=self._texels(self.seen[e, 0], e),
+            visible=self._texels(self._visible_bits(e), e),
             n_seen=self.n_seen[e].clone(),
             lifecycle=self.lifecycle.state(e),
         )
 
-    def _seen_texels(self, e) -> torch.Tensor:
-        """(T,) bool: the wall texels of environment ``e`` that were seen this episode."""
-        bits = (
-            self.seen[e, 0, :, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1
-        )
+    def _visible_bits(self, e) -> torch.Tensor:
+        """(n_words,) int32: texels that ``coverage`` counts, or all without metrics."""
+        return self.visible[self.layout[e]] if self.runs else torch.full_like(self.seen[e, 0], -1)
+
+    def _texels(self, words, e) -> torch.Tensor:
+        """(T,) bool: the bits (n_words,) of the wall texels of environment ``e``."""
+        bits = words[:, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1
         layouts, d = self.core.scenery.layouts, int(self.core.scenery.layout[e])
         first, last = layouts.texel_starts[layouts.wall_starts[d : d + 2].long()].tolist()
         return bits.flatten()[: last - first].bool()
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
-        """Draws a numpyified :meth:`state`: the floor plan, bright where it was seen, above the
-        agent's images. Returns a matplotlib figure.
+        """Draws a numpyified :meth:`state`: the floor plan, where walls that were not seen are
+        grey, above the agent's images. Returns a matplotlib figure.
         """
-        steps, n_texels = state.lifecycle.age[0], len(state.seen)
-        title = f"step {steps}, {state.n_seen} of {n_texels} texels seen"
+        coverage = (state.seen & state.visible).sum() / max(state.visible.sum(), 1)
+        title = f"step {state.lifecycle.age[0]} · {100 * coverage:.0f} % seen"
         yaws = state.core.yaws
         figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))
-        distances = engine.AGENT_RADIUS + 10 * (1 - state.obs.d[0].astype("float32"))
-        Core.plot_state(state.core, plan, seen=state.seen, distances=distances)
+        Core.plot_state(state.core, plan, state.seen)
         modules.RGB.plot_state(state.obs.rgb, strips[:1], yaws)
         modules.Depth.plot_state(state.obs.d, strips[1:], yaws)
         return figure

@@ -22,6 +22,7 @@ from megastep.envs.on_host.frames import as_frame
 from megastep.envs.on_host.spaces import RESERVED as RESERVED_KEYS
 from megastep.envs.on_host.spaces import actions, identifiers, observation
 from megastep.sync_envs import CHECKED_STEPS, BadValue, EnvError
+from megastep.types import Tree
 from megastep.vector_processes import VectorProcesses, start_rendering
 
 __all__ = ["VectorizedEnv"]
@@ -149,14 +150,14 @@ class VectorizedEnv:
             self._n_to_check[:] = 0
             warnings.warn(f"{self.id}: {sentence}. It is used as it is", stacklevel=4)
 
-    def wrapper_state(self) -> dict[str, Any]:
+    def wrapper_state(self) -> Tree:
         """Returns what the wrappers of an environment have learnt, such as running statistics, as
         tensors and numbers by path.
         """
         state = getattr(self.vector, "wrapper_state", dict)()
         return {path: _plain(value) for path, value in state.items()}
 
-    def load_wrapper_state(self, state: Mapping[str, Any], is_frozen: bool) -> None:
+    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
         """Gives the wrappers of all environments what those of others have learnt.
 
         Args:

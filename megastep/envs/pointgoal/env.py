@@ -213,13 +213,12 @@ class PointGoal(SceneryEnv):
         and the agent's RGB and depth.
         """
         title = (
-            f"step {state.age}, {state.distance:.1f} m to go, {state.walked:.1f} m walked, "
-            f"{state.shortest:.1f} m shortest"
+            f"step {state.age} · {state.distance:.1f} of {state.shortest:.1f} m to go"
+            f" · {state.walked:.1f} m walked"
         )
         yaws = state.core.yaws
         figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))
-        distances = engine.AGENT_RADIUS + 10 * (1 - state.d[0].astype("float32"))
-        Core.plot_state(state.core, plan, distances=distances)
+        Core.plot_state(state.core, plan)
         plotting.plot_goal(plan, state.goal, REACH)
         modules.RGB.plot_state(state.rgb, strips[:1], yaws)
         modules.Depth.plot_state(state.d, strips[1:], yaws)

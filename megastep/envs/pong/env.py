@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from megastep import engine, spaces
+from megastep import engine, plotting, spaces
 from megastep.arrdict import arrdict, numpyify
 from megastep.engine import checks
 from megastep.envs.common import DisplayedEnv
@@ -179,13 +179,23 @@ class Pong(DisplayedEnv):
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":
         """Draws the court and the score of a numpyified :meth:`state` as a matplotlib figure."""
-        from matplotlib.figure import Figure
-
         left, right = state.scores
-        figure = Figure(figsize=(6, 4.8), dpi=100, layout="constrained")
-        court = figure.subplots()
-        court.set_title(f"step {state.age}, {left} : {right}")
-        court.imshow(cls.image(state), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-        court.set_xticks([])
-        court.set_yticks([])
+        figure, court, _ = plotting.panels(title=f"step {state.age} · {left} : {right}")
+        court.fit(np.array([0, 0]), np.array([COLUMNS, ROWS]))
+        theme = court.style.colours
+        court.polygon(
+            [(0, 0), (COLUMNS, 0), (COLUMNS, ROWS), (0, ROWS)],
+            fill=theme.floor,
+            edge=theme.faint,
+            width=1,
+        )
+        middle = [(COLUMNS / 2, 0), (COLUMNS / 2, ROWS)]
+        court.line(middle, colour=theme.hatch, width=2)
+        for side, top in enumerate(state.paddles):
+            x, y = side * (COLUMNS - 1), ROWS - top
+            corners = [(x, y), (x + 1, y), (x + 1, y - PADDLE_ROWS), (x, y - PADDLE_ROWS)]
+            court.polygon(corners, 1, fill=plotting.AGENTS[side])
+        for z, alpha, ball in (2, 0.35, state.last_ball), (3, 1.0, state.ball):
+            x, y = np.floor(ball)
+            court.disc((x + 0.5, ROWS - y - 0.5), 0.5, z, fill=theme.text, alpha=alpha)
         return figure

@@ -196,7 +196,8 @@ def build_cuda(library: KernelLibrary, architecture: str) -> bytes:
 def bindings() -> tuple[Any, Any]:
     """Returns the modules ``driver`` and ``nvrtc`` of cuda.bindings."""
     try:
-        from cuda.bindings import driver, nvrtc  # pyright: ignore[reportMissingImports]
+        # pyright finds no types, whether it is installed or not
+        from cuda.bindings import driver, nvrtc  # pyright: ignore
     except ImportError:
         raise EngineError(
             "Kernels on a GPU need the package cuda-bindings, which comes with PyTorch for CUDA "

@@ -6,27 +6,28 @@ from typing import TYPE_CHECKING
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.shard import Shard
-from megastep.agents.evaluation import arena, playing, statistics, suite, tables
+from megastep.agents.evaluation import arena, episodes, statistics, suite, tables
 from megastep.agents.factory import env_failures, settings
-from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
-from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import optional
 
 if TYPE_CHECKING:
     import torch
 
+    from megastep.agents.types import Row
+
 
 def run(cfg: settings.Evaluate) -> Path:
     """Evaluates a run, each environment in one home throughout. Returns the path of the table.
 
-    Of several ranks, each plays its share. Rank 0 writes; the others return the run's folder.
+    With several ranks, each plays some of the environments. Rank 0 writes; the others return the
+    run's folder.
 
-    Writes .json and .md into the run's folder `evaluations`, one of each per source of geometries
-    (per environment where it has none), split and checkpoint. Of `geometry=suite` plays as many
-    episodes in each source, and adds the worst source and the worst dense homes. With `cfg.against`
-    plays duels instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
+    Writes .json, .md and .csv, which has a row per episode, into the run's folder `evaluations`,
+    one of each per source of geometries (per environment where it has none), split and checkpoint.
+    Of `geometry=suite` plays as many episodes in each source, and adds the worst source and the
+    worst dense homes. With `cfg.against` plays duels instead; with `cfg.ratings` writes
+    ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
@@ -55,9 +56,17 @@ def measure(
     elif cfg.against is not None:
         path = duel(cfg, loaded, env_settings, geometry, homes, device)
     else:
-        rows = []
+        rows, single = [], []
+        numbers = {id(home): number for number, home in enumerate(homes)}
         for source, part in suite.parts_of(geometry, homes):
-            rows += suite.of_source(source, play(cfg, loaded, env_settings, part, device, source))
+            table, each = play(cfg, loaded, env_settings, part, device, source)
+            rows += suite.of_source(source, table)
+            if source:  # the number among all homes, not among those of the source
+                where = [numbers[id(home)] for home in part]
+                each = [
+                    row | {"home": where[row["home"]]} if "home" in row else row for row in each
+                ]
+            single += each
         if process_group.rank() > 0:
             return folders.folder_of(loaded.path)
         labels = tables.labels(env_settings, geometry, homes, cfg.split)
@@ -72,6 +81,7 @@ def measure(
             f"({loaded.path.name}), seed {cfg.seed}",
             rows,
             [*map(tables.cells, rows)],
+            single,
         )
     return path
 
@@ -83,38 +93,47 @@ def play(
     homes: list,
     device: "torch.device",
     source: str | None = None,
-) -> list[dict]:
-    """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the table rows."""
-    seed, trained = rank_seed(cfg.seed, process_group.rank()), factory.config_of(loaded)
-    sample = factory.make_sample(env_settings, homes, seed=seed, device=device)
-    n_envs = -(-cfg.episodes // optional(sample, "n_agents"))
-    homes = factory.spread(homes, n_envs)
-    shard = Shard.of_this_rank(n_envs, len(homes))
-    env_settings = settings.changed(env_settings, n_envs=len(shard.envs), resample=False)
-    where = dict(geometries=[homes[home] for home in shard.homes], seed=seed, device=device)
-    env, rows = factory.construct(env_settings, **where), []
-    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
-    factory.load_wrappers(env, loaded)
-    players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
-    players += [("random", RandomActions(env.action_space), False)] * cfg.baseline
-    sources = None if source else factory.sources_of(homes)
-    for name, player, greedy in players:
-        played = playing.first_episodes(env, player, seed, greedy, cfg.max_steps)
-        episodes = shard.with_others(played)
-        n_cut = int((~episodes["done"]).sum())
+) -> "tuple[list[Row], list[Row]]":
+    """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the rows of the
+    table, and those of the episodes.
+    """
+    stage = arena.Stage(env_settings, homes, cfg.episodes, cfg.seed, device)
+    env, roles = stage.env, optional(stage.env, "roles")
+    sources = factory.sources_of(stage.homes)
+    rows, single = [], []
+    for player, greedy in players_of(cfg, loaded, stage):
+        played = stage.play(player.policy, greedy, cfg.max_steps)
+        n_cut = int((~played["done"]).sum())
         if n_cut and process_group.rank() == 0:
             limit = cfg.max_steps or optional(env, "max_episode_steps")
             console.warn(
-                f"{name}: {n_cut:,} of {len(episodes['done']):,} episodes had not ended after "
+                f"{player.name}: {n_cut:,} of {len(played['done']):,} episodes had not ended after "
                 f"{limit:,} steps and are counted as truncated there; max_steps= sets the limit"
             )
-        summaries = statistics.summaries(episodes, optional(env, "roles"), sources)
-        if source == suite.DENSE and "homes" in episodes:
-            summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(episodes)})
-        rows += [{"agent": name, **row} for row in summaries]
+        summaries = statistics.summaries(played, roles, None if source else sources)
+        if source == suite.DENSE and "homes" in played:
+            summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(played)})
+        rows += [{"agent": player.name, **row} for row in summaries]
+        each = episodes.rows_of(played, cfg.seed, stage.numbers, sources, roles)
+        single += [{"agent": player.name, **row} for row in each]
     if process_group.rank() == 0:
-        arena.warn_without_layout(env, homes)
-    return rows
+        arena.warn_without_layout(env, stage.homes)
+    return rows, single
+
+
+def players_of(
+    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, stage: arena.Stage
+) -> list[tuple[arena.Player, bool]]:
+    """Returns who plays, the run's agent and each of `cfg.baseline`, and whether it is greedy."""
+    policy = factory.make_policy(factory.config_of(loaded).agent, stage.env)
+    policy = factory.load_weights(policy, stage.env, loaded)
+    factory.load_wrappers(stage.env, loaded)
+    players = [(arena.Player("trained, greedy" if cfg.greedy else "trained", policy), cfg.greedy)]
+    for name in cfg.baseline:
+        player = arena.find_player(name, loaded, stage.settings, stage.sample, cfg.trust)
+        own = factory.in_env(player.policy, stage.settings, stage.env)
+        players.append((player._replace(policy=own), cfg.greedy and player.step is not None))
+    return players
 
 
 def duel(

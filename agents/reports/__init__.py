@@ -1,0 +1,1 @@
+"""Reports of runs: one page about a run or several, and plots that compare them."""

@@ -1,0 +1,63 @@
+"""Compares runs in one plot, averaged over seeds, and in a table of its numbers."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from megastep.agents import console
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.reports import runs, statistics
+from megastep.agents.runs.atomic_files import write_atomically
+from megastep.settings import closest
+
+#: Endings of plots.
+FORMATS = (".pdf", ".svg", ".png")
+
+
+def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> Path:
+    """Draws a metric over samples, a line per group of runs that differ in their seeds alone, with
+    a 95 % bootstrap interval over seeds. Prints the interquartile means, and writes the plot and,
+    beside it, a .csv of its lines. Returns the plot's path.
+
+    Raises:
+        UserError: a folder is no run, a run has not reported the metric, or a file cannot be
+            written.
+    """
+    from matplotlib.figure import Figure  # which takes a while
+    from matplotlib.ticker import EngFormatter
+
+    if file.suffix not in FORMATS:
+        raise UserError(f"file={file} is no plot; its name ends with {', '.join(FORMATS)}")
+    every = [*map(runs.read, paths)]
+    if metric not in (shared := runs.metrics_of(every)):
+        if not shared:
+            raise UserError("these runs share no metric, so they cannot be compared")
+        raise UserError(f"not all of these runs report {metric!r}; {closest(metric, shared)}")
+    groups, table, rows = runs.groups_of(every), [], []
+    figure = Figure(figsize=(5.5, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for name, group in groups.items():
+        one = statistics.band([run.curve(metric) for run in group])
+        (line,) = axes.plot(one["x"], one["mean"], label=f"{name} ({len(group)})")
+        axes.fill_between(one["x"], one["lower"], one["upper"], alpha=0.2, color=line.get_color())
+        columns = zip(*(one[key].tolist() for key in ("x", "mean", "lower", "upper")), strict=True)
+        table += [[name, *row] for row in columns]
+        values = [value for run in group if (value := run.score(metric)) is not None]
+        middle, lower, upper = statistics.interval([values]) if values else 3 * (float("nan"),)
+        rows.append([name, str(len(group)), f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}"])
+    axes.set(xlabel="samples", ylabel=metric)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    plot, text = io.BytesIO(), io.StringIO()
+    figure.savefig(plot, format=file.suffix[1:], dpi=200)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([["runs", "samples", "mean", "lower", "upper"], *table])
+    with user_errors(f"{file} cannot be written: "):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file.with_suffix(".csv"), text.getvalue().encode())
+        write_atomically(file, plot.getvalue())
+    head = ["runs", "seeds", f"IQM of {metric}", "95 % interval"]
+    console.say(console.table(head, rows, width=console.terminal_width()))
+    return file

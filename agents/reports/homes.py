@@ -1,0 +1,102 @@
+"""The homes of an evaluation, drawn from above and coloured by what was earned in them."""
+
+import html
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from megastep.agents import factory
+from megastep.agents.errors import ConfigErrors, UserError
+from megastep.agents.evaluation.statistics import SCORES
+from megastep.agents.factory import check, settings
+from megastep.agents.reports import runs
+from megastep.agents.runs import folders
+from megastep.agents.runs.typed_json import loads
+
+#: Homes that are drawn: so many of the worst, and of the best.
+N_WORST, N_BEST = 36, 12
+
+
+def section(run: runs.Run) -> list[str]:
+    """Returns the part of a report that shows where the agent does badly; empty without an
+    evaluation in several homes.
+    """
+    for table in run.evaluations:
+        if "home" not in table.get("episodes", {}):
+            continue
+        try:
+            name, by_home = score_by_home(table["episodes"])
+            plans = plans_of(run, table)
+            worst = sorted(by_home, key=by_home.__getitem__)
+            if len(worst) < 2 or not all(0 <= home < len(plans) for home in worst):
+                continue
+        except (UserError, ConfigErrors, KeyError, TypeError, ValueError, IndexError) as error:
+            return [f"<p>Homes are not drawn: {html.escape(str(error))}</p>"]
+        best = worst[max(N_WORST, len(worst) - N_BEST) :]
+        span = by_home[worst[0]], by_home[worst[-1]]
+        n_left = len(worst) - len(worst[:N_WORST]) - len(best)
+        left = f"; {n_left:,} between them are not drawn" if n_left > 0 else ""
+        text = (
+            f"{table.get('title', '')}. By {name}, worst first: {span[0]:.3g} to {span[1]:.3g} in "
+            f"{len(worst):,} homes{left}."
+        )
+        shown = [figure(home, plans[home], by_home[home], span) for home in worst[:N_WORST] + best]
+        return [
+            "<h2>Homes, worst first</h2>",
+            f"<p>{html.escape(text)} <code>record.py home=N</code> films one of this split.</p>",
+            f'<div class="plans">{"".join(shown)}</div>',
+        ]
+    return []
+
+
+def score_by_home(episodes: Mapping[str, Sequence]) -> tuple[str, dict[int, float]]:
+    """Returns the first of `SCORES` that episodes have, and its mean in each home, of the first
+    agent of a table.
+    """
+    name = next(name for name in SCORES if any(v is not None for v in episodes.get(name, ())))
+    agents, values = episodes["agent"], defaultdict(list)
+    for agent, home, value in zip(agents, episodes["home"], episodes[name], strict=True):
+        if agent == agents[0] and home is not None and value is not None:
+            values[int(home)].append(float(value))
+    return name, {home: float(np.mean(some)) for home, some in values.items()}
+
+
+def plans_of(run: runs.Run, table: Mapping) -> list:
+    """Returns the geometries of the split that a table is about.
+
+    Raises:
+        UserError: the run needs classes that are not imported without trust.
+    """
+    loaded = folders.load_checkpoint(folders.find(str(run.folder)), False, "cpu")
+    trained = factory.config_of(loaded)
+    chosen = loads(json.dumps(table["evaluation"]))
+    geometry = chosen.get("geometry")
+    if geometry is None:
+        kept = trained.geometry
+    else:
+        kind = settings.kind_of("geometry", str(geometry["name"]))
+        kept = check.check(kind, geometry)
+    return factory.homes(trained.env, kept, str(chosen["split"]))
+
+
+def figure(number: int, plan: Mapping, value: float, span: tuple[float, float]) -> str:
+    """Returns a home from above, its floor coloured by a value between the bounds of `span`."""
+    walls = np.asarray(plan["walls"], float)
+    low, high = walls.min((0, 1)), walls.max((0, 1))
+    lines = "".join(
+        f"M{a[0] - low[0]:.2f} {high[1] - a[1]:.2f}L{b[0] - low[0]:.2f} {high[1] - b[1]:.2f}"
+        for a, b in walls
+    )
+    width, height = high - low
+    fraction = (value - span[0]) / (span[1] - span[0]) if span[1] > span[0] else 1.0
+    box = f"-.3 -.3 {width + 0.6:.2f} {height + 0.6:.2f}"
+    floor = f'<rect width="{width:.2f}" height="{height:.2f}" fill="{colour(fraction)}"/>'
+    drawing = f'<svg viewBox="{box}" role="img">{floor}<path d="{lines}"/></svg>'
+    return f"<figure>{drawing}<figcaption>{number}: {value:.3g}</figcaption></figure>"
+
+
+def colour(fraction: float) -> str:
+    """Returns a colour between a dark red, 0, and a light green, 1: lightness differs as well."""
+    return f"hsl({10 + 110 * fraction:.0f} {70 - 15 * fraction:.0f}% {48 + 20 * fraction:.0f}%)"

@@ -1,0 +1,150 @@
+"""What is known of runs that have been trained: read from their folders, nothing imported."""
+
+import contextlib
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import yaml
+
+from megastep.agents.errors import UserError
+from megastep.agents.factory.check import leaves
+from megastep.agents.factory.settings import label
+from megastep.agents.runs import folders, json_lines, scores, strange_files
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Config, Row
+
+#: Settings that differ between seeds of one experiment, or do not change what is learnt.
+OF_A_SEED = "seed", "folder", "resume", "rerun", "ranks", "device", "finish", "logger", "dry_run"
+#: Largest file that is read, bytes.
+MAX_BYTES = 64_000_000
+
+
+class Run(NamedTuple):
+    """A run that has been trained, or is being trained.
+
+    Attributes:
+        folder: of the run.
+        config: its settings as nested dicts.
+        metrics, perf, provenance: the rows of its files.
+        evaluations: the contents of `evaluations/*.json`, in the order of names.
+    """
+
+    folder: Path
+    config: "Config"
+    metrics: "list[Row]"
+    perf: "list[Row]"
+    provenance: "list[Row]"
+    evaluations: "list[Row]"
+
+    @property
+    def task(self) -> str:
+        """Environment and source of homes."""
+        names = [self.config[group] for group in ("env", "geometry") if group in self.config]
+        return ", ".join(label(str(group.get("name"))) for group in names)
+
+    def settings(self) -> "Row":
+        """Returns {dotted key: value} of all settings but those of a seed."""
+        return {k: v for k, v in leaves(self.config) if k.split(".")[0] not in OF_A_SEED}
+
+    def score(self, metric: str = "episode/return") -> float | None:
+        """Returns the mean of a metric over the last reports, of returns weighted by episodes."""
+        if metric == "episode/return":
+            return scores.mean_return(self.metrics)
+        values = [row[metric] for row in self.metrics if row.get(metric) is not None][-10:]
+        return sum(values) / len(values) if values else None
+
+    def curve(self, metric: str) -> tuple[list[float], list[float]]:
+        """Returns the samples and values of a metric of `metrics.jsonl` or `perf.jsonl`."""
+        rows = self.perf if metric.startswith("perf/") else self.metrics
+        points = [(row["samples"], row[metric]) for row in rows if row.get(metric) is not None]
+        return [x for x, _ in points], [y for _, y in points]
+
+
+def read(folder: Path) -> Run:
+    """Returns what a run's folder holds. Raises UserError if it is no run."""
+    path = folders.find(str(folder))
+    folder = folders.folder_of(path)
+    config = _config(folder)
+    rows = []
+    for name in ("metrics.jsonl", "perf.jsonl", "provenance.jsonl"):
+        with contextlib.suppress(FileNotFoundError):
+            rows.append(json_lines.read(folder / name))
+            continue
+        rows.append([])
+    if not rows[0]:
+        raise UserError(f"{folder} has no metrics yet; its first report writes metrics.jsonl")
+    tables = sorted((folder / "evaluations").glob("*.json"))
+    return Run(folder, config, *rows, evaluations=[*filter(None, map(_evaluation, tables))])
+
+
+def _config(folder: Path) -> "Config":
+    path = folder / "config.yaml"
+    try:
+        config = yaml.safe_load(strange_files.read_bytes(path, MAX_BYTES))
+    except FileNotFoundError:
+        raise UserError(f"{folder} is not a run: it has no config.yaml") from None
+    except (ValueError, yaml.YAMLError, RecursionError):
+        config = None
+    if not isinstance(config, dict) or not isinstance(config.get("env"), dict):
+        raise UserError(f"{path} does not hold the settings of a run")
+    return config
+
+
+def _evaluation(path: Path) -> "Row | None":
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        table = json.loads(strange_files.read_bytes(path, MAX_BYTES))
+        if isinstance(table, dict) and isinstance(table.get("rows"), list) and table["rows"]:
+            return table
+    return None
+
+
+def expanded(names: Sequence[str]) -> list[Path]:
+    """Returns the run folders that names stand for: runs, `latest`, and folders of sweeps, which
+    stand for all of their jobs.
+
+    Raises:
+        UserError: a name is none of them.
+    """
+    paths = []
+    for name in names:
+        jobs = sorted(file.parent for file in Path(name).glob("*/metrics.jsonl"))
+        is_run = (Path(name) / "metrics.jsonl").exists()
+        paths += jobs if jobs and not is_run else [folders.folder_of(folders.find(name))]
+    return [*dict.fromkeys(paths)]
+
+
+def groups_of(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Returns {label: the runs that differ in their seeds alone}. Labels name what differs between
+    groups.
+    """
+    by_settings: dict[str, list[Run]] = {}
+    for run in runs:
+        by_settings.setdefault(repr(sorted(run.settings().items())), []).append(run)
+    keys = differing([group[0] for group in by_settings.values()])
+    named: dict[str, list[Run]] = {}
+    for group in by_settings.values():
+        text = ", ".join(f"{key}={group[0].settings().get(key)}" for key in keys[:4])
+        if not text or text in named:
+            text = f"{text} {group[0].folder.name}".strip()
+        named[text] = group
+    return named
+
+
+def differing(runs: Iterable[Run]) -> list[str]:
+    """Returns the dotted keys whose values are not the same in all runs."""
+    trees = [run.settings() for run in runs]
+    keys = dict.fromkeys(key for tree in trees for key in tree)
+    return [key for key in keys if len({repr(tree.get(key)) for tree in trees}) > 1]
+
+
+def metrics_of(runs: Sequence[Run]) -> list[str]:
+    """Returns the names of numbers that all runs report, in the order of the first run."""
+    names = []
+    for run in runs:
+        last = {key: value for row in run.metrics + run.perf for key, value in row.items()}
+        names.append([key for key, x in last.items() if isinstance(x, (int, float, type(None)))])
+    shared = [name for name in names[0] if all(name in other for other in names[1:])]
+    return [name for name in shared if name != "samples"]

@@ -1,0 +1,79 @@
+"""Statistics over the seeds of runs: interquartile means, intervals, performance profiles, curves.
+
+As Agarwal et al. define them (Deep Reinforcement Learning at the Edge of the Statistical Precipice,
+NeurIPS 2021), whose library is rliable. A task is an environment in its homes.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def iqm(scores: ArrayLike) -> float:
+    """Returns the interquartile mean: of the middle half of all scores, of any shape. A quarter of
+    them, rounded down, is left out at either end.
+    """
+    ordered = np.sort(np.asarray(scores, float), axis=None)
+    n_cut = len(ordered) // 4
+    return float(ordered[n_cut : len(ordered) - n_cut].mean())
+
+
+def interval(
+    scores: Sequence[ArrayLike],
+    statistic: Callable[[np.ndarray], float] = iqm,
+    level: float = 0.95,
+    n_resamples: int = 2000,
+    seed: int = 1,
+) -> tuple[float, float, float]:
+    """Returns a statistic and its stratified bootstrap interval: `(value, lower, upper)`.
+
+    The runs of each task are resampled by themselves.
+
+    Args:
+        scores: of each task, those of its runs.
+        statistic: of the scores of all tasks.
+    """
+    tasks = [np.asarray(task, float) for task in scores]
+    draw = np.random.default_rng(seed)
+    resampled = []
+    for _ in range(n_resamples):
+        drawn = [task[draw.integers(len(task), size=len(task))] for task in tasks]
+        resampled.append(statistic(np.concatenate(drawn)))
+    lower, upper = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2])
+    return statistic(np.concatenate(tasks)), float(lower), float(upper)
+
+
+def profile(scores: Sequence[ArrayLike], thresholds: ArrayLike) -> np.ndarray:
+    """Returns the performance profile, (K,): the fraction of runs whose score exceeds each of K
+    thresholds, averaged over tasks.
+    """
+    limits = np.asarray(thresholds, float)[:, None]
+    return np.mean([(np.asarray(task, float) > limits).mean(1) for task in scores], 0)
+
+
+def band(
+    curves: Sequence[tuple[ArrayLike, ArrayLike]],
+    n_points: int = 200,
+    level: float = 0.95,
+    n_resamples: int = 500,
+    seed: int = 1,
+) -> dict[str, np.ndarray]:
+    """Returns the mean curve of several seeds, with its bootstrap interval.
+
+    Curves are interpolated linearly where all of them have points.
+
+    Args:
+        curves: `(x, y)` of each seed, in the order of x.
+
+    Returns:
+        {x, mean, lower, upper}, (n_points,) each; the bounds are the mean if there is one seed.
+    """
+    start = max(np.min(x) for x, _ in curves)
+    end = max(start, min(np.max(x) for x, _ in curves))
+    x = np.linspace(start, end, n_points)
+    values = np.stack([np.interp(x, np.asarray(at), np.asarray(y)) for at, y in curves])
+    draws = np.random.default_rng(seed).integers(len(curves), size=(n_resamples, len(curves)))
+    means = values[draws].mean(1)
+    lower, upper = np.quantile(means, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return {"x": x, "mean": values.mean(0), "lower": lower, "upper": upper}
