@@ -1,7 +1,7 @@
 """Trains in other units of observations and rewards, and prints a table of returns.
 
     python scripts/check_units.py                  # CartPole and Pendulum, on a CPU
-    python scripts/check_units.py explorer         # on a GPU, 6 seconds each
+    python scripts/check_units.py explorer         # on a GPU
     python scripts/check_units.py cartpole --seeds 1 2 --jobs 2
 
 Returns are the last ones of training, in the environment's own units: mean and range over seeds. In
@@ -34,7 +34,7 @@ TASKS = {
     "cartpole": "env=gymnasium env.id=check_units:Units-v0 env.kwargs.of=CartPole-v1 samples=60000",
     "pendulum": "env=gymnasium env.id=check_units:Units-v0 env.kwargs.of=Pendulum-v1 "
     "samples=200000",
-    "explorer": "env=check_units:ExplorerInUnits seconds=6",
+    "explorer": "env=check_units:ExplorerInUnits samples=60_000_000",
 }
 FACTORS = {
     "explorer": "env.obs_factor={} env.reward_factor={}",
