@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from megastep.agents import console, factory, package
-from megastep.agents.algorithms.learner import GradientLearner
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.distributed import process_group
 from megastep.agents.errors import UserError, memory_problem, shortened
@@ -89,8 +88,8 @@ def make_trainer(
                 formats.check(formats.Counts, {k: state.get(k) for k in formats.COUNTS})
                 if name := nonfinite_leaf(state["learner"]):
                     raise ValueError(f"learner.{name} has a NaN or an infinity")
-                if isinstance(learner, GradientLearner):
-                    learner.check_state(state["learner"])  # before anything is written
+                if check_state := getattr(learner, "check_state", None):
+                    check_state(state["learner"])  # before anything is written
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
