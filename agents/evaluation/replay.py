@@ -8,7 +8,7 @@ import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -26,6 +26,9 @@ from megastep.agents.runs import checkpoint, folders, strange_files, trust
 from megastep.agents.runs.typed_json import loads
 from megastep.arrdict import arrdict
 from megastep.types import Env, PolicyLike, Tree, World, optional
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
 
 
 class Actions(NamedTuple):
@@ -137,11 +140,11 @@ class Table(NamedTuple):
     cfg: settings.Evaluate
     env: settings.Env
     geometry: settings.Geometry
-    rows: list[dict[str, Any]]
+    rows: "list[Row]"
 
     def chosen(
         self, worst: int | None, episode: int | None = None, home: int | None = None
-    ) -> list[dict[str, Any]]:
+    ) -> "list[Row]":
         """Returns the rows of some episodes: the `worst`, by the first of `SCORES` that they have,
         or those of a number, in a home or in all.
 
@@ -172,10 +175,10 @@ class Table(NamedTuple):
 
     def plays(
         self,
-        rows: Sequence[Mapping[str, Any]],
+        rows: "Sequence[Row]",
         loaded: checkpoint.Checkpoint,
         device: torch.device,
-    ) -> Iterator[tuple[Mapping[str, Any], Env, PolicyLike, int]]:
+    ) -> "Iterator[tuple[Row, Env, PolicyLike, int]]":
         """Yields each of some rows with an environment, what plays there, and the lane in it. Rows
         of one rank's environment share it.
 

@@ -8,7 +8,14 @@ from megastep.agents.cli import train
 from megastep.agents.evaluation import in_training
 from megastep.agents.factory import settings as settings_module
 from megastep.agents.runs import checkpoint, checkpoint_format
-from tests.helpers.tiny import SHORT_EPISODES, TINY, UPDATE, settings
+from tests.helpers.tiny import (
+    ON_GPU,
+    SHORT_EPISODES,
+    TINY,
+    UPDATE,
+    UPDATE_ON_GPU,
+    settings,
+)
 
 WORDS = [*TINY, *SHORT_EPISODES, "learner.anneal=never", "logger=none", "geometry=homes"]
 EVERY = [f"evaluate_every={4 * UPDATE}", "evaluate_episodes=8"]
@@ -103,3 +110,14 @@ def test_each_evaluation_plays_the_same_episodes():
     policy = in_training.factory.make_policy(cfg.agent, sample)
     first = evaluator(policy)
     assert evaluator(policy) == first and first.keys() >= {"return", "length"}
+
+
+@pytest.mark.cuda
+def test_evaluations_change_nothing_of_the_training_on_a_gpu(here):
+    words = [*ON_GPU, f"samples={9 * UPDATE_ON_GPU}", "log_every=2", "logger=none"]
+    plain = train.run(settings(*words, "folder=plain"))
+    every = [f"evaluate_every={2 * UPDATE_ON_GPU}", "evaluate_episodes=64"]
+    evaluated = train.run(settings(*words, *every, "folder=evaluated"))
+    rows = lines_of(evaluated)
+    assert without_evaluations(rows) == lines_of(plain)
+    assert sum("eval/return" in row for row in rows) >= 4
