@@ -406,11 +406,18 @@ def logged_with_real_wandb(folder, mode, **environment):
     script = f"""
 import pathlib
 from megastep.agents.training.loggers import Loggers, wandb
+from megastep.agents.types import RunResult
+from megastep.video import Mp4Writer
+import numpy as np
 wandb.TIMEOUT = 2
 folder = pathlib.Path({str(folder)!r})
 make = lambda: wandb.Wandb(folder, "n", dict(a=1), "p", {mode!r})
 run_loggers = Loggers(folder, others=dict(wandb=make))
 run_loggers.write(1, dict(x=1), dict(y=2))
+film = Mp4Writer(10)
+film.add(np.zeros((64, 64, 3), np.uint8))
+(folder / "film.mp4").write_bytes(film.close())
+run_loggers.finish(2, RunResult(dict(score=1.0), folder / "film.mp4", [dict(agent="trained")]))
 run_loggers.close()"""
     process = subprocess.run(
         [sys.executable, "-W", "always::UserWarning", "-c", script],
@@ -439,3 +446,6 @@ def test_real_wandb_writes_an_offline_run(tmp_path):
     assert not logged_with_real_wandb(tmp_path, "offline")
     (path,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
     assert path.stat().st_size > 1000
+    (film,) = tmp_path.glob("wandb/offline-run-*/files/media/videos/film_*.mp4")
+    assert film.stat().st_size > 500
+    assert [*tmp_path.glob("wandb/offline-run-*/files/media/table/evaluation_*.json")]
