@@ -95,7 +95,7 @@ def play(
     homes: list,
     device: "torch.device",
     source: str | None = None,
-) -> "tuple[list[Row], list[Row], replay.Actions | None]":
+) -> "tuple[list[Row], list[Row], playing.Actions | None]":
     """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the rows of the
     table, those of the episodes, and the actions of the run's agent.
     """
@@ -121,7 +121,7 @@ def play(
         single += [{"agent": player.name, **row} for row in each]
     if process_group.rank() == 0:
         arena.warn_without_layout(env, stage.homes)
-    return rows, single, replay.gathered(recorder, stage.shard)
+    return rows, single, stage.actions(recorder)
 
 
 def players_of(

@@ -1,6 +1,7 @@
 """Plays episodes with a policy."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -89,6 +90,18 @@ def _has_fixed_form(before, after) -> bool:
     """Returns whether both trees have tensors only, under the same names."""
     (_, spec), (leaves, other) = map(_pytree.tree_flatten, (before, after))
     return spec == other and all(isinstance(leaf, torch.Tensor) for leaf in leaves)
+
+
+class Actions(NamedTuple):
+    """The actions of all lanes of an environment.
+
+    Attributes:
+        leaves: (T, B, ...) per leaf of the action space, by name.
+        n_ranks: number of ranks that played, each with a seed of its own.
+    """
+
+    leaves: dict[str, np.ndarray]
+    n_ranks: int = 1
 
 
 class Recorder:

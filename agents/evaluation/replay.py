@@ -15,11 +15,9 @@ import torch
 
 from megastep import spaces
 from megastep.agents import factory
-from megastep.agents.distributed.process_group import gather_objects
-from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.evaluation import arena, suite
-from megastep.agents.evaluation.playing import MAX_BYTES, Recorder, narrow
+from megastep.agents.evaluation.playing import MAX_BYTES, Actions, narrow
 from megastep.agents.evaluation.statistics import SCORES
 from megastep.agents.factory import check, settings
 from megastep.agents.runs import checkpoint, folders, strange_files, trust
@@ -29,37 +27,6 @@ from megastep.types import Env, PolicyLike, Tree, World, optional
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
-
-
-class Actions(NamedTuple):
-    """The actions of all lanes of an environment.
-
-    Attributes:
-        leaves: (T, B, ...) per leaf of the action space, by name.
-        n_ranks: number of ranks that played, each with a seed of its own.
-    """
-
-    leaves: dict[str, np.ndarray]
-    n_ranks: int = 1
-
-
-def gathered(recorder: Recorder, shard: Shard) -> Actions | None:
-    """Returns the actions of all ranks; None if those of one are too many to keep."""
-    own = recorder.actions()
-    n_steps = None if own is None else len(next(iter(own.values())))
-    lengths = [n_steps] if shard.n_ranks == 1 else gather_objects(n_steps)
-    if own is None or None in lengths:
-        return None
-    if shard.n_ranks == 1:
-        return Actions(own)
-    wide = {}
-    for name, steps in own.items():
-        steps = np.pad(steps, [(0, max(lengths) - len(steps)), *[(0, 0)] * (steps.ndim - 1)])
-        dtype = np.int64 if steps.dtype.kind in "iu" else steps.dtype  # ranks may differ
-        wide[name] = torch.as_tensor(steps.astype(dtype)).transpose(0, 1)
-    every = shard.with_others(arrdict(wide))
-    leaves = {name: lanes.transpose(0, 1).numpy() for name, lanes in every.items()}
-    return Actions(leaves, shard.n_ranks)
 
 
 def as_bytes(parts: Sequence[Actions | None]) -> bytes | None:

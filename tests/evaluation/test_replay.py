@@ -129,9 +129,9 @@ def test_actions_of_several_ranks(evaluated, monkeypatch):
         other = recorders[1].actions()[""]
         return [value, {"": torch.as_tensor(other).long().transpose(0, 1)}]
 
-    monkeypatch.setattr(replay, "gather_objects", of_both)
+    monkeypatch.setattr("megastep.agents.distributed.process_group.gather_objects", of_both)
     monkeypatch.setattr("megastep.agents.distributed.shard.gather_objects", of_both)
-    actions = replay.gathered(recorders[0], stages[0].shard)
+    actions = stages[0].actions(recorders[0])
     assert actions.n_ranks == 2 and actions.leaves[""].shape[:2] == (6, 8)
     for number, stage in enumerate(stages):
         own = {"": actions.leaves[""][:, [*stage.shard.envs]]}
