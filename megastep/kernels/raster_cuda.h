@@ -132,6 +132,17 @@ DEVICE void raster_group(View<is_split>& v, const Float4* ends, int line, int ac
     }
 }
 
+// Returns 1 if warp lane k's box is entirely behind what is rasterised already. `tiles`: the box's
+// first and, 16 bits higher, last tile. `max_inverse`: as of its ScreenBounds.
+template <int is_split>
+DEVICE int is_hidden(const View<is_split>& v, int k, int tiles, float max_inverse) {
+    tiles = __shfl_sync(FULL_WARP, tiles, k);
+    max_inverse = __shfl_sync(FULL_WARP, max_inverse, k);
+    int covers = v.warp_lane >= (tiles & 0xffff) && v.warp_lane <= tiles >> 16;
+    float tile_min = covers ? v.tile_min : INF_VALUE;
+    return __all_sync(FULL_WARP, tile_min > max_inverse);
+}
+
 // Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
 // skipped. The others come nearest first, so that groups entirely behind earlier ones can be
 // skipped too.
@@ -156,12 +167,8 @@ DEVICE void raster_walls(View<is_split>& v, const RenderParams& p, const EnvScen
             int k = __ffs(__ballot_sync(FULL_WARP, key == min_key)) - 1;
             if (v.warp_lane == k)
                 key = ~0u;
-            int box_tiles = __shfl_sync(FULL_WARP, tiles, k);
-            float max_inverse = __shfl_sync(FULL_WARP, bounds.max_inverse, k);
-            int covers = v.warp_lane >= (box_tiles & 0xffff) && v.warp_lane <= box_tiles >> 16;
-            float tile_min = covers ? v.tile_min : INF_VALUE;
-            if (__all_sync(FULL_WARP, tile_min > max_inverse))
-                continue;  // the box is entirely behind earlier ones
+            if (is_hidden(v, k, tiles, bounds.max_inverse))
+                continue;
             int l = BOX_WALLS * (start + k);
             raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
                          first_static_line<drawn>(p, scenery) + l,
@@ -178,15 +185,5 @@ DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvSc
         int l = first + v.warp_lane;
         int active = l < scenery.n_agent_lines && l / s.n_model != a;
         raster_group(v, (const Float4*)scenery.agent_lines + l, first, active);
-    }
-}
-
-// Rasterises the lines of all objects, as drawn by draw_line.
-template <int is_split>
-DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
-                           const Float4* objects) {
-    for (int first = 0; first < p.objects.n_lines; first += WARP) {
-        int l = first + v.warp_lane;
-        raster_group(v, objects + l, scenery.n_agent_lines + first, l < p.objects.n_lines);
     }
 }

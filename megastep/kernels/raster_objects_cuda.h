@@ -1,0 +1,43 @@
+// Rasterises objects by warps, only those in view.
+#pragma once
+#include "raster_cuda.h"
+#include "render.h"
+
+// Rasterises objects, and draws these into `drawn`. Called after the walls: objects that are
+// off-screen or entirely behind them are skipped.
+template <int is_split>
+DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
+                           int env, int layout, int a, Float4* drawn) {
+    const ObjectsParams& o = p.objects;
+    for (int start = 0; start < o.n_objects; start += WARP) {
+        int own = start + v.warp_lane;
+        ScreenBounds bounds = {-1.f, 0.f, 0, 0};
+        if (own < o.n_objects) {
+            Object object = object_at(p, env, own);
+            float reach = 1.5f * object.size;  // beyond crates' corners
+            draw_texel(p, object, env, layout, a, own, drawn);
+            if (is_drawn(object) && object.carrier != a)
+                bounds = bounds_of(v.camera, v.screen, p.half_width, object.x - reach,
+                                   object.y - reach, object.x + reach, object.y + reach);
+        }
+        int tiles = bounds.first / TILE | bounds.last / TILE << 16;
+        unsigned int in_view = 0u;  // a bit for each object
+        for (unsigned int left = __ballot_sync(FULL_WARP, bounds.distance2 >= 0.f); left;
+             left &= left - 1)
+            if (!is_hidden(v, __ffs(left) - 1, tiles, bounds.max_inverse))
+                in_view |= left & -left;
+        if (!in_view)
+            continue;
+        int end = o.line_starts[mini(start + WARP, o.n_objects)];
+        for (int first = o.line_starts[start]; first < end; first += WARP) {
+            int l = first + v.warp_lane, active = 0;
+            if (l < end) {
+                int k = o.line_object[l];
+                active = in_view >> (k - start) & 1;
+                if (active)
+                    draw_line(p, object_at(p, env, k), a, k, l, drawn);
+            }
+            raster_group(v, drawn + l, scenery.n_agent_lines + first, active);
+        }
+    }
+}
