@@ -4,31 +4,39 @@
 #include "render.h"
 
 // Rasterises objects, and draws these into `drawn`. Called after the walls: objects that are
-// off-screen or entirely behind them are skipped.
+// off-screen or entirely behind them are skipped. Returns 1 if any was not.
 template <int is_split>
-DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
-                           int env, int layout, int a, Float4* drawn) {
+DEVICE int raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
+                          int env, int layout, int a, Float4* drawn) {
     const ObjectsParams& o = p.objects;
+    int result = 0;
+#pragma unroll 1
     for (int start = 0; start < o.n_objects; start += WARP) {
         int own = start + v.warp_lane;
+        Object object = {};
         ScreenBounds bounds = {-1.f, 0.f, 0, 0};
         if (own < o.n_objects) {
-            Object object = object_at(p, env, own);
-            float reach = 1.5f * object.size;  // beyond crates' corners
-            draw_texel(p, object, env, layout, a, own, drawn);
+            object = object_at(p, env, own);
+            if (a == 0)
+                settle(o, p.scenery, object, layout, env * o.n_objects + own);
             if (is_drawn(object) && object.carrier != a)
-                bounds = bounds_of(v.camera, v.screen, p.half_width, object.x - reach,
-                                   object.y - reach, object.x + reach, object.y + reach);
+                bounds = bounds_of_disc(v.camera, v.screen, p.half_width, object.x, object.y,
+                                        1.42f * object.size);  // with a crate's corners
         }
         int tiles = bounds.first / TILE | bounds.last / TILE << 16;
         unsigned int in_view = 0u;  // a bit for each object
+#pragma unroll 1
         for (unsigned int left = __ballot_sync(FULL_WARP, bounds.distance2 >= 0.f); left;
              left &= left - 1)
             if (!is_hidden(v, __ffs(left) - 1, tiles, bounds.max_inverse))
                 in_view |= left & -left;
         if (!in_view)
             continue;
+        result = 1;
+        if (in_view >> v.warp_lane & 1)
+            draw_texel(p, object, env, own, drawn);
         int end = o.line_starts[mini(start + WARP, o.n_objects)];
+#pragma unroll 1
         for (int first = o.line_starts[start]; first < end; first += WARP) {
             int l = first + v.warp_lane, active = 0;
             if (l < end) {
@@ -40,4 +48,5 @@ DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvSc
             raster_group(v, drawn + l, scenery.n_agent_lines + first, active);
         }
     }
+    return result;
 }

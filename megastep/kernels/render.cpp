@@ -354,7 +354,9 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     scratch.objects.resize(p.objects.n_lines + p.objects.n_objects);
     for (int k = 0; k < p.objects.n_objects; k++) {
         Object object = object_at(p, env, k);
-        draw_texel(p, object, env, layout, a, k, scratch.objects.data());
+        if (a == 0)
+            settle(p.objects, s, object, layout, env * p.objects.n_objects + k);
+        draw_texel(p, object, env, k, scratch.objects.data());
         for (int l = p.objects.line_starts[k]; l < p.objects.line_starts[k + 1]; l++)
             draw_line(p, object, a, k, l, scratch.objects.data());
     }

@@ -35,15 +35,11 @@ HD Object object_at(const RenderParams& p, int env, int k) {
     return placed(object, p.scenery, p.positions, p.angles, env);
 }
 
-// Draws the texel of an environment's object k into `drawn`, after all lines. The first of the
-// agents settles the object.
-HD void draw_texel(const RenderParams& p, const Object& object, int env, int layout, int a, int k,
-                   Float4* drawn) {
+// Draws the texel of an environment's object k into `drawn`, after all lines.
+HD void draw_texel(const RenderParams& p, const Object& object, int env, int k, Float4* drawn) {
     const ObjectsParams& o = p.objects;
     int i = env * o.n_objects + k;
     drawn[o.n_lines + k] = texel_of(o, object, o.lit ? o.texels[4 * i + 3] : 1.f);
-    if (a == 0)
-        settle(o, p.scenery, object, layout, i);
 }
 
 // Draws line l of an environment's objects, one of object k, as agent a sees it into `drawn`.

@@ -39,10 +39,23 @@ DEVICE Float4* drawn_objects(const RenderParams& p, NearestLine* nearest) {
            warp * (p.objects.n_lines + p.objects.n_objects);
 }
 
-// Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels.
+// Shades ray r of a camera, which hits one of the lines `hit` of those drawn.
+template <int full_res, int drawn, int hit, int is_split>
+DEVICE RaySample shade_hit(const RenderParams& p, const View<is_split>& v,
+                           const EnvScenery& scenery, int view, unsigned int* seen, int r,
+                           const NearestLine& nearest, int& newly_seen) {
+    const Float4* objects = drawn_objects<hit, is_split>(p, v.nearest);
+    Surface surface = surface_of<drawn, hit>(p, scenery, v.camera, nearest.line, objects);
+    return shade_ray<full_res, hit>(p, v.screen, scenery, surface, objects, view, seen, r,
+                                    nearest.inverse, newly_seen);
+}
+
+// Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels. Batches
+// that hit no object are shaded as if there were none, which takes fewer instructions.
+// `sees_objects`: 0 if none is hit.
 template <int full_res, int drawn, int is_split>
 DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScenery& scenery,
-                  int view, unsigned int* seen, int& newly_seen) {
+                  int view, unsigned int* seen, int sees_objects, int& newly_seen) {
     int subsample = p.subsample, warp_lane = v.warp_lane;
     int first = is_split ? TILE * v.tiles.first : 0;
     int res = is_split ? mini(p.res, TILE * v.tiles.end) : p.res;
@@ -55,16 +68,23 @@ DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScene
     for (int start = first; start < res; start += batch) {
         int r = start + warp_lane, active = r < res && warp_lane < batch;
         RaySample sample = {0.f, 0.f, 0.f, 0.f};
+        int hits_objects = 0;
+        if (drawn & OBJECTS && sees_objects)
+            hits_objects = __any_sync(
+                FULL_WARP, active && (unsigned int)(v.nearest[r].line - scenery.n_agent_lines) <
+                                         (unsigned int)p.objects.n_lines);
         if (active) {
             NearestLine nearest = v.nearest[r];
             long long ray = (long long)view * p.res + r;
             if (full_res)
                 p.indices[ray] = nearest.line;
             if (nearest.line >= 0) {
-                const Float4* objects = drawn_objects<drawn, is_split>(p, v.nearest);
-                Surface surface = surface_of<drawn>(p, scenery, v.camera, nearest.line, objects);
-                sample = shade_ray<full_res, drawn>(p, v.screen, scenery, surface, objects, view,
-                                                    seen, r, nearest.inverse, newly_seen);
+                if (drawn & OBJECTS && hits_objects)
+                    sample = shade_hit<full_res, drawn, drawn>(p, v, scenery, view, seen, r,
+                                                               nearest, newly_seen);
+                else
+                    sample = shade_hit<full_res, drawn, drawn & ~OBJECTS>(p, v, scenery, view, seen,
+                                                                          r, nearest, newly_seen);
             } else if (full_res) {
                 write_miss(p, ray);
             }
@@ -128,9 +148,10 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         if (drawn & AGENTS && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
         raster_walls<drawn>(v, p, scenery, p.half_width);
+        int sees_objects = 0;
         if (drawn & OBJECTS)
-            raster_objects(v, p, scenery, env, layout, a,
-                           drawn_objects<drawn, is_split>(p, nearest));
+            sees_objects = raster_objects(v, p, scenery, env, layout, a,
+                                          drawn_objects<drawn, is_split>(p, nearest));
         __syncwarp();
         if (reads_both)
             __syncthreads();
@@ -145,7 +166,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         }
         if (reads_both)
             __syncthreads();
-        shade<full_res, drawn>(p, v, scenery, view, seen, newly_seen);
+        shade<full_res, drawn>(p, v, scenery, view, seen, sees_objects, newly_seen);
     }
     if (!p.newly_seen)
         return;
