@@ -132,17 +132,6 @@ DEVICE void raster_group(View<is_split>& v, const Float4* ends, int line, int ac
     }
 }
 
-// Returns 1 if warp lane k's box is entirely behind what is rasterised already. `tiles`: the box's
-// first and, 16 bits higher, last tile. `max_inverse`: as of its ScreenBounds.
-template <int is_split>
-DEVICE int is_hidden(const View<is_split>& v, int k, int tiles, float max_inverse) {
-    tiles = __shfl_sync(FULL_WARP, tiles, k);
-    max_inverse = __shfl_sync(FULL_WARP, max_inverse, k);
-    int covers = v.warp_lane >= (tiles & 0xffff) && v.warp_lane <= tiles >> 16;
-    float tile_min = covers ? v.tile_min : INF_VALUE;
-    return __all_sync(FULL_WARP, tile_min > max_inverse);
-}
-
 // Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
 // skipped. The others come nearest first, so that groups entirely behind earlier ones can be
 // skipped too.
@@ -167,8 +156,12 @@ DEVICE void raster_walls(View<is_split>& v, const RenderParams& p, const EnvScen
             int k = __ffs(__ballot_sync(FULL_WARP, key == min_key)) - 1;
             if (v.warp_lane == k)
                 key = ~0u;
-            if (is_hidden(v, k, tiles, bounds.max_inverse))
-                continue;
+            int box_tiles = __shfl_sync(FULL_WARP, tiles, k);
+            float max_inverse = __shfl_sync(FULL_WARP, bounds.max_inverse, k);
+            int covers = v.warp_lane >= (box_tiles & 0xffff) && v.warp_lane <= box_tiles >> 16;
+            float tile_min = covers ? v.tile_min : INF_VALUE;
+            if (__all_sync(FULL_WARP, tile_min > max_inverse))
+                continue;  // the box is entirely behind earlier ones
             int l = BOX_WALLS * (start + k);
             raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
                          first_static_line<drawn>(p, scenery) + l,

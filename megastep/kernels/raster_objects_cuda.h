@@ -23,13 +23,15 @@ DEVICE int raster_objects(View<is_split>& v, const RenderParams& p, const EnvSce
                 bounds = bounds_of_disc(v.camera, v.screen, p.half_width, object.x, object.y,
                                         1.42f * object.size);  // with a crate's corners
         }
-        int tiles = bounds.first / TILE | bounds.last / TILE << 16;
-        unsigned int in_view = 0u;  // a bit for each object
+        int is_seen = 0;
 #pragma unroll 1
-        for (unsigned int left = __ballot_sync(FULL_WARP, bounds.distance2 >= 0.f); left;
-             left &= left - 1)
-            if (!is_hidden(v, __ffs(left) - 1, tiles, bounds.max_inverse))
-                in_view |= left & -left;
+        for (int tile = 0; TILE * tile < p.res; tile++) {
+            float tile_min = __shfl_sync(FULL_WARP, v.tile_min, tile);
+            is_seen |= bounds.first / TILE <= tile && tile <= bounds.last / TILE &&
+                       bounds.max_inverse >= tile_min;
+        }
+        // a bit for each object
+        unsigned int in_view = __ballot_sync(FULL_WARP, is_seen && bounds.distance2 >= 0.f);
         if (!in_view)
             continue;
         result = 1;
