@@ -91,11 +91,10 @@ def _allocate(n, device) -> torch.Tensor | None:
     # multicast is not used, and on some machines fails
     os.environ.setdefault("TORCH_SYMM_MEM_DISABLE_MULTICAST", "1")
     try:
-        from torch.distributed import _symmetric_memory
+        from torch._C._distributed_c10d import _SymmetricMemory
 
-        # not `empty`, which may put several buffers into one allocation
-        make = _symmetric_memory._SymmetricMemory.empty_strided_p2p
-        return make((n,), (1,), torch.float32, device)
+        # PyTorch's `empty` may put several buffers into one allocation
+        return _SymmetricMemory.empty_strided_p2p((n,), (1,), torch.float32, device)
     except Exception:  # of any kind, from a version of PyTorch or a driver without it
         return None
 
