@@ -21,7 +21,8 @@ KERNEL pack(PackParams p) {
     float factor = p.is_float ? *(const float*)p.n_valid : (float)*(const long long*)p.n_valid;
     const float* source = its.source + at;
     float* target = p.bucket + its.first + at;
-    if (its.source && at + 4 <= its.n && !(((size_t)source | (size_t)target) % 16)) {
+    if (its.source && at + 4 <= its.n &&
+        !(((unsigned long long)source | (unsigned long long)target) % 16)) {
         float4 word = *(const float4*)source;
         *(float4*)target =
             make_float4(word.x * factor, word.y * factor, word.z * factor, word.w * factor);
