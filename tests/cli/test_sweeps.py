@@ -109,8 +109,9 @@ def test_sweep_folders_and_table(here, capsys):
     assert config["folder"] == f"mine/{names[0]}"
     said = capsys.readouterr().out
     assert "sweep.md" in said and "IQM of episode/return" in "\n".join(lines)
-    (pooled,) = [words for line in said.splitlines() if "env.pay=3" in (words := line.split())]
-    assert pooled[1::2][:3] == ["env.pay=3", "2", "12"] and "12 to 12" in " ".join(pooled)
+    rows_of_seeds = [line.split() for line in said.split("IQM of episode/return")[1].splitlines()]
+    (pooled,) = [words for words in rows_of_seeds if words[1:2] == ["env.pay=3"]]
+    assert pooled[1:6:2] == ["env.pay=3", "2", "12"] and "12 to 12" in " ".join(pooled)
     assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
