@@ -72,6 +72,7 @@ SHARED = {
     "megastep.settings",
     "megastep.spaces",
     "megastep.types",
+    "megastep.video",  # a logger has films
 }
 # Bots walk in homes, by the truth about them.
 BOTS = "megastep.agents.selfplay.bots"
@@ -81,12 +82,13 @@ SHARED_WITH_BOTS = SHARED | {
     "megastep.modules.movement",
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
-# environments, writes videos and starts processes.
+# environments, keeps the global generators, writes videos and starts processes.
 UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",
     "megastep.engine",
+    "megastep.global_generators",
     "megastep.recording",
     "megastep.scene",
     "megastep.sync_envs",
