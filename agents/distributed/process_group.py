@@ -43,11 +43,12 @@ class Counts:
     Attributes:
         n_operations: collective operations started.
         n_updates: updates that the ranks have agreed to start.
+        n_phases: phases of updates that the GPU has finished.
         is_exempt: True while the others wait for this rank without limit.
         is_waiting: True while it waits for the others.
     """
 
-    n_operations = n_updates = 0
+    n_operations = n_updates = n_phases = 0
     is_exempt = is_waiting = False
 
 

@@ -6,11 +6,13 @@ from typing import Any
 
 import torch
 
+from megastep.agents.distributed.process_group import counts, waiting
+
 #: The phases of an iteration.
 PHASES = "collect", "update", "rest"
-#: Seconds after which the host no longer waits for a GPU: another rank may be lost, which the host
-#: notices when it speaks to the others.
-PATIENCE = 5.0
+#: Seconds after which the host no longer waits for a GPU, which itself may wait for a lost rank.
+#: By then the watch has ended the ranks, if there are several.
+PATIENCE = 90.0
 
 
 class PhaseTimer:
@@ -46,9 +48,10 @@ class PhaseTimer:
         phase, or `PATIENCE` is over.
         """
         deadline = time.monotonic() + PATIENCE
-        while len(self._starts) > n_phases + 1 and time.monotonic() < deadline:
-            time.sleep(0.0005)
-            self._add_finished()
+        with waiting():
+            while len(self._starts) > n_phases + 1 and time.monotonic() < deadline:
+                time.sleep(0.0005)
+                self._add_finished()
 
     def pop(self) -> dict[str, float]:
         """Returns the seconds of each phase since the last call. The current phase goes on.
@@ -86,6 +89,7 @@ class PhaseTimer:
                 return
             self._seconds[phase] = self._seconds.get(phase, 0.0) + seconds
             self._starts.popleft()
+            counts.n_phases += 1
 
 
 def device_memory(device: torch.device | str) -> dict[str, int]:
