@@ -16,8 +16,8 @@ COMMAND = (
 #: The extras of all files, and of those that the image gets, with a package of another extra.
 ALL, IMAGE = ["--extra=test"], ["--extra=wandb", "--extra=sweep", "-"]
 OF_IMAGE = "gymnasium"
-#: Files: what they hold, and which packages these are. `test.txt` takes what the image does not get,
-#: `packages.txt` the rest.
+#: Files: what they hold, and which packages these are. Of the last, `test.txt` takes those that the
+#: image does not get.
 FILES = {
     "build.txt": ("What builds packages from source", r"setuptools"),
     "torch.txt": (

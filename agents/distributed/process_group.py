@@ -32,6 +32,9 @@ T = TypeVar("T")
 #: it, and a rank must have left.
 START_SECONDS, CONNECT_SECONDS, STOP_SECONDS = 300.0, 50.0, 30.0
 
+#: Limit of an operation on the host.
+LONGEST_WAIT = datetime.timedelta(days=1)
+
 
 class RankLost(RuntimeError):
     """Another rank has ended or does not answer."""
@@ -102,6 +105,9 @@ def start(seconds: float = START_SECONDS) -> None:
         distributed.init_process_group(
             backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
         )
+    # a rank may evaluate or write files for longer; `watch` finds those that are lost
+    on_host = distributed.group.WORLD._get_backend(torch.device("cpu"))
+    on_host._set_default_timeout(LONGEST_WAIT)
     atexit.register(stop)  # gloo threads must not outlive the interpreter
 
 

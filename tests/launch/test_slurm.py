@@ -18,7 +18,7 @@ from tests.helpers.processes import HUNG, ROOT
 
 pytestmark = pytest.mark.nightly
 #: Updates that take long enough to be interrupted.
-N = 300
+N = 100
 WORDS = [*tiny.TINY, "log_every=1", "checkpoint_seconds=0.5"]
 SAMPLES = f"samples={2 * N * tiny.UPDATE}"
 #: As much as Slurm can be told: times are in minutes, and signals up to a minute early.
