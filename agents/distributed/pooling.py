@@ -3,6 +3,8 @@
 R ranks.
 """
 
+import functools
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import cast
 
@@ -11,7 +13,6 @@ from torch import distributed
 
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
-from megastep.agents.private_ops import copy_all_
 from megastep.agents.types import Moments
 
 
@@ -117,19 +118,21 @@ def average_gradients(
     if n_ranks() == 1:
         return n_valid, means
     with torch.no_grad():
-        held = [(p, p.grad) for p in parameters if p.grad is not None]
-        gradients = [gradient.flatten() for _, gradient in held]
-        numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
+        held = [(p, p.grad.flatten()) for p in parameters if p.grad is not None]
+        one, zeros = _constants(n_valid.device)
         # one buffer; each gradient starts at a multiple of 16 bytes, for Adam's vector loads
-        sizes = [n + -n % 4 for n in map(len, gradients)]
-        n_numbers = sum(sizes) + len(numbers)
-        bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)
-        *parts, pooled = bucket.split([*sizes, len(numbers)])
-        parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
-        copy_all_([*parts, *pooled.unbind()], [*gradients, *numbers])
-        all_reduce(bucket.mul_(n_valid))
-        n = pooled[-1].clone()
-        bucket /= n.clamp(min=1)
-        for (p, _), part in zip(held, parts, strict=True):
-            p.grad = part.view_as(p)
+        padded = [(gradient, zeros[: -len(gradient) % 4]) for _, gradient in held]
+        numbers = [number.float()[None] for number in means] + [one]
+        sizes = [len(gradient) + len(padding) for gradient, padding in padded]
+        bucket = torch.cat([*itertools.chain(*padded), *numbers]).mul_(n_valid)
+        n = all_reduce(bucket)[-1]
+        *parts, pooled = (bucket / n.clamp(min=1)).split([*sizes, len(numbers)])
+        for (p, gradient), part in zip(held, parts, strict=True):
+            p.grad = part[: len(gradient)].view_as(p)
     return n, list(pooled[:-1].unbind())
+
+
+@functools.cache
+def _constants(device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns a one and three zeros, float32, which no graph has to make again."""
+    return torch.ones(1, device=device), torch.zeros(3, device=device)

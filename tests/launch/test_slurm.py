@@ -89,7 +89,7 @@ def test_script_trains_on_two_nodes_and_a_requeued_job_goes_on(cluster, checkout
     state, text = finish(cluster, alone)
     assert state == "COMPLETED" and "Training on 2 x cpu in alone\n" in text, text
     (provenance,) = json_lines.read(Path("alone/provenance.jsonl"))
-    assert set(slurm_cluster.NODES) <= set(str(provenance).replace("'", " ").split())
+    assert sorted(provenance["hosts"].split(", ")) == [*slurm_cluster.NODES]
 
     number = submit(cluster, "--requeue", "train.sbatch", *WORDS, SAMPLES, "resume=auto")
     folder = Path("runs", f"slurm-{number}")
