@@ -11,6 +11,7 @@ from typing import cast
 import torch
 from torch import distributed
 
+from megastep.agents.distributed import symmetric
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
 from megastep.agents.types import Moments
@@ -124,12 +125,21 @@ def average_gradients(
         padded = [(gradient, zeros[: -len(gradient) % 4]) for _, gradient in held]
         numbers = [number.float()[None] for number in means] + [one]
         sizes = [len(gradient) + len(padding) for gradient, padding in padded]
-        bucket = torch.cat([*itertools.chain(*padded), *numbers]).mul_(n_valid)
-        n = all_reduce(bucket)[-1]
+        bucket = _weighted_sum(torch.cat([*itertools.chain(*padded), *numbers]), n_valid)
+        n = bucket[-1].clone()
         *parts, pooled = (bucket / n.clamp(min=1)).split([*sizes, len(numbers)])
         for (p, gradient), part in zip(held, parts, strict=True):
             p.grad = part[: len(gradient)].view_as(p)
     return n, list(pooled[:-1].unbind())
+
+
+def _weighted_sum(numbers, weight) -> torch.Tensor:
+    """Returns the sum of `numbers` (n,) times `weight` () over the ranks, valid until the next."""
+    shared = symmetric.buffer(len(numbers), numbers.device)
+    if shared is None:
+        return all_reduce(numbers.mul_(weight))
+    torch.mul(numbers, weight, out=shared[: len(numbers)])
+    return symmetric.all_reduce(shared)[: len(numbers)]
 
 
 @functools.cache

@@ -54,6 +54,9 @@ class Counts:
     n_operations = n_updates = n_phases = 0
     is_exempt = is_waiting = False
 
+    def finish_phase(self) -> None:
+        self.n_phases += 1
+
 
 counts = Counts()
 

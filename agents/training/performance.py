@@ -2,11 +2,10 @@
 
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import torch
-
-from megastep.agents.distributed.process_group import counts, waiting
 
 #: The phases of an iteration.
 PHASES = "collect", "update", "rest"
@@ -31,10 +30,11 @@ class PhaseTimer:
 
     Args:
         device: where the loop's work is done.
+        on_finished: called whenever a phase has ended.
     """
 
-    def __init__(self, device: torch.device | str):
-        self.device = torch.device(device)
+    def __init__(self, device: torch.device | str, on_finished: Callable[[], None] = lambda: None):
+        self.device, self.on_finished = torch.device(device), on_finished
         self._seconds = {}
         self._starts = deque()  # (phase, its start); the ends of all but the last are starts too
 
@@ -48,10 +48,9 @@ class PhaseTimer:
         phase, or `PATIENCE` is over.
         """
         deadline = time.monotonic() + PATIENCE
-        with waiting():
-            while len(self._starts) > n_phases + 1 and time.monotonic() < deadline:
-                time.sleep(0.0005)
-                self._add_finished()
+        while len(self._starts) > n_phases + 1 and time.monotonic() < deadline:
+            time.sleep(0.0005)
+            self._add_finished()
 
     def pop(self) -> dict[str, float]:
         """Returns the seconds of each phase since the last call. The current phase goes on.
@@ -89,7 +88,7 @@ class PhaseTimer:
                 return
             self._seconds[phase] = self._seconds.get(phase, 0.0) + seconds
             self._starts.popleft()
-            counts.n_phases += 1
+            self.on_finished()
 
 
 def device_memory(device: torch.device | str) -> dict[str, int]:

@@ -21,8 +21,8 @@ pytestmark = pytest.mark.nightly
 N = 100
 WORDS = [*tiny.TINY, "log_every=1", "checkpoint_seconds=0.5"]
 SAMPLES = f"samples={2 * N * tiny.UPDATE}"
-#: As much as Slurm can be told: times are in minutes, and signals up to a minute early.
-LIMITS = "--time=3", "--signal=TERM@60"
+#: Seconds before its time limit at which a job gets a signal, or up to a minute earlier.
+EARLY = 60
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +68,14 @@ def finish(cluster, number):
     return re.search(r"JobState=(\w+)", job).group(1), printed(number)
 
 
+def limit(cluster, number):
+    """Sets the time limit of a job so that it gets its signal within two minutes."""
+    job = cluster.read("scontrol", "show", "job", number)
+    days, hours, minutes = re.search(r"RunTime=(?:(\d+)-)?(\d+):(\d+)", job).groups()
+    minutes = 60 * (24 * int(days or 0) + int(hours)) + int(minutes) + 2
+    cluster.read("scontrol", "update", f"job={number}", f"TimeLimit={minutes}")
+
+
 def printed(number):
     path = Path(f"megastep-{number}.txt")
     return path.read_text() if path.exists() else ""
@@ -104,28 +112,43 @@ def test_script_trains_on_two_nodes_and_a_requeued_job_goes_on(cluster, checkout
 
 
 def test_job_that_outlives_its_time_saves_and_stops(cluster, checkout):
-    number = submit(cluster, *LIMITS, "train.sbatch", *WORDS, "seconds=3600", "folder=run")
+    words = f"--signal=TERM@{EARLY}", "train.sbatch", *WORDS, "seconds=36000", "folder=run"
+    number = submit(cluster, *words)
+    wait_until(cluster, lambda: checkpoint.list_checkpoints(Path("run/checkpoints")))
+    limit(cluster, number)
     state, text = finish(cluster, number)
     assert state in ("FAILED", "TIMEOUT")
     loaded = checkpoint.load_latest(Path("run/checkpoints"))
     stopped = f"train.py: Stopped after {loaded.step:,} samples. To continue: python train.py "
     assert f"{stopped}resume=run\n" in text and loaded.step > 0, text
     words = f"more_samples={2 * tiny.UPDATE}", "resume=run"
-    state, text = finish(cluster, submit(cluster, *LIMITS, "train.sbatch", *words))
+    state, text = finish(cluster, submit(cluster, "train.sbatch", *words))
     assert state == "COMPLETED", text
     assert rows("run")[-1]["samples"] == loaded.step + 2 * tiny.UPDATE
 
 
-def sweep(cluster, *words):
+def sweep(cluster, *words, meanwhile=lambda: None):
     """Runs a sweep on the login node. Returns the rows of its table."""
     options = "partition=gpu", "gpus_per_node=1", "cpus_per_task=1"
     launcher = [f"hydra.launcher.{option}" for option in options]
-    cluster.run(
-        *(sys.executable, ROOT / "train.py", "-m", *WORDS, "hydra.sweep.dir=sweep"),
-        *("hydra/launcher=submitit_slurm", *launcher, *words),
-        check=True,
-        timeout=HUNG,
+    words = (
+        "-m",
+        *WORDS,
+        "hydra.sweep.dir=sweep",
+        "hydra/launcher=submitit_slurm",
+        *launcher,
+        *words,
     )
+    process = subprocess.Popen(
+        cluster.words(slurm_cluster.LOGIN, sys.executable, ROOT / "train.py", "-m", *words),
+        env=cluster.environment(),
+    )
+    try:
+        meanwhile()
+        assert process.wait(timeout=HUNG) == 0
+    finally:
+        process.kill()
+        process.wait()
     with open("sweep/sweep.csv") as file:
         return list(csv.DictReader(file))
 
@@ -139,12 +162,21 @@ def test_sweep_of_four_jobs(cluster, checkout):
 
 def test_job_of_a_sweep_that_outlives_its_time_goes_on_in_another(cluster, checkout):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    limits = "timeout_min=3", "signal_delay_s=60", "max_num_timeout=2"
-    words = [f"hydra.launcher.{limit}" for limit in limits]
-    (row,) = sweep(cluster, *words, "seed=1", "seconds=200")
+
+    def meanwhile():
+        saved = "sweep/0*/checkpoints/step_*"
+        wait_until(cluster, lambda: any(p.name[5:].isdecimal() for p in Path().glob(saved)))
+        (number,) = cluster.read("squeue", "--noheader", "--format=%A").split()
+        limit(cluster, number)
+        show = "scontrol", "show", "job", number
+        wait_until(cluster, lambda: "Restarts=1" in cluster.read(*show))
+        cluster.read("scontrol", "update", f"job={number}", "TimeLimit=60")
+
+    words = f"hydra.launcher.signal_delay_s={EARLY}", "seed=1", "seconds=150"
+    (row,) = sweep(cluster, *words, meanwhile=meanwhile)
     assert row["state"] == "done"
     (folder,) = Path("sweep").glob("0*")
-    assert len(json_lines.read(folder / "provenance.jsonl")) > 1
+    assert len(json_lines.read(folder / "provenance.jsonl")) == 2
 
 
 def test_job_without_gpus_names_its_node(cluster, checkout):
