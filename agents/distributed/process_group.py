@@ -109,7 +109,9 @@ def start(seconds: float = START_SECONDS) -> None:
             backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
         )
     # a rank may evaluate or write files for longer; `watch` finds those that are lost
-    on_host = distributed.group.WORLD._get_backend(torch.device("cpu"))
+    ranks = distributed.group.WORLD
+    assert ranks is not None
+    on_host = ranks._get_backend(torch.device("cpu"))
     on_host._set_default_timeout(LONGEST_WAIT)
     atexit.register(stop)  # gloo threads must not outlive the interpreter
 

@@ -69,4 +69,6 @@ def all_reduce(shared: torch.Tensor) -> torch.Tensor:
 
 
 def _group() -> str:
-    return distributed.group.WORLD.group_name  # pyright: ignore[reportOptionalMemberAccess]
+    ranks = distributed.group.WORLD
+    assert ranks is not None
+    return ranks.group_name
