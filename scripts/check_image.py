@@ -153,7 +153,7 @@ def check(builder: Builder, tag: str, folder: Path, samples: float, row: str) ->
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("--tag", default="megastep", help="name of the image")
     parser.add_argument("--stand-in", action="store_true", help="makes a base image")
     parser.add_argument("--torch", help="what pip installs as PyTorch, such as torch==2.13.0")

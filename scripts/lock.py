@@ -49,8 +49,9 @@ def split(lock: str, of_image: set[str]) -> dict[str, str]:
 def compiled(extras: list[str]) -> str:
     """Returns what uv resolves for some of the extras."""
     words = [*COMMAND.split(), *extras]
-    options = dict(cwd=ROOT, input=OF_IMAGE, stdout=subprocess.PIPE, text=True, check=True)
-    return subprocess.run(words, **options).stdout
+    return subprocess.run(
+        words, cwd=ROOT, input=OF_IMAGE, stdout=subprocess.PIPE, text=True, check=True
+    ).stdout
 
 
 def main() -> None:

@@ -185,7 +185,7 @@ class Cluster:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
     parser.add_argument("command", nargs=argparse.REMAINDER, help="what to run on the login node")
     options = parser.parse_args()
     if reason := problem():

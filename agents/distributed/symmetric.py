@@ -62,13 +62,13 @@ def all_reduce(shared: torch.Tensor) -> torch.Tensor:
 
     def call() -> None:
         with communicating():
-            torch.ops.symm_mem.two_shot_all_reduce_(shared, "sum", _group())
+            torch.ops.symm_mem.two_shot_all_reduce_(shared, "sum", _group().group_name)
 
     between_graphs(call)
     return shared
 
 
-def _group() -> str:
+def _group() -> distributed.ProcessGroup:
     ranks = distributed.group.WORLD
     assert ranks is not None
-    return ranks.group_name
+    return ranks
