@@ -3,17 +3,17 @@
 R ranks.
 """
 
-import functools
-import itertools
 from collections.abc import Iterable, Sequence
 from typing import cast
 
 import torch
 from torch import distributed
 
-from megastep.agents.distributed import symmetric
+from megastep.agents.distributed import symmetric_memory
+from megastep.agents.distributed.bucket import Layout
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
+from megastep.agents.private_ops import copy_all_
 from megastep.agents.types import Moments
 
 
@@ -119,30 +119,41 @@ def average_gradients(
     if n_ranks() == 1:
         return n_valid, means
     with torch.no_grad():
-        held = [(p, p.grad.flatten()) for p in parameters if p.grad is not None]
-        one, zeros = _constants(n_valid.device)
+        held = [(p, p.grad) for p in parameters if p.grad is not None]
+        gradients = [gradient.flatten() for _, gradient in held]
+        if n_valid.is_cuda:
+            parts, (*pooled, n) = _averages_on_gpu(gradients, means, n_valid)
+            for (p, _), part in zip(held, parts, strict=True):
+                p.grad = part.view_as(p)
+            return n, pooled
+        numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
         # one buffer; each gradient starts at a multiple of 16 bytes, for Adam's vector loads
-        padded = [(gradient, zeros[: -len(gradient) % 4]) for _, gradient in held]
-        numbers = [number.float()[None] for number in means] + [one]
-        sizes = [len(gradient) + len(padding) for gradient, padding in padded]
-        bucket = _weighted_sum(torch.cat([*itertools.chain(*padded), *numbers]), n_valid)
-        n = bucket[-1].clone()
-        *parts, pooled = (bucket / n.clamp(min=1)).split([*sizes, len(numbers)])
-        for (p, gradient), part in zip(held, parts, strict=True):
-            p.grad = part[: len(gradient)].view_as(p)
+        sizes = [n + -n % 4 for n in map(len, gradients)]
+        n_numbers = sum(sizes) + len(numbers)
+        bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)
+        *parts, pooled = bucket.split([*sizes, len(numbers)])
+        parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
+        copy_all_([*parts, *pooled.unbind()], [*gradients, *numbers])
+        all_reduce(bucket.mul_(n_valid))
+        n = pooled[-1].clone()
+        bucket /= n.clamp(min=1)
+        for (p, _), part in zip(held, parts, strict=True):
+            p.grad = part.view_as(p)
     return n, list(pooled[:-1].unbind())
 
 
-def _weighted_sum(numbers, weight) -> torch.Tensor:
-    """Returns the sum of `numbers` (n,) times `weight` () over the ranks, valid until the next."""
-    shared = symmetric.buffer(len(numbers), numbers.device)
+def _averages_on_gpu(gradients, means, n_valid) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """Returns the averages (n,) of gradients (n,), and those of the means, then the sum of
+    n_valid.
+    """
+    layout = Layout([len(gradient) for gradient in gradients], len(means))
+    if (n := n_valid).dtype != torch.float32:
+        n = n.long()
+    shared = symmetric_memory.buffer(layout.n, n.device)
+    bucket = torch.empty(layout.n, device=n.device) if shared is None else shared
+    layout.pack(bucket, gradients, [mean.float() for mean in means], n)
     if shared is None:
-        return all_reduce(numbers.mul_(weight))
-    torch.mul(numbers, weight, out=shared[: len(numbers)])
-    return symmetric.all_reduce(shared)[: len(numbers)]
-
-
-@functools.cache
-def _constants(device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns a one and three zeros, float32, which no graph has to make again."""
-    return torch.ones(1, device=device), torch.zeros(3, device=device)
+        all_reduce(bucket)
+    else:
+        symmetric_memory.all_reduce_(bucket)
+    return layout.divide(bucket)

@@ -1,7 +1,6 @@
 """Two ranks, each with some of the lanes, learn what one process learns from all of them."""
 
 import itertools
-from unittest import mock
 
 import pytest
 import torch
@@ -9,7 +8,7 @@ import torch
 from megastep.agents.algorithms.masked_stats import pooled_mean, pooled_normalise
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
-from megastep.agents.distributed import pooling, process_group, reports, symmetric
+from megastep.agents.distributed import pooling, process_group, reports
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.storage.rollout import Rollout
 from tests.helpers import ranks
@@ -75,44 +74,14 @@ def on_ranks():
     return ranks.call(all_learnt)
 
 
-def averaged(x, valid):
-    """Returns parameters with averaged gradients, the number of valid entries, and a mean."""
-    parameters = [torch.nn.Parameter(torch.zeros(3, device=x.device)) for _ in range(2)]
-    parameters[1].grad = torch.full((3,), 1.0 + process_group.rank(), device=x.device)
-    n, (mean,) = pooling.average_gradients(parameters, valid.sum(), [x[0]])
-    return parameters, n, mean
-
-
-def on_gpus():
-    """Returns gradients that this rank averages through shared memory and by NCCL."""
-    device = torch.device("cuda", process_group.rank())
-    torch.cuda.set_device(device)
-    found = []
-    for function in symmetric.buffer, lambda n, device: None:
-        torch.manual_seed(process_group.rank())
-        parameters = [torch.nn.Parameter(torch.zeros(n, device=device)) for n in (70_001, 3, 512)]
-        for parameter in parameters:
-            parameter.grad = torch.randn(len(parameter), device=device)
-        n_valid = torch.tensor(3 + process_group.rank(), device=device)
-        with mock.patch.object(symmetric, "buffer", function):
-            n, _ = pooling.average_gradients(parameters, n_valid)
-        found.append(torch.cat([n[None], *(parameter.grad for parameter in parameters)]).cpu())
-    return symmetric.buffer(5, device) is not None, found
-
-
 def every(device="cpu"):
     """Returns what this rank gets from each operation on numbers of its own."""
     rank = process_group.rank()
     x = torch.tensor([[1.0, 2.0, 30.0], [4.0, torch.nan, 60.0]])[rank].to(device)
     valid = torch.tensor([[True, True, False], [True, False, False]])[rank].to(device)
-    parameters, n, mean = averaged(x, valid)
-    buffer = torch.zeros(16, device=device)
-    with (
-        mock.patch.object(symmetric, "buffer", lambda n, device: buffer),
-        mock.patch.object(symmetric, "all_reduce", pooling.all_reduce),
-    ):
-        _, *through_memory = averaged(x, valid)
-        averaged(2 * x, valid)  # overwrites the buffer, but no earlier result
+    parameters = [torch.nn.Parameter(torch.zeros(3, device=device)) for _ in range(2)]
+    parameters[1].grad = torch.full((3,), 1.0 + rank, device=device)
+    n, (mean,) = pooling.average_gradients(parameters, valid.sum(), [x[0]])
     several = [  # a vector, a number without an entry on rank 0, and a matrix
         (torch.tensor(1 + 2 * rank), torch.tensor([1.0, 5.0 + rank]), torch.tensor([0.5, 0.0])),
         (torch.tensor(3 * rank), torch.tensor(7.0 * rank), torch.tensor(2.0 * rank)),
@@ -144,16 +113,7 @@ def every(device="cpu"):
         gradient=parameters[1].grad,
         no_gradient=parameters[0].grad,
         averages=torch.stack([n, mean]),
-        through_memory=torch.stack(through_memory),
     )
-
-
-@pytest.mark.cuda
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_gpus_that_reach_each_others_memory_sum_there():
-    for is_shared, (through_memory, by_nccl) in ranks.call(on_gpus):
-        assert is_shared and through_memory[0] == 7
-        assert torch.equal(through_memory, by_nccl)
 
 
 def test_one_process_pools_nothing():
@@ -184,7 +144,6 @@ def test_operations():
         assert found["gradient"].tolist() == pytest.approx([4 / 3] * 3)
         assert found["no_gradient"] is None
         assert found["averages"].tolist() == pytest.approx([3, (2 * 1 + 4) / 3])
-        assert torch.equal(found["through_memory"], found["averages"])
         assert found["total"].tolist() == [5] and found["total"].dtype == torch.float64
         assert found["needed"] == [0, 1] and found["not_needed"] == [rank]
         assert not found["are_small"][0] and found["are_small"][1]
