@@ -15,7 +15,7 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-slow test-nightly test-gpu lint docs pictures wheel setup lock clean
+.PHONY: train test test-slow test-nightly test-gpu lint docs pictures image wheel setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
@@ -46,6 +46,9 @@ pictures: $(SETUP)         ## draw the pictures of README and docs again, from p
 docs: $(SETUP)             ## build the site in docs/_build; warnings are errors
 	$(PYTHON) -m sphinx -W --keep-going -q docs docs/_build
 
+image:                     ## build the container image with buildah, try it; IMAGE_OPTIONS=--stand-in
+	$(BASE) scripts/check_image.py $(IMAGE_OPTIONS)
+
 wheel:                     ## build sdist and wheel into dist/, check them, train with the wheel alone
 	rm -rf dist build
 	$(BASE) -m venv build/tools
@@ -64,7 +67,7 @@ setup: $(SETUP)            ## create .venv
 # packages are built from source, without isolation: with the setuptools whose hash is checked.
 LOCKED = $(BASE) -c 'import sys; sys.exit(sys.version_info >= (3, 14))' \
 	&& .venv/bin/python -m pip install --no-deps --require-hashes -r requirements/build.txt \
-	&& .venv/bin/python -m pip install --no-deps --require-hashes --no-build-isolation -r requirements/packages.txt
+	&& .venv/bin/python -m pip install --no-deps --require-hashes --no-build-isolation -r requirements/packages.txt -r requirements/test.txt
 
 .venv/stamp: pyproject.toml constraints.txt $(wildcard requirements/*.txt)
 	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "megastep needs Python 3.10 or newer. Choose one with: make BASE=python3.12"; exit 1; }

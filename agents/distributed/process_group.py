@@ -32,6 +32,9 @@ T = TypeVar("T")
 #: it, and a rank must have left.
 START_SECONDS, CONNECT_SECONDS, STOP_SECONDS = 300.0, 50.0, 30.0
 
+#: Limit of an operation on the host.
+LONGEST_WAIT = datetime.timedelta(days=1)
+
 
 class RankLost(RuntimeError):
     """Another rank has ended or does not answer."""
@@ -43,12 +46,16 @@ class Counts:
     Attributes:
         n_operations: collective operations started.
         n_updates: updates that the ranks have agreed to start.
+        n_phases: phases of updates that the GPU has finished.
         is_exempt: True while the others wait for this rank without limit.
         is_waiting: True while it waits for the others.
     """
 
-    n_operations = n_updates = 0
+    n_operations = n_updates = n_phases = 0
     is_exempt = is_waiting = False
+
+    def finish_phase(self) -> None:
+        self.n_phases += 1
 
 
 counts = Counts()
@@ -101,6 +108,11 @@ def start(seconds: float = START_SECONDS) -> None:
         distributed.init_process_group(
             backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
         )
+    # a rank may evaluate or write files for longer; `watch` finds those that are lost
+    ranks = distributed.group.WORLD
+    assert ranks is not None
+    on_host = ranks._get_backend(torch.device("cpu"))
+    on_host._set_default_timeout(LONGEST_WAIT)
     atexit.register(stop)  # gloo threads must not outlive the interpreter
 
 

@@ -2,23 +2,28 @@
 
 from megastep.agents import console, factory
 from megastep.agents.factory import settings
-from megastep.agents.launch import launcher
+from megastep.agents.launch import gpu, launcher
 from megastep.agents.selfplay.opponents import count_environments
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import n_lanes, optional
 
 
 def show(cfg: settings.Train) -> None:
-    """Prints environments, lanes and batch sizes, per rank and in total. Writes no file."""
+    """Prints environments, lanes and batch sizes, per rank and in total. Writes no file.
+
+    A machine without a GPU, such as a login node, tells the sizes of `device=cuda`, too.
+    """
     n_ranks = launcher.n_ranks(cfg)
-    device = factory.make_device(cfg.device)
+    is_elsewhere = cfg.device.startswith("cuda") and not gpu.is_available()
+    device = factory.make_device("cpu" if is_elsewhere else cfg.device)
+    kind = "cuda" if is_elsewhere else device.type
     names = ["", "per rank", "in total"] if n_ranks > 1 else ["", "in total"]
     rows = [
         [name, *(f"{number * factor:,}" for factor in {1: None, n_ranks: None})]
         for name, number in sizes(cfg, device).items()
     ]
     ranks = f"{n_ranks} x " if n_ranks > 1 else ""
-    console.say(f"Would train on {ranks}{device.type}:\n{console.table(names, rows)}")
+    console.say(f"Would train on {ranks}{kind}:\n{console.table(names, rows)}")
 
 
 def sizes(cfg: settings.Train, device) -> dict[str, int]:

@@ -28,7 +28,7 @@ from megastep.agents.errors import (
 from megastep.agents.evaluation import evaluate_run, in_training, record, tables
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_loggers, make_trainer
-from megastep.agents.launch import again, dry_run, launcher, rank, rank_checks, signals
+from megastep.agents.launch import again, dry_run, gpu, launcher, rank, rank_checks, signals
 from megastep.agents.runs import folders, provenance, scores
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
@@ -134,6 +134,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 provenance.record(
                     folder, trainer.samples, device, package.version(), package.ROOT, hosts
                 )
+                if cfg.device == "auto":
+                    gpu.warn_of_job_without()
                 ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
                 console.say(f"Training on {ranks} in {folder}")
             undo.pop_all()

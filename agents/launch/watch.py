@@ -57,6 +57,7 @@ class Heartbeat(NamedTuple):
         number: counts heartbeats.
         n_operations: collective operations started.
         n_updates: updates started.
+        n_phases: phases of updates that its GPU has finished.
         is_exempt: True while the others wait for it without limit, as during an evaluation.
         is_waiting: True while it waits for the other ranks.
         has_left: True once it is done and no longer monitored.
@@ -66,6 +67,7 @@ class Heartbeat(NamedTuple):
     number: int
     n_operations: int
     n_updates: int
+    n_phases: int
     is_exempt: bool
     is_waiting: bool
     has_left: bool
@@ -107,6 +109,7 @@ class LossDetector:
             )
         is_stalled = ours.is_waiting and theirs.is_waiting and before.is_waiting
         is_stalled &= ours.n_operations == theirs.n_operations == before.n_operations
+        is_stalled &= theirs.n_phases == before.n_phases
         self.n_stalled = self.n_stalled + 1 if is_stalled else 0
         is_ahead = ours.n_operations > theirs.n_operations and not theirs.is_exempt
         if is_ahead and theirs.n_operations == before.n_operations:
@@ -272,6 +275,7 @@ class Watch:
             self.number,
             process_group.counts.n_operations,
             process_group.counts.n_updates,
+            process_group.counts.n_phases,
             process_group.counts.is_exempt,
             process_group.counts.is_waiting,
             self.has_left,

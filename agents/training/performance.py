@@ -2,15 +2,16 @@
 
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
 #: The phases of an iteration.
 PHASES = "collect", "update", "rest"
-#: Seconds after which the host no longer waits for a GPU: another rank may be lost, which the host
-#: notices when it speaks to the others.
-PATIENCE = 5.0
+#: Seconds after which the host no longer waits for a GPU, which itself may wait for a lost rank.
+#: By then the watch has ended the ranks, if there are several.
+PATIENCE = 90.0
 
 
 class PhaseTimer:
@@ -29,10 +30,11 @@ class PhaseTimer:
 
     Args:
         device: where the loop's work is done.
+        on_finished: called whenever a phase has ended.
     """
 
-    def __init__(self, device: torch.device | str):
-        self.device = torch.device(device)
+    def __init__(self, device: torch.device | str, on_finished: Callable[[], None] = lambda: None):
+        self.device, self.on_finished = torch.device(device), on_finished
         self._seconds = {}
         self._starts = deque()  # (phase, its start); the ends of all but the last are starts too
 
@@ -86,6 +88,7 @@ class PhaseTimer:
                 return
             self._seconds[phase] = self._seconds.get(phase, 0.0) + seconds
             self._starts.popleft()
+            self.on_finished()
 
 
 def device_memory(device: torch.device | str) -> dict[str, int]:

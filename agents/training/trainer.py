@@ -12,7 +12,7 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue
 from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
-from megastep.agents.distributed.process_group import n_ranks, rank, unhurried
+from megastep.agents.distributed.process_group import counts, n_ranks, rank, unhurried, waiting
 from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.training.budget import Budget, Stopwatch, evaluation_in, reaches
@@ -159,7 +159,7 @@ class Trainer:
             env, policy, learner, self.collect, self.episode_stats, self.curriculum
         )
         self.nonfinite_guard = NonFiniteGuard(env, learner, lambda value: repeat_hint(self, value))
-        self.clock, self.timer = Stopwatch(), PhaseTimer(env.device)
+        self.clock, self.timer = Stopwatch(), PhaseTimer(env.device, counts.finish_phase)
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.samples_per_second = None
@@ -246,7 +246,8 @@ class Trainer:
         Args:
             is_stopped: a signal stops this rank.
         """
-        self.timer.wait(MAX_AHEAD * len(PHASES))
+        with waiting():
+            self.timer.wait(MAX_AHEAD * len(PHASES))
         seconds = self.clock.seconds
         seconds_since = seconds - self.seconds_at_checkpoint
         plan = Plan(

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import socket
 
 import torch
 
@@ -48,7 +49,9 @@ def _missing(count) -> str:
     if count:
         return f"there are {count} GPUs"
     built = "" if torch.version.cuda else " and this PyTorch is built for the CPU only"
-    return f"PyTorch sees no GPU{built}"
+    if job := os.environ.get("SLURM_JOB_ID"):
+        built += f", and job {job} of Slurm may have been given none (--gpus-per-node=1)"
+    return f"PyTorch sees no GPU on {socket.gethostname()}{built}"
 
 
 def threads() -> int:

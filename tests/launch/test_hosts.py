@@ -302,6 +302,15 @@ def test_hosts_of_which_one_does_not_come(here, hosts):
 
 
 @pytest.mark.nightly
+def test_endpoint_that_nobody_answers(here, hosts):
+    """torchrun ends 30 s after it has started, by the words that the page gives."""
+    options = ["--rdzv-conf=read_timeout=20"]
+    process = hosts.torchrun(1, ROOT / "train.py", *TINY, options=options, cwd=here)
+    code, _, error = finished([process])[0]
+    assert code != 0 and "RendezvousConnectionError" in error and not (here / "run").exists()
+
+
+@pytest.mark.nightly
 def test_rank_that_does_not_start_is_named(here, hosts):
     """Its host's torchrun has started it, and it ends, or hangs, before it can say so."""
     (here / "late.py").write_text(LATE)

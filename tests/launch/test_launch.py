@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import socket
 import time
 
 import pytest
@@ -97,6 +98,27 @@ def test_dry_run(here, capsys):
     for name, number in numbers.items():
         (line,) = (line for line in text.splitlines() if name in line)
         assert {str(number), str(3 * number)} <= set(line.split())
+
+
+def test_dry_run_of_a_job_for_gpus_that_are_elsewhere(here, capsys, monkeypatch):
+    monkeypatch.setattr(gpu, "is_available", lambda: False)
+    assert train.main([*TINY, "ranks=8", "device=cuda", "dry_run=true"]) == 0
+    assert "Would train on 8 x cuda:" in capsys.readouterr().out
+
+
+def test_slurm_job_without_a_gpu_says_so(monkeypatch, capsys):
+    monkeypatch.setattr(gpu, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    gpu.warn_of_job_without()
+    assert not capsys.readouterr().err
+    monkeypatch.setenv("SLURM_JOB_ID", "77")
+    gpu.warn_of_job_without()
+    text = capsys.readouterr().err
+    assert text.startswith(f"warning: job 77 of Slurm has no GPU on {socket.gethostname()}, so it ")
+    assert "ask for GPUs with --gpus-per-node " in text
+    monkeypatch.setattr(torch.version, "cuda", None)  # nor could it use one
+    gpu.warn_of_job_without()
+    assert not capsys.readouterr().err
 
 
 def test_dry_run_counts_lanes_that_learn(here, capsys):
