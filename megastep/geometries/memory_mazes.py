@@ -23,7 +23,7 @@ COUNT = 5_000  # mazes per size, of seeds 0 to 4,999
 MIN_CELL = 0.5  # metres
 LIT = 3  # cells; a light is at most this walk from any floor
 ATTEMPTS = 200  # to put a room somewhere
-LOOPS = 0.1  # chance that an opening is made that no room needs
+LOOPS = 0.2  # chance that an opening is made that no room needs
 STEPS = (0, 1), (0, -1), (1, 0), (-1, 0)
 
 
@@ -97,7 +97,9 @@ def _dig(size, rooms, generator) -> np.ndarray:
             exits = [
                 (y, x)
                 for y, x in STEPS
-                if 0 <= i + 2 * y < size and 0 <= j + 2 * x < size and not regions[i + 2 * y, j + 2 * x]
+                if 0 <= i + 2 * y < size
+                and 0 <= j + 2 * x < size
+                and not regions[i + 2 * y, j + 2 * x]
             ]
             if not exits:
                 way.pop()
@@ -163,7 +165,7 @@ def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, i
     return regions > 0, rooms
 
 
-def generate(seed: int, size: int = 9, cell: float = 1.0) -> dotdict:
+def generate(seed: int, size: int = 9, cell: float = 0.6) -> dotdict:
     """Returns the maze of a seed: a geometry whose rooms are the maze's, without corridors. So
     agents spawn in rooms.
 

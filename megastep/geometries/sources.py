@@ -182,7 +182,7 @@ def memory_maze(
     split: str = "training",
     seed: Seed = 1,
     size: Annotated[int, Field(ge=9, le=15)] = 9,
-    cell: Annotated[float, Field(gt=0, le=10)] = 1.0,
+    cell: Annotated[float, Field(gt=0, le=10)] = 0.6,
 ) -> list[dotdict]:
     """Returns mazes of rooms and corridors, as those of Memory Maze, from 5,000 of each size.
 

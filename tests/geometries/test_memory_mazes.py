@@ -83,7 +83,7 @@ def test_a_seed_gives_the_same_maze_on_every_machine():
     for size in KINDS:
         g = memory_mazes.generate(7, size)
         digest.update(g.walls.tobytes() + g.lights.tobytes() + g.masks.tobytes())
-    assert digest.hexdigest()[:16] == "c254df2e29a34443"
+    assert digest.hexdigest()[:16] == "84073e7a4b7e0f09"
     plans = {memory_mazes.floor_plan(seed, 9)[0].tobytes() for seed in range(100)}
     assert len(plans) == 100
 

@@ -13,7 +13,7 @@ from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv, images
 from megastep.envs.memory.arrangements import arrangements
-from megastep.envs.memory.step import N_PRIVILEGED, memory_step
+from megastep.envs.memory.step import N_GOAL, memory_step
 from megastep.modules.objects import REACH
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
@@ -77,9 +77,10 @@ class Memory(SceneryEnv):
         control: discrete or continuous actions.
         resample: if True, each episode takes place in a randomly drawn maze. Otherwise an
             environment keeps its own.
-        privileged: if True, worlds have ``privileged.goal`` (B, 1, 4) for a critic: where the
-            object to find is, in tens of metres ahead, to the left and in a straight line, and the
-            fraction of the steps that is left.
+        privileged: if True, worlds have ``privileged`` for a critic: ``goal`` (B, 1, 4), tens of
+            metres to the object to find, ahead, to the left and in a straight line, and the
+            fraction of the steps that is left; ``places`` (B, 1, 2 ``objects``), tens of metres
+            ahead and to the left to each object.
     """
 
     n_agents = 1
@@ -130,7 +131,9 @@ class Memory(SceneryEnv):
         )
         self.action_space = self.movement.space
         self.privileged_space = (
-            dotdict(goal=spaces.MultiVector(1, N_PRIVILEGED)) if privileged else None
+            dotdict(goal=spaces.MultiVector(1, N_GOAL), places=spaces.MultiVector(1, 2 * objects))
+            if privileged
+            else None
         )
         engine.fit(n_envs, 8 * self.obs_space.d.H * self.obs_space.d.W + 64, self.device)
         self.cue, self.found, self.n_draws, self.ages = (
@@ -178,8 +181,8 @@ class Memory(SceneryEnv):
             truncated=step.truncated,
             metrics=arrdict(found=step.metrics),
         )
-        if step.privileged is not None:
-            world["privileged"] = arrdict(goal=step.privileged)
+        if step.goal is not None:
+            world["privileged"] = arrdict(goal=step.goal, places=step.places)
         return world
 
     def _view(self) -> arrdict:

@@ -19,10 +19,10 @@ from megastep.engine.scenery import Scenery
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
 
-__all__ = ["LIBRARY", "N_PRIVILEGED", "MemoryStep", "memory_step"]
+__all__ = ["LIBRARY", "N_GOAL", "MemoryStep", "memory_step"]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
-N_PRIVILEGED = LIBRARY.constants["N_PRIVILEGED"]  # numbers that a critic sees
+N_GOAL = LIBRARY.constants["N_GOAL"]  # numbers that a critic sees of the object to find
 
 
 class MemoryStep(NamedTuple):
@@ -34,7 +34,11 @@ class MemoryStep(NamedTuple):
     truncated: torch.Tensor  # (N,) bool
     metrics: torch.Tensor  # (N,) objects found where an episode ends
     cue_obs: torch.Tensor  # (N, 1, 3) fp16, linear light: the colour of the object to find
-    privileged: torch.Tensor | None  # (N, 1, 4) for a critic; None if not wanted
+    goal: (
+        torch.Tensor | None
+    )  # (N, 1, 4) for a critic: tens of metres to the object to find: ahead,
+    # to the left and in a straight line; fraction of the steps that is left. None if not wanted
+    places: torch.Tensor | None  # (N, 1, 2 O) tens of metres ahead and to the left to each object
 
 
 def memory_step(
@@ -68,8 +72,7 @@ def memory_step(
         seed: the generator's key.
         limit: steps after which an episode is truncated.
         reach: metres between surfaces at which an agent touches an object.
-        privileged: compute the privileged observation: the object to find, tens of metres ahead, to
-            the left and in a straight line, and the fraction of the steps that is left.
+        privileged: compute the privileged observation.
 
     Raises:
         TypeError, ValueError: naming the argument that does not fit.
@@ -81,15 +84,17 @@ def memory_step(
     n_objects = checks.integer("objects", objects.n_objects if objects is not None else 0, 2)
     n_arrangements = checks.length("arrangements", arrangements, axis=1)
     flags = [torch.empty(n, dtype=torch.bool, device=device) for _ in range(3)]
-    privileged_out = None
+    goal = places = None
     if checks.flag("privileged", privileged):
-        privileged_out = torch.empty((n, 1, N_PRIVILEGED), device=device)
+        goal = torch.empty((n, 1, N_GOAL), device=device)
+        places = torch.empty((n, 1, 2 * n_objects), device=device)
     out = MemoryStep(
         torch.empty(n, device=device),
         *flags,
         metrics=torch.empty(n, device=device),
         cue_obs=torch.empty((n, 1, 3), dtype=torch.float16, device=device),
-        privileged=privileged_out,
+        goal=goal,
+        places=places,
     )
     counters = dict(cue=cue, found=found, n_draws=n_draws, ages=ages)
     shape = len(scenery.layouts), n_arrangements, n_objects, 2

@@ -21,8 +21,7 @@ HD int touches(const MemoryStepParams& p, int env, int k) {
 
 HD void arrange(const MemoryStepParams& p, int env, int layout, int arrangement) {
     int n = p.objects.n_objects;
-    const float* at =
-        p.arrangements + 2 * n * (layout * (long long)p.n_arrangements + arrangement);
+    const float* at = p.arrangements + 2 * n * (layout * (long long)p.n_arrangements + arrangement);
     for (int k = 0; k < n; k++) {
         Object& object = objects_of(p.objects)[env * n + k];
         object.x = at[2 * k];
@@ -53,15 +52,23 @@ HD int next_cue(const MemoryStepParams& p, int cue, unsigned int bits) {
     return index + (index >= cue);
 }
 
+// Writes where the object to find and all objects are, in the agent's frame, for a critic.
 HD void write_privileged(const MemoryStepParams& p, int env, int cue, int age) {
-    const Object& object = objects_of(p.objects)[env * p.objects.n_objects + cue];
+    int n = p.objects.n_objects;
+    const Object* objects = objects_of(p.objects) + env * n;
     Pose pose = pose_at(p.positions[2 * env], p.positions[2 * env + 1], p.angles[env]);
-    float dx = object.x - pose.x, dy = object.y - pose.y;
-    float* out = p.privileged + N_PRIVILEGED * (long long)env;
-    out[0] = 0.1f * (pose.cosine * dx + pose.sine * dy);
-    out[1] = 0.1f * (pose.cosine * dy - pose.sine * dx);
-    out[2] = 0.1f * SQRT(dx * dx + dy * dy);
-    out[3] = (float)(p.limit - age) / (float)p.limit;
+    float* places = p.places + 2 * n * (long long)env;
+    for (int k = 0; k < n; k++) {
+        float dx = objects[k].x - pose.x, dy = objects[k].y - pose.y;
+        places[2 * k] = 0.1f * (pose.cosine * dx + pose.sine * dy);
+        places[2 * k + 1] = 0.1f * (pose.cosine * dy - pose.sine * dx);
+    }
+    float ahead = places[2 * cue], left = places[2 * cue + 1];
+    float* goal = p.goal + N_GOAL * (long long)env;
+    goal[0] = ahead;
+    goal[1] = left;
+    goal[2] = SQRT(ahead * ahead + left * left);
+    goal[3] = (float)(p.limit - age) / (float)p.limit;
 }
 
 HD void memory_env(const MemoryStepParams& p, int env) {
@@ -98,6 +105,6 @@ HD void memory_env(const MemoryStepParams& p, int env) {
     colour = (unsigned int)colour < (unsigned int)p.objects.n_colours ? colour : 0;
     for (int c = 0; c < 3; c++)
         p.cue_obs[3 * (long long)env + c] = HALF_BITS(p.objects.palette[3 * colour + c]);
-    if (p.privileged)
+    if (p.goal)
         write_privileged(p, env, cue, age);
 }

@@ -17,13 +17,14 @@ struct MemoryStepParams {
     int* ages;                  // (N) steps since the first observation
     unsigned char* ended;       // (N) in: starts an episode in this step; out: ends it in this step
     int* error_flag;            // (1) out: see common/errors.h
-    float* reward;              // (N) out, as the next six
+    float* reward;              // (N) out, as the next seven
     unsigned char* reset;       // (N)
     unsigned char* terminal;    // (N)
     unsigned char* truncated;   // (N)
     float* metrics;             // (N) objects found where an episode ends
     unsigned short* cue_obs;    // (N, 3) fp16: the colour of the object to find
-    float* privileged;          // (N, N_PRIVILEGED) for a critic; null: none
+    float* goal;                // (N, N_GOAL) for a critic, as the next; null: neither
+    float* places;              // (N, O, 2) tens of metres ahead and to the left of the agent
     unsigned int key0;          // the seed
     unsigned int key1;
     int n_arrangements;  // per layout
