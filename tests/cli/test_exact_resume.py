@@ -46,6 +46,7 @@ CASES = {
     "mingru": [*tiny.TINY, "agent.core=mingru"],
     "none": [*tiny.TINY, "agent.core=none"],
     "explorer": ["env=explorer", "env.res=8", *SMALL, "learner.n_minibatches=2"],
+    "memory": ["env=memory", "env.res=8", "env.limit=9", *SMALL],
     "pointgoal": ["env=pointgoal", "env.res=8", *SMALL, "learner.n_minibatches=2"],
     "deathmatch": FIGHT,
     "plr": [*DRAWN, "env=pointgoal", "env.limit=12", "curriculum=plr", "curriculum.every=3"],

@@ -25,6 +25,8 @@ SHORT = {
         patience=1, res=1, subsample=1, privileged=True, resample=True, control="continuous"
     ),
     "explorer, cameras": dict(patience=1, res=1, subsample=1, cameras=(0, 0)),
+    "memory": dict(limit=15, res=1, subsample=1),
+    "memory, privileged": dict(limit=15, res=1, subsample=1, privileged=True, resample=True),
     "deathmatch": dict(limit=20),
     "deathmatch, privileged": dict(limit=20, n_agents=2, damage=1, privileged=True),
     "deathmatch, all rules": dict(
@@ -63,7 +65,7 @@ def make(name, device="cpu", n_envs=12, seed=1, **settings):
     return cls(n_envs, seed=seed, device=device, **{**SHORT[name], **settings})
 
 
-@pytest.mark.parametrize("name", ["minimal", "explorer", "deathmatch", "pointgoal"])
+@pytest.mark.parametrize("name", ["minimal", "explorer", "memory", "deathmatch", "pointgoal"])
 def test_few_environments_are_spread_over_all_homes(name):
     """Three environments and seven rooms, 4 to 10 m wide."""
     rooms = [toys.box(width) for width in range(4, 11)]
