@@ -9,12 +9,16 @@ from megastep.agents.distributed import process_group
 from megastep.agents.evaluation import arena, episodes, statistics, suite, tables
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import checkpoint, folders
+from megastep.env_state import EnvState
 from megastep.types import optional
 
 if TYPE_CHECKING:
     import torch
 
     from megastep.agents.types import Row
+    from megastep.arrdict import arrdict
+
+ORACLE = "oracle"  # the bot that knows where everything is
 
 
 def run(cfg: settings.Evaluate) -> Path:
@@ -101,8 +105,8 @@ def play(
     env, roles = stage.env, optional(stage.env, "roles")
     sources = factory.sources_of(stage.homes)
     rows, single = [], []
-    for player, greedy in players_of(cfg, loaded, stage):
-        played = stage.play(player.policy, greedy, cfg.max_steps)
+    players = players_of(cfg, loaded, stage)
+    for (player, _), played in zip(players, play_all(stage, players, cfg.max_steps), strict=True):
         n_cut = int((~played["done"]).sum())
         if n_cut and process_group.rank() == 0:
             limit = cfg.max_steps or optional(env, "max_episode_steps")
@@ -119,6 +123,29 @@ def play(
     if process_group.rank() == 0:
         arena.warn_without_layout(env, stage.homes)
     return rows, single
+
+
+def play_all(
+    stage: arena.Stage, players: list[tuple[arena.Player, bool]], max_steps: int | None
+) -> "list[arrdict]":
+    """Returns the first episodes of each player, see `playing.first_episodes`.
+
+    If the bot `oracle` is among them, all play the same episodes, and have a further metric,
+    `oracle_fraction`: what they found divided by what the oracle found in the same episode.
+    """
+    names = [player.name for player, _ in players]
+    if ORACLE not in names:
+        return [stage.play(player.policy, greedy, max_steps) for player, greedy in players]
+    stage.env.reset()
+    state, all_played = EnvState(stage.env), []
+    first = state.state_dict()
+    for player, greedy in players:
+        state.load_state_dict(first)
+        all_played.append(stage.play(player.policy, greedy, max_steps))
+    found = all_played[names.index(ORACLE)]["metrics"]["found"]
+    for played in all_played:
+        played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found
+    return all_played
 
 
 def players_of(

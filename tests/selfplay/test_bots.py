@@ -198,6 +198,24 @@ def test_refusals(name, env, sentence):
     assert "\n" not in str(error.value)
 
 
+def test_evaluations_give_the_fraction_of_what_an_oracle_finds(tmp_path, monkeypatch):
+    """In the same episodes: the same mazes, spawns, objects and cues."""
+    monkeypatch.chdir(tmp_path)
+    words = ["env=memory", "env.n_envs=4", "env.limit=90", "env.res=8", "geometry=memory_maze"]
+    words += ["geometry.n=2", "agent.width=8", "learner.n_steps=8", "samples=1", "device=cpu"]
+    assert train.main([*words, "folder=run"]) == 0
+    words = ["run=run", "baseline=oracle,wanderer,oracle", "episodes=4", "device=cpu"]
+    assert evaluate.main(words) == 0
+    (path,) = (tmp_path / "run" / "evaluations").glob("*.json")
+    episodes = json.loads(path.read_text())["episodes"]
+    found = torch.tensor(episodes["found"]).view(4, 4)  # trained, oracle, wanderer, oracle again
+    fractions = torch.tensor(episodes["oracle_fraction"]).view(4, 4)
+    assert (found[1] > 0).all()
+    torch.testing.assert_close(fractions, found / found[1])
+    starts = torch.tensor([episodes["start_x"], episodes["start_y"]]).view(2, 4, 4)
+    assert (starts == starts[:, :1]).all() and torch.equal(found[1], found[3])
+
+
 def test_commands_take_bots_by_name(tmp_path, monkeypatch):
     """Training against a bot that walks in other homes than those of the duels that follow."""
     monkeypatch.chdir(tmp_path)
