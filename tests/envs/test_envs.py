@@ -27,6 +27,8 @@ SHORT = {
     "explorer, cameras": dict(patience=1, res=1, subsample=1, cameras=(0, 0)),
     "memory": dict(limit=15, res=1, subsample=1),
     "memory, privileged": dict(limit=15, res=1, subsample=1, privileged=True, resample=True),
+    "keys": dict(limit=15, res=1, subsample=1),
+    "keys, privileged": dict(limit=15, res=1, subsample=1, privileged=True, resample=True),
     "deathmatch": dict(limit=20),
     "deathmatch, privileged": dict(limit=20, n_agents=2, damage=1, privileged=True),
     "deathmatch, all rules": dict(
@@ -61,7 +63,7 @@ FIRST = [name if "," not in name else pytest.param(name, marks=pytest.mark.slow)
 def make(name, device="cpu", n_envs=12, seed=1, **settings):
     cls = envs.ENVS[name.split(",")[0]]
     if "geometries" in inspect.signature(cls).parameters:
-        settings["geometries"] = sample("bench", 4)
+        settings["geometries"] = sample("homes" if name.startswith("keys") else "bench", 4)
     return cls(n_envs, seed=seed, device=device, **{**SHORT[name], **settings})
 
 
