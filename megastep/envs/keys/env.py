@@ -132,8 +132,11 @@ class Keys(SceneryEnv):
         self.objects = modules.Objects(
             geometries, self.core, kinds, [*colours, LOCKED, GOAL], n_points=1
         )
-        self.tables = [torch.from_numpy(table).to(self.device) for table in tables]
-        self.tables.append(self.objects["door"].poses)
+        self.tables: dict = {
+            name: torch.from_numpy(table).to(self.device)
+            for name, table in tables._asdict().items()
+        }
+        self.tables["doorways"] = self.objects["door"].poses
         self.obs_space = dotdict(
             rgb=modules.RGB(self.core, subsample).space,
             d=modules.Depth(self.core, subsample).space,
@@ -171,11 +174,11 @@ class Keys(SceneryEnv):
         step = keys_step(
             self.core.scenery,
             self.core.agents,
-            *self.tables,
-            self.opened,
-            self.n_draws,
-            self.ages,
-            self.ended,
+            **self.tables,
+            opened=self.opened,
+            n_draws=self.n_draws,
+            ages=self.ages,
+            ended=self.ended,
             seed=self.seed,
             reach=REACH,
             privileged=self.privileged_space is not None,

@@ -52,16 +52,18 @@ HD int next_cue(const MemoryStepParams& p, int cue, unsigned int bits) {
     return index + (index >= cue);
 }
 
-// Writes where the object to find and all objects are, in the agent's frame, for a critic.
+// Writes where the object to find and all objects are, in the agent's frame, for a critic. Written
+// with sums alone, which compilers do not fuse.
 HD void write_privileged(const MemoryStepParams& p, int env, int cue, int age) {
     int n = p.objects.n_objects;
     const Object* objects = objects_of(p.objects) + env * n;
     Pose pose = pose_at(p.positions[2 * env], p.positions[2 * env + 1], p.angles[env]);
+    float minus_sine = -pose.sine;
     float* places = p.places + 2 * n * (long long)env;
     for (int k = 0; k < n; k++) {
         float dx = objects[k].x - pose.x, dy = objects[k].y - pose.y;
         places[2 * k] = 0.1f * (pose.cosine * dx + pose.sine * dy);
-        places[2 * k + 1] = 0.1f * (pose.cosine * dy - pose.sine * dx);
+        places[2 * k + 1] = 0.1f * (pose.cosine * dy + minus_sine * dx);
     }
     float ahead = places[2 * cue], left = places[2 * cue + 1];
     float* goal = p.goal + N_GOAL * (long long)env;
