@@ -106,6 +106,7 @@ OWN_USERS = {
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
         "agents/algorithms/*.py",
         "agents/algorithms/kernels/*.py",
+        "agents/distributed/bucket.py",
         "agents/networks/*_cpu.py",
         "agents/networks/kernels/*.py",
         "agents/selfplay/opponents.py",
