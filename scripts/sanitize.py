@@ -93,6 +93,8 @@ def run_all(device):
         (envs.Minimal(7, homes, device=device), seven),
         (continuous, (0.5, -2.0, math.inf, math.nan)),
         (envs.PointGoal(7, homes, **everywhere, cameras=[0, 180]), seven),
+        (envs.Memory(7, sample("memory_maze", 2), device=device, privileged=True), seven),
+        (envs.Keys(7, sample("homes", 2), device=device, privileged=True), seven),
     ]
     for n_agents in (2, 16):
         settings = dict(n_agents=n_agents, damage=1, privileged=True)

@@ -44,9 +44,9 @@ def test_settings_say_what_applies():
     assert rows["`log_every`"][2:] == ("100", "4", "updates between two lines of metrics")
 
 
-@pytest.mark.parametrize("name", ["deathmatch", "explorer", "pointgoal", "pong"])
+@pytest.mark.parametrize("name", ["deathmatch", "explorer", "keys", "memory", "pointgoal", "pong"])
 def test_metrics_of_environments_are_described(name):
-    plans = {} if name == "pong" else {"geometries": [toys.box()]}
+    plans = {} if name in ("keys", "pong") else {"geometries": [toys.box()]}
     world = envs.ENVS[name](2, device="cpu", **plans).reset()
     assert {*world.metrics} == {*reference.described(envs.ENVS[name], "Metrics")}
 

@@ -9,12 +9,16 @@ from megastep.agents.distributed import process_group
 from megastep.agents.evaluation import arena, episodes, playing, replay, statistics, suite, tables
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import checkpoint, folders
+from megastep.env_state import EnvState
 from megastep.types import optional
 
 if TYPE_CHECKING:
     import torch
 
     from megastep.agents.types import Row
+    from megastep.arrdict import arrdict
+
+ORACLE = "oracle"  # the bot that knows where everything is
 
 
 def run(cfg: settings.Evaluate) -> Path:
@@ -103,9 +107,9 @@ def play(
     env, roles = stage.env, optional(stage.env, "roles")
     sources = factory.sources_of(stage.homes)
     rows, single, recorder = [], [], playing.Recorder()
-    for number, (player, greedy) in enumerate(players_of(cfg, loaded, stage)):
-        # of the first, as the environment's generators are where its seed puts them
-        played = stage.play(player.policy, greedy, cfg.max_steps, None if number else recorder)
+    players = players_of(cfg, loaded, stage)
+    all_played = play_all(stage, players, cfg.max_steps, recorder)
+    for (player, _), played in zip(players, all_played, strict=True):
         n_cut = int((~played["done"]).sum())
         if n_cut and process_group.rank() == 0:
             limit = cfg.max_steps or optional(env, "max_episode_steps")
@@ -122,6 +126,36 @@ def play(
     if process_group.rank() == 0:
         arena.warn_without_layout(env, stage.homes)
     return rows, single, stage.actions(recorder)
+
+
+def play_all(
+    stage: arena.Stage,
+    players: list[tuple[arena.Player, bool]],
+    max_steps: int | None,
+    recorder: playing.Recorder,
+) -> "list[arrdict]":
+    """Returns the first episodes of each player, see `playing.first_episodes`.
+
+    If the bot `oracle` is among them, all play the same episodes, and have a further metric,
+    `oracle_fraction`: what they found divided by what the oracle found in the same episode.
+
+    Args:
+        recorder: of the first player, as the environment's generators are where its seed puts them.
+    """
+    names = [player.name for player, _ in players]
+    state = EnvState(stage.env) if ORACLE in names else None
+    first = None if state is None else state.state_dict()
+    all_played = []
+    for number, (player, greedy) in enumerate(players):
+        if state is not None:
+            state.load_state_dict(first)
+        own = None if number else recorder
+        all_played.append(stage.play(player.policy, greedy, max_steps, own))
+    if state is not None:
+        found = all_played[names.index(ORACLE)]["metrics"]["found"]
+        for played in all_played:
+            played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found
+    return all_played
 
 
 def players_of(

@@ -47,7 +47,8 @@ def sample(
         seed: of the order in which geometries are drawn.
         options: of the source: `width` of "box"; `width` and `pillar` of "column"; `outer`,
             `density` and `clutter` of "homes"; `path` of "files"; `size`, `corridor`, `thickness`
-            and `braid` of "maze"; `parts` of "mixed"; `parts` and `plans` of "suite".
+            and `braid` of "maze"; `size` and `cell` of "memory_maze"; `parts` of "mixed"; `parts`
+            and `plans` of "suite".
 
     Raises:
         ValueError: for an unknown name, split or option, or a value that the source cannot use.

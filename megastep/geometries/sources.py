@@ -14,13 +14,15 @@ from pydantic import Field
 
 from megastep.dotdict import dotdict
 from megastep.geometries import files as npz
-from megastep.geometries import mazes, toys
+from megastep.geometries import mazes, memory_mazes, toys
 from megastep.geometries.homes import database, plan
 from megastep.geometry import mirror_image
 from megastep.imports import import_object
 from megastep.settings import checked, closest
 
-__all__ = ["bench", "box", "column", "files", "homes", "maze", "mixed", "suite"]
+__all__ = [
+    *("bench", "box", "column", "files", "homes", "maze", "memory_maze", "mixed", "suite"),
+]
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -171,6 +173,34 @@ def maze(
     what = f"mazes of {size} x {size} cells"
     fit(len(unique), mazes.bytes_each(size, corridor, thickness), "cpu", what)
     generated = {i: mazes.generate(i, size, corridor, thickness, braid) for i in unique}
+    return [generated[i] for i in indices]
+
+
+@checked
+def memory_maze(
+    n: Count = 512,
+    split: str = "training",
+    seed: Seed = 1,
+    size: Annotated[int, Field(ge=9, le=15)] = 9,
+    cell: Annotated[float, Field(gt=0, le=10)] = 0.6,
+) -> list[dotdict]:
+    """Returns mazes of rooms and corridors, as those of Memory Maze, from 5,000 of each size.
+
+    Args:
+        n: number of geometries; a split with fewer repeats them.
+        split: training, test or all.
+        seed: which geometries of the split are drawn, and in which order.
+        size: cells per side: 9, 11, 13 or 15.
+        cell: side of a cell, in metres, at least 0.5.
+    """
+    from megastep.engine.devices import fit  # as in `maze`
+
+    memory_mazes.validate(size, cell)
+    indices = _draw_indices(memory_mazes.COUNT, n, split, seed)
+    unique = dict.fromkeys(indices)
+    what = f"mazes of {size} x {size} cells"
+    fit(len(unique), memory_mazes.bytes_each(size, cell), "cpu", what)
+    generated = {i: memory_mazes.generate(i, size, cell) for i in unique}
     return [generated[i] for i in indices]
 
 

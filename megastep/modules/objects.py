@@ -297,6 +297,7 @@ class Doors(Kind):
 
     Attributes:
         n_doorways: (D,) int64, doors that each layout has.
+        poses: (D, K, 4) float32, of each: x and y in metres, angle in degrees, half the length.
     """
 
     def set_openings(self, openings: RaggedNumpy) -> None:
@@ -309,7 +310,7 @@ class Doors(Kind):
             poses[d, : len(a), :2] = (a + b) / 2
             poses[d, : len(a), 2] = np.degrees(np.arctan2(along[:, 1], along[:, 0]))
             poses[d, : len(a), 3] = np.hypot(*along.T) / 2 + _INTO_WALL
-        self._poses = torch.as_tensor(poses, device=device)
+        self.poses = torch.as_tensor(poses, device=device)
         self.n_doorways = torch.as_tensor(openings.widths, device=device).clamp(max=len(self))
 
     def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
@@ -322,7 +323,7 @@ class Doors(Kind):
         mask = self._broadcast(mask)
         self._paint(mask, colours)
         layout = self._objects.core.scenery.layout.long()
-        poses = self._poses[layout]
+        poses = self.poses[layout]
         for tensor, values in (
             (self.positions, poses[..., :2]),
             (self.angles, poses[..., 2]),

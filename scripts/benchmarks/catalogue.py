@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
-from env_steps import deathmatch, memory, objects, pong, step
+from env_steps import deathmatch, mazes, memory, objects, pong, step
 from films import films
 from nsight_counters import counters
 from peers import peers
@@ -21,6 +21,7 @@ from training_benchmarks import ablation, curricula, duels, learners, train, wor
 BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "step": step,
     "objects": objects,
+    "mazes": mazes,
     "kernels": kernels,
     "counters": counters,
     "observe": observe,

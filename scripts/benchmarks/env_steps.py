@@ -1,4 +1,4 @@
-"""Benchmarks of whole environments: `step`, `objects`, `deathmatch`, `pong`, `memory`."""
+"""Benchmarks of whole environments: `step`, `objects`, `mazes`, `deathmatch`, `pong`, `memory`."""
 
 import itertools
 from collections.abc import Iterator
@@ -52,6 +52,22 @@ def objects(device: torch.device) -> Iterator[dict]:
                 things.place(torch.ones(n_envs, dtype=torch.bool, device=device))
             _, take_step = walk(env)
             what = f"explorer, `env.step`, {n_envs:,} environments, objects: {name}"
+            yield rate(what, n_envs, seconds_per_call(take_step, device))
+
+
+def mazes(device: torch.device) -> Iterator[dict]:
+    """Frames per second of Memory's `env.step`, with as many objects as its recipes have, and of
+    Explorer's, without its metrics, in the same mazes.
+    """
+    kinds = {"explorer": dict(metrics=False), "memory": {}}
+    for size, n_objects in ((9, 3), (15, 6)):
+        plans = sample("memory_maze", N_HOMES, size=size)
+        kinds["memory"] = dict(objects=n_objects)
+        for n_envs, (name, settings) in itertools.product(
+            N_ENVS_WITH_OBJECTS[device.type], kinds.items()
+        ):
+            _, take_step = walk(envs.ENVS[name](n_envs, plans, device=device, **settings))
+            what = f"{name}, `env.step`, {n_envs:,} environments, mazes of {size} x {size} cells"
             yield rate(what, n_envs, seconds_per_call(take_step, device))
 
 

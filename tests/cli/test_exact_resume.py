@@ -47,6 +47,7 @@ CASES = {
     "mingru": [*tiny.TINY, "agent.core=mingru"],
     "none": [*tiny.TINY, "agent.core=none"],
     "explorer": ["env=explorer", "env.res=8", *SMALL, "learner.n_minibatches=2"],
+    "memory": ["env=memory", "env.res=8", "env.limit=9", *SMALL],
     "pointgoal": ["env=pointgoal", "env.res=8", *SMALL, "learner.n_minibatches=2"],
     "deathmatch": FIGHT,
     "plr": [*DRAWN, "env=pointgoal", "env.limit=12", "curriculum=plr", "curriculum.every=3"],
@@ -154,6 +155,9 @@ def differences(one, other, path=""):
         return [
             d for i, pair in enumerate(zip(one, other)) for d in differences(*pair, f"{path}.{i}")
         ]
+    if isinstance(one, torch.Tensor) and one.is_floating_point():  # integers may be stored there
+        bits = {2: torch.int16, 4: torch.int32, 8: torch.int64}[one.element_size()]
+        one, other = one.view(bits), other.view(bits)
     is_equal = torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
     return [] if is_equal or path == ".seconds" else [path]
 

@@ -16,6 +16,8 @@ import torch
 from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.envs.deathmatch.step import LIBRARY as DEATHMATCH
 from megastep.envs.explorer.step import LIBRARY as EXPLORER
+from megastep.envs.keys.step import LIBRARY as KEYS
+from megastep.envs.memory.step import LIBRARY as MEMORY
 from megastep.envs.pointgoal.step import LIBRARY as POINTGOAL
 from megastep.envs.pong.step import LIBRARY as PONG
 from megastep.kernels.build import compile, kernel_library, launch
@@ -44,7 +46,14 @@ def run(code, cache, **env):
     return process.returncode, process.stdout.strip(), process.stderr
 
 
-GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
+GAMES = dict(
+    deathmatch=DEATHMATCH,
+    explorer=EXPLORER,
+    keys=KEYS,
+    memory=MEMORY,
+    pointgoal=POINTGOAL,
+    pong=PONG,
+)
 libraries = pytest.mark.parametrize("kernels", [ENGINE, *GAMES.values()], ids=["engine", *GAMES])
 
 

@@ -16,12 +16,21 @@ from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.agents.training.episode_stats import LIBRARY as TRAINING
 from megastep.envs.deathmatch.step import LIBRARY as DEATHMATCH
 from megastep.envs.explorer.step import LIBRARY as EXPLORER
+from megastep.envs.keys.step import LIBRARY as KEYS
+from megastep.envs.memory.step import LIBRARY as MEMORY
 from megastep.envs.pointgoal.step import LIBRARY as POINTGOAL
 from megastep.envs.pong.step import LIBRARY as PONG
 from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
-GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
+GAMES = dict(
+    deathmatch=DEATHMATCH,
+    explorer=EXPLORER,
+    keys=KEYS,
+    memory=MEMORY,
+    pointgoal=POINTGOAL,
+    pong=PONG,
+)
 NETWORKS = dict(cores=LIBRARY, sequences=SEQUENCES, acting=ACTING)
 LEARNER = dict(algorithms=ALGORITHMS, copies=COPIES, selfplay=SELFPLAY, training=TRAINING)
 LIBRARIES = dict(engine=ENGINE, **NETWORKS, **LEARNER, **GAMES)

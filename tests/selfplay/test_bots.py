@@ -18,6 +18,7 @@ from megastep.agents.selfplay.bots.explorer import Explorer
 from megastep.agents.selfplay.bots.hunter import Hunter
 from megastep.agents.selfplay.bots.plans import Plans
 from megastep.agents.selfplay.bots.random import RandomActions
+from megastep.agents.selfplay.bots.seekers import Mapper, Oracle, Wanderer
 from megastep.agents.selfplay.bots.walker import Walker
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
@@ -110,6 +111,25 @@ def test_hunter_turns_to_an_agent_and_kills_it(device):
     assert world.terminal.tolist() == [False, True]
 
 
+def test_an_oracle_finds_an_object_every_few_seconds(device):
+    """In mazes of 9 x 9 cells: one in 3 s, about."""
+    env = envs.Memory(8, sample("memory_maze", 8, split="test"), device=device, res=8, subsample=1)
+    play(env, Oracle(env), 150)
+    assert env.found.float().mean() > 3 and env.found.min() > 0
+
+
+@pytest.mark.nightly
+def test_what_a_seeker_remembers_is_worth_finds():
+    """Over whole episodes. The oracle's are within 20 % of Memory Maze's, 34.8."""
+    mazes = sample("memory_maze", 48, split="test")
+    found = {}
+    for kind in (Oracle, Mapper, Wanderer):
+        env = envs.Memory(48, mazes, device="cpu", res=8, subsample=1)
+        found[kind] = float(first_episodes(env, kind(env)).metrics.found.mean())
+    assert abs(found[Oracle] / 34.8 - 1) < 0.2
+    assert found[Oracle] > 1.02 * found[Mapper] and found[Mapper] > 1.3 * found[Wanderer], found
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("homes", [HOMES, DENSE], ids=["homes", "dense"])
 @pytest.mark.parametrize("opponent, least", [("bot", 0.6), ("random", 0.8)])
@@ -127,6 +147,18 @@ def test_bots_play_alike_in_some_lanes(device):
     for kind in (Explorer, Hunter):
         bot = kind(env)
         decision, state, world = play(env, bot, 20)
+        all_decided, _ = bot(world, state)
+        some = [part.map(lambda leaf: leaf[lanes]) for part in (world, state)]
+        some_decided, _ = bot.in_lanes(lanes)(*some)
+        assert (some_decided.actions == all_decided.actions[lanes]).all()
+
+
+def test_seekers_play_alike_in_some_lanes():
+    env = envs.Memory(6, sample("memory_maze", 3), device="cpu", res=8, subsample=1)
+    lanes = torch.tensor([5, 0, 3])
+    for kind in (Oracle, Mapper):
+        bot = kind(env)
+        decision, state, world = play(env, bot, 10)
         all_decided, _ = bot(world, state)
         some = [part.map(lambda leaf: leaf[lanes]) for part in (world, state)]
         some_decided, _ = bot.in_lanes(lanes)(*some)
@@ -156,6 +188,7 @@ PONG = envs.Pong(2, self_play=True, device="cpu")
         *((n, PONG, f"{n} cannot play in Pong.*Pong has no core") for n in BOTS if n != "random"),
         ("hunter", envs.PointGoal(1, HOMES[:1], device="cpu"), "observations d and health"),
         ("explorer", Matrix(2), "explorer cannot play in Matrix"),
+        ("oracle", envs.PointGoal(1, HOMES[:1], device="cpu"), "PointGoal has no cue"),
         ("hunted", PONG, "hunted"),
     ],
 )
@@ -163,6 +196,24 @@ def test_refusals(name, env, sentence):
     with pytest.raises(UserError, match=sentence) as error:
         factory.make_bot(name, SimpleNamespace(), env)
     assert "\n" not in str(error.value)
+
+
+def test_evaluations_give_the_fraction_of_what_an_oracle_finds(tmp_path, monkeypatch):
+    """In the same episodes: the same mazes, spawns, objects and cues."""
+    monkeypatch.chdir(tmp_path)
+    words = ["env=memory", "env.n_envs=4", "env.limit=90", "env.res=8", "geometry=memory_maze"]
+    words += ["geometry.n=2", "agent.width=8", "learner.n_steps=8", "samples=1", "device=cpu"]
+    assert train.main([*words, "folder=run"]) == 0
+    words = ["run=run", "baseline=oracle,wanderer,oracle", "episodes=4", "device=cpu"]
+    assert evaluate.main(words) == 0
+    (path,) = (tmp_path / "run" / "evaluations").glob("*.json")
+    episodes = json.loads(path.read_text())["episodes"]
+    found = torch.tensor(episodes["found"]).view(4, 4)  # trained, oracle, wanderer, oracle again
+    fractions = torch.tensor(episodes["oracle_fraction"]).view(4, 4)
+    assert (found[1] > 0).all()
+    torch.testing.assert_close(fractions, found / found[1])
+    starts = torch.tensor([episodes["start_x"], episodes["start_y"]]).view(2, 4, 4)
+    assert (starts == starts[:, :1]).all() and torch.equal(found[1], found[3])
 
 
 def test_commands_take_bots_by_name(tmp_path, monkeypatch):

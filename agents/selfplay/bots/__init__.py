@@ -9,6 +9,9 @@ opponents and baselines, not competitors.
 BOTS = {
     "explorer": "megastep.agents.selfplay.bots.explorer:Explorer",
     "hunter": "megastep.agents.selfplay.bots.hunter:Hunter",
+    "mapper": "megastep.agents.selfplay.bots.seekers:Mapper",
+    "oracle": "megastep.agents.selfplay.bots.seekers:Oracle",
     "random": "megastep.agents.selfplay.bots.random:RandomActions",
     "walker": "megastep.agents.selfplay.bots.walker:Walker",
+    "wanderer": "megastep.agents.selfplay.bots.seekers:Wanderer",
 }

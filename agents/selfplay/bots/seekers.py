@@ -1,0 +1,185 @@
+"""Bots that find the objects of Memory. n lanes, L landmarks per plan, K objects.
+
+They know their pose and walk along shortest paths; they differ in what they know of the objects.
+"""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from megastep.agents.selfplay.bots.explorer import BENT, SIGHT, Explorer
+from megastep.agents.selfplay.bots.steering import REACH, Pose, Steering
+from megastep.agents.selfplay.bots.walker import Walker
+from megastep.arrdict import arrdict
+
+LAST = 1.5  # metres, at most, of the last leg of a way: from a landmark straight to an object
+FAR = 100.0  # metres that a longer last leg is worth
+
+
+class Oracle:
+    """Knows the maze and where the object to find is. The most that an agent can find.
+
+    Args:
+        env: a Memory.
+    """
+
+    def __init__(self, env: Any):
+        self.steering = Steering(env)
+        if not hasattr(env, "cue"):
+            raise ValueError(f"it finds the object of env.cue, and {type(env).__name__} has no cue")
+        self.cue, self.positions = env.cue, env.objects.all.positions
+
+    def in_lanes(self, lanes: torch.Tensor) -> "Oracle":
+        """Returns one that plays in lanes (n,) int64 of the environment."""
+        seeker = copy.copy(self)
+        seeker.steering = self.steering.in_lanes(lanes)
+        return seeker
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the initial state: nothing to remember, (n,) bool."""
+        return arrdict(nothing=torch.zeros(n_lanes, dtype=torch.bool, device=device))
+
+    def __call__(
+        self,
+        world: Mapping,
+        state: Mapping,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> tuple[arrdict, arrdict]:
+        """Returns (arrdict(actions (n, 1)), next state)."""
+        pose = self.steering.pose()
+        near = self.steering.near(pose)
+        return self.walk_to(self.cued(), *self.ways(pose, near), pose, near), arrdict(state)
+
+    def cued(self) -> torch.Tensor:
+        """Returns the object to find of each lane, (n,) int64."""
+        return self.cue[self.steering.lanes].long()
+
+    def ways(self, pose: Pose, near: tuple) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Returns where objects are, (n, K, 2), the lengths of the shortest ways to them, (n, K)
+        metres, and the landmark at which each way turns to its object, (n, K).
+        """
+        steering, at = self.steering, self.positions[self.steering.lanes]
+        landmarks, plans = steering.plans.targets[pose.plan], steering.plans
+        last = torch.stack(
+            [plans.straight(pose.plan, at[:, k], landmarks) for k in range(at.shape[1])], 1
+        )
+        last = last + FAR * (last > LAST)
+        metres, landmark = (steering.lengths(near)[:, None] + last).min(-1)
+        return at, metres, landmark
+
+    def walk_to(
+        self,
+        k: torch.Tensor,
+        at: torch.Tensor,
+        metres: torch.Tensor,
+        landmark: torch.Tensor,
+        pose: Pose,
+        near: tuple,
+    ) -> arrdict:
+        """Returns the decision that walks to object k (n,) of each lane."""
+        steering, k = self.steering, k[:, None]
+        goal = at.gather(1, k[..., None].expand(-1, 1, 2))
+        aim = steering.aim(pose, near, landmark.gather(1, k)[:, 0])
+        is_close = steering.plans.straight(pose.plan, pose.position, goal) < REACH
+        aim = torch.where(is_close, goal[:, 0], aim)
+        return steering.decide(pose, aim, aim, turning=0.0)
+
+    def in_view(self, pose: Pose, at: torch.Tensor, metres: torch.Tensor) -> torch.Tensor:
+        """Returns which objects lanes see, (n, K) bool: those to which the way is straight."""
+        offsets = at - pose.position[:, None]
+        away = offsets.norm(dim=-1)
+        is_straight = (metres < BENT[0] * away + BENT[1]) & (away < SIGHT)
+        return is_straight & self.steering.are_in_view(self.steering.bearings(pose, offsets))
+
+
+class Mapper(Oracle):
+    """Does not know the maze or the objects at first: explores frontiers as `Explorer`, remembers
+    without error which objects it has seen, and walks to one that it knows by the shortest path.
+
+    What perfect memory can find.
+    """
+
+    def __init__(self, env: Any):
+        super().__init__(env)
+        self.explorer = Explorer(env)
+        self.explorer.steering = self.steering
+
+    def in_lanes(self, lanes: torch.Tensor) -> "Mapper":
+        """Returns one that plays in lanes (n,) int64 of the environment."""
+        mapper = copy.copy(self)
+        mapper.steering = self.steering.in_lanes(lanes)
+        mapper.explorer = copy.copy(self.explorer)
+        mapper.explorer.steering = mapper.steering
+        return mapper
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the initial state: that of an `Explorer`, and `known` (n, K) bool."""
+        known = torch.zeros(n_lanes, self.positions.shape[1], dtype=torch.bool, device=device)
+        return arrdict(self.explorer.initial(n_lanes, device), known=known)
+
+    def __call__(
+        self,
+        world: Mapping,
+        state: Mapping,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> tuple[arrdict, arrdict]:
+        """Returns (arrdict(actions (n, 1)), next state)."""
+        pose, k = self.steering.pose(), self.cued()
+        near = self.steering.near(pose)
+        at, metres, landmark = self.ways(pose, near)
+        known = state["known"] & ~world["reset"][:, None] | self.in_view(pose, at, metres)
+        explored = self.explorer.explore(world["reset"], state, pose, near)
+        to_object = self.walk_to(k, at, metres, landmark, pose, near)
+        aim = self.steering.aim(pose, near, explored["target"])
+        to_frontier = self.steering.decide(pose, aim, aim)
+        knows = known.gather(1, k[:, None])
+        actions = torch.where(
+            knows.view(-1, *[1] * (to_object["actions"].ndim - 1)),
+            to_object["actions"],
+            to_frontier["actions"],
+        )
+        return arrdict(actions=actions), arrdict(explored, known=known)
+
+
+class Wanderer(Oracle):
+    """Walks between random places as `Walker`, and to the object to find while it sees it. What an
+    agent without memory can find.
+    """
+
+    def __init__(self, env: Any):
+        super().__init__(env)
+        self.walker = Walker(env)
+        self.walker.steering = self.steering
+
+    def in_lanes(self, lanes: torch.Tensor) -> "Wanderer":
+        """Returns one that plays in lanes (n,) int64 of the environment."""
+        wanderer = copy.copy(self)
+        wanderer.steering = self.steering.in_lanes(lanes)
+        wanderer.walker = copy.copy(self.walker)
+        wanderer.walker.steering = wanderer.steering
+        return wanderer
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the initial state, that of a `Walker`."""
+        return self.walker.initial(n_lanes, device)
+
+    def __call__(
+        self,
+        world: Mapping,
+        state: Mapping,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> tuple[arrdict, arrdict]:
+        """Returns (arrdict(actions (n, 1)), next state)."""
+        pose, k = self.steering.pose(), self.cued()
+        near = self.steering.near(pose)
+        ways = self.ways(pose, near)
+        to_object = self.walk_to(k, *ways, pose, near)["actions"]
+        wandering, state = self.walker(world, state, sample, generator)
+        sees = self.in_view(pose, *ways[:2]).gather(1, k[:, None])
+        sees = sees.view(-1, *[1] * (to_object.ndim - 1))
+        return arrdict(actions=torch.where(sees, to_object, wandering["actions"])), state

@@ -1,0 +1,193 @@
+"""Episodes of Keys: which doors are shut, where keys and goal lie, and where the agent begins.
+
+A home's *areas* are what its doorways divide it into. A random tree of doors connects them; the
+doors that are not in it stay locked. Some doors of the tree are shut, which leaves *zones*. From
+the zone where the agent begins, doors are opened one after the other, and the key of each lies in a
+zone that is open by then. So every episode can be solved. The goal is in the zone that opens last.
+
+D layouts, M episodes per layout, C colours, K doorways.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from megastep import geometry
+from megastep.dotdict import dotdict
+from megastep.modules.spawning import CLEARANCE, candidates, distances
+
+RES = 0.1  # metres per cell, of the areas
+N_POINTS = 512  # drawn per layout
+SIDES = 0.15, 0.25, 0.35  # metres from a doorway, at which the areas beside it are looked up
+OPEN = -1  # the state of a doorway without a door; else a door's colour, or C if it stays locked
+APART = 0.5  # metres between the points of an episode, and between them and doorways
+ROUNDS = 50  # of drawing an episode's points; then the search ends
+
+
+class Episodes(NamedTuple):
+    """Episodes of all layouts. In a home of one area they have no doors."""
+
+    starts: np.ndarray  # (D, M, 2) float32 metres
+    keys: np.ndarray  # (D, M, C, 2) float32 metres, NaN of a colour without a door
+    goals: np.ndarray  # (D, M, 2) float32 metres
+    doors: np.ndarray  # (D, M, K) int32: OPEN, a colour, or C
+
+
+class Areas:
+    """The areas of a home.
+
+    Attributes:
+        labels: (H, W) int, the area of each cell from 1, 0 where a wall or doorway is.
+        sides: (K, 2) int, the areas beside each doorway, 0 if there is none.
+    """
+
+    def __init__(self, g: dotdict):
+        doors = np.reshape(g.get("doors", ()), (-1, 2, 2))
+        blocked = geometry.masks(np.concatenate([g.walls, doors]), [], RES)[::-1] < 0
+        self.labels = _components(~blocked)
+        along = doors[:, 1] - doors[:, 0]
+        normal = along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=-1, keepdims=True)
+        middle = doors.mean(1)
+        self.sides = np.zeros((len(doors), 2), int)
+        for metres in SIDES[::-1]:  # the nearest wins
+            for side, sign in enumerate((-1, 1)):
+                found = self.at(middle + sign * metres * normal)
+                self.sides[:, side] = np.where(found, found, self.sides[:, side])
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Returns the areas (P,) at points (P, 2) metres."""
+        column, row = np.floor(points / RES).astype(int).T
+        return self.labels[row, column]
+
+
+def _components(free) -> np.ndarray:
+    """Returns the connected parts (H, W) of free cells, numbered from 1; 0 elsewhere."""
+    labels = np.zeros(free.shape, int)
+    width, n = free.shape[1], 0
+    left = {int(cell) for cell in np.flatnonzero(free)}
+    flat = labels.reshape(-1)
+    while left:
+        n += 1
+        stack = [left.pop()]
+        while stack:
+            cell = stack.pop()
+            flat[cell] = n
+            for other in (cell - 1, cell + 1, cell - width, cell + width):
+                if other in left:
+                    left.remove(other)
+                    stack.append(other)
+    return labels
+
+
+def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:
+    """Returns n random episodes of each geometry, with up to `n_colours` shut doors.
+
+    Args:
+        geometries: floor plans. The same object may occur several times.
+        n: episodes per layout.
+        n_colours: shut doors, at most.
+        seed: of the draws.
+
+    Raises:
+        ValueError: no geometry has a doorway between two of its areas, or one has no room.
+    """
+    distinct = {id(g): g for g in geometries}
+    n_doors = max(len(np.reshape(g.get("doors", ()), (-1, 2, 2))) for g in geometries)
+    found = {}
+    for d, (key, g) in enumerate(distinct.items()):
+        random = np.random.Generator(np.random.Philox([seed, d]))
+        found[key] = _episodes(g, n, n_colours, n_doors, random)
+    if not any((part[1] == part[1]).any() for part in found.values()):
+        raise ValueError(
+            f"geometry {geometries[0].id} has no doorway between two of its parts, nor has any "
+            "other: Keys needs homes with doors, such as geometry=homes"
+        )
+    starts, keys, goals, doors = (
+        np.stack([found[id(g)][part] for g in geometries]) for part in range(4)
+    )
+    return Episodes(
+        starts.astype(np.float32), keys.astype(np.float32), goals.astype(np.float32), doors
+    )
+
+
+def _episodes(g, n, n_colours, n_doors, random) -> tuple[np.ndarray, ...]:
+    areas = Areas(g)
+    points = next(candidates(g, N_POINTS, random))
+    doors = np.reshape(g.get("doors", ()), (-1, 2, 2))
+    is_clear = distances(points, g.walls) > 0.15 + CLEARANCE
+    points = points[is_clear & (distances(points, doors) > APART)]
+    of_point = areas.at(points)
+    points, of_point = points[of_point > 0], of_point[of_point > 0]
+    known = {*of_point.tolist()}
+    usable = [k for k, (a, b) in enumerate(areas.sides.tolist()) if a != b and {a, b} <= known]
+    starts, keys, goals = np.empty((n, 2)), np.full((n, n_colours, 2), np.nan), np.empty((n, 2))
+    states = np.full((n, n_doors), OPEN, np.int32)
+    for m in range(n):
+        for _ in range(ROUNDS):
+            zones, opened = np.arange(areas.labels.max() + 1), []
+            if usable:
+                zones, opened, states[m, : len(doors)] = _doors(areas, usable, n_colours, random)
+            at = _points(points, zones[of_point], opened, random)
+            if at is not None:
+                break
+        else:
+            raise ValueError(f"geometry {g.id} has no room for keys and a goal, {APART:g} m apart")
+        starts[m], goals[m] = at[:2]
+        for (colour, *_), place in zip(opened, at[2:]):
+            keys[m, colour] = place
+    return starts, keys, goals, states
+
+
+def _doors(areas, usable, n_colours, random) -> tuple[np.ndarray, list, np.ndarray]:
+    """Draws which doors are shut. Returns the zone of each area, -1 if it cannot be reached; the
+    doors in the order in which they are opened, as (colour, zone where the key lies, zone behind);
+    and the states of all doorways (K,).
+    """
+    n_areas = int(areas.labels.max()) + 1
+    part, tree, states = [*range(n_areas)], [], np.full(len(areas.sides), OPEN, np.int32)
+    for k in random.permutation(usable).tolist():
+        a, b = (part[area] for area in areas.sides[k])
+        if a == b:
+            states[k] = n_colours  # locked: the tree leads there by another way
+        else:
+            part = [a if p == b else p for p in part]
+            tree.append(k)
+    home = part[areas.sides[tree[0], 0]]  # of several unconnected ones
+    tree = [k for k in tree if part[areas.sides[k, 0]] == home]
+    shut = tree[:n_colours]
+    zones = [area if part[area] == home else -1 for area in range(n_areas)]
+    for k in tree[n_colours:]:
+        a, b = (zones[area] for area in areas.sides[k])
+        zones = [a if zone == b else zone for zone in zones]
+    start = zones[areas.sides[shut[int(random.integers(len(shut)))], int(random.integers(2))]]
+    reached, opened = [start], []
+    colours = random.permutation(n_colours).tolist()
+    while len(opened) < len(shut):
+        ready = []
+        for k in shut:
+            a, b = (zones[area] for area in areas.sides[k])
+            if (a in reached) != (b in reached):
+                ready.append((k, b if a in reached else a))
+        k, behind = ready[int(random.integers(len(ready)))]
+        states[k] = colours[len(opened)]
+        lies = reached[int(random.integers(len(reached)))]
+        opened.append((states[k], lies, behind))
+        reached.append(behind)
+    return np.array(zones), opened, states
+
+
+def _points(points, zones, opened, random) -> list | None:
+    """Draws points (2,) for start, goal and the key of each door, apart from each other; None if
+    there is no room. `zones` (P,) are those of the points.
+    """
+    first = opened[0][1] if opened else zones[random.integers(len(zones))] if len(zones) else 0
+    last, chosen = opened[-1][2] if opened else first, []
+    for zone in (first, last, *(lies for _, lies, _ in opened)):
+        fits = zones == zone
+        for other in chosen:
+            fits &= np.linalg.norm(points - other, axis=-1) > APART
+        if not fits.any():
+            return None
+        chosen.append(points[random.choice(np.flatnonzero(fits))])
+    return chosen

@@ -1,0 +1,112 @@
+// One step of Memory, before it is rendered. Where an episode starts, puts objects where one of the
+// layout's arrangements has them. Rewards an agent that touches the object to find, and draws the
+// next.
+#pragma once
+#include "common/errors.h"
+#include "common/objects.h"
+#include "common/philox.h"
+#include "constants.h"
+#include "params.h"
+
+// An integer in [0, n), drawn by random bits.
+HD int below(unsigned int bits, int n) { return (int)(unit_float(bits) * (float)n); }
+
+// Returns 1 if the agent of an environment touches its object k.
+HD int touches(const MemoryStepParams& p, int env, int k) {
+    Object object = objects_of(p.objects)[env * p.objects.n_objects + k];
+    float dx = p.positions[2 * env] - object.x, dy = p.positions[2 * env + 1] - object.y;
+    float reach = p.scenery.radius + object.size + p.reach;
+    return dx * dx + dy * dy <= reach * reach;
+}
+
+HD void arrange(const MemoryStepParams& p, int env, int layout, int arrangement) {
+    int n = p.objects.n_objects;
+    const float* at = p.arrangements + 2 * n * (layout * (long long)p.n_arrangements + arrangement);
+    for (int k = 0; k < n; k++) {
+        Object& object = objects_of(p.objects)[env * n + k];
+        object.x = at[2 * k];
+        object.y = at[2 * k + 1];
+        object.visible = 1;
+    }
+}
+
+// The first object to find: any that the agent does not touch, or any if it touches all.
+HD int first_cue(const MemoryStepParams& p, int env, unsigned int bits) {
+    int n = p.objects.n_objects, n_apart = 0;
+    for (int k = 0; k < n; k++)
+        n_apart += !touches(p, env, k);
+    int index = below(bits, n_apart ? n_apart : n), cue = 0;
+    while (n_apart && touches(p, env, cue))
+        cue++;
+    for (; index > 0; index--) {
+        cue++;
+        while (n_apart && touches(p, env, cue))
+            cue++;
+    }
+    return cue;
+}
+
+// The next object to find: any but the one that was found.
+HD int next_cue(const MemoryStepParams& p, int cue, unsigned int bits) {
+    int index = below(bits, p.objects.n_objects - 1);
+    return index + (index >= cue);
+}
+
+// Writes where the object to find and all objects are, in the agent's frame, for a critic. Written
+// with sums alone, which compilers do not fuse.
+HD void write_privileged(const MemoryStepParams& p, int env, int cue, int age) {
+    int n = p.objects.n_objects;
+    const Object* objects = objects_of(p.objects) + env * n;
+    Pose pose = pose_at(p.positions[2 * env], p.positions[2 * env + 1], p.angles[env]);
+    float minus_sine = -pose.sine;
+    float* places = p.places + 2 * n * (long long)env;
+    for (int k = 0; k < n; k++) {
+        float dx = objects[k].x - pose.x, dy = objects[k].y - pose.y;
+        places[2 * k] = 0.1f * (pose.cosine * dx + pose.sine * dy);
+        places[2 * k + 1] = 0.1f * (pose.cosine * dy + minus_sine * dx);
+    }
+    float ahead = places[2 * cue], left = places[2 * cue + 1];
+    float* goal = p.goal + N_GOAL * (long long)env;
+    goal[0] = ahead;
+    goal[1] = left;
+    goal[2] = SQRT(ahead * ahead + left * left);
+    goal[3] = (float)(p.limit - age) / (float)p.limit;
+}
+
+HD void memory_env(const MemoryStepParams& p, int env) {
+    int reset = p.ended[env], cue = p.cue[env], hit = 0;
+    flag_nonfinite(p.error_flag, env, p.positions[2 * env], p.positions[2 * env + 1],
+                   p.angles[env]);
+    if (!reset && (unsigned int)cue >= (unsigned int)p.objects.n_objects) {
+        flag_error(p.error_flag, env, BAD_GOAL);
+        cue = 0;
+    }
+    if (!reset)
+        hit = touches(p, env, cue);
+    if (reset || hit) {
+        unsigned int draw = (unsigned int)p.n_draws[env];
+        p.n_draws[env] = (int)(draw + 1u);  // wraps, as Philox's counter does
+        Philox bits = philox((unsigned int)env, draw, p.key0, p.key1);
+        if (reset)
+            arrange(p, env, layout_of(p.scenery, env, p.error_flag),
+                    below(bits.b, p.n_arrangements));
+        cue = reset ? first_cue(p, env, bits.a) : next_cue(p, cue, bits.a);
+    }
+    int age = reset ? 0 : p.ages[env] + 1, ends = !reset && age >= p.limit;
+    int found = reset ? 0 : p.found[env] + hit;
+    p.cue[env] = cue;
+    p.found[env] = found;
+    p.ages[env] = age;
+    p.ended[env] = (unsigned char)ends;
+    p.reward[env] = (float)hit;
+    p.reset[env] = (unsigned char)reset;
+    p.terminal[env] = 0;
+    p.truncated[env] = (unsigned char)ends;
+    p.metrics[env] = ends ? (float)found : 0.f;
+    int colour = objects_of(p.objects)[env * p.objects.n_objects + cue].colour;
+    colour = (unsigned int)colour < (unsigned int)p.objects.n_colours ? colour : 0;
+    for (int c = 0; c < 3; c++)
+        p.cue_obs[3 * (long long)env + c] = HALF_BITS(p.objects.palette[3 * colour + c]);
+    if (p.goal)
+        write_privileged(p, env, cue, age);
+}

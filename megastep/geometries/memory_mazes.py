@@ -1,0 +1,202 @@
+"""Mazes of rooms and corridors, as those of Memory Maze (Pasukonis et al. 2022).
+
+A maze is a square of `size` x `size` cells, each floor or wall. Rooms and corridors have odd
+coordinates and odd lengths, so that a wall of one cell fits between any two. As in DeepMind Lab's
+mazes: rooms are put at random places, what is left is filled with corridors, all are joined by
+openings, and dead ends are filled in. A seed gives the same bytes on every machine.
+
+Cell (row, column) is floor if `floor[row, column]`; row 0 is at the bottom.
+"""
+
+import numbers
+from typing import NamedTuple
+
+import numpy as np
+
+from megastep import geometry
+from megastep.dotdict import dotdict
+from megastep.geometries.homes.portable_generator import PortableGenerator
+from megastep.geometries.homes.walls import INDOORS, WALL, segments
+from megastep.geometries.mazes import BYTES_PER_METRE, START, lit_cells
+
+COUNT = 5_000  # mazes per size, of seeds 0 to 4,999
+MIN_CELL = 0.5  # metres
+LIT = 3  # cells; a light is at most this walk from any floor
+ATTEMPTS = 200  # to put a room somewhere
+LOOPS = 0.2  # chance that an opening is made that no room needs
+STEPS = (0, 1), (0, -1), (1, 0), (-1, 0)
+
+
+class Kind(NamedTuple):
+    """What a size of mazes has."""
+
+    objects: int  # that an episode of Memory Maze has; each in a room of its own
+    steps: int  # of such an episode
+    rooms: int  # at most
+    widest: int  # cells of the side of a room; the shortest is 3
+
+
+#: The kinds by size.
+KINDS = {
+    9: Kind(objects=3, steps=1000, rooms=4, widest=5),
+    11: Kind(objects=4, steps=2000, rooms=6, widest=5),
+    13: Kind(objects=5, steps=3000, rooms=6, widest=5),
+    15: Kind(objects=6, steps=4000, rooms=9, widest=3),
+}
+
+
+def validate(size: int, cell: float) -> int:
+    """Returns the side of a cell in mm.
+
+    Raises:
+        ValueError: if there are no mazes of that size, or its cells are too small or too large.
+    """
+    if size not in KINDS:
+        raise ValueError(
+            f"size={size!r}: Memory Maze has mazes of {', '.join(map(str, KINDS))} cells"
+        )
+    if not isinstance(cell, numbers.Real) or not MIN_CELL <= cell <= 10:
+        raise ValueError(f"cell={cell!r} must be the side of a cell, from {MIN_CELL:g} to 10 m")
+    return round(1000 * cell)
+
+
+def bytes_each(size: int, cell: float) -> float:
+    """Returns the maximum memory of a maze: its masks, walls, and the scenery made of them."""
+    pixels = ((size + 2) * cell / geometry.RES + 15) ** 2
+    return BYTES_PER_METRE * 2 * size * size * cell + 2 * pixels
+
+
+def _rooms(size, generator) -> list[tuple[int, int, int, int]]:
+    """Returns (first row, first column, rows, columns) of rooms that do not touch."""
+    kind, rooms = KINDS[size], []
+    taken = np.zeros((size, size), bool)
+    for _ in range(ATTEMPTS):
+        height, width = (3 + 2 * generator.below((kind.widest - 1) // 2) for _ in range(2))
+        i, j = (2 * generator.below((size - n) // 2 + 1) for n in (height, width))
+        if len(rooms) < kind.rooms and not taken[i : i + height, j : j + width].any():
+            taken[i : i + height, j : j + width] = True
+            rooms.append((i, j, height, width))
+    return rooms
+
+
+def _dig(size, rooms, generator) -> np.ndarray:
+    """Returns the region of each cell, 0 for walls: rooms from 1, then trees of corridors."""
+    regions = np.zeros((size, size), int)
+    for number, (i, j, height, width) in enumerate(rooms, 1):
+        regions[i : i + height, j : j + width] = number
+    n_regions = len(rooms)
+    for start in range(((size + 1) // 2) ** 2):
+        i, j = (2 * k for k in divmod(start, (size + 1) // 2))
+        if regions[i, j]:
+            continue
+        n_regions += 1
+        regions[i, j] = n_regions
+        way = [(i, j)]  # a random walk that turns back where it is stuck
+        while way:
+            i, j = way[-1]
+            exits = [
+                (y, x)
+                for y, x in STEPS
+                if 0 <= i + 2 * y < size
+                and 0 <= j + 2 * x < size
+                and not regions[i + 2 * y, j + 2 * x]
+            ]
+            if not exits:
+                way.pop()
+                continue
+            y, x = exits[generator.below(len(exits))]
+            regions[i + y, j + x] = regions[i + 2 * y, j + 2 * x] = n_regions
+            way.append((i + 2 * y, j + 2 * x))
+    return regions
+
+
+def _join(regions, generator) -> None:
+    """Opens walls between regions until all are connected, and some more."""
+    size = len(regions)
+    doors = [
+        (i, j, i + y, j + x, i - y, j - x)
+        for i in range(size)
+        for j in range(size)
+        for y, x in ((0, 1), (1, 0))
+        if not regions[i, j] and y <= i < size - y and x <= j < size - x
+        and 0 != regions[i + y, j + x] != regions[i - y, j - x] != 0
+    ]  # fmt: skip
+    part = list(range(regions.max() + 1))
+    for k in range(len(doors)):
+        at = k + generator.below(len(doors) - k)
+        doors[k], doors[at] = doors[at], doors[k]
+        i, j, *sides = doors[k]
+        a, b = (part[regions[i, j]] for i, j in (sides[:2], sides[2:]))
+        if a != b:
+            part = [a if p == b else p for p in part]
+        elif not generator.chance(LOOPS):
+            continue
+        regions[i, j] = -1
+    regions[regions < 0] = regions.max() + 1
+
+
+def _around(floor, i, j) -> list[tuple[int, int]]:
+    n = len(floor)
+    beside = [(i + y, j + x) for y, x in STEPS]
+    return [(i, j) for i, j in beside if 0 <= i < n and 0 <= j < n and floor[i, j]]
+
+
+def _fill_dead_ends(regions) -> None:
+    is_end = True
+    while is_end:
+        is_end = False
+        for i, j in np.argwhere(regions).tolist():
+            if len(_around(regions, i, j)) < 2:
+                regions[i, j] = 0
+                is_end = True
+
+
+def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, int, int]]]:
+    """Returns the floor (size, size) bool of the maze of a seed, and its rooms, of each the first
+    row and column and the number of both.
+    """
+    generator = PortableGenerator(seed * len(KINDS) + sorted(KINDS).index(size))
+    rooms = []
+    while len(rooms) < KINDS[size].objects:
+        rooms = _rooms(size, generator)
+    regions = _dig(size, rooms, generator)
+    _join(regions, generator)
+    _fill_dead_ends(regions)
+    return regions > 0, rooms
+
+
+def generate(seed: int, size: int = 9, cell: float = 0.6) -> dotdict:
+    """Returns the maze of a seed: a geometry whose rooms are the maze's, without corridors. So
+    agents spawn in rooms.
+
+    Args:
+        seed: any integer.
+        size: cells per side, one of `KINDS`.
+        cell: side of a cell in metres, rounded to a millimetre.
+
+    Raises:
+        ValueError: naming the argument that is out of range.
+    """
+    side = validate(size, cell)
+    floor, rooms = floor_plan(seed, size)
+    lines = START + side * np.arange(size + 3)
+    grid = np.full((size + 2, size + 2), WALL, np.int8)
+    grid[1:-1, 1:-1][floor] = INDOORS
+    walls = segments(lines, lines, grid, INDOORS) / 1000
+
+    cells = [tuple(at) for at in np.argwhere(floor).tolist()]
+    numbers_of = {at: k for k, at in enumerate(cells)}
+    beside = [[numbers_of[other] for other in _around(floor, *at)] for at in cells]
+    lit = np.array([cells[k] for k in lit_cells(beside, LIT)])[:, ::-1]
+    polygons = [
+        lines[1] / 1000
+        + side / 1000 * np.array([(j, i), (j + width, i), (j + width, i + height), (j, i + height)])
+        for i, j, height, width in rooms
+    ]
+    return dotdict(
+        id=seed,
+        walls=walls.astype(np.float32),
+        lights=((lines[1] + side * (lit + 0.5)) / 1000).astype(np.float32),
+        masks=geometry.masks(walls, polygons),
+        res=geometry.RES,
+    )

@@ -1,0 +1,139 @@
+"""Keys: every episode can be solved, and its rules by hand."""
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import contract, envs, toys
+from megastep.arrdict import arrdict
+from megastep.envs.keys.episodes import OPEN, Areas, episodes
+from megastep.geometries import sample
+
+N_COLOURS = 3
+
+
+def solve(g, areas, start, keys, goal, doors):
+    """Walks to all that can be reached, picks up all keys, opens all doors that it can, until
+    nothing changes. Returns (whether the goal was reached, doors opened, doors that were open or
+    needed no key when the goal was reached first).
+    """
+    has, opened = set(), set()
+    n_before_goal = None
+    while True:
+        reached = {int(areas.at(start[None])[0])}
+        while True:
+            more = {
+                b
+                for k, sides in enumerate(areas.sides.tolist())
+                for a, b in (sides, sides[::-1])
+                if a in reached and b and (doors[k] == OPEN or k in opened)
+            }
+            if more <= reached:
+                break
+            reached |= more
+        if n_before_goal is None and int(areas.at(goal[None])[0]) in reached:
+            n_before_goal = len(opened)
+        for colour in np.flatnonzero(np.isfinite(keys[:, 0])):
+            if int(areas.at(keys[None, colour])[0]) in reached:
+                has.add(int(colour))
+        ready = [
+            k
+            for k, sides in enumerate(areas.sides.tolist())
+            if doors[k] in has and k not in opened and reached & set(sides)
+        ]
+        if not ready:
+            return n_before_goal, len(opened)
+        opened.add(ready[0])
+
+
+def check_episodes(n_homes, n, n_colours=N_COLOURS, **options):
+    """Solves n episodes of each home. Returns how many have each number of doors."""
+    homes = sample("homes", n_homes, **options)
+    drawn = episodes(homes, n, n_colours, seed=1)
+    counts = np.zeros(n_colours + 1, int)
+    for d, g in enumerate(homes):
+        areas = Areas(g)
+        for m in range(n):
+            start, keys, goal, doors = (part[d, m] for part in drawn)
+            n_before_goal, n_opened = solve(g, areas, start, keys, goal, doors)
+            n_shut = int(np.isfinite(keys[:, 0]).sum())
+            used = doors[(doors >= 0) & (doors < n_colours)]
+            assert len(set(used.tolist())) == len(used) == n_shut >= 1, "a door of each colour"
+            assert n_opened == n_shut and n_before_goal, (g.id, m)
+            counts[n_shut] += 1
+    return counts
+
+
+def test_every_episode_can_be_solved_and_needs_a_door():
+    counts = check_episodes(6, 12)
+    assert counts[N_COLOURS] > 40
+
+
+@pytest.mark.nightly
+def test_ten_thousand_episodes_can_be_solved():
+    counts = check_episodes(300, 30) + check_episodes(40, 25, density=3.0)
+    assert counts.sum() == 10_000 and counts[N_COLOURS] > 7_500
+
+
+def test_homes_without_doors_are_refused():
+    words = "no doorway between two of its parts.*Keys needs homes with doors"
+    with pytest.raises(ValueError, match=words):
+        envs.Keys(1, [toys.box()], device="cpu")
+
+
+def make_env(device="cpu", n_envs=5, **settings):
+    homes = sample("homes", 2)
+    return envs.Keys(n_envs, homes, device=device, res=8, subsample=1, **settings)
+
+
+def still(env):
+    return arrdict(actions=torch.zeros((env.n_envs, 1), dtype=torch.long, device=env.device))
+
+
+def visit(env, positions):
+    """Puts each agent at a point (N, 2), at rest, and takes a step."""
+    env.core.agents.positions[:, 0] = positions
+    env.core.agents.velocity.zero_()
+    return env.step(still(env))
+
+
+def test_keys_open_doors_of_their_colours_and_the_goal_ends_the_episode(device):
+    env = make_env(device, n_envs=5, key_reward=0.25, door_reward=0.5, privileged=True)
+    world = env.reset()
+    keys, doors, goal = (env.objects[name] for name in ("key", "door", "goal"))
+    assert not world.obs["keys"].any() and (env.core.agents.positions[:, 0] != 0).all()
+    n_keys = keys.visible.sum(1)
+    lanes = torch.arange(5, device=device)
+    for colour in range(3):
+        is_there = keys.visible[:, colour].clone()
+        door = (doors.colours == colour).int().argmax(1)
+        before = visit(env, doors.positions[lanes, door])
+        assert not before.reward.any(), "a door stays shut without its key"
+        world = visit(env, keys.positions[:, colour].clone())
+        assert torch.equal(world.reward > 0, is_there)
+        assert torch.equal(world.obs["keys"][:, 0, colour] == 1, is_there)
+        world = visit(env, doors.positions[lanes, door])
+        torch.testing.assert_close(world.reward, 0.5 * is_there)
+        assert torch.equal(doors.open[lanes, door], is_there) and not world.obs["keys"].any()
+        assert not visit(env, doors.positions[lanes, door]).reward.any(), "it is open"
+    world = visit(env, goal.positions[:, 0].clone())
+    assert (world.reward == 1).all() and world.terminal.all() and not world.truncated.any()
+    assert (world.metrics.success == 1).all() and not world.metrics.wasted.any()
+    assert torch.equal(world.metrics.doors, n_keys.float())
+    world = env.step(still(env))
+    assert world.reset.all() and not world.reward.any() and not doors.open.any()
+
+
+def test_a_key_that_is_not_used_is_wasted():
+    env = make_env(limit=2)
+    env.reset()
+    keys = env.objects["key"]
+    colour = keys.visible.int().argmax(1)
+    visit(env, keys.positions[torch.arange(5), colour])
+    world = env.step(still(env))
+    assert world.truncated.all() and (world.metrics.wasted == 1).all()
+    assert not world.metrics.success.any() and not world.metrics.doors.any()
+
+
+def test_contract(device):
+    contract.rollout(make_env(device, limit=12, resample=True, privileged=True), 40)
