@@ -15,9 +15,11 @@ from megastep.agents.distributed.plan import Plan, agree
 from megastep.agents.distributed.process_group import n_ranks, rank, unhurried
 from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
+from megastep.agents.runs.saver import NoSaver
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.closing import close_env
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
+from megastep.agents.training.loggers import NoLogger
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import PHASES, PhaseTimer, device_memory
 from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
@@ -47,9 +49,9 @@ class Trainer:
         env: the environment.
         policy: the policy that the learner trains.
         learner: such as `PPO`.
-        logger: such as `loggers.Loggers`.
-        saver: such as `saver.Saver`.
-        budget: when the run ends and how its learning rate falls.
+        logger: such as `loggers.Loggers`; None writes nothing.
+        saver: such as `saver.Saver`; None saves nothing.
+        budget: when the run ends and how its learning rate falls; None: when `stop()` says so.
         log_every: updates between two reports.
         checkpoint_seconds: seconds between two checkpoints. One that is due while the last is still
             being written comes after it; below a second, training waits for it.
@@ -95,9 +97,9 @@ class Trainer:
         env: Env,
         policy: Policy,
         learner: Learner,
-        logger: RunLogger,
-        saver: SaverLike,
-        budget: Budget,
+        logger: RunLogger | None = None,
+        saver: SaverLike | None = None,
+        budget: Budget | None = None,
         *,
         log_every: int = 1,
         checkpoint_seconds: float = 30.0,
@@ -112,7 +114,9 @@ class Trainer:
         profiler: Profiler | None = None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
-        self.logger, self.saver, self.budget = logger, saver, budget
+        self.logger = NoLogger() if logger is None else logger
+        self.saver = NoSaver() if saver is None else saver
+        self.budget = budget = Budget() if budget is None else budget
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.on_log, self.evaluator, self.snapshot_saver = on_log, evaluator, snapshot_saver
         self.opponents = optional(env, "opponent_pool")
