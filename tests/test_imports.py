@@ -56,7 +56,7 @@ AGENTS = (
     ("selfplay",),
     ("factory",),
     ("evaluation", "pretrained"),
-    ("reports",),
+    ("export", "reports"),
     ("launch",),
     ("cli",),
     ("api",),
@@ -84,7 +84,7 @@ SHARED_WITH_BOTS = SHARED | {
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
 # environments, writes videos and starts processes.
-UPPER_ROOMS = ("api", "cli", "evaluation", "factory", "launch", "pretrained", "reports")
+UPPER_ROOMS = ("api", "cli", "evaluation", "export", "factory", "launch", "pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",

@@ -35,7 +35,7 @@ _tanh_backward = torch.ops.aten.tanh_backward.grad_input  # (d, y): d (1 - y^2)
 
 
 def _split(gates) -> tuple[torch.Tensor, ...]:
-    return gates.view(len(gates), 4, -1).unbind(1)
+    return gates.unflatten(1, (4, -1)).unbind(1)
 
 
 def _start(reset, last_output, last_cell, hidden, cell) -> None:
@@ -97,7 +97,7 @@ def _unroll(
     outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
     cells = [torch.empty_like(cell)]
     steps.start(reset[0], output, cell, hiddens[0], cells[0])
-    next_steps = [*zip(reset[1:], hiddens[1:], strict=True), (None, None)]
+    next_steps = [*((reset[t], hiddens[t]) for t in range(1, len(x))), (None, None)]
     for t, (next_reset, next_hidden) in enumerate(next_steps):
         gates[t].addmm_(hiddens[t], weight.T)
         cells.append(torch.empty_like(cells[t]))

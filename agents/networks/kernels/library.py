@@ -1,6 +1,8 @@
 """The kernel library of the networks, for CPU and GPU, and helpers of its wrappers."""
 
+import contextlib
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -48,9 +50,28 @@ def n_threads(state: torch.Tensor) -> int:
     return state.numel() // units_per_thread(state.shape[1])
 
 
-@functools.cache
+#: Whether everything is computed by PyTorch's operations, which other runtimes have.
+_is_plain = False
+
+
+@contextlib.contextmanager
+def plain_operations() -> Iterator[None]:
+    """Has a CPU compute by PyTorch's operations alone for the duration of the context."""
+    global _is_plain
+    before, _is_plain = _is_plain, True
+    try:
+        yield
+    finally:
+        _is_plain = before
+
+
 def is_built_for_cpu() -> bool:
     """Returns whether the CPU's operations can be used, which takes a C++ compiler."""
+    return not _is_plain and _is_built()
+
+
+@functools.cache
+def _is_built() -> bool:
     try:
         return bool(cpu(LIBRARY))
     except EngineError:
@@ -59,7 +80,7 @@ def is_built_for_cpu() -> bool:
 
 def aligned(tensor: torch.Tensor) -> torch.Tensor:
     """Returns the tensor, or a copy, contiguous and starting at a multiple of 16 bytes."""
-    if tensor.data_ptr() % 16:
+    if not _is_plain and tensor.data_ptr() % 16:
         return tensor.clone(memory_format=torch.contiguous_format)
     return tensor.contiguous()
 
