@@ -46,6 +46,7 @@ from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.gradient_steps import GradientSteps
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
+from megastep.agents.networks.running_norm import VERSION
 from megastep.agents.storage.rollout import Rollout
 from megastep.agents.types import StateDict
 
@@ -165,17 +166,14 @@ class GradientLearner:
         """
         return dict(
             learner=type(self).__name__,
+            normalisation=VERSION,
             **self.steps.state_dict(),
             generator=self.generator.state_dict(),
             policy_generator=self.policy.generator.state_dict(),
         )
 
-    def load_state_dict(self, state: StateDict) -> None:
-        """Continues from a `state_dict`, which may come from another device.
-
-        Raises:
-            ValueError: if the state belongs to another class of learner.
-        """
+    def check_state(self, state: StateDict) -> None:
+        """Raises ValueError if a `state_dict` is not one that `load_state_dict` continues from."""
         name = type(self).__name__
         saved_name = state.get("learner", name)
         if saved_name != name:
@@ -183,6 +181,21 @@ class GradientLearner:
                 f"the state of a {saved_name} learner cannot be loaded by {name}: use "
                 f"{saved_name}, or start from the policy's weights alone (init=RUN)"
             )
+        if state.get("normalisation") != VERSION:
+            raise ValueError(
+                "a version of megastep that normalised observations and returns otherwise began "
+                "this run: continue it with the version that began it, or start from its weights "
+                "(init=RUN)"
+            )
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Continues from a `state_dict`, which may come from another device.
+
+        Raises:
+            ValueError: if the state belongs to another class of learner, or to a version of
+                megastep that normalised observations and returns otherwise.
+        """
+        self.check_state(state)
         self.steps.load_state_dict(state)
         self.generator.load_state_dict(state["generator"], self.device)
         self.policy.generator.load_state_dict(state["policy_generator"], self.device)

@@ -38,9 +38,8 @@ def explained_variance(
     """
     error, spread = targets - value, targets - masked_mean(targets, valid)
     error = error - masked_mean(error, valid)
-    return 1 - masked_mean(error.square(), valid) / masked_mean(spread.square(), valid).clamp(
-        min=1e-8
-    )
+    error, spread = (masked_mean(x.square(), valid) for x in (error, spread))
+    return 1 - error / torch.maximum(spread, 1e-8 * error).clamp(min=1e-30)
 
 
 def effective_sample_size(weights: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:

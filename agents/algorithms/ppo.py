@@ -5,8 +5,9 @@ over valid steps: those that the environment took, of lanes that learn. An updat
 synchronises: conditions are bool tensors on the device.
 """
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import torch
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
@@ -20,9 +21,6 @@ from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
-
-if TYPE_CHECKING:
-    import torch
 
 _PARTS = "starts", "actions", "logprobs"  # of a rollout, that a minibatch copies
 
@@ -105,6 +103,7 @@ class PPO(GradientLearner):
 
     def collector(self, env: Env) -> Collector:
         """Returns a collector of rollouts of `n_steps` steps."""
+        self.policy.clear_stats()
         return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps))
 
     def bytes_per_env(self, env: Env) -> float:
@@ -124,7 +123,7 @@ class PPO(GradientLearner):
         advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
         moments = masked_moments(valid, targets, advantages)
         (_, _, variance), (_, _, error) = moments  # an advantage is the error of the value
-        explained = 1 - error / variance.clamp(min=1e-8)
+        explained = 1 - error / torch.maximum(variance, 1e-8 * error).clamp(min=1e-30)
         # One row of observations is enough: every rollout brings another B.
         last = rollout.world(-1)
         own_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
 from megastep.agents.algorithms.td_loss import Result, Settings, td_loss
+from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
@@ -25,6 +26,8 @@ from megastep.types import Env, Tree, World, optional
 
 #: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
+#: Between these root mean squares, rewards stay as they are.
+_USUAL = 1e-2, 1e2
 #: Parts of a minibatch with a time axis that the loss needs.
 _STEPS = "actions", "reward", "terminal", "truncated", "starts", "learns"
 
@@ -67,6 +70,9 @@ class R2D2(GradientLearner):
     stored one. Then it moves the values of the actions taken towards n-step returns, which
     bootstrap from the target network's value of the online network's best action (double
     Q-learning, van Hasselt et al. 2016). Networks predict values transformed by `returns.rescale`.
+
+    Rewards whose root mean square is far from 1, in the first rollout that has any, are divided by
+    it, so that learning does not depend on their units.
 
     Args:
         policy: a policy with `output="duelling"`.
@@ -133,6 +139,7 @@ class R2D2(GradientLearner):
         self._target_copies = [
             (target, weights[name]) for name, target in self.target.state_dict().items()
         ]
+        self.reward_scale = torch.zeros((), device=self.device)  # 0: there was no reward yet
         self.n_taken = torch.zeros((), dtype=torch.int64, device=self.device)  # gradient steps
         # Both networks' LSTMs leave a fifth of a GPU idle, where the other's products can run.
         on_gpu = self.device.type == "cuda"
@@ -145,6 +152,7 @@ class R2D2(GradientLearner):
         Raises:
             ValueError: if the replay buffer is too small, or a gradient step has no sequence.
         """
+        self.policy.clear_stats()
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
         ratio, n_lanes = self.replay_settings.ratio, rollout.n_lanes
         if ratio * n_lanes < self.gradient_steps:
@@ -178,8 +186,13 @@ class R2D2(GradientLearner):
     def _update(self, rollout) -> dict[str, torch.Tensor]:
         replay = self.replay_buffer
         assert replay is not None
-        is_finite, _ = self.steps.begin(rollout.floats())
+        own = masked_moments(~rollout.reset & rollout.learns[:-1], rollout.reward)
+        is_finite, ((_, mean, variance),) = self.steps.begin(rollout.floats(), *own)
         replay.add(rollout, is_finite)
+        size = (variance + mean.square()).sqrt()
+        is_first = is_finite & (self.reward_scale == 0) & (size > 0)
+        size = size.masked_fill((size > _USUAL[0]) & (size < _USUAL[1]), 1.0)
+        self.reward_scale.copy_(torch.where(is_first, size, self.reward_scale))
         # A non-finite rollout counts as skipped even while the replay buffer is not ready.
         is_enabled = replay.is_ready | ~is_finite
         generator = self.generator.on(self.device)
@@ -215,13 +228,19 @@ class R2D2(GradientLearner):
             torch.cuda.current_stream(self.device).wait_stream(self._beside)
         steps = arrdict({name: batch[name] for name in _STEPS})
         steps = mapping(lambda leaf: leaf[burn_in:])(steps)
+        scale = self.reward_scale.masked_fill(self.reward_scale == 0, 1.0)
+        steps["reward"] = steps.reward / scale
         learned = arrdict({**steps, "weight": batch.weight, "age": batch.age})
-        return td_loss(q, target_q, learned, self.policy.output, self.loss_settings)
+        result = td_loss(q, target_q, learned, self.policy.output, self.loss_settings)
+        result.metrics["q"] = result.metrics["q"] * scale
+        return result
 
     def state_dict(self) -> StateDict:
-        """Returns the base's state, the target network and the number of gradient steps taken."""
-        target = self.target.state_dict()
-        return dict(super().state_dict(), target=target, n_taken=self.n_taken.clone())
+        """Returns the base's state, the target network, the number of gradient steps taken and the
+        scale of rewards.
+        """
+        own = dict(n_taken=self.n_taken.clone(), reward_scale=self.reward_scale.clone())
+        return dict(super().state_dict(), target=self.target.state_dict(), **own)
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`, which may come from another device.
@@ -232,3 +251,4 @@ class R2D2(GradientLearner):
         super().load_state_dict(state)
         self.target.load_state_dict(state["target"])
         self.n_taken.copy_(state["n_taken"])
+        self.reward_scale.copy_(state["reward_scale"])

@@ -152,6 +152,7 @@ class VTrace(GradientLearner):
             ValueError: if the replay buffer is too small, or the environment has opponents and
                 `lag` > 0.
         """
+        self.policy.clear_stats()
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
         if self.replay_settings:
             env_spaces = env.obs_space, env.action_space
@@ -181,9 +182,14 @@ class VTrace(GradientLearner):
         return settings.capacity, bytes_per_observation(env, self.policy, self.n_steps, settings)
 
     def _update(self, rollout) -> dict[str, torch.Tensor]:
-        is_finite, _ = self.steps.begin(rollout.floats())
+        of_own_rewards = masked_moments(~rollout.reset, rollout.reward)
+        is_finite, (of_rewards,) = self.steps.begin(rollout.floats(), *of_own_rewards)
         if self.replay_buffer is not None:
             self.replay_buffer.add(rollout, is_finite)
+        # The first rollout with rewards tells only their size. It counts as skipped if not finite.
+        _, mean, variance = of_rewards
+        is_unknown = self.critic.output.is_clear & ((mean != 0) | (variance > 0))
+        is_enabled = ~(is_unknown & is_finite)
         all_estimates = []
         for _ in range(self.n_epochs):
             generator = self.generator.on(self.device)
@@ -191,7 +197,7 @@ class VTrace(GradientLearner):
             for lanes in order.tensor_split(self.n_minibatches):
                 loss, metrics, estimates = self._losses(self._batch(rollout, lanes), len(lanes))
                 self.steps.backward(loss, metrics, estimates.valid.sum())
-                self.steps.take()
+                self.steps.take(is_enabled)
                 all_estimates.append(estimates)
         # Statistics change only now, so the whole update saw the normalisation that acted. One row
         # of observations is enough: every rollout brings another B.

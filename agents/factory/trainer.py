@@ -88,6 +88,8 @@ def make_trainer(
                 formats.check(formats.Counts, {k: state.get(k) for k in formats.COUNTS})
                 if name := nonfinite_leaf(state["learner"]):
                     raise ValueError(f"learner.{name} has a NaN or an infinity")
+                if check_state := getattr(learner, "check_state", None):
+                    check_state(state["learner"])  # before anything is written
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)

@@ -10,6 +10,7 @@ from megastep.agents.networks.kernels import moments as kernels
 from megastep.agents.types import Moments
 
 _MAX_NUMBERS = 2**31 - 1
+_TINY = 1e-30  # so that equal numbers are not divided by 0
 
 
 @torch.no_grad()
@@ -40,7 +41,7 @@ def normalise_masked(x: torch.Tensor, valid: torch.Tensor, moments: Moments) -> 
     _, mean, variance = moments
     if _is_fused(valid, x):
         return kernels.normalise_masked(x, valid, mean, variance)
-    return (x - mean).masked_fill(~valid, 0.0) / (variance.sqrt() + 1e-8)
+    return (x - mean).masked_fill(~valid, 0.0) / (variance.sqrt() + _TINY)
 
 
 def _is_fused(valid, *arrays) -> bool:

@@ -357,6 +357,16 @@ class Policy(nn.Module):
         """
         running_norm.add_moments(self._norms(), moments, is_counted)
 
+    def clear_stats(self) -> None:
+        """Makes observations and values 0 until there are statistics of them, which begin with the
+        first rollout, so that learning does not depend on their units. Leaves statistics that there
+        are as they are. Learners call it before they collect.
+        """
+        for norm in self._norms():
+            norm.clear()
+        if self.critic is not None:
+            self.critic.output.clear()
+
     def _norms(self) -> list[running_norm.RunningNorm]:
         norms = self.intake.running_norms
         return norms + self._critic.intake.running_norms if self.privileged_space else norms

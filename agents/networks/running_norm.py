@@ -1,4 +1,5 @@
-"""Normalisation by running means and standard deviations. Ignores non-finite numbers.
+"""Normalisation by running means and standard deviations, in whatever units the numbers are.
+Ignores non-finite numbers.
 
 B lanes; `...` any further axes.
 """
@@ -11,44 +12,58 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.kernels import moments as kernels
+from megastep.agents.networks.kernels.library import LIBRARY
 from megastep.agents.types import Moments
 from megastep.types import Space
+
+#: The version of the rules below. A run that began with others cannot continue bit for bit.
+VERSION = 2
+#: The scale of a number that has not varied yet, which makes it 0.
+UNKNOWN_SCALE = LIBRARY.constants["UNKNOWN_SCALE"]
+#: A standard deviation below this fraction of the mean may be rounding errors.
+RESOLUTION = LIBRARY.constants["RESOLUTION"]
 
 
 class _Statistics(Protocol):
     mean: torch.Tensor
     scale: torch.Tensor
-    min_scale: float
 
 
 class RunningNorm(nn.Module):
     """Subtracts a running mean and divides by a running standard deviation: per channel for images,
-    per number for vectors.
+    per number for vectors. A number that has not varied yet becomes 0: nothing tells by how much
+    to divide when it does.
 
     Needed also for images from 0 to 1: if pixels are .87 plus or minus .1, a new network would
     mostly see the .87.
 
+    Before the first moments, observations stay as they are, or are 0 after `clear`.
+
     Args:
         space: leaf space of an image or a vector.
-        min_scale: smallest divisor, so that nearly constant inputs are not amplified.
     """
 
     mean: torch.Tensor
     scale: torch.Tensor
     count: torch.Tensor  # ()
 
-    def __init__(self, space: Space, min_scale: float = 1e-2):
+    def __init__(self, space: Space):
         super().__init__()
         is_image = isinstance(space, spaces.MultiImage)
         shape = (*space.shape[:2], 1, 1) if is_image else space.shape
         self.pooled_axes = (0, -2, -1) if is_image else (0,)
-        self.min_scale = min_scale
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("scale", torch.ones(shape))
         self.register_buffer("count", torch.tensor(0.0))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (obs - self.mean) / self.scale
+
+    def clear(self) -> None:
+        """Makes observations 0 until the first moments, unless it has some: in their own units they
+        could be of any size.
+        """
+        self.scale.masked_fill_(self.count == 0, UNKNOWN_SCALE)
 
     @torch.no_grad()
     def moments(self, obs: torch.Tensor, is_counted: torch.Tensor | bool = True) -> Moments:
@@ -75,6 +90,7 @@ class RunningNorm(nn.Module):
         """
         count = self.count + 1
         mean, scale = mix_moments(self, mean, variance, 1 / count)
+        scale = scale.masked_fill(scale <= RESOLUTION * mean.abs(), UNKNOWN_SCALE)
         is_stored = (n_lanes > 0) & (mean + scale).isfinite().all()
         store_if(is_stored, [(self.mean, mean), (self.scale, scale), (self.count, count)])
 
@@ -140,13 +156,13 @@ def _is_readable(leaf) -> bool:
 def mix_moments(
     norm: _Statistics, mean: torch.Tensor, variance: torch.Tensor, rate: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns mean and scale of a mixture: the norm's moments with weight 1 - rate, `mean` and
-    `variance` with weight rate.
+    """Returns mean and standard deviation of a mixture: the norm's moments with weight 1 - rate,
+    `mean` and `variance` with weight rate.
     """
-    old_variance = norm.scale.square()
+    old_variance = norm.scale.masked_fill(norm.scale >= UNKNOWN_SCALE, 0.0).square()
     spread = rate * (1 - rate) * (mean - norm.mean).square()
     variance = old_variance.lerp(variance, rate) + spread
-    return norm.mean.lerp(mean, rate), variance.sqrt().clamp(min=norm.min_scale)
+    return norm.mean.lerp(mean, rate), variance.sqrt()
 
 
 def store_if(condition: torch.Tensor, pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:

@@ -13,7 +13,7 @@ from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.precision import compute_dtype
-from megastep.agents.networks.running_norm import mix_moments, store_if
+from megastep.agents.networks.running_norm import RESOLUTION, mix_moments, store_if
 from megastep.agents.types import Moments
 
 
@@ -26,14 +26,14 @@ class ValueOutput(nn.Module):
 
     Args:
         width: number of features.
-        min_scale: smallest standard deviation; returns that vary less count as constant.
+        min_scale: smallest standard deviation, far below that of returns in any units, and not 0.
     """
 
     mean: torch.Tensor  # ()
     scale: torch.Tensor
     count: torch.Tensor
 
-    def __init__(self, width: int, min_scale: float = 1e-3):
+    def __init__(self, width: int, min_scale: float = 1e-15):
         super().__init__()
         self.linear = nn.Linear(width, 1)
         nn.init.orthogonal_(self.linear.weight, gain=0.1)
@@ -41,6 +41,19 @@ class ValueOutput(nn.Module):
         self.min_scale = min_scale
         for name, start in dict(mean=0.0, scale=1.0, count=0.0).items():
             self.register_buffer(name, torch.tensor(start))
+
+    @torch.no_grad()
+    def clear(self) -> None:
+        """Makes predictions 0, unless there are statistics of returns: whatever a new network
+        predicts may be many times the size of returns, and PopArt would keep it.
+        """
+        for parameter in self.linear.parameters():
+            parameter.masked_fill_(self.count == 0, 0.0)
+
+    @property
+    def is_clear(self) -> torch.Tensor:
+        """Whether there have been no statistics since `clear`: () bool."""
+        return (self.count == 0) & ~self.linear.weight.any() & ~self.linear.bias.any()
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         normalised = linear(x, self.linear).float().squeeze(-1)
@@ -81,7 +94,8 @@ class ValueOutput(nn.Module):
         """Adds moments of returns to the statistics, the n-th call with weight max(min_rate, 1/n).
         On a GPU in one kernel.
 
-        Changes nothing if there is no return, or if mean or variance is not finite.
+        Changes nothing if there is no return, if mean or variance is not finite, or if all returns
+        have been 0, which tells nothing about their size.
 
         Args:
             moments: number of returns, their mean and variance.
@@ -96,9 +110,11 @@ class ValueOutput(nn.Module):
         count = self.count + 1
         rate = (1 / count).clamp(min=min_rate, max=1.0)
         mean, scale = mix_moments(self, mean, variance, rate)
+        is_nothing = (self.count == 0) & (scale == 0) & (mean == 0)
+        scale = torch.maximum(scale, (RESOLUTION * mean.abs()).clamp(min=self.min_scale))
         weight = self.linear.weight * (self.scale / scale)
         bias = (self.linear.bias * self.scale + (self.mean - mean)) / scale
-        is_stored = (n_valid > 0) & (mean + scale).isfinite()
+        is_stored = (n_valid > 0) & (mean + scale).isfinite() & ~is_nothing
         if is_counted is not None:
             is_stored = is_stored & is_counted
         old = self.linear.weight, self.linear.bias, self.mean, self.scale, self.count

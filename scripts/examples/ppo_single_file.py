@@ -95,6 +95,7 @@ def train(settings, env):
 
     # The collector acts for T steps and stores them in the rollout, always the same one. On a GPU
     # it replays a CUDA graph.
+    policy.clear_stats()  # observations and values are 0 until the first rollout tells their units
     rollout = make_rollout(env, policy, settings.n_steps)
     collect = Collector(env, policy, rollout)
     has_random_ages = optional(env, "desync") is not None

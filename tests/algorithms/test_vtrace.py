@@ -128,8 +128,8 @@ def test_staleness_metric(lag):
     assert 1 + lag < metrics["staleness"] < 2 + lag
     assert metrics["kl"] < metrics["replayed_kl"]
     assert metrics["replayed_effective_samples"] <= 1 and metrics["replayed_rho"] <= 1
-    _, first = replaying(1)
-    assert first["staleness"] == first["replayed_rho"] == first["replayed_effective_samples"] == 0
+    _, first = replaying(1)  # which tells only the size of returns
+    assert all(math.isnan(first[name]) for name in ("staleness", "replayed_rho", "policy"))
 
 
 def test_priorities_follow_errors():

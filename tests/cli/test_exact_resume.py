@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from megastep import engine, spaces
+from megastep.agents import factory
 from megastep.agents.cli import entry, train
 from megastep.agents.runs import annealing, checkpoint, json_lines
 from megastep.agents.storage.collector import Collector
@@ -295,18 +296,23 @@ def test_resume_with_another_number_of_threads(here, capsys):
         assert row == pytest.approx(expected, rel=0.01, abs=0.01)
 
 
-def test_format_6_is_migrated(here, capsys):
-    """A checkpoint of the format before environments were saved, of a run with opponents."""
+def test_run_with_other_statistics_is_refused_and_its_weights_are_read(here, capsys):
+    """A checkpoint of format 6, which has the statistics of that time."""
     shutil.copytree(DATA / "format6", here / "run")
     assert entry.run_command("inspect", ["run"]) == 0 and "format 6" in capsys.readouterr().out
-    saved = checkpoint.load_latest("run/checkpoints").state
-    run("resume=run", "more_samples=96")
-    assert "not bit for bit: environments were not saved" in capsys.readouterr().out
-    state = checkpoint.load_latest("run/checkpoints").state
-    assert state["updates"] == saved["updates"] + 2
-    assert state["learner"]["optimizer"]["n_steps"] > saved["learner"]["optimizer"]["n_steps"]
-    rows = json_lines.read("run/metrics.jsonl")
-    assert [row["updates"] for row in rows] == [2, 4, 6, 7, 8, 9]
+    before = sorted(here.rglob("*"))
+    assert train.main(["resume=run", "more_samples=96"]) == 2
+    assert "normalised observations and returns otherwise began this" in capsys.readouterr().err
+    assert sorted(here.rglob("*")) == before
+    saved = checkpoint.load_latest("run/checkpoints").state["policy"]
+    device = dict(seed=1, device="cpu")
+    trained = factory.config_of(checkpoint.load_latest("run/checkpoints"))
+    homes = factory.homes(trained.env, trained.geometry, "test")
+    env = factory.make_sample(trained.env, homes, **device)
+    policy = factory.make_policy(trained.agent, env)
+    factory.load_weights(policy, env, checkpoint.load_latest("run/checkpoints"))
+    state = policy.state_dict()
+    assert all(torch.equal(leaf, saved[name]) for name, leaf in state.items())
 
 
 def test_run_of_before_a_learner_had_some_settings_resumes_bit_for_bit(here, capsys):

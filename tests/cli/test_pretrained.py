@@ -222,7 +222,8 @@ def test_loads_in_python_and_acts_as_the_run(folder, exported):
 def test_rounding_error_sees_other_weights(folder, exported):
     env = pretrained.make_env(NAME, geometries.sample("maze", 2), n_envs=3, device="cpu")
     policy, original = pretrained.load(NAME, "cpu"), original_of(exported, env)
-    policy.load_state_dict({k: 1.1 * v for k, v in policy.state_dict().items()})
+    weights = policy.state_dict()  # of a policy that has hardly learnt: its actions are alike
+    policy.load_state_dict({k: 30 * v if "output" in k else v for k, v in weights.items()})
     assert export_agent.rounding_error(policy, original, env, 30) > 0.02
 
 

@@ -23,6 +23,7 @@ class Walks:
     from the start earn a huge number made of their place.
 
     Args:
+        wage: reward of a step ahead.
         resumable: as in an environment's contract.
         opaque: it has something that checkpoints cannot reach.
     """
@@ -30,10 +31,11 @@ class Walks:
     obs_space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 3)
     n_agents = A
 
-    def __init__(self, n_envs, device="cpu", seed=1, resumable=True, opaque=False):
+    def __init__(self, n_envs, device="cpu", seed=1, wage=0.0, resumable=True, opaque=False):
         self.n_envs, self.device, self.resumable = n_envs, torch.device(device), resumable
         self.generator = torch.Generator(device).manual_seed(seed)
         self.opaque = iter(range(99)) if opaque else None
+        self.wage, self.earned = wage, 0.0
         self.clock = torch.zeros((), dtype=torch.int64, device=device)
         self.places = torch.zeros(n_envs * A, device=device)
 
@@ -46,12 +48,13 @@ class Walks:
         self.clock.add_(1)
         noise = torch.rand(len(self.places), generator=self.generator, device=self.device)
         self.places.add_(decision["actions"][:, 0] - 1 + noise)
+        self.earned = self.wage * (decision["actions"][:, 0] == 2)
         return self._world(is_first=False)
 
     def _world(self, is_first):
         reset = torch.full_like(self.places, is_first, dtype=torch.bool)
         is_bad = (self.clock == FAULT) & (self.places > 15)
-        reward = torch.where(is_bad, 1e13 * self.places, 0.0)
+        reward = torch.where(is_bad, 1e13 * self.places, self.earned)
         obs, never = self.places[:, None, None] / 100, torch.zeros_like(reset)
         return arrdict(obs=obs, reward=reward, reset=reset, terminal=never, truncated=never)
 
@@ -183,6 +186,6 @@ def test_files_are_copied_where_they_cannot_have_two_names(capsys, monkeypatch):
 
 
 def test_a_policy_that_diverges_is_not_repeated_without_a_checkpoint(capsys):
-    words = ["learner.lr=1e3", "learner.max_grad_norm=1e6", "learner.entropy_coef=0"]
+    words = ["env.wage=1", "learner.lr=1e3", "learner.max_grad_norm=1e6", "learner.entropy_coef=0"]
     assert train.main([*TINY, *PPO, *words, f"samples={60 * UPDATE}"]) == 1
     assert "rerun" not in capsys.readouterr().err

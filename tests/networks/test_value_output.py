@@ -35,10 +35,31 @@ def test_statistics_of_valid_returns():
 
 def test_constant_returns_do_not_divide_by_zero():
     value = ValueOutput(WIDTH)
-    for _ in range(5):
+    value.update_stats(torch.ones(64), VALID)
+    assert value.scale.item() == pytest.approx(1e-5) and value.count == 1
+    for _ in range(3000):
         value.update_stats(torch.zeros(64), VALID)
-    assert value.scale.item() == pytest.approx(1e-3)
+    assert 0 < value.scale.item() < 1e-12
     assert value(torch.randn(8, WIDTH)).isfinite().all()
+
+
+def test_returns_of_0_tell_nothing_before_there_are_others():
+    value = ValueOutput(WIDTH)
+    value.update_stats(torch.zeros(64), VALID)
+    assert value.count == 0 and value.scale == 1
+    value.update_stats(torch.tensor([1e-9, 3e-9] * 32), VALID)
+    assert value.count == 1 and value.scale.item() == pytest.approx(1e-9)
+
+
+def test_cleared_output_predicts_0_until_returns_tell_their_size():
+    value, x = ValueOutput(WIDTH), torch.randn(8, WIDTH)
+    value.clear()
+    assert value.is_clear and not value(x).any()
+    value.update_stats(torch.randn(64) * 1e5 + 1e6, VALID)
+    assert not value.is_clear and value(x).abs().max() < 1  # float32 at a mean of 1e6
+    before = value.linear.bias.item()
+    value.clear()
+    assert value.linear.bias.item() == before != 0
 
 
 def test_values_are_float32_under_autocast():
@@ -82,6 +103,7 @@ def test_a_gpu_adds_the_same_moments(to_gpu):
     other = moved(one, to_gpu)
     calls = [(5, 3.0, 4.0, None), (5, 30.0, 400.0, yes), (0, 1.0, 1.0, yes), (4, 8.0, 9.0, ~yes)]
     calls += [(5, math.nan, 1.0, None), (5, 1.0, math.inf, None), (4, 9.0, 0.0, yes)]
+    calls = [(5, 0.0, 0.0, yes), *calls]
     for *moments, is_counted in calls:
         moments = [torch.tensor(number) for number in moments]
         one.add(moments, is_counted)

@@ -20,7 +20,9 @@ SETTINGS = dict(n_steps=T, n_minibatches=2, lr=1e-2, gamma=0.99, advantage_floor
 
 
 def policy_of(env):
-    return Policy(env.obs_space, env.action_space, width=8, bf16=False).to(env.device)
+    policy = Policy(env.obs_space, env.action_space, width=8, bf16=False).to(env.device)
+    policy.clear_stats()  # as a learner's collector does
+    return policy
 
 
 def acted(rollout):

@@ -14,3 +14,6 @@ constexpr int CAST_THREADS = 256;      // of a block
 constexpr int DUELLING_OUTPUTS = 8;    // action values of a lane, at most
 constexpr int DUELLING_STRIP = 128;    // rows that a block of their gradients adds up
 constexpr int DUELLING_THREADS = 256;  // of such a block, two columns each
+
+constexpr float UNKNOWN_SCALE = 1e30f;  // divides a number that has not varied yet
+constexpr float RESOLUTION = 1e-5f;     // of a mean, which rounding errors stay below

@@ -76,10 +76,10 @@ KERNEL normalise_masked(NormaliseMaskedParams p) {
         return;
     long long at = (long long)policy * p.n + of_policy;
     float away = p.values[at] - p.mean[policy];
-    p.normalised[at] = p.valid[at] ? __fdiv_rn(away, sqrtf(p.variance[policy]) + 1e-8f) : 0.f;
+    p.normalised[at] = p.valid[at] ? __fdiv_rn(away, sqrtf(p.variance[policy]) + 1e-30f) : 0.f;
 }
 
-// Changes nothing if no return is valid, or if a number is not finite.
+// Changes nothing if no return is valid, if a number is not finite, or if all returns have been 0.
 KERNEL BOUNDS(256) add_returns(AddReturnsParams p) {
     wait_for_previous();
     int policy = blockIdx.y;
@@ -90,9 +90,11 @@ KERNEL BOUNDS(256) add_returns(AddReturnsParams p) {
     float variance = old_variance + rate * (p.new_variance[policy] - old_variance) +
                      rate * (1.f - rate) * away * away;
     float mean = old_mean + rate * away, scale = sqrtf(variance);
-    scale = scale < p.min_scale ? p.min_scale : scale;  // NaN stays
+    bool is_nothing = count == 1.f && scale == 0.f && mean == 0.f;
+    float min_scale = fmaxf(p.min_scale, RESOLUTION * fabsf(mean));
+    scale = scale < min_scale ? min_scale : scale;  // NaN stays
     bool is_counted = !p.is_counted || p.is_counted[policy];
-    if (!is_counted || p.n_valid[policy] <= 0 || !isfinite(mean + scale))
+    if (!is_counted || is_nothing || p.n_valid[policy] <= 0 || !isfinite(mean + scale))
         return;
     float* weight = p.weight + (long long)policy * p.width;
     for (int i = threadIdx.x; i < p.width; i += MASKED_THREADS)

@@ -86,12 +86,13 @@ KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
         bool is_finite = true;
         for (int i = first + threadIdx.x; i < first + norm.n; i += MOMENTS_THREADS) {
             float old_mean = norm.mean[i], old_scale = norm.scale[i];
-            float away = norm.new_mean[i] - old_mean, old_variance = old_scale * old_scale;
+            float away = norm.new_mean[i] - old_mean;
+            float old_variance = old_scale < UNKNOWN_SCALE ? old_scale * old_scale : 0.f;
             float variance = old_variance + rate * (norm.new_variance[i] - old_variance) +
                              rate * (1.f - rate) * away * away;
             float mean = old_mean + rate * away;
             float scale = sqrtf(variance);
-            scale = scale < norm.min_scale ? norm.min_scale : scale;  // NaN stays
+            scale = scale <= RESOLUTION * fabsf(mean) ? UNKNOWN_SCALE : scale;  // NaN stays
             is_finite = is_finite && isfinite(mean + scale);
             if (stores) {
                 norm.mean[i] = mean;

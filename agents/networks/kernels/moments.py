@@ -77,7 +77,6 @@ def add_moments(
                 new_variance=variance,
                 n_counted=n_counted,
                 n=mean.numel(),
-                min_scale=norm.min_scale,
             )
         )
     blocks = Blocks(len(packed), threads=_MOMENTS_THREADS)

@@ -147,7 +147,6 @@ struct RunningNormParams {
     const float* new_variance;   // (P, n)
     const long long* n_counted;  // (P)
     int n;
-    float min_scale;
 };
 
 struct AddMomentsParams {
