@@ -107,6 +107,17 @@ class Run:
         """Films the agent; see `megastep.record`."""
         return record(self, **settings)
 
+    def export(self, format: str, file: "str | os.PathLike | None" = None) -> Path:
+        """Writes the agent for another runtime: `run.export("onnx")`. Returns the path.
+
+        Args:
+            format: "onnx", "torch", "safetensors" or "hub".
+            file: default: one in the run's folder.
+        """
+        from megastep.agents.cli.export import export
+
+        return export(str(self.path), format, None if file is None else os.fspath(file))
+
 
 def make(env: object, privileged: bool = False, **settings_of_env: object) -> "Env":
     """Returns an environment: `megastep.make("explorer", n_envs=64, geometry="homes")`.

@@ -35,47 +35,55 @@ def main(words: list[str]) -> int:
     for key, cure in {"run": "latest takes the newest run", "format": ", ".join(FORMATS)}.items():
         if key not in given:
             raise UserError(f"{key} is missing; {key}={cure}")
-    run, kind = given["run"][0], given["format"][0]
-    if kind not in FORMATS:
-        raise UserError(f"format: {kind!r} is unknown; {closest(kind, FORMATS)}")
-    path = folders.find(run)
-    default, suffix = folders.folder_of(path) / FORMATS[kind], Path(FORMATS[kind]).suffix
-    file = Path(given["file"][0]) if "file" in given else default
-    if suffix and file.suffix != suffix:
-        raise UserError(f"file={file} must end with {suffix} for format={kind}")
-    run_export(run, kind, file)
+    export(given["run"][0], given["format"][0], *given.get("file", ()))
     return 0
 
 
-def run_export(run: str, kind: str, file: Path) -> None:
-    """Writes `file` and says what was written."""
+def export(run: str, kind: str, file: str | None = None) -> Path:
+    """Writes an agent's file or folder, and says what was written. Returns its path.
+
+    Args:
+        run: a run, one of its checkpoints, or a packaged agent.
+        kind: a key of `FORMATS`.
+        file: default: one in the run's folder.
+
+    Raises:
+        UserError: there is no such run or format; or it cannot be written so.
+    """
+    if kind not in FORMATS:
+        raise UserError(f"format: {kind!r} is unknown; {closest(kind, FORMATS)}")
+    source, suffix = folders.find(run), Path(FORMATS[kind]).suffix
+    path = folders.folder_of(source) / FORMATS[kind] if file is None else Path(file)
+    if suffix and path.suffix != suffix:
+        raise UserError(f"file={path} must end with {suffix} for format={kind}")
     from megastep.agents import pretrained  # with PyTorch
     from megastep.agents.export import agent, hub, runtimes
     from megastep.agents.export.step import Step
 
     if kind == "safetensors":
-        for path in agent.write(run, file):
-            console.say(f"Wrote {path}")
-        return
+        for written in agent.write(run, path):
+            console.say(f"Wrote {written}")
+        return path
     policy, env = pretrained.load_with_env(run, "cpu", films=kind == "hub")
-    name = folders.name_of(folders.find(run))
+    name = folders.name_of(source)
     if kind == "hub":
-        for path in hub.write(run, file, name, policy, env):
-            console.say(f"Wrote {path}")
-        return
-    with user_errors(f"{file} cannot be written: "):
-        file.parent.mkdir(parents=True, exist_ok=True)
+        for written in hub.write(run, path, name, policy, env):
+            console.say(f"Wrote {written}")
+        return path
+    with user_errors(f"{path} cannot be written: "):
+        path.parent.mkdir(parents=True, exist_ok=True)
     step = Step(policy, env.obs_space)
     write, runner = {
         "onnx": (runtimes.write_onnx, runtimes.run_onnx),
         "torch": (runtimes.write_torch, runtimes.run_torch),
     }[kind]
-    with user_errors(f"{file} cannot be written: ", (OSError,)):
-        write(step, file, name)
-    found = runtimes.compare(step, runner(file), policy, env)
-    runtimes.check(file, found)
+    with user_errors(f"{path} cannot be written: ", (OSError,)):
+        write(step, path, name)
+    found = runtimes.compare(step, runner(path), policy, env)
+    runtimes.check(path, found)
+    inputs, outputs = (", ".join(p.name for p in side) for side in (step.inputs, step.outputs))
     console.say(
-        f"Wrote {file}: {', '.join(port.name for port in step.inputs)} -> "
-        f"{', '.join(port.name for port in step.outputs)}; in 1,000 steps its numbers differ from "
-        f"the policy's by at most {found.difference:.1g}"
+        f"Wrote {path}: {inputs} -> {outputs}; in 1,000 steps its numbers differ from the policy's "
+        f"by at most {found.difference:.1g}"
     )
+    return path

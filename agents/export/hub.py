@@ -17,13 +17,11 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import agent_file, folders
 from megastep.types import Env
 
-#: Steps of the film.
+#: Frames of the film.
 N_STEPS = 400
 
 
-def write(
-    run: str, folder: Path, name: str, policy: Policy, env: Env, n_steps: int = N_STEPS
-) -> list[Path]:
+def write(run: str, folder: Path, name: str, policy: Policy, env: Env) -> list[Path]:
     """Writes the folder. Returns its files.
 
     Args:
@@ -31,7 +29,6 @@ def write(
         folder: empty, or does not exist.
         name: of the agent.
         policy, env: what is filmed.
-        n_steps: frames of the film.
 
     Raises:
         UserError: the folder is not empty; or as `agent.write`.
@@ -48,7 +45,7 @@ def write(
     about = agent_file.read_metadata(file)
     film = folder / "replay.mp4"
     with console.warned("The card has no film: "), user_errors(kinds=(Exception,)):
-        recording.film(env, policy, film, n_steps)
+        recording.film(env, policy, film, N_STEPS)
     text = agent.card(file).replace("# agent\n", f"# {name}\n", 1)
     head = yaml.safe_dump(front_matter(about, name), sort_keys=False)
     with user_errors(f"{folder} cannot be written: "):

@@ -1,6 +1,7 @@
 """Files of other runtimes: ONNX, and the format of `torch.export`; and whether they act alike."""
 
 import contextlib
+import importlib
 import json
 import logging
 import warnings
@@ -15,7 +16,6 @@ from megastep.agents.errors import UserError, shortened
 from megastep.agents.export.step import Step
 from megastep.agents.networks.kernels.library import plain_operations
 from megastep.agents.runs.atomic_files import write_atomically
-from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 from megastep.types import Env, n_lanes
 
@@ -164,8 +164,6 @@ def check(path: Path, comparison: Comparison) -> None:
 
 def require(*names: str) -> list:
     """Returns modules of the extra `export`. Raises UserError if one is missing."""
-    import importlib
-
     try:
         return [importlib.import_module(name) for name in names]
     except ImportError as error:

@@ -12,7 +12,6 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks import cores
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.types import Space, Tree
@@ -61,8 +60,7 @@ class Step(nn.Module):
         """Returns the outputs for the inputs, (B, ...) each."""
         obs, reset, state = self._trees(tensors)
         obs = mapping(torch.unsqueeze)(obs, 0)
-        features = self.policy.intake(obs)
-        features, state = cores.with_residual(self.policy.core, features, reset[None], state)
+        features, state = self.policy._features(obs, reset[None], state)
         logits = self.policy.output(features[0])
         actions = self.policy.output.greedy(logits)
         return *leaves(actions), *leaves(logits), *leaves(state)

@@ -65,6 +65,11 @@ def plain_operations() -> Iterator[None]:
         _is_plain = before
 
 
+def is_plain() -> bool:
+    """Returns whether `plain_operations` asks for operations that change nothing in place."""
+    return _is_plain
+
+
 def is_built_for_cpu() -> bool:
     """Returns whether the CPU's operations can be used, which takes a C++ compiler."""
     return not _is_plain and _is_built()
@@ -80,7 +85,7 @@ def _is_built() -> bool:
 
 def aligned(tensor: torch.Tensor) -> torch.Tensor:
     """Returns the tensor, or a copy, contiguous and starting at a multiple of 16 bytes."""
-    if not _is_plain and tensor.data_ptr() % 16:
+    if tensor.data_ptr() % 16:
         return tensor.clone(memory_format=torch.contiguous_format)
     return tensor.contiguous()
 
