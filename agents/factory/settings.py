@@ -43,6 +43,19 @@ def _device(name: str) -> str:
     return name
 
 
+def _listed(names: object) -> object:
+    return [names] if isinstance(names, str) else names
+
+
+def _callback(name: str) -> str:
+    kind = import_object(name)
+    try:
+        inspect.signature(kind).bind()
+    except TypeError as error:
+        raise ValueError(f"{name} must take no arguments ({error})") from None
+    return name
+
+
 def _ranks(n: int | str) -> int | str:
     if n != "all" and (isinstance(n, str) or not 1 <= n <= 10_000):
         raise ValueError(f"{n!r} is not a number of ranks; use 1 or more, or all")
@@ -70,6 +83,7 @@ def quantity(text: object, kind: str) -> object:
     return int(total) if total.is_integer() else total
 
 
+Callback = Annotated[str, AfterValidator(_callback)]
 Above0 = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]
@@ -334,6 +348,9 @@ class Train(Common):
     replay_every: Count = 20
     desync: bool = True
     profile: Annotated[int, Field(ge=0, le=1000)] = 0
+    callbacks: Annotated[
+        tuple[Annotated[str, AfterValidator(_callback)], ...], BeforeValidator(_listed)
+    ] = ()
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
     restarts: Annotated[int, Field(ge=0, le=1000)] = 0

@@ -17,6 +17,7 @@ from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.runs.saver import NoSaver
 from megastep.agents.training.budget import Budget, Stopwatch
+from megastep.agents.training.callbacks import Callbacks
 from megastep.agents.training.closing import close_env
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.loggers import NoLogger
@@ -72,6 +73,7 @@ class Trainer:
         layout_sources: the name of the source of each of the environment's layouts, whose episodes
             have statistics of their own; None for none.
         profiler: profiles some of the updates, if not None.
+        callbacks: objects with methods of `callbacks.HOOKS`.
 
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
@@ -112,6 +114,7 @@ class Trainer:
         make_curriculum: Callable[[Env, Learner, RolloutLike], Curriculum] | None = None,
         layout_sources: Sequence[str] | None = None,
         profiler: Profiler | None = None,
+        callbacks: Sequence[object] = (),
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.logger = NoLogger() if logger is None else logger
@@ -121,6 +124,7 @@ class Trainer:
         self.on_log, self.evaluator, self.snapshot_saver = on_log, evaluator, snapshot_saver
         self.opponents = optional(env, "opponent_pool")
         self.annealing_record, self.profiler = annealing_record, profiler
+        self.callbacks, self.is_stopped = Callbacks(callbacks), False
         self.set_lr = with_defaults(learner, LearnerOptions).set_lr
         if budget.anneal != "never" and not self.set_lr:
             raise ValueError(
@@ -180,13 +184,16 @@ class Trainer:
         """
         try:
             self.snapshot_saver(self)
-            while (plan := self.plan(stop())).goes_on:
+            self.callbacks("on_start", self)
+            while (plan := self.plan(stop() or self.is_stopped)).goes_on:
                 if plan.saves and self.nonfinite_guard.check(self.rollout):
                     self.save_checkpoint()
                 self.start("collect")
                 self.rollout = self.collect()
+                self.callbacks("on_rollout", self, self.rollout)
                 self.start("update")
                 losses = self.update(plan.lr_fraction)
+                self.callbacks("on_update", self, losses)
                 with unhurried():
                     self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
@@ -214,6 +221,11 @@ class Trainer:
             self.wait_for_files()
         self.save_checkpoint(state, is_last=True)
         self.wait_for_files()
+        self.callbacks("on_end", self)
+
+    def stop(self) -> None:
+        """Ends training after the current update, as for a callback; all ranks do if one does."""
+        self.is_stopped = True
 
     def close(self) -> None:
         """Closes the environment, which is no reason to lose what was learnt, and the files of
@@ -360,6 +372,7 @@ class Trainer:
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
         self.on_log(self)
+        self.callbacks("on_report", self, {**metrics, **perf, "samples": self.samples})
 
     def save_checkpoint(self, state: StateDict | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update. All ranks call it.
@@ -380,6 +393,7 @@ class Trainer:
         with unhurried():
             self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
+        self.callbacks("on_checkpoint", self)
 
     @unhurried()
     def wait_for_files(self) -> None:
