@@ -44,7 +44,8 @@ def _device(name: str) -> str:
 
 
 def _listed(names: object) -> object:
-    return [names] if isinstance(names, str) else names
+    names = [names] if isinstance(names, str) else names
+    return tuple(names) if isinstance(names, list) else names
 
 
 def _callback(name: str) -> str:

@@ -14,6 +14,7 @@ from megastep.agents.cli import evaluate, export, train
 from megastep.agents.errors import UserError
 from megastep.agents.export import hub, runtimes
 from megastep.agents.export.step import Step
+from megastep.agents.networks.kernels.library import plain_operations
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict
 from megastep.types import n_lanes
@@ -69,8 +70,13 @@ def made(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_step_is_the_policys_greedy_one(kind):
     policy, env, step = made(kind)
-    found = runtimes.compare(step, lambda inputs: step(*inputs), policy, env, n_steps=30)
-    assert found.difference < 1e-4 and found.n_apart == 0 and found.largest > 0.5
+
+    def plain(inputs):
+        with plain_operations():
+            return step(*inputs)
+
+    found = runtimes.compare(step, plain, policy, env, n_steps=30)
+    assert found.difference < 1e-4 and found.n_apart == 0 and found.largest > 0.2
 
 
 def test_ports_are_named_after_the_spaces():
