@@ -140,7 +140,8 @@ def test_export_refuses_what_acts_otherwise(exported, tmp_path, monkeypatch):
 
 
 def test_export_warns_of_what_a_card_lacks(exported, tmp_path, monkeypatch, capsys):
-    shutil.copytree(exported / "run/checkpoints", tmp_path / "other/checkpoints")
+    without = shutil.ignore_patterns("evaluations")
+    shutil.copytree(exported / "run", tmp_path / "other", ignore=without)
     _, card = agent.write(str(tmp_path / "other"), tmp_path / f"{NAME}.safetensors")
     assert "geometry=suite episodes=8000 was not run" in capsys.readouterr().err
     assert "Not evaluated." in card.read_text()
