@@ -124,7 +124,13 @@ def table(
             n -= 1
         if n < len(head):
             shown = table(head[:n], [row[:n] for row in rows], is_markdown)
+            if _width(shown) > width:  # of two columns: their cells are broken
+                shown = _rendered(head[:n], [row[:n] for row in rows], is_markdown, width)
             return f"{shown}\nToo wide for this terminal, but in the file: {', '.join(head[n:])}"
+    return _rendered(head, rows, is_markdown)
+
+
+def _rendered(head, rows, is_markdown, width=10_000) -> str:
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -134,7 +140,7 @@ def table(
     for row in rows:
         grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
     plain: dict = dict(markup=False, emoji=False, color_system=None)
-    Console(file=text, width=10_000, force_terminal=False, **plain).print(grid)
+    Console(file=text, width=width, force_terminal=False, **plain).print(grid)
     return text.getvalue().strip()
 
 

@@ -7,10 +7,10 @@ what the class `X` of megastep and any stand-in for it have in common. The rules
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 
@@ -29,6 +29,7 @@ __all__ = [
     "RolloutLike",
     "Row",
     "RunLogger",
+    "RunResult",
     "SaverLike",
     "StateDict",
     "with_defaults",
@@ -207,6 +208,21 @@ class Logger(Protocol):
 
     def close(self) -> None:
         """Writes what is buffered and closes files and connections."""
+
+
+class RunResult(NamedTuple):
+    """What a logger that has a method `finish(step, result)` gets at the end of a run that was not
+    interrupted. It is made anew for that, with the number of samples as `step`.
+
+    Attributes:
+        numbers: the final ones by name, such as `score`, the last mean return.
+        film: path of the video, if one was made.
+        table: rows of the evaluation, if there was one: texts by column.
+    """
+
+    numbers: dict[str, float]
+    film: Path | None = None
+    table: Sequence[Mapping[str, str]] = ()
 
 
 class RunLogger(Protocol):

@@ -1,7 +1,10 @@
 """Core: scenery, agents and camera settings in one object."""
 
+import copy
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -20,6 +23,12 @@ if TYPE_CHECKING:
     from megastep.plotting import Area
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]
+
+
+#: What moves of agents.
+STATE = "positions", "angles", "velocity", "angvelocity"
+#: The copies that `Core.alone` returns, outside of the cores, whose state is saved.
+_ALONE: "WeakKeyDictionary[Core, Core]" = WeakKeyDictionary()
 
 
 class Core:
@@ -70,6 +79,42 @@ class Core:
         """Returns an (N,) tensor filled with ``value``, of the dtype that suits it."""
         return torch.full((self.n_envs,), value, device=self.device)
 
+    def alone(self, e: int) -> "Core":
+        """Returns a copy of environment ``e`` as the only one of a core, whose layouts are shared
+        with this one. The next call changes it. Takes the same time however many environments there
+        are.
+        """
+        one = _ALONE.get(self)
+        if one is None or (one.scenery.objects is None) != (self.scenery.objects is None):
+            one = _ALONE[self] = self._one()
+        pairs = [(one.agents, self.agents, name) for name in STATE]
+        pairs.append((one.scenery, self.scenery, "layout"))
+        if self.scenery.objects is not None:
+            objects = one.scenery.objects, self.scenery.objects
+            pairs += [(*objects, name) for name in ("records", "lines", "texels")]
+        for own, shared, name in pairs:
+            getattr(own, name).copy_(getattr(shared, name)[[e]])
+        return one
+
+    def _one(self) -> "Core":
+        shared = self.scenery
+        widths = shared.model_texels.tolist()
+        scenery = engine.Scenery.of_layouts(
+            self.n_agents,
+            shared.layouts,
+            shared.model,
+            [end - start for start, end in itertools.pairwise(widths)],
+            shared.layout[:1],
+        )
+        if shared.objects is not None:
+            objects = copy.copy(shared.objects)
+            names = "records", "lines", "texels"
+            own = {name: getattr(objects, name)[:1].clone() for name in names}
+            vars(objects).update(own, n_envs=1)
+            vars(objects).pop("_packed", None)  # the addresses of all environments'
+            scenery.objects = objects
+        return Core(scenery, self.res, self.fov, self.fps, self.agents.yaws.tolist(), self.seed)
+
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`: walls and their lit texels, lights,
         agents' poses and how far their cameras see, objects.
@@ -77,35 +122,36 @@ class Core:
         A film adds ``trail``, (T, A, 2), and ``views``, (T, A, C, R + 1, 2), where agents were in
         this episode and what they saw; see :func:`megastep.recording.film`.
         """
-        engine.update_objects(self.scenery, self.agents)
-        lines, colours, lights = self.scenery.env(e)
-        agents, n_moving = self.agents, self.scenery.agent_lines.shape[1]
-        objects = self.scenery.objects
+        core = self.alone(e)
+        agents, scenery, objects = core.agents, core.scenery, core.scenery.objects
+        engine.update_objects(scenery, agents)
+        lines, colours, lights = scenery.env(0)
+        n_moving = scenery.agent_lines.shape[1]
         if objects is not None:
             n_moving += objects.lines.shape[1]
-        depth = engine.observe(self.scenery, agents, rgb=False).depth
+        depth = engine.observe(scenery, agents, rgb=False).depth
         assert depth is not None
         state = arrdict(
             lines=lines[n_moving:],
             texels=torch.cat([colours[0][:0], *colours[n_moving:]]),
             widths=torch.tensor([len(texels) for texels in colours[n_moving:]], dtype=torch.int64),
             lights=lights,
-            positions=agents.positions[e].clone(),
-            angles=agents.angles[e].clone(),
+            positions=agents.positions[0].clone(),
+            angles=agents.angles[0].clone(),
             yaws=agents.yaws.clone(),
             fov=torch.tensor(agents.fov),
-            distances=(AGENT_RADIUS + 10 * (1 - depth[e].float())).view(
+            distances=(AGENT_RADIUS + 10 * (1 - depth[0].float())).view(
                 self.n_agents, len(agents.yaws), -1
             ),
         )
         if objects is not None:
-            there = objects.visible[e] & ~objects.open[e]
+            there = objects.visible[0] & ~objects.open[0]
             state["objects"] = arrdict(
                 shapes=objects.shapes[there],
-                positions=objects.positions[e][there],
-                angles=objects.angles[e][there],
-                sizes=objects.sizes[e][there],
-                colours=objects.palette[objects.colours[e][there].long()],
+                positions=objects.positions[0][there],
+                angles=objects.angles[0][there],
+                sizes=objects.sizes[0][there],
+                colours=objects.palette[objects.colours[0][there].long()],
             )
         return state
 

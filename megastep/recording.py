@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
     from typing_extensions import Self
 
-    from megastep.types import Env, PolicyLike
+    from megastep.types import Env, PolicyLike, World
 
 __all__ = ["Film", "ParallelEncoder", "Player", "draw", "film", "film_all"]
 
@@ -388,11 +388,22 @@ def check_path(path: str | os.PathLike) -> None:
 
 
 class Player(NamedTuple):
-    """What is filmed: environment 0 of ``env``, played by ``policy``."""
+    """What is filmed: the environment of a lane of ``env``, played by ``policy``. Players of the
+    same ``env`` have the same policy.
+
+    Attributes:
+        title: above the picture.
+        lane: number of the lane.
+        steps: frames, if other than the film's.
+        expected: what the lane's return must be in the last frame, if not None.
+    """
 
     env: Env
     policy: PolicyLike
     title: str | None = None
+    lane: int = 0
+    steps: int | None = None
+    expected: float | None = None
 
 
 def film(
@@ -437,6 +448,7 @@ def film_all(
     """Films several environments at once, in a grid; otherwise as :func:`film`.
 
     Args:
+        steps: frames of each player. Who is at the end before others stays as it was there.
         theme: light or dark.
         dpi: pixels per inch; an environment's picture has 720 lines at 100.
         speed: how much faster than the environment's own frames per second.
@@ -445,7 +457,7 @@ def film_all(
     """
     path = Film(path)
     check_path(path)
-    for env, _, _ in players:
+    for env in (player.env for player in players):
         if getattr(env, "plot_state", None) is None or not hasattr(env, "state"):
             raise ValueError(
                 f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
@@ -456,7 +468,7 @@ def film_all(
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
     _check_packages("matplotlib", *["av"] * (path.suffix[1:] in WRITERS))
-    moments = zip(*(_moments(player, steps, greedy, seed, trail) for player in players))
+    moments = _moments(players, steps, greedy, seed, trail)
     with plotting.styled(theme=theme, dpi=dpi, axes=axes):
         if path.suffix[1:] in WRITERS:
             fps = optional(players[0].env, "fps") * speed
@@ -520,22 +532,50 @@ class _Moment(NamedTuple):
     note: str
 
 
-def _moments(player, steps, greedy, seed, trail) -> Iterator[_Moment]:
-    env: Any = player.env
-    policy, n_agents, past = player.policy, optional(env, "n_agents"), _Past(trail)
+def _moments(players, steps, greedy, seed, trail) -> Iterator[list[_Moment]]:
+    """The moments of all players, until the last of them is at the end."""
+    by_env = collections.defaultdict(list)
+    for player in players:
+        by_env[id(player.env)].append(player)
+    streams = {}
+    for same in by_env.values():
+        for player, worlds in zip(same, itertools.tee(_worlds(same[0], greedy, seed), len(same))):
+            streams[id(player)] = _moments_of(player, worlds, steps, trail)
+        del worlds  # which would keep those that a player at the end does not take
+    latest = [None] * len(players)
+    for moments in itertools.zip_longest(*(streams.pop(id(player)) for player in players)):
+        latest = [new or old for new, old in zip(moments, latest, strict=True)]
+        yield latest
+
+
+def _worlds(player, greedy, seed) -> Iterator[World]:
+    env, policy = player.env, player.policy
     world, hidden = env.reset(), policy.initial(n_lanes(env), env.device)
     generator = torch.Generator(env.device).manual_seed(seed)
-    returns = np.zeros(n_agents)
-    for step in range(steps):
-        if step:
-            decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
-            world = env.step(decision)
+    while True:
+        yield world
+        decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
+        world = env.step(decision)
+
+
+def _moments_of(player, worlds, steps, trail) -> Iterator[_Moment]:
+    env: Any = player.env
+    n_agents, past = optional(env, "n_agents"), _Past(trail)
+    e, agent = divmod(player.lane, n_agents)
+    lanes = slice(e * n_agents, (e + 1) * n_agents)
+    returns = np.zeros(n_agents, np.float32)
+    for world in itertools.islice(worlds, player.steps or steps):
         rewards, starts = (
-            world[key][:n_agents].cpu().numpy().reshape(n_agents) for key in ("reward", "reset")
+            world[key][lanes].cpu().numpy().reshape(n_agents) for key in ("reward", "reset")
         )
-        returns = np.where(starts, 0, returns + rewards)
-        state = past(numpyify(clone(env.state(0))), starts)
+        returns = np.where(starts, np.float32(0), returns + rewards)
+        state = past(numpyify(clone(env.state(e))), starts)
         yield _Moment(state, _returns(returns))
+    if player.expected is not None and not np.isclose(returns[agent], player.expected, rtol=1e-4):
+        raise ValueError(
+            f"its return is {returns[agent]:.6g} and not {player.expected:.6g}: the environment "
+            "has changed since, or draws what no seed decides"
+        )
 
 
 def _returns(returns) -> str:

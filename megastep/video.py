@@ -1,7 +1,11 @@
 """Writers of mp4 and GIF, and the images they take."""
 
 import io
+import itertools
+import os
 import zlib
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from typing import Any
 
@@ -12,11 +16,14 @@ __all__ = ["GifWriter", "Mp4Writer", "as_image"]
 
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"
+MAX_PENDING = 4  # images that wait for the encoder
 EXACT_COLOURS, GREYS = 64, 32  # of a GIF's palette
 
 
 class Mp4Writer:
     """Encodes images into an mp4 in memory: h264 in yuv420p, which every player can show.
+
+    A thread encodes, while the next image is drawn.
 
     Args:
         fps: frames per second.
@@ -37,12 +44,15 @@ class Mp4Writer:
         self._stream.pix_fmt = self.pixels
         self._stream.options = self.options
         self._shape = None
+        self._thread = ThreadPoolExecutor(1)
+        self._pending: deque[Future] = deque()
 
     def add(self, image: np.ndarray) -> None:
         """Adds a frame, (H, W, 3) uint8. Odd sizes are padded to even.
 
         Raises:
             ValueError: its size differs from the first frame's.
+            Exception: an earlier one could not be encoded.
         """
         if self._shape is None:
             self._shape = image.shape
@@ -52,7 +62,12 @@ class Mp4Writer:
                 "all frames must have the size of the first, {1} x {0} pixels, "
                 "but this one has {3} x {2}".format(*self._shape[:2], *image.shape[:2])
             )
-        self._add(image)
+        self._pending.append(self._thread.submit(self._add, image))
+        self._wait(MAX_PENDING)
+
+    def _wait(self, n_pending) -> None:
+        while len(self._pending) > n_pending:
+            self._pending.popleft().result()
 
     def _add(self, image) -> None:
         padding = [(0, size % 2) for size in image.shape[:2]]  # yuv420p halves both sides
@@ -64,11 +79,37 @@ class Mp4Writer:
 
     def close(self) -> bytes:
         """Returns the finished file, empty if there were no frames."""
+        try:
+            self._wait(0)
+        finally:
+            self._thread.shutdown(cancel_futures=True)
         if self._shape is None:
             return b""
         self._container.mux(self._stream.encode(None))
         self._container.close()
         return self._buffer.getvalue()
+
+
+def small_gif(path: str | os.PathLike, height: int, n_frames: int) -> tuple[bytes, tuple[int, int]]:
+    """Returns a film as a GIF, and its height and width in pixels.
+
+    Args:
+        path: of an mp4 or GIF.
+        height: the most pixels that its images are high.
+        n_frames: the most frames, evenly spaced over the film, which takes as long as before.
+    """
+    import av
+
+    with av.open(os.fspath(path)) as film:
+        stream = film.streams.video[0]
+        height = min(height, stream.height)
+        size = height, max(1, round(stream.width * height / stream.height))
+        every = max(1, -(-stream.frames // n_frames))
+        writer = GifWriter(float(stream.average_rate or 10) / every)
+        for frame in itertools.islice(film.decode(video=0), None, None, every):
+            small = frame.reformat(width=size[1], height=size[0], format="rgb24")
+            writer.add(small.to_ndarray())
+    return writer.close(), size
 
 
 class GifWriter(Mp4Writer):
@@ -90,6 +131,7 @@ class GifWriter(Mp4Writer):
         """Returns the finished file, empty if there were no frames."""
         from PIL import Image
 
+        self._wait(0)
         if self._frames:
             sample = [self._image(i) for i in np.linspace(0, len(self._frames) - 1, 12).astype(int)]
             colours = _palette(np.concatenate(sample))

@@ -74,6 +74,7 @@ SHARED = {
     "megastep.settings",
     "megastep.spaces",
     "megastep.types",
+    "megastep.video",  # a logger has films
 }
 # Bots walk in homes, by the truth about them.
 BOTS = "megastep.agents.selfplay.bots"
@@ -83,12 +84,13 @@ SHARED_WITH_BOTS = SHARED | {
     "megastep.modules.movement",
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
-# environments, writes videos and starts processes.
+# environments, keeps the global generators, writes videos and starts processes.
 UPPER_ROOMS = ("api", "cli", "evaluation", "export", "factory", "launch", "pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",
     "megastep.engine",
+    "megastep.global_generators",
     "megastep.recording",
     "megastep.scene",
     "megastep.sync_envs",
@@ -108,6 +110,7 @@ OWN_USERS = {
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
         "agents/algorithms/*.py",
         "agents/algorithms/kernels/*.py",
+        "agents/distributed/bucket.py",
         "agents/networks/*_cpu.py",
         "agents/networks/kernels/*.py",
         "agents/selfplay/opponents.py",

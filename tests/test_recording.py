@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import recording
+from megastep import engine, envs, modules, recording
 from megastep.arrdict import arrdict
+from megastep.core import AGENT_RADIUS
+from megastep.geometries import sample
 from megastep.recording import ParallelEncoder
 from tests.helpers.processes import HUNG, is_running, wait_until
 
@@ -464,3 +466,28 @@ def test_films_of_strangers_have_a_caption_and_show_themselves(tmp_path, monkeyp
         "image/png;base64"
         in recording.film(Stranger(), Still(), tmp_path / "film.png", steps=2)._repr_html_()
     )
+
+
+def test_state_renders_the_environment_that_is_shown_alone(monkeypatch):
+    """Its images are those that all environments' have, bit by bit, objects included."""
+    homes = sample("bench", 3)
+    env = envs.Deathmatch(6, n_agents=2, geometries=homes, res=16, subsample=1, device="cpu")
+    things = modules.Objects(homes, env.core, {"crate": modules.Crate(2)})["crate"]
+    env.reset()
+    things.place(torch.ones(6, dtype=torch.bool))
+    every = engine.observe(env.core.scenery, env.core.agents)
+    seen, observe = [], engine.observe
+
+    def counted(scenery, *arguments, **options):
+        seen.append(scenery.n_envs)
+        return observe(scenery, *arguments, **options)
+
+    monkeypatch.setattr(engine, "observe", counted)
+    for e in (5, 0, 3):
+        state = env.state(e)
+        depth = 1 - (state.core.distances - AGENT_RADIUS) / 10
+        assert torch.allclose(depth[:, 0], every.depth[e].float(), atol=1e-6)
+        assert (state.rgb[:, :, 0] == every.rgb[e]).all()
+        assert (state.core.positions == env.core.agents.positions[e]).all()
+        assert len(state.core.objects.shapes) == int(env.core.scenery.objects.visible[e].sum()) > 0
+    assert seen and {*seen} == {1}

@@ -50,6 +50,9 @@ The most common words:
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
                                learner.buffer=replay also learns from old experience
+  evaluate_every=60s stop.return=475
+                               evaluate while training, also evaluate_every=1M, and end the run when
+                               an evaluation reaches a return, or stop.success=0.95
   finish.evaluate=true finish.record=true
                                a table and a video at the end
   opponents.past=0.4 opponents.bot=0.1
@@ -234,6 +237,7 @@ The most common words:
   against=RUN      its duel with another run's agent, a bot, or an import path, in one home
   home=3           another of the unseen homes; split=training: one it was trained in
   homes=[1,2,3,4]  several homes in a grid
+  worst=3          the worst episodes of the run's newest evaluation, as they were; episode=12: one
   runs=[A,B]       several runs side by side, in one home from the same spawn
   theme=dark       also title=, dpi=200, speed=2, trail=0, axes=true
   file=out.mp4     this file, overwritten if it exists; out.gif: the same as a GIF; out.png, out.svg

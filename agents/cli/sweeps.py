@@ -39,6 +39,7 @@ from megastep.agents.errors import ConfigErrors, UserError, shortened, user_erro
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
 from megastep.agents.launch.again import AUTO
+from megastep.agents.reports import statistics
 from megastep.agents.runs import folders, scores
 from megastep.agents.runs.atomic_files import make_folders, write_atomically
 
@@ -391,17 +392,20 @@ def _is_locked(path: Path) -> bool:
 
 
 def report(folder: Path, rows: "list[Row]") -> None:
-    """Prints the table of a sweep and writes it into its folder."""
-    console.say(f"Sweep\n{console.table(*_cells(rows))}")
+    """Prints the table of a sweep and one that pools its seeds, and writes both into its folder."""
+    console.say(f"Sweep\n{console.table(*_cells(rows), width=console.terminal_width())}")
+    if pooled := _pooled(rows):
+        console.say(console.table(*pooled, width=console.terminal_width()))
     with console.warned(f"{folder} cannot be written: "):
         write_table(folder, rows)
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
 
 
 def write_table(folder: Path, rows: "list[Row]") -> None:
-    """Writes sweep.md, the table as it is printed, and sweep.csv, with all digits and folders."""
-    table = console.table(*_cells(rows), is_markdown=True)
-    write_atomically(folder / "sweep.md", table.encode())
+    """Writes sweep.md, the tables as printed, and sweep.csv, with all digits and folders."""
+    tables = filter(None, [_cells(rows), _pooled(rows)])
+    texts = [console.table(*table, is_markdown=True) for table in tables]
+    write_atomically(folder / "sweep.md", "\n\n".join(texts).encode())
     head, text = [*_head(rows), "folder"], io.StringIO()
     rows = [row | row["varied"] | {"job": row["number"]} for row in rows]
     csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
@@ -421,6 +425,20 @@ def _cells(rows) -> tuple[list[str], list[list[str]]]:
     """Returns the head and the rows of a table, as text."""
     rows, head = [row | row["varied"] | {"job": row["number"]} for row in rows], _head(rows)
     return head, [[_brief(row.get(name)) for name in head] for row in rows]
+
+
+def _pooled(rows) -> tuple[list[str], list[list[str]]] | None:
+    """Returns head and rows of the table of `megastep compare`: jobs that differ in their seeds
+    alone are one row. None if there are no such jobs.
+    """
+    scores: dict[str, list[float]] = {}
+    for row in rows:
+        if row.get("score") is not None:
+            varied = [f"{key}={value}" for key, value in row["varied"].items() if key != "seed"]
+            scores.setdefault(", ".join(varied) or "all", []).append(row["score"])
+    if all(len(values) < 2 for values in scores.values()):
+        return None
+    return [text.format("episode/return") for text in statistics.POOLED], statistics.pooled(scores)
 
 
 def _brief(value: object) -> str:

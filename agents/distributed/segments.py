@@ -1,7 +1,8 @@
 """Records a function as several CUDA graphs, with collective operations between them.
 
 NCCL collectives inside CUDA graphs can deadlock, since graphs of different processes may start in
-different orders on a GPU's queues. So the collectives are called between graphs.
+different orders on a GPU's queues. So they are called between graphs. What may be inside a graph is
+`symmetric_memory.all_reduce_`.
 """
 
 from __future__ import annotations

@@ -5,8 +5,9 @@ import itertools
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from megastep.agents import console, factory
@@ -19,10 +20,8 @@ from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.slots import rotating_slots
+from megastep.arrdict import arrdict
 from megastep.types import Env, PolicyLike, optional
-
-if TYPE_CHECKING:
-    from megastep.arrdict import arrdict
 
 
 class Player(NamedTuple):
@@ -95,6 +94,8 @@ class Stage:
             are in evenly spaced ones; if more, their number is rounded up to a multiple of homes.
         seed: of spawns.
         device: a name of PyTorch.
+        rank: (number, ranks) whose share of the environments is made. Default: this process's.
+        options: other arguments of the environment, such as `films`.
 
     Attributes:
         env, sample: the environment, with this rank's share of all lanes, and a small one.
@@ -111,22 +112,53 @@ class Stage:
         episodes: int,
         seed: int = 1,
         device: torch.device | str = "cpu",
+        rank: tuple[int, int] | None = None,
+        **options,
     ):
-        self.seed = rank_seed(seed, process_group.rank())
+        self.seed = rank_seed(seed, process_group.rank() if rank is None else rank[0])
         self.sample = factory.make_sample(env, [*homes], seed=self.seed, device=device)
         n_envs = -(-episodes // optional(self.sample, "n_agents"))
         n_envs += -n_envs % len(homes) if n_envs > len(homes) > 0 else 0
         self.homes = factory.spread([*homes], n_envs)
         self.numbers = factory.spread([*range(len(homes))], n_envs)
-        self.shard = Shard.of_this_rank(n_envs, len(self.homes))
+        self.shard = (
+            Shard.of_this_rank(n_envs, len(self.homes))
+            if rank is None
+            else Shard(n_envs, len(self.homes), *rank)
+        )
         self.settings = settings.changed(env, n_envs=len(self.shard.envs), resample=False)
         where = dict(geometries=[self.homes[home] for home in self.shard.homes], device=device)
-        self.env: Env = factory.construct(self.settings, seed=self.seed, **where)
+        self.env: Env = factory.construct(self.settings, seed=self.seed, **where, **options)
 
-    def play(self, policy: PolicyLike, greedy: bool, max_steps: int | None = None) -> "arrdict":
+    def play(
+        self,
+        policy: PolicyLike,
+        greedy: bool,
+        max_steps: int | None = None,
+        recorder: playing.Recorder | None = None,
+    ) -> arrdict:
         """Returns the first episodes of all lanes, see `playing.first_episodes`, of all ranks."""
-        played = playing.first_episodes(self.env, policy, self.seed, greedy, max_steps)
+        played = playing.first_episodes(self.env, policy, self.seed, greedy, max_steps, recorder)
         return self.shard.with_others(played)
+
+    def actions(self, recorder: playing.Recorder) -> playing.Actions | None:
+        """Returns the actions of all ranks; None if those of one are too many to keep."""
+        own = recorder.actions()
+        n_steps = None if own is None else len(next(iter(own.values())))
+        is_alone = self.shard.n_ranks == 1
+        lengths = [n_steps] if is_alone else process_group.gather_objects(n_steps)
+        if own is None or None in lengths:
+            return None
+        if is_alone:
+            return playing.Actions(own)
+        wide = {}
+        for name, steps in own.items():
+            steps = np.pad(steps, [(0, max(lengths) - len(steps)), *[(0, 0)] * (steps.ndim - 1)])
+            dtype = np.int64 if steps.dtype.kind in "iu" else steps.dtype  # ranks may differ
+            wide[name] = torch.as_tensor(steps.astype(dtype)).transpose(0, 1)
+        every = self.shard.with_others(arrdict(wide))
+        leaves = {name: lanes.transpose(0, 1).numpy() for name, lanes in every.items()}
+        return playing.Actions(leaves, self.shard.n_ranks)
 
 
 def check_duels(env: Env) -> None:
@@ -180,7 +212,7 @@ class Arena:
         self.sources = factory.sources_of(homes)
         warn_without_layout(self.env, homes)
 
-    def play(self, player: Player, opponent: Player) -> "arrdict":
+    def play(self, player: Player, opponent: Player) -> arrdict:
         """Returns the duels of two players, those of all ranks."""
         policies = player.policy, opponent.policy
         with factory.errors():

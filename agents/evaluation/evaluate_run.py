@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.evaluation import arena, episodes, statistics, suite, tables
+from megastep.agents.evaluation import arena, episodes, playing, replay, statistics, suite, tables
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import checkpoint, folders
 from megastep.types import optional
@@ -23,11 +23,11 @@ def run(cfg: settings.Evaluate) -> Path:
     With several ranks, each plays some of the environments. Rank 0 writes; the others return the
     run's folder.
 
-    Writes .json, .md and .csv, which has a row per episode, into the run's folder `evaluations`,
-    one of each per source of geometries (per environment where it has none), split and checkpoint.
-    Of `geometry=suite` plays as many episodes in each source, and adds the worst source and the
-    worst dense homes. With `cfg.against` plays duels instead; with `cfg.ratings` writes
-    ratings.csv and ratings.svg.
+    Writes .json, .md, .csv, which has a row per episode, and .npz, from which `record.py worst=3`
+    plays episodes again, into the run's folder `evaluations`, one of each per source of geometries
+    (per environment where it has none), split and checkpoint. Of `geometry=suite` plays as many
+    episodes in each source, and adds the worst source and the worst dense homes. With `cfg.against`
+    plays duels instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
@@ -56,10 +56,11 @@ def measure(
     elif cfg.against is not None:
         path = duel(cfg, loaded, env_settings, geometry, homes, device)
     else:
-        rows, single = [], []
+        rows, single, actions = [], [], []
         numbers = {id(home): number for number, home in enumerate(homes)}
         for source, part in suite.parts_of(geometry, homes):
-            table, each = play(cfg, loaded, env_settings, part, device, source)
+            table, each, taken = play(cfg, loaded, env_settings, part, device, source)
+            actions.append(taken)
             rows += suite.of_source(source, table)
             if source:  # the number among all homes, not among those of the source
                 where = [numbers[id(home)] for home in part]
@@ -82,6 +83,7 @@ def measure(
             rows,
             [*map(tables.cells, rows)],
             single,
+            replay.as_bytes(actions),
         )
     return path
 
@@ -93,16 +95,17 @@ def play(
     homes: list,
     device: "torch.device",
     source: str | None = None,
-) -> "tuple[list[Row], list[Row]]":
+) -> "tuple[list[Row], list[Row], playing.Actions | None]":
     """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the rows of the
-    table, and those of the episodes.
+    table, those of the episodes, and the actions of the run's agent.
     """
     stage = arena.Stage(env_settings, homes, cfg.episodes, cfg.seed, device)
     env, roles = stage.env, optional(stage.env, "roles")
     sources = factory.sources_of(stage.homes)
-    rows, single = [], []
-    for player, greedy in players_of(cfg, loaded, stage):
-        played = stage.play(player.policy, greedy, cfg.max_steps)
+    rows, single, recorder = [], [], playing.Recorder()
+    for number, (player, greedy) in enumerate(players_of(cfg, loaded, stage)):
+        # of the first, as the environment's generators are where its seed puts them
+        played = stage.play(player.policy, greedy, cfg.max_steps, None if number else recorder)
         n_cut = int((~played["done"]).sum())
         if n_cut and process_group.rank() == 0:
             limit = cfg.max_steps or optional(env, "max_episode_steps")
@@ -118,7 +121,7 @@ def play(
         single += [{"agent": player.name, **row} for row in each]
     if process_group.rank() == 0:
         arena.warn_without_layout(env, stage.homes)
-    return rows, single
+    return rows, single, stage.actions(recorder)
 
 
 def players_of(

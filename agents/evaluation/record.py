@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
@@ -10,7 +11,7 @@ import torch
 from megastep import recording
 from megastep.agents import console, factory
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import arena, duels
+from megastep.agents.evaluation import arena, duels, replay
 from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.runs import folders
 from megastep.agents.runs.atomic_files import make_folders, remove_folders
@@ -23,6 +24,8 @@ def run(cfg: settings.Record) -> Path:
     first free name of `video.mp4`, `video-2.mp4`, ...
     """
     folder, device = Path(), factory.make_device(cfg.device)
+    if cfg.worst is not None or cfg.episode is not None:
+        return film_stored(cfg, device)
     env_settings, geometry = cfg.env, cfg.geometry
     names = (cfg.run,) if cfg.run is not None else cfg.runs or ()
     runs = [folders.load_checkpoint(folders.find(name), cfg.trust, device) for name in names]
@@ -37,7 +40,7 @@ def run(cfg: settings.Record) -> Path:
     homes = factory.homes(env_settings, geometry, cfg.split)
     env_settings = settings.changed(env_settings, n_envs=1)
     players = []
-    for home in (cfg.home,) if cfg.homes is None else cfg.homes:
+    for home in (cfg.home or 0,) if cfg.homes is None else cfg.homes:
         for loaded in runs or [None]:
             home_alone = _home(homes, home, cfg.split)
             env = factory.make_sample(
@@ -50,6 +53,44 @@ def run(cfg: settings.Record) -> Path:
                 name = folders.name_of(loaded.path)
                 title = name if title is None else f"{title}, {name}"
             players.append(recording.Player(env, policy, title))
+    path = film(cfg, players, folder, cast("settings.Env", env_settings))
+    console.say(f"Filmed {cfg.steps} steps: {path}")
+    return path
+
+
+def film_stored(cfg: settings.Record, device: torch.device) -> Path:
+    """Films episodes of a run's newest evaluation once more. Returns the path of the video."""
+    path = folders.find(str(cfg.run))
+    loaded = folders.load_checkpoint(path, cfg.trust, device)
+    folder = folders.folder_of(loaded.path)
+    table = replay.newest(folder, loaded, cfg.trust)
+    rows = table.chosen(cfg.worst, cfg.episode, cfg.home)
+    if (evaluated := folder / "checkpoints" / table.checkpoint).exists():
+        loaded = folders.load_checkpoint(evaluated, cfg.trust, device)
+    players = []
+    for row, env, policy, lane in table.plays(rows, loaded, device):
+        title = f"{cfg.title}, " if cfg.title else ""
+        title += f"episode {row['episode']}" + (f", home {row['home']}" if "home" in row else "")
+        title += f": return {row['return']:.4g}, {row['ended']}"
+        frames = int(row["length"]) + 1
+        players.append(recording.Player(env, policy, title, lane, frames, row["return"]))
+    path = film(cfg, players, folder, table.env)
+    lines = "\n".join(str(player.title) for player in players)
+    console.say(f"{table.title}\n{lines}\nFilmed: {path}")
+    return path
+
+
+def film(
+    cfg: settings.Record,
+    players: Sequence[recording.Player],
+    folder: Path,
+    env_settings: settings.Env,
+) -> Path:
+    """Films players into `cfg.file`, or a new file in a folder. Returns its path.
+
+    Raises:
+        UserError: it cannot be made. No file is left.
+    """
     with contextlib.ExitStack() as undo:
         path = Path(cfg.file) if cfg.file else take_free_name(folder / "video.mp4")
         if not cfg.file:
@@ -61,12 +102,11 @@ def run(cfg: settings.Record) -> Path:
         problem = f"The video {path} could not be made: "
         look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail", "axes")}
         with (
-            env_failures.told(cast("settings.Env", env_settings), folder),
+            env_failures.told(env_settings, folder),
             user_errors(problem, (Exception,)),
         ):
             recording.film_all(players, path, cfg.steps, cfg.greedy, cfg.seed, **look)
         undo.pop_all()
-    console.say(f"Filmed {cfg.steps} steps: {path}")
     return path
 
 

@@ -62,12 +62,14 @@ def write_table(
     rows: list,
     cells: list[dict],
     episodes: Sequence[Mapping] = (),
+    actions: bytes | None = None,
 ) -> Path:
     """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
     and `rows` for programs, .json. Returns the latter's path.
 
     Args:
         episodes: a row per episode, for the .csv and, by column, the .json.
+        actions: content of the .npz, None for none.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
     folder, name = folder_of(loaded.path) / "evaluations", for_file("-".join(names))
@@ -91,6 +93,10 @@ def write_table(
         )
         if columns:
             write_atomically(folder / f"{name[:200]}.csv", as_csv(episodes, [*columns]).encode())
+        if actions:
+            write_atomically(folder / f"{name[:200]}.npz", actions)
+        else:
+            (folder / f"{name[:200]}.npz").unlink(missing_ok=True)
         write_atomically(folder / f"{name[:200]}.json", text.encode())
     return folder / f"{name[:200]}.json"
 

@@ -85,6 +85,28 @@ def quantity(text: object, kind: str) -> object:
 
 
 Callback = Annotated[str, AfterValidator(_callback)]
+
+
+def _every(given: int | float | str) -> int | str:
+    """Returns a number of samples, or text such as `60s`."""
+    seconds, samples = (quantity(given, kind) for kind in UNITS)
+    if isinstance(given, str) and re.fullmatch(r"[\d.]+ *m", given):
+        raise ValueError(f"{given!r} may be minutes or millions: write min or M")
+    is_samples = isinstance(given, str) and given.endswith("M")
+    if isinstance(given, str) and not isinstance(seconds, str) and not is_samples:
+        if not 0 < seconds < 1e9:
+            raise ValueError(f"{given!r} is no time")
+        return f"{seconds}s"
+    if isinstance(samples, str) or samples < 1 or samples != int(samples):
+        raise ValueError(f"{given!r} is neither samples, such as 1M, nor a time, such as 60s")
+    return int(samples)
+
+
+def every(value: int | str) -> tuple[float, str]:
+    """Returns (number, "samples" or "seconds") of `evaluate_every`."""
+    return (value, "samples") if isinstance(value, int) else (float(value[:-1]), "seconds")
+
+
 Above0 = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]
@@ -344,6 +366,11 @@ class Train(Common):
     more_samples: Samples | None = None
     more_seconds: Above0 | None = None
     log_every: Count
+    evaluate_every: Annotated[int | float | str, AfterValidator(_every)] | None = None
+    evaluate_episodes: Count = 128
+    stop: dict[str, Annotated[float, Field(allow_inf_nan=False)]] = dataclasses.field(
+        default_factory=dict
+    )
     checkpoint_seconds: Above0
     keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
     replay_every: Count = 20
@@ -391,6 +418,9 @@ class Train(Common):
                 and f"extends a resumed run; give resume=RUN, or {name}= for a new run"
                 for name in ("samples", "seconds")
             },
+            "stop": bool(self.stop)
+            and self.evaluate_every is None
+            and "needs evaluations in training to reach it: give evaluate_every=60s, or samples",
             "snapshots": self.snapshots
             and not (self.samples or self.seconds or self.more_samples or self.more_seconds)
             and "are spread over the budget; give samples= or seconds=",
@@ -439,8 +469,10 @@ class Record(Played):
     run: str | None
     runs: Annotated[tuple[str, ...], Field(min_length=2, max_length=9)] | None = None
     steps: Steps
-    home: Home
+    home: Home | None
     homes: Annotated[tuple[Home, ...], Field(min_length=1, max_length=16)] | None = None
+    worst: Annotated[int, Field(ge=1, le=16)] | None = None
+    episode: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
     against: str | None = None
     file: str | None
     title: str | None = None
@@ -452,7 +484,18 @@ class Record(Played):
 
     def errors(self) -> dict[str, object]:
         has_run, has_env = self.run is not None or self.runs is not None, self.env is not None
+        stored = [name for name in ("worst", "episode") if getattr(self, name) is not None]
+        of_stored = {
+            name: getattr(self, name) is not None
+            and f"cannot be combined with {stored[0]}, whose evaluation has its own"
+            for name in ("geometry", "homes", "against", "env")
+            if stored
+        }
         return {
+            **{
+                name: self.run is None and "needs run=, whose newest evaluation it is about"
+                for name in stored
+            },
             "run": not (has_run or has_env)
             and "is missing; without a run, env=explorer records random actions",
             "runs": self.runs is not None
@@ -468,4 +511,6 @@ class Record(Played):
             "against": self.against is not None
             and self.run is None
             and "needs run=, the agent that plays against it",
+            **({"episode": "cannot be combined with worst"} if len(stored) == 2 else {}),
+            **{name: text for name, text in of_stored.items() if text},
         }

@@ -48,6 +48,7 @@ def make_trainer(
     device: torch.device,
     token: str = "",
     on_log: Callable[[Trainer], None] = lambda trainer: None,
+    make_evaluator: Callable | None = None,
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
@@ -57,6 +58,8 @@ def make_trainer(
     Args:
         token: a name that all ranks of this start have, and no other start.
         on_log: called with the trainer after each report.
+        make_evaluator: returns what measures the policy every `cfg.evaluate_every`, for `cfg`, the
+            environment of the training and the device, such as `evaluation.in_training.Evaluator`.
     """
     number, n_ranks = process_group.rank(), process_group.n_ranks()
     seed = rank_seed(cfg.seed, number)
@@ -93,6 +96,13 @@ def make_trainer(
                     check_state(state["learner"])  # before anything is written
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
+    measured = {}
+    if cfg.evaluate_every is not None and make_evaluator is not None:
+        measured = dict(
+            evaluator=make_evaluator(cfg, env, device),
+            evaluate_every=settings.every(cfg.evaluate_every),
+            stop=cfg.stop,
+        )
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
@@ -107,12 +117,7 @@ def make_trainer(
         rank_files = RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
             step = had["samples_at_report"]
-            facts = dict(folder=folder, step=step, run_name=folder.name, config=config["train"])
-            makers = {
-                label: functools.partial(factory.construct, one, **facts)
-                for label, one in cfg.logger.items()
-            }
-            logger = loggers.Loggers(folder, step, makers)
+            logger = make_loggers(cfg, folder, step)
             snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
             writers = dict(
                 on_log=on_log,
@@ -136,6 +141,7 @@ def make_trainer(
             layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
             repeat_hint=functools.partial(repeat.hint, is_resumed=cfg.resume is not None),
             callbacks=[import_object(name)() for name in cfg.callbacks],
+            **measured,
             **writers,
         )
         if cfg.resume:
@@ -143,6 +149,16 @@ def make_trainer(
                 trainer.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
             trainer.lost += differing(loaded.made_with, made_with)
     return trainer
+
+
+def make_loggers(cfg: settings.Train, folder: Path, step: int) -> loggers.Loggers:
+    """Returns the loggers of a run that starts, resumes or ends at `step`."""
+    facts = dict(folder=folder, step=step, run_name=folder.name, config=check.as_tree(cfg))
+    makers = {
+        label: functools.partial(factory.construct, one, **facts)
+        for label, one in cfg.logger.items()
+    }
+    return loggers.Loggers(folder, step, makers)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from megastep.agents.errors import ConfigErrors, shortened
 from megastep.agents.factory import check, settings
 from megastep.agents.runs import checkpoint, folders
+from megastep.agents.training.budget import evaluation_in, reaches
 
 #: The value of `resume` that continues the run in `folder`, if there is one.
 AUTO = "auto"
@@ -27,6 +28,9 @@ RESUMABLE = (
     "device",
     "trust",
     "log_every",
+    "evaluate_every",
+    "evaluate_episodes",
+    "stop",
     "checkpoint_seconds",
     "keep_checkpoints",
     "replay_every",
@@ -48,12 +52,14 @@ class Start(NamedTuple):
     Attributes:
         cfg: settings to train with; `resume` is still `AUTO` if the run has saved nothing yet.
         folder: the run folder.
-        is_done: True if the run has used up its budget.
+        is_done: True if the run has used up its budget, or reached `stop`.
+        is_reached: True if it has reached `stop`.
     """
 
     cfg: settings.Train
     folder: Path
     is_done: bool = False
+    is_reached: bool = False
 
 
 def folder_of(cfg: settings.Train) -> Path:
@@ -93,8 +99,9 @@ def automatic(cfg: settings.Train) -> Start:
     numbers = loaded.numbers
     budgets = {name: getattr(cfg, name) for name in ("samples", "seconds")}
     is_done = any(limit is not None and numbers[name] >= limit for name, limit in budgets.items())
+    is_reached = reaches(evaluation_in(numbers), cfg.stop)
     cfg = settings.changed(cfg, resume=str(folder), folder=None, init=None)
-    return Start(cfg, folder, is_done)
+    return Start(cfg, folder, is_done or is_reached, is_reached)
 
 
 def has_checkpoint(folder: Path) -> bool:

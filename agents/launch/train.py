@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import itertools
+import json
 import os
 import shutil
 from pathlib import Path
@@ -24,15 +25,17 @@ from megastep.agents.errors import (
     memory_problem,
     user_errors,
 )
-from megastep.agents.evaluation import evaluate_run, record
+from megastep.agents.evaluation import evaluate_run, in_training, record, tables
 from megastep.agents.factory import env_failures, settings
-from megastep.agents.factory.trainer import make_trainer
+from megastep.agents.factory.trainer import make_loggers, make_trainer
 from megastep.agents.launch import again, dry_run, launcher, rank, rank_checks, signals
-from megastep.agents.runs import folders, provenance
+from megastep.agents.runs import folders, provenance, scores
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
 from megastep.agents.training.trainer import Trainer
+from megastep.agents.types import RunResult
+from megastep.imports import import_object
 
 if TYPE_CHECKING:
     from megastep.agents.types import Config
@@ -92,7 +95,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     if cfg.resume == again.AUTO:
         start = together(lambda: again.automatic(cfg))
         if start.is_done:
-            console.say(f"The run in {start.folder} has already used up its budget.")
+            why = "reached its stop" if start.is_reached else "used up its budget"
+            console.say(f"The run in {start.folder} has already {why}.")
             return start.folder
         cfg = start.cfg
     is_new = not cfg.resume or (cfg.resume == again.AUTO and not os.path.exists(str(cfg.folder)))
@@ -111,7 +115,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             try:
                 trainer = together(
                     env_failures.told(cfg.env, folder, rank=process_group.rank())(
-                        lambda: make_trainer(cfg, folder, device, token, show)
+                        lambda: make_trainer(
+                            cfg, folder, device, token, show, in_training.Evaluator
+                        )
                     )
                 )
             except EnvFailed:
@@ -167,26 +173,31 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
         nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
-        result = result_of(trainer)
+        result, samples = result_of(trainer), trainer.samples
         del trainer, saved  # frees GPU memory for the evaluation
         common: dict = dict(
             run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device
         )
         common["trust"] = True  # its modules have just been imported
+        table, film = None, None
         if cfg.finish.evaluate:
             with process_group.unhurried():
                 episodes = cfg.finish.episodes
-                evaluate_run.run(
+                table = evaluate_run.run(
                     settings.Evaluate(episodes=episodes, baseline=("random",), **common)
                 )
         if cfg.finish.record and is_first:
             with console.warned():
-                record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
+                film = record.run(
+                    settings.Record(steps=cfg.finish.steps, home=None, file=None, **common)
+                )
         if cfg.finish.report and is_first:
             from megastep.agents.reports import report
 
             with console.warned():
                 console.say(f"Report: {report.write([folder], folder / 'report.html')}")
+        if is_first:
+            tell_loggers(cfg, folder, samples, table, film)
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All other rollouts were used; the run is in {folder}"
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
@@ -197,9 +208,36 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     return folder
 
 
+def tell_loggers(
+    cfg: settings.Train, folder: Path, samples: int, table: Path | None, film: Path | None
+) -> None:
+    """Gives the result of a run to those of its loggers that have a method `finish`.
+
+    Args:
+        table: the .json of its evaluation.
+        film: its video.
+    """
+    if not any(hasattr(import_object(one.name), "finish") for one in cfg.logger.values()):
+        return
+    numbers = {name: x for name, x in scores.outcome(folder).items() if x is not None}
+    cells = []
+    if table is not None:
+        cells = [tables.cells(row) for row in json.loads(table.read_text())["rows"]]
+    with console.warned(), process_group.unhurried():
+        logger = make_loggers(cfg, folder, samples)
+        logger.finish(samples, RunResult({"samples": samples, **numbers}, film, cells))
+        logger.close()
+
+
 def result_of(trainer: Trainer) -> str:
     """Returns what a run came to: samples, seconds, and the return of its last episodes."""
     text = f"Trained {trainer.samples:,} samples in {console.duration(trainer.clock.seconds)}"
+    if trainer.is_reached:
+        goals = ", ".join(
+            f"{name} {trainer.evaluation[name]:.4g} (stop.{name}={goal:g})"
+            for name, goal in trainer.stop.items()
+        )
+        return f"{text}, when an evaluation had {goals}"
     latest = trainer.latest_stats
     if "episode/return" not in latest:
         return f"{text}; no episode ended since the last report"

@@ -21,11 +21,12 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
     beside it, a .csv of its lines. Returns the plot's path.
 
     Raises:
-        UserError: a folder is no run, a run has not reported the metric, or a file cannot be
-            written.
+        UserError: a folder is no run, a run has not reported the metric, matplotlib fails, or a
+            file cannot be written.
     """
-    from matplotlib.figure import Figure  # which takes a while
-    from matplotlib.ticker import EngFormatter
+    with user_errors("drawing needs matplotlib, which fails: ", (ImportError, ValueError)):
+        from matplotlib.figure import Figure  # which takes a while
+        from matplotlib.ticker import EngFormatter
 
     if file.suffix not in FORMATS:
         raise UserError(f"file={file} is no plot; its name ends with {', '.join(FORMATS)}")
@@ -34,7 +35,7 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         if not shared:
             raise UserError("these runs share no metric, so they cannot be compared")
         raise UserError(f"not all of these runs report {metric!r}; {closest(metric, shared)}")
-    groups, table, rows = runs.groups_of(every), [], []
+    groups, table, scores = runs.groups_of(every), [], {}
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     axes = figure.subplots()
     for name, group in groups.items():
@@ -43,9 +44,7 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         axes.fill_between(one["x"], one["lower"], one["upper"], alpha=0.2, color=line.get_color())
         columns = zip(*(one[key].tolist() for key in ("x", "mean", "lower", "upper")), strict=True)
         table += [[name, *row] for row in columns]
-        values = [value for run in group if (value := run.score(metric)) is not None]
-        middle, lower, upper = statistics.interval([values]) if values else 3 * (float("nan"),)
-        rows.append([name, str(len(group)), f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}"])
+        scores[name] = [value for run in group if (value := run.score(metric)) is not None]
     axes.set(xlabel="samples", ylabel=metric)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
@@ -58,6 +57,7 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file.with_suffix(".csv"), text.getvalue().encode())
         write_atomically(file, plot.getvalue())
-    head = ["runs", "seeds", f"IQM of {metric}", "95 % interval"]
+    head = [text.format(metric) for text in statistics.POOLED]
+    rows = statistics.pooled(scores)
     console.say(console.table(head, rows, width=console.terminal_width()))
     return file

@@ -4,7 +4,7 @@ As Agarwal et al. define them (Deep Reinforcement Learning at the Edge of the St
 NeurIPS 2021), whose library is rliable. A task is an environment in its homes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +42,21 @@ def interval(
         resampled.append(statistic(np.concatenate(drawn)))
     lower, upper = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2])
     return statistic(np.concatenate(tasks)), float(lower), float(upper)
+
+
+#: The head of the table of `pooled`, with the name of a metric to fill in.
+POOLED = ["runs", "seeds", "IQM of {}", "95 % interval"]
+
+
+def pooled(scores: Mapping[str, Sequence[float]]) -> list[list[str]]:
+    """Returns the rows of a table: for each label, the number of seeds, and the interquartile mean
+    of their scores with its interval.
+    """
+    rows = []
+    for name, values in scores.items():
+        middle, lower, upper = interval([values]) if len(values) else 3 * (float("nan"),)
+        rows.append([name, str(len(values)), f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}"])
+    return rows
 
 
 def profile(scores: Sequence[ArrayLike], thresholds: ArrayLike) -> np.ndarray:

@@ -41,13 +41,13 @@ def outcome(result: Path) -> dict[str, float | None]:
         result: the job's run folder, or the .json file of an evaluation.
 
     Returns:
-        `evaluated`: the return in an evaluation (for a run, its first), or the fraction of duels
+        `evaluated`: the return in an evaluation (for a run, its last), or the fraction of duels
         won against the first opponent; `lower` and `upper`: its 95 % interval. `score`: a run's
         `mean_return`; for an evaluation, the same as `evaluated`. Each is None if unknown.
     """
     files, rows = [result], []
     if is_run := result.is_dir():
-        files = sorted(result.glob("evaluations/*.json"))
+        files = sorted(result.glob("evaluations/*.json"), key=lambda file: -file.stat().st_mtime)
         with contextlib.suppress(OSError):
             rows = json_lines.read(result / "metrics.jsonl")
     tables = [json.loads(file.read_text())["rows"][0] for file in files if file.suffix == ".json"]

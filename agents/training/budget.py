@@ -3,10 +3,11 @@
 A sample is one environment step of one lane.
 """
 
+import contextlib
 import dataclasses
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +61,17 @@ def _fraction_left(spent, limit) -> float:
     return 1.0 if limit is None else 1 - spent / limit
 
 
+def evaluation_in(state: Mapping) -> dict[str, float]:
+    """Returns the last evaluation in the state of a run, or in its numbers."""
+    return {name[5:]: float(x) for name, x in state.items() if name.startswith("eval/")}
+
+
+def reaches(evaluation: Mapping[str, float], stop: Mapping[str, float]) -> bool:
+    """Returns whether an evaluation has at least all numbers of `stop`, if there are any."""
+    least = -math.inf
+    return bool(stop) and all(evaluation.get(name, least) >= x for name, x in stop.items())
+
+
 class Stopwatch:
     """Counts seconds of training.
 
@@ -75,6 +87,16 @@ class Stopwatch:
     def start(self) -> None:
         """Starts counting. Called after the first update, so compilation does not count."""
         self.started = time.monotonic()
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """What is done inside does not count."""
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            if self.started is not None:
+                self.started += time.monotonic() - began
 
     @property
     def is_running(self) -> bool:

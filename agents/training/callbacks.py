@@ -3,7 +3,7 @@
     class Stop:
         def on_report(self, trainer, metrics):
             if metrics.get("episode/return", 0) > 50:
-                trainer.stop()
+                trainer.end()
 
 `train.py callbacks=[my_module:Stop]`, or `megastep.train(callbacks=[Stop])`.
 """

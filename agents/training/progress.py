@@ -23,6 +23,8 @@ def progress_of(trainer: Trainer) -> tuple[float | None, list[str]]:
         words += few_means(latest, trainer.episode_stats.metrics, trainer.episode_stats.groups)
         won = [(key.partition("episode/won/")[2], rate) for key, rate in latest.items()]
         words += [f"won vs {opponent} {100 * rate:.0f} %" for opponent, rate in won if opponent]
+    if trainer.evaluate_every and "return" in trainer.evaluation:
+        words.append(f"evaluated {trainer.evaluation['return']:.3g}")
     if trainer.budget.is_limited and left < 1:
         words.append(f"{console.duration(trainer.clock.seconds * left / (1 - left))} left")
     return 1 - left if trainer.budget.is_limited else None, words

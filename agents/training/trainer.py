@@ -16,7 +16,7 @@ from megastep.agents.distributed.process_group import n_ranks, rank, unhurried
 from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.runs.saver import NoSaver
-from megastep.agents.training.budget import Budget, Stopwatch
+from megastep.agents.training.budget import Budget, Stopwatch, evaluation_in, reaches
 from megastep.agents.training.callbacks import Callbacks
 from megastep.agents.training.closing import close_env
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
@@ -60,8 +60,13 @@ class Trainer:
             same time, if the environment has a method `desync()`. Statistics leave these episodes
             out.
         on_log: called with the trainer after each report, for example to show progress.
-        evaluator: measures the policy for each report, which has the numbers as `eval/NAME`, means
-            over the ranks. Whatever it plays in is not the environment of the training.
+        evaluator: measures the policy for a report, which has the numbers as `eval/NAME`, means
+            over the ranks. Whatever it plays in is not the environment of the training, and its
+            time does not count.
+        evaluate_every: (number, "samples" or "seconds"): which reports the evaluator is called for,
+            the first after each so many. A checkpoint follows, whose score is the return that was
+            measured; other checkpoints have none. None: all reports.
+        stop: by name, what the evaluator must measure at least for the run to end.
         snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
             update and after each.
         repeat_hint: returns how to meet the first NaN or infinity of the run again, as the rest of
@@ -83,6 +88,7 @@ class Trainer:
             of few episodes is luck, and would mark the first checkpoint as the best.
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
+        evaluation: name -> the last value that the evaluator measured.
         lost: what could not be restored of a resumed run and begins anew, a clause each; if any,
             the run does not continue bit for bit.
         nonfinite_guard: has the first NaN or infinity of the run.
@@ -108,6 +114,8 @@ class Trainer:
         desync: bool = False,
         on_log: Callable[[Trainer], None] = lambda trainer: None,
         evaluator: Callable[[Policy], Mapping[str, float]] = lambda policy: {},
+        evaluate_every: tuple[float, str] | None = None,
+        stop: Mapping[str, float] | None = None,
         snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
         repeat_hint: Callable[[Trainer, NonFiniteValue], str] = lambda trainer, value: "",
         annealing_record: AnnealingRecord | None = None,
@@ -122,6 +130,10 @@ class Trainer:
         self.budget = budget = Budget() if budget is None else budget
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.on_log, self.evaluator, self.snapshot_saver = on_log, evaluator, snapshot_saver
+        self.evaluate_every, self.stop = evaluate_every, dict(stop or {})
+        self.evaluation: dict[str, float] = {}
+        self.evaluated_at: int | None = None
+        self.last_report = {"samples": 0.0, "seconds": 0.0}
         self.opponents = optional(env, "opponent_pool")
         self.annealing_record, self.profiler = annealing_record, profiler
         self.callbacks, self.is_stopped = Callbacks(callbacks), False
@@ -170,6 +182,11 @@ class Trainer:
         return self.budget.fraction_left(self.updates, self.samples, self.clock.seconds)
 
     @property
+    def is_reached(self) -> bool:
+        """Whether the last evaluation ends the run."""
+        return reaches(self.evaluation, self.stop)
+
+    @property
     def is_saved(self) -> bool:
         """True if the last checkpoint holds every update, once `saver.wait()` has returned."""
         return self.updates_at_checkpoint == self.updates and self.saver.error is None
@@ -199,7 +216,9 @@ class Trainer:
                 if self.updates % self.log_every == 0:
                     self.samples_at_report = self.samples
                     self.log(losses)
-                    self.nonfinite_guard.check(self.rollout)
+                    is_sound = self.nonfinite_guard.check(self.rollout)
+                    if is_sound and self.evaluate_every and self.evaluated_at == self.samples:
+                        self.save_checkpoint()
             state = self.state_dict()  # a resumed run repeats what this last report empties
             if self.updates > self.updates_at_log:
                 self.log(losses)
@@ -223,7 +242,7 @@ class Trainer:
         self.wait_for_files()
         self.callbacks("on_end", self)
 
-    def stop(self) -> None:
+    def end(self) -> None:
         """Ends training after the current update, as for a callback; all ranks do if one does."""
         self.is_stopped = True
 
@@ -247,7 +266,7 @@ class Trainer:
         seconds = self.clock.seconds
         seconds_since = seconds - self.seconds_at_checkpoint
         plan = Plan(
-            goes_on=self.fraction_left > 0,
+            goes_on=self.fraction_left > 0 and not self.is_reached,
             saves=self.clock.is_running and seconds_since >= self.checkpoint_seconds,
             lr_fraction=self.budget.lr_fraction(self.updates, self.samples, seconds),
         )
@@ -314,13 +333,15 @@ class Trainer:
             updates: updates so far.
             lr: learning rate.
             anneal: what the learning rate falls with.
-            eval/NAME: what an evaluation in training measured.
+            eval/NAME: what an evaluation in training measured: `return`, `length`, and each metric
+                of the environment, means over episodes in unseen homes.
             perf/rate: samples per second since the last report.
             perf/seconds: seconds of training so far.
             perf/collect: seconds of collecting since the last report, on a GPU of the GPU; with
                 `learner.lag`, as far as the learner waits for it.
             perf/update: seconds of updates, in the same way.
-            perf/rest: seconds of everything else: statistics, logging, checkpoints.
+            perf/rest: seconds of everything else: statistics, logging, checkpoints, evaluations.
+            perf/seconds_to_stop: seconds of training at which an evaluation reached `stop`.
             perf/memory_allocated: on a GPU, bytes of tensors.
             perf/memory_reserved: on a GPU, bytes that PyTorch has reserved.
             perf/memory_peak: on a GPU, the most bytes of tensors so far.
@@ -338,10 +359,15 @@ class Trainer:
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates(sum_over_ranks)
         of_curriculum = {} if self.curriculum is None else self.curriculum.stats()
-        with unhurried():
-            evaluation = self.evaluator(self.policy)
+        evaluation = {}
+        if self.evaluate_every is None or any_rank(self._evaluation_is_due()):
+            with unhurried(), self.clock.paused():
+                evaluation = self.evaluator(self.policy)
         evaluation = {f"eval/{name}": value for name, value in evaluation.items()}
         means = mean_over_ranks({**of_curriculum, **loss_values, **evaluation})
+        if evaluation:
+            self.evaluated_at = self.samples
+            self.evaluation = {n[5:]: means[n] for n in evaluation if n in means}
         stats |= {name: means[name] for name in of_curriculum if name in means}
         if (n_restarts := optional(self.env, "pop_restarts")()) is not None:
             n_restarts = torch.tensor([n_restarts], device=self.env.device)
@@ -356,6 +382,9 @@ class Trainer:
         }
         seconds = self.clock.seconds
         perf = {"perf/seconds": seconds}
+        if evaluation and self.is_reached:
+            perf["perf/seconds_to_stop"] = seconds
+        self.last_report = {"samples": self.samples, "seconds": seconds}
         if self.samples > self.samples_at_log:  # not for the first update, which compiles
             n_samples = self.samples - self.samples_at_log
             self.samples_per_second = n_samples / (seconds - self.seconds_at_log)
@@ -374,6 +403,12 @@ class Trainer:
         self.on_log(self)
         self.callbacks("on_report", self, {**metrics, **perf, "samples": self.samples})
 
+    def _evaluation_is_due(self) -> bool:
+        assert self.evaluate_every is not None
+        every, unit = self.evaluate_every
+        now = {"samples": self.samples, "seconds": self.clock.seconds}
+        return now[unit] // every > self.last_report[unit] // every
+
     def save_checkpoint(self, state: StateDict | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update. All ranks call it.
 
@@ -390,8 +425,12 @@ class Trainer:
         # a checkpoint must not reach further than what is on disk of the run's files
         if any_rank(not self._sync_files()) and not is_last:
             return
+        score = self.score
+        if self.evaluate_every is not None:
+            is_evaluated = self.evaluated_at == self.samples
+            score = self.evaluation.get("return") if is_evaluated else None
         with unhurried():
-            self.saver(self.samples, state, self.score, is_last)
+            self.saver(self.samples, state, score, is_last)
         self.updates_at_checkpoint = self.updates
         self.callbacks("on_checkpoint", self)
 
@@ -432,6 +471,7 @@ class Trainer:
             updates=self.updates,
             seconds=self.clock.seconds,
             samples_at_report=self.samples_at_report,
+            **{f"eval/{name}": value for name, value in self.evaluation.items()},
         )
         return counts | self.run_state.state_dict(has_episodes)
 
@@ -444,5 +484,7 @@ class Trainer:
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.seconds_before = state["seconds"]
         self.samples_at_report = state["samples_at_report"]
+        self.last_report = {"samples": self.samples_at_report, "seconds": state["seconds"]}
+        self.evaluation = evaluation_in(state)
         self.updates_at_checkpoint = self.updates_at_log = self.updates
         self.lost = self.run_state.load_state_dict(state, is_new_rank)

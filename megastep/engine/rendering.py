@@ -160,12 +160,15 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)  # of an agent
     n = scenery.n_envs * scenery.n_agents
     kernel = "render" if "indices" in outputs else _kernel(scenery, res, subsample)
-    n_per_block = 1 if kernel == "render_split" else BLOCK // WARP
-    if scenery.objects is not None:
-        shared += LINE_BYTES * (len(scenery.objects.line_object) + scenery.objects.n_objects)
+    n_warps = BLOCK // WARP
+    n_per_block = 1 if kernel == "render_split" else n_warps
+    shared *= n_per_block
+    if scenery.objects is not None:  # which each warp draws for itself
+        n_drawn = len(scenery.objects.line_object) + scenery.objects.n_objects
+        shared += LINE_BYTES * n_drawn * n_warps
         kernel = kernel.replace("render", "render_objects")
     launch(
-        *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared * n_per_block)),
+        *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared)),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         yaws=checks.address("agents.yaws", agents.yaws, (agents.n_cameras,), torch.float32, device),

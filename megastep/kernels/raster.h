@@ -113,3 +113,27 @@ HD ScreenBounds bounds_of(const Pose& camera, const Screen& screen, float half_w
     }
     return bounds;
 }
+
+// Bounds on what a disc covers. distance2 is 0, or -1 if it covers no pixel.
+HD ScreenBounds bounds_of_disc(const Pose& camera, const Screen& screen, float half_width, float x,
+                               float y, float radius) {
+    float depth, left;
+    to_camera(camera, x, y, depth, left);
+    float reach = radius * (1.f + half_width) + 1e-3f * (1.f + half_width);
+    float least_depth = depth - radius, most_depth = depth + radius;
+    int is_beside = left - half_width * depth > reach || left + half_width * depth < -reach;
+    ScreenBounds bounds = {0.f, 1e9f, 0, screen.res - 1};
+    if (is_beside || most_depth < -1e-3f)
+        bounds.distance2 = -1.f;
+    if (least_depth > 0.01f) {
+        float right = left - radius, last = (float)(screen.res - 1);
+        left += radius;
+        float nearest = RECIPROCAL(least_depth - 1e-3f), farthest = RECIPROCAL(most_depth);
+        float left_slope = left * (left > 0.f ? nearest : farthest);
+        float right_slope = right * (right > 0.f ? farthest : nearest);
+        bounds.max_inverse = 1.01f * nearest;
+        bounds.first = (int)clamp(screen.centre - screen.scale * left_slope - 1.f, 0.f, last);
+        bounds.last = (int)clamp(screen.centre - screen.scale * right_slope + 2.f, 0.f, last);
+    }
+    return bounds;
+}

@@ -180,13 +180,3 @@ DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvSc
         raster_group(v, (const Float4*)scenery.agent_lines + l, first, active);
     }
 }
-
-// Rasterises the lines of all objects, as drawn by draw_line.
-template <int is_split>
-DEVICE void raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
-                           const Float4* objects) {
-    for (int first = 0; first < p.objects.n_lines; first += WARP) {
-        int l = first + v.warp_lane;
-        raster_group(v, objects + l, scenery.n_agent_lines + first, l < p.objects.n_lines);
-    }
-}

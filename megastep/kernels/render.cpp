@@ -352,8 +352,14 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     int layout = layout_of(s, env, p.error_flag);
     EnvScenery scenery = env_scenery(s, env, layout);
     scratch.objects.resize(p.objects.n_lines + p.objects.n_objects);
-    for (int l = 0; l < p.objects.n_lines; l++)
-        draw_line(p, env, layout, a, l, scratch.objects.data());
+    for (int k = 0; k < p.objects.n_objects; k++) {
+        Object object = object_at(p, env, k);
+        if (a == 0)
+            settle(p.objects, s, object, layout, env * p.objects.n_objects + k);
+        draw_texel(p, object, env, k, scratch.objects.data());
+        for (int l = p.objects.line_starts[k]; l < p.objects.line_starts[k + 1]; l++)
+            draw_line(p, object, a, k, l, scratch.objects.data());
+    }
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);
     if (p.imu)

@@ -29,18 +29,23 @@ HD float depth_reading(float distance, float radius, float inv_max_depth) {
     return 1.f - clamp((distance - radius) * inv_max_depth, 0.f, 1.f);
 }
 
-// Draws line l of an environment's objects as agent a sees it into `drawn`, and with an object's
-// first line its texel, after all lines. The first of the agents settles the objects.
-HD void draw_line(const RenderParams& p, int env, int layout, int a, int l, Float4* drawn) {
+// Object k of an environment, where it is.
+HD Object object_at(const RenderParams& p, int env, int k) {
+    const Object& object = objects_of(p.objects)[env * p.objects.n_objects + k];
+    return placed(object, p.scenery, p.positions, p.angles, env);
+}
+
+// Draws the texel of an environment's object k into `drawn`, after all lines.
+HD void draw_texel(const RenderParams& p, const Object& object, int env, int k, Float4* drawn) {
     const ObjectsParams& o = p.objects;
-    int k = o.line_object[l], i = env * o.n_objects + k, first = o.line_starts[k];
-    Object object = placed(objects_of(o)[i], p.scenery, p.positions, p.angles, env);
-    drawn[l] = seen_line(object, o.shapes[k], l - first, a);
-    if (l != first)
-        return;
+    int i = env * o.n_objects + k;
     drawn[o.n_lines + k] = texel_of(o, object, o.lit ? o.texels[4 * i + 3] : 1.f);
-    if (a == 0)
-        settle(o, p.scenery, object, layout, i);
+}
+
+// Draws line l of an environment's objects, one of object k, as agent a sees it into `drawn`.
+HD void draw_line(const RenderParams& p, const Object& object, int a, int k, int l, Float4* drawn) {
+    const ObjectsParams& o = p.objects;
+    drawn[l] = seen_line(object, o.shapes[k], l - o.line_starts[k], a);
 }
 
 // What a ray contributes to its pixel.

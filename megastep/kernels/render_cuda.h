@@ -4,8 +4,7 @@
 #pragma once
 #include "common/errors.h"
 #include "common/scenery.h"
-#include "raster_cuda.h"
-#include "render.h"
+#include "raster_objects_cuda.h"
 
 // The sum over `n` warp lanes, in order: this one and those after it.
 DEVICE RaySample sum_of(const RaySample& ray, int n) {
@@ -30,16 +29,33 @@ DEVICE float quarter_of_sum(const RaySample& ray, int warp_lane) {
     return (second ? two : one) + __shfl_xor_sync(FULL_WARP, second ? one : two, 2);
 }
 
-// Where objects are drawn: after the nearest lines in shared memory.
-template <int drawn>
+// Where this warp draws objects: after the nearest lines in shared memory.
+template <int drawn, int is_split>
 DEVICE Float4* drawn_objects(const RenderParams& p, NearestLine* nearest) {
-    return drawn & OBJECTS ? (Float4*)(nearest + whole_tiles(p.res)) : 0;
+    if (!(drawn & OBJECTS))
+        return 0;
+    int warp = is_split ? threadIdx.x / WARP : 0;
+    return (Float4*)(nearest + whole_tiles(p.res)) +
+           warp * (p.objects.n_lines + p.objects.n_objects);
 }
 
-// Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels.
+// Shades ray r of a camera, which hits one of the lines `hit` of those drawn.
+template <int full_res, int drawn, int hit, int is_split>
+DEVICE RaySample shade_hit(const RenderParams& p, const View<is_split>& v,
+                           const EnvScenery& scenery, int view, unsigned int* seen, int r,
+                           const NearestLine& nearest, int& newly_seen) {
+    const Float4* objects = drawn_objects<hit, is_split>(p, v.nearest);
+    Surface surface = surface_of<drawn, hit>(p, scenery, v.camera, nearest.line, objects);
+    return shade_ray<full_res, hit>(p, v.screen, scenery, surface, objects, view, seen, r,
+                                    nearest.inverse, newly_seen);
+}
+
+// Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels. Batches
+// that hit no object are shaded as if there were none, which takes fewer instructions.
+// `sees_objects`: 0 if none is hit.
 template <int full_res, int drawn, int is_split>
 DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScenery& scenery,
-                  int view, unsigned int* seen, int& newly_seen) {
+                  int view, unsigned int* seen, int sees_objects, int& newly_seen) {
     int subsample = p.subsample, warp_lane = v.warp_lane;
     int first = is_split ? TILE * v.tiles.first : 0;
     int res = is_split ? mini(p.res, TILE * v.tiles.end) : p.res;
@@ -52,16 +68,23 @@ DEVICE void shade(const RenderParams& p, const View<is_split>& v, const EnvScene
     for (int start = first; start < res; start += batch) {
         int r = start + warp_lane, active = r < res && warp_lane < batch;
         RaySample sample = {0.f, 0.f, 0.f, 0.f};
+        int hits_objects = 0;
+        if (drawn & OBJECTS && sees_objects)
+            hits_objects = __any_sync(
+                FULL_WARP, active && (unsigned int)(v.nearest[r].line - scenery.n_agent_lines) <
+                                         (unsigned int)p.objects.n_lines);
         if (active) {
             NearestLine nearest = v.nearest[r];
             long long ray = (long long)view * p.res + r;
             if (full_res)
                 p.indices[ray] = nearest.line;
             if (nearest.line >= 0) {
-                const Float4* objects = drawn_objects<drawn>(p, v.nearest);
-                Surface surface = surface_of<drawn>(p, scenery, v.camera, nearest.line, objects);
-                sample = shade_ray<full_res, drawn>(p, v.screen, scenery, surface, objects, view,
-                                                    seen, r, nearest.inverse, newly_seen);
+                if (drawn & OBJECTS && hits_objects)
+                    sample = shade_hit<full_res, drawn, drawn>(p, v, scenery, view, seen, r,
+                                                               nearest, newly_seen);
+                else
+                    sample = shade_hit<full_res, drawn, drawn & ~OBJECTS>(p, v, scenery, view, seen,
+                                                                          r, nearest, newly_seen);
             } else if (full_res) {
                 write_miss(p, ray);
             }
@@ -103,9 +126,6 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     Screen screen = screen_of(p);
     int layout = layout_of(s, env, p.error_flag);
     EnvScenery scenery = env_scenery(s, env, layout);
-    if (drawn & OBJECTS && rank == warp_lane)
-        for (int l = warp_lane; l < p.objects.n_lines; l += WARP)
-            draw_line(p, env, layout, a, l, drawn_objects<drawn>(p, nearest));
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
     if (rank == 0)
         flag_nonfinite(p.error_flag, env, x, y, angle);
@@ -117,7 +137,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     Tiles tiles = {0, 0};
     if (is_split) {
         tiles = half_of_screen(p.res, warp);
-        __syncthreads();  // `seen` is clear, and objects are drawn
+        __syncthreads();  // `seen` is clear
     }
     int reads_both = is_split && (p.centre_line || p.agent_ray);  // halves of `nearest`
     for (int c = 0; c < p.n_cameras; c++) {
@@ -127,9 +147,11 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         clear(v);
         if (drawn & AGENTS && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
-        if (drawn & OBJECTS)
-            raster_objects(v, p, scenery, drawn_objects<drawn>(p, nearest));
         raster_walls<drawn>(v, p, scenery, p.half_width);
+        int sees_objects = 0;
+        if (drawn & OBJECTS)
+            sees_objects = raster_objects(v, p, scenery, env, layout, a,
+                                          drawn_objects<drawn, is_split>(p, nearest));
         __syncwarp();
         if (reads_both)
             __syncthreads();
@@ -144,7 +166,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         }
         if (reads_both)
             __syncthreads();
-        shade<full_res, drawn>(p, v, scenery, view, seen, newly_seen);
+        shade<full_res, drawn>(p, v, scenery, view, seen, sees_objects, newly_seen);
     }
     if (!p.newly_seen)
         return;

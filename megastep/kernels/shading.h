@@ -43,20 +43,20 @@ struct Surface {
     int first_texel, width, kind;
 };
 
-// Line l of an environment: agents' come first, then objects', then walls. `objects`: as drawn by
-// draw_line.
-template <int drawn>
+// Line l of an environment: agents' come first, then objects', then walls. Of what is drawn, it may
+// be one of those `hit`. `objects`: as drawn by draw_line.
+template <int drawn, int hit = drawn>
 HD Surface surface_of(const RenderParams& p, const EnvScenery& scenery, const Pose& camera, int l,
                       const Float4* objects) {
     const SceneryParams& s = p.scenery;
     float ax, ay, bx, by;
-    if (drawn & OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(p, scenery)) {
+    if (hit & OBJECTS && l >= scenery.n_agent_lines && l < first_static_line<drawn>(p, scenery)) {
         int i = l - scenery.n_agent_lines;
         to_camera(camera, objects[i].x, objects[i].y, ax, ay);
         to_camera(camera, objects[i].z, objects[i].w, bx, by);
         return {ax, ay, bx - ax, by - ay, p.objects.line_object[i], 1, OBJECTS};
     }
-    int is_agent = drawn & AGENTS && l < scenery.n_agent_lines;
+    int is_agent = hit & AGENTS && l < scenery.n_agent_lines;
     int i = is_agent ? l : l + (scenery.first_wall - first_static_line<drawn>(p, scenery));
     Float4 line = LOAD((const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i);
     const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, memory, objects, pong, step
+from films import films
 from nsight_counters import counters
 from peers import peers
 from published import published
@@ -30,6 +31,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "pong": pong,
     "paths": paths,
     "checkpoints": checkpoints,
+    "films": films,
     "compile": compile_kernels,
     "first": first_step,
     "startup": startup,

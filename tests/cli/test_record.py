@@ -15,7 +15,7 @@ from matplotlib import pyplot as plt
 from megastep import recording
 from megastep.agents.cli import record, train
 from megastep.agents.runs import checkpoint
-from tests.helpers import tiny
+from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
 
 TINY = [*tiny.TINY, "samples=1"]
@@ -154,6 +154,12 @@ def test_full_disk(trained, here, monkeypatch, capsys, ending):
     file = f"new/film.{ending}"
     assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
     assert "No space left on device" in capsys.readouterr().err and not os.listdir()
+
+
+def test_disk_that_fills_up_while_the_film_is_written(trained, here, capsys):
+    with faults.full_disk(2000):
+        assert record.main([f"run={trained}", "steps=3", "device=cpu", "file=film.mp4"]) == 2
+    assert "File too large" in capsys.readouterr().err and not os.listdir()
 
 
 @pytest.mark.parametrize(

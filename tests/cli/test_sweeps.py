@@ -107,8 +107,21 @@ def test_sweep_folders_and_table(here, capsys):
     assert lines[3].split()[1:16:2] == ["1", "1", "3", "done", "12.0", "12.0", "12.0", "12.0"]
     config = yaml.safe_load((here / "mine" / names[0] / "config.yaml").read_text())
     assert config["folder"] == f"mine/{names[0]}"
-    assert "sweep.md" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "sweep.md" in said and "IQM of episode/return" in "\n".join(lines)
+    rows_of_seeds = [line.split() for line in said.split("IQM of episode/return")[1].splitlines()]
+    (pooled,) = [words for words in rows_of_seeds if words[1:2] == ["env.pay=3"]]
+    assert pooled[1:6:2] == ["env.pay=3", "2", "12"] and "12 to 12" in " ".join(pooled)
     assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
+
+
+def test_score_of_a_run_has_its_last_evaluation(here):
+    (here / "run/evaluations").mkdir(parents=True)
+    for number, name in enumerate("ba"):
+        path = here / f"run/evaluations/{name}.json"
+        path.write_text(json.dumps({"rows": [{"return": number, "lower": 0, "upper": 1}]}))
+        os.utime(path, (number, number))
+    assert scores.outcome(here / "run")["evaluated"] == 1
 
 
 @pytest.mark.parametrize(

@@ -343,8 +343,8 @@ def test_repeated_non_finite_updates_stop(here, monkeypatch, capsys):
 
 
 def test_divergence_stops_with_advice(here, capsys):
-    words = ["learner.lr=1e3", "samples=1e9", "checkpoint_seconds=1e-9", "folder=run"]
-    assert train.main([*TINY, *words]) == 1
+    words = ["env=explorer", *tiny.TINY[1:], "log_every=1", "learner.lr=1e3", "samples=1e5"]
+    assert train.main([*words, "checkpoint_seconds=1e-9", "folder=run"]) == 1
     sentence = capsys.readouterr().err.splitlines()[-1]
     assert "learning rate smaller than 1000" in sentence
     assert len(json_lines.read(here / "run" / "metrics.jsonl")) < 100

@@ -278,9 +278,13 @@ def test_killed_rank(here, rank, base):
     assert checkpoint.load_latest(here / "run" / "checkpoints").step > 0
 
 
-@pytest.mark.slow
-def test_stopped_rank(here):
-    with started(here, "checkpoint_seconds=1") as run:
+@pytest.mark.parametrize(
+    "base",
+    [pytest.param(TINY, marks=pytest.mark.slow), pytest.param(ON_GPUS, marks=TWO_GPUS)],
+    ids=["cpu", "cuda"],
+)
+def test_stopped_rank(here, base):
+    with started(here, "checkpoint_seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
         pids = [pid_of(here, n) for n in range(2)]
         os.kill(pids[1], signal.SIGSTOP)

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from html.parser import HTMLParser
 
 import pytest
@@ -172,6 +173,22 @@ def test_refused(here, main, words, sentence):
     with pytest.raises(errors.UserError, match=re.escape(sentence)):
         main(words)
     assert {*here.rglob("*")} == before
+
+
+def test_runs_that_share_no_metric(here, tmp_path, capsys):
+    odd = shutil.copytree(here / "a", tmp_path / "odd")
+    (odd / "perf.jsonl").unlink()
+    (odd / "metrics.jsonl").write_text('{"samples": 1, "x": 1.0}\n')
+    with pytest.raises(errors.UserError, match="share no metric, so they cannot be compared"):
+        compare.main([f"run=[{here / 'a'},{odd}]", f"file={tmp_path / 'plot.pdf'}"])
+    assert not [*tmp_path.glob("plot*")]
+
+
+def test_comparison_without_matplotlib(here, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)  # as a bad MPLBACKEND does
+    with pytest.raises(errors.UserError, match="drawing needs matplotlib, which fails: "):
+        compare.main(["run=a", f"file={tmp_path / 'plot.pdf'}"])
+    assert not [*tmp_path.iterdir()]
 
 
 def test_training_can_end_with_a_report(tmp_path, monkeypatch, capsys):

@@ -22,7 +22,7 @@ class Noted:
 class Stop:
     def on_update(self, trainer, losses):
         if trainer.updates == 3:
-            trainer.stop()
+            trainer.end()
 
 
 class Fails:
@@ -90,7 +90,7 @@ def test_examples_of_the_page(here):
     names = {}
     exec(code((ROOT / "docs/callbacks.md").read_text())[0], names)
     patience, calls = names["Patience"](), []
-    trainer = type("T", (), {"stop": lambda self: calls.append(1)})()
+    trainer = type("T", (), {"end": lambda self: calls.append(1)})()
     for score in [1.0, 2.0, *20 * [1.5]]:
         patience.on_report(trainer, {"episode/return": score})
     assert calls == [1]

@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import io
 import json
 import os
 import pathlib
@@ -9,15 +10,19 @@ import subprocess
 import sys
 import types
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from megastep.agents.runs import json_lines
 from megastep.agents.training import loggers
-from megastep.agents.training.curves import panels_of, plot_curves
+from megastep.agents.training.curves import panels_of, places_of, plot_curves, smoothed
 from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.loggers.csv import CSV
 from megastep.agents.training.loggers.tensorboard import TensorBoard
 from megastep.agents.training.loggers.wandb import Wandb
+from megastep.agents.types import RunResult
+from megastep.video import Mp4Writer
 from tests.helpers import faults
 from tests.helpers.processes import HUNG
 
@@ -208,7 +213,7 @@ def fake_wandb(monkeypatch, key="key", init=None, log=None):
     logged = []
     namespace = types.SimpleNamespace
     log = log or (lambda values, step: logged.append((step, values)))
-    run = namespace(log=log, finish=lambda: None)
+    run = namespace(log=log, finish=lambda: None, summary={})
 
     def started(**options):
         module.options.append(options)
@@ -216,6 +221,9 @@ def fake_wandb(monkeypatch, key="key", init=None, log=None):
         return run
 
     module = namespace(login=lambda prompt: key is not None, Settings=dict, init=init or started)
+    module.Video = lambda path, format: ("video", path, format)
+    module.Table = lambda columns, data: ("table", columns, data)
+    module.run = run
     module.options = []
     monkeypatch.setitem(sys.modules, "wandb", module)
     return logged
@@ -239,12 +247,59 @@ def test_wandb_logs_metrics_and_perf(tmp_path, monkeypatch):
 
 def test_resumed_run_continues_its_wandb_run(tmp_path, monkeypatch):
     fake_wandb(monkeypatch)
-    for folder, step in ((tmp_path / "a", 0), (tmp_path / "b", 0), (tmp_path / "a", 5)):
-        folder.mkdir(exist_ok=True)
-        with_wandb(folder, step).close()
+    for name, step in (("a", 0), ("b", 0), ("a", 5), ("a", 9)):
+        (tmp_path / name).mkdir(exist_ok=True)
+        with_wandb(tmp_path / name, step).close()
     started = sys.modules["wandb"].options
-    assert [options["id"] for options in started] == [None, None, "id1"]
-    assert [options["resume"] for options in started] == ["allow"] * 3
+    assert [options["id"] for options in started] == [None, None, "id1", "id1"]
+    assert [options["resume"] for options in started] == ["allow"] * 4
+    assert {options["job_type"] for options in started} == {"train"}
+    assert started[0]["config"].keys() == {"commit"}
+
+
+RESULT = RunResult({"score": 3.5}, None, [{"agent": "trained", "return": "3.5"}])
+
+
+def test_wandb_has_the_result_of_a_run(tmp_path, monkeypatch):
+    logged = fake_wandb(monkeypatch)
+    run_loggers = with_wandb(tmp_path, 5)
+    run_loggers.finish(5, RESULT._replace(film=tmp_path / "video.mp4"))
+    run_loggers.close()
+    film = "video", str(tmp_path / "video.mp4"), "mp4"
+    table = "table", ["agent", "return"], [["trained", "3.5"]]
+    assert logged == [(5, {"samples": 5, "film": film, "evaluation": table})]
+    assert sys.modules["wandb"].run.summary == {"final/score": 3.5}
+
+
+def test_tensorboard_has_the_result_of_a_run(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    film, config = tmp_path / "video.mp4", {"seed": 1, "learner": {"lr": 0.1, "names": [1, 2]}}
+    writer = Mp4Writer(10)
+    for number in range(8):
+        writer.add(np.full((720, 640, 3), 30 * number, np.uint8))
+    film.write_bytes(writer.close())
+    made = []
+
+    def make():
+        made.append(TensorBoard(tmp_path, 5, config))
+        return made[-1]
+
+    run_loggers = Loggers(tmp_path, 5, {"tensorboard": make, "csv": lambda: CSV(tmp_path, 5)})
+    run_loggers.finish(5, RESULT._replace(film=film))
+    assert [*run_loggers.others] == ["tensorboard"], "a table has no use for it"
+    run_loggers.close()
+    assert made[0].error is None
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [(e.step, e.value) for e in events.Scalars("final/score")] == [(5, 3.5)]
+    (text,) = events.Tensors("evaluation/text_summary")
+    assert b"| trained" in text.tensor_proto.string_val[0]
+    (image,) = events.Images("film")
+    assert (image.height, image.width) == (360, 320)
+    with Image.open(io.BytesIO(image.encoded_image_string)) as gif:
+        assert gif.n_frames == 8 and gif.size == (320, 360)
+    hparams = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    assert b"learner.lr" in hparams and b"learner.names" in hparams
 
 
 @pytest.mark.parametrize(
@@ -298,6 +353,37 @@ def test_curves_are_drawn_from_the_files(tmp_path):
     assert imread(tmp_path / "curves.png").shape[1] > 200
 
 
+def test_training_ends_without_curves_where_matplotlib_fails(tmp_path, monkeypatch):
+    (tmp_path / "metrics.jsonl").write_text('{"samples": 1, "episode/return": 1.0}\n')
+    (tmp_path / "perf.jsonl").write_text("")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)  # as a bad MPLBACKEND does
+    with pytest.warns(UserWarning, match="curves.png cannot be drawn .*matplotlib.figure"):
+        plot_curves(tmp_path)
+
+
+def test_curves_are_means_in_a_band():
+    values = np.r_[np.zeros(40), np.ones(40)]
+    mean, deviation = smoothed(values)  # of two on either side
+    assert mean[:38].tolist() == [0] * 38 and mean[[0, -1]].tolist() == [0, 1]
+    assert mean[38:42] == pytest.approx([0.2, 0.4, 0.6, 0.8])
+    assert deviation[39] == pytest.approx(0.24**0.5) and deviation[0] == pytest.approx(0, abs=1e-7)
+    large, *small = places_of(9)
+    cells = {(i, j) for i in range(4) for j in range(4)}
+    taken = [{(i, j) for i in range(4)[rows] for j in range(4)[columns]}
+             for rows, columns in (large, *small)]  # fmt: skip
+    assert len(taken[0]) == 4 and all(len(one) == 1 for one in taken[1:])
+    assert len(set.union(*taken)) == 12 and set.union(*taken) < cells, "none lies on another"
+
+
+def test_curves_leave_out_what_never_changes():
+    rows = [{"samples": n, "episode/return": n, "loss/kl": 0.0, "loss/td": n} for n in (1, 2)]
+    rows[1] |= {"eval/return": 5.0, "eval/coverage": 0.5}
+    panels = panels_of(rows, [])
+    assert [*panels] == ["return", "coverage", "loss/td"]
+    assert panels["return"] == {"all": [(1, 1), (2, 2)], "evaluated": [(2, 5.0)]}
+    assert [*panels_of([{"samples": n, "loss/kl": 0.0} for n in (1, 2)], [])] == ["loss/kl"]
+
+
 def test_curves_are_those_that_the_rows_have():
     """A learner without entropy has a panel for each loss that it does have."""
     none = {"samples": 1, "episode/count": 0, "loss/td": None, "updates": 1, "anneal": "never"}
@@ -320,11 +406,18 @@ def logged_with_real_wandb(folder, mode, **environment):
     script = f"""
 import pathlib
 from megastep.agents.training.loggers import Loggers, wandb
+from megastep.agents.types import RunResult
+from megastep.video import Mp4Writer
+import numpy as np
 wandb.TIMEOUT = 2
 folder = pathlib.Path({str(folder)!r})
 make = lambda: wandb.Wandb(folder, "n", dict(a=1), "p", {mode!r})
 run_loggers = Loggers(folder, others=dict(wandb=make))
 run_loggers.write(1, dict(x=1), dict(y=2))
+film = Mp4Writer(10)
+film.add(np.zeros((64, 64, 3), np.uint8))
+(folder / "film.mp4").write_bytes(film.close())
+run_loggers.finish(2, RunResult(dict(score=1.0), folder / "film.mp4", [dict(agent="trained")]))
 run_loggers.close()"""
     process = subprocess.run(
         [sys.executable, "-W", "always::UserWarning", "-c", script],
@@ -353,3 +446,6 @@ def test_real_wandb_writes_an_offline_run(tmp_path):
     assert not logged_with_real_wandb(tmp_path, "offline")
     (path,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
     assert path.stat().st_size > 1000
+    (film,) = tmp_path.glob("wandb/offline-run-*/files/media/videos/film_*.mp4")
+    assert film.stat().st_size > 500
+    assert [*tmp_path.glob("wandb/offline-run-*/files/media/table/evaluation_*.json")]

@@ -2,6 +2,7 @@
 other errors.
 """
 
+import contextlib
 import dataclasses
 from types import SimpleNamespace
 
@@ -349,7 +350,8 @@ def test_slow_disk_delays_checkpoints_of_a_second_or_more(tmp_path, seconds, ste
             saved.append(step // UPDATE)
 
     # snapshots are thought of before the first update, and after each
-    run.saver, run.clock = SlowDisk(tmp_path, {}), SimpleNamespace(seconds=-2.0, is_running=True)
+    run.saver = SlowDisk(tmp_path, {})
+    run.clock = SimpleNamespace(seconds=-2.0, is_running=True, paused=contextlib.nullcontext)
     run.snapshot_saver = lambda trainer: setattr(run.clock, "seconds", run.clock.seconds + 2)
     run.train()
     assert saved == steps

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from megastep.agents.runs.json_lines import JsonLines, truncate_after
-from megastep.agents.types import Logger
+from megastep.agents.types import Logger, RunResult
 
 
 class LoggerError(RuntimeError):
@@ -71,6 +71,12 @@ class Loggers:
             self._call_lines(self.metrics, "write", step, metrics)
         self._call_lines(self.perf, "write", step, perf)
         self._call_others("write", step, {**(metrics or {}), **perf})
+
+    def finish(self, step: int, result: RunResult) -> None:
+        """Gives the result of the run to all loggers that have a method `finish`."""
+        for name in [name for name in self.others if not hasattr(self.others[name], "finish")]:
+            self.others.pop(name).close()
+        self._call_others("finish", step, result)
 
     def sync(self) -> None:
         """Flushes the metrics to disk. Raises OSError if they cannot be written."""

@@ -6,8 +6,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
+from megastep.agents import package
+from megastep.agents.runs import provenance
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training.loggers import first_line
+from megastep.agents.types import RunResult
 
 #: Seconds that Weights & Biases may take to start before the run goes on without it.
 TIMEOUT = 20
@@ -17,6 +20,7 @@ class Wandb:
     """Logs to Weights & Biases, online or offline. Never asks for a key on the terminal.
 
     The run's id is stored in its folder, so a resumed run continues the same Weights & Biases run.
+    Its configuration has the settings and the commit of megastep, its summary the final numbers.
 
     Args:
         folder: the run folder.
@@ -50,13 +54,15 @@ class Wandb:
                 "logger.wandb.mode=offline, which needs none"
             )
         id_file = folder / "wandb-id.txt"
+        self.wandb = wandb
         try:
             self.run = wandb.init(
                 project=project,
                 mode=mode,
                 name=run_name,
                 group=group,
-                config=config,
+                job_type="train",
+                config={"commit": provenance.commit(package.ROOT), **config},
                 dir=str(folder),
                 id=id_file.read_text() if id_file.exists() else None,
                 resume="allow",
@@ -77,6 +83,19 @@ class Wandb:
     def write(self, step: int, values: dict[str, float | str]) -> None:
         """Logs one report."""
         self.run.log({"samples": step, **values}, step=step)
+
+    def finish(self, step: int, result: RunResult) -> None:
+        """Logs the final numbers as the run's summary, the film, and the evaluation as a table."""
+        self.run.summary.update({f"final/{name}": x for name, x in result.numbers.items()})
+        shown = {}
+        if result.film is not None:
+            ending = result.film.suffix[1:]
+            shown["film"] = self.wandb.Video(str(result.film), format=ending)
+        if result.table:
+            rows = [[*row.values()] for row in result.table]
+            shown["evaluation"] = self.wandb.Table(columns=[*result.table[0]], data=rows)
+        if shown:
+            self.run.log({"samples": step, **shown}, step=step)
 
     def close(self) -> None:
         """Ends the run on Weights & Biases."""

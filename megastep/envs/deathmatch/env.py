@@ -270,10 +270,11 @@ class Deathmatch(SceneryEnv):
         starts = self.ended.view(self.n_envs, self.n_agents)
         return dict(seen=self.seen, clear_mask=starts)
 
-    def _view(self, **search) -> engine.Observation:
+    def _view(self, core=None, **search) -> engine.Observation:
+        core = core or self.core
         return engine.observe(
-            self.core.scenery,
-            self.core.agents,
+            core.scenery,
+            core.agents,
             self.subsample,
             imu=True,
             centre_line=True,
@@ -283,11 +284,10 @@ class Deathmatch(SceneryEnv):
 
     def _images(self, view) -> arrdict:
         """The images and the IMU of a view, by lane: (B, 1, ...)."""
-        lanes = self.n_envs * self.n_agents
         return arrdict(
-            rgb=view.rgb.view(lanes, *self.obs_space.rgb.shape),
-            d=view.depth.view(lanes, *self.obs_space.d.shape),
-            imu=view.imu.view(lanes, 1, 3),
+            rgb=view.rgb.view(-1, *self.obs_space.rgb.shape),
+            d=view.depth.view(-1, *self.obs_space.d.shape),
+            imu=view.imu.view(-1, 1, 3),
         )
 
     def state(self, e: int = 0) -> arrdict:
@@ -297,15 +297,15 @@ class Deathmatch(SceneryEnv):
         current episode's.
         """
         lanes = slice(e * self.n_agents, (e + 1) * self.n_agents)
-        view, n_model = self._view(), len(self.core.scenery.model)
+        view, n_model = self._view(self.core.alone(e)), len(self.core.scenery.model)
         assert view.centre_line is not None
-        line = view.centre_line[e]
+        line = view.centre_line[0]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
         images = self._images(view)
         return arrdict(
             core=self.core.state(e),
-            rgb=images.rgb[lanes, 0],
-            d=images.d[lanes, 0],
+            rgb=images.rgb[:, 0],
+            d=images.d[:, 0],
             health=self.health[lanes].clone(),
             kills=self.tally[0, lanes].clone(),
             age=self.ages[lanes].clone(),

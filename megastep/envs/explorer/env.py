@@ -173,22 +173,24 @@ class Explorer(SceneryEnv):
         """(B,) int32: texels seen this episode."""
         return self.lifecycle.limits - self.patience
 
-    def _observation(self, **bitmaps) -> tuple[arrdict, torch.Tensor | None]:
+    def _observation(self, core=None, **bitmaps) -> tuple[arrdict, torch.Tensor | None]:
         """Returns the observation and the number of newly seen texels, (N, 1) int32.
+
+        Args:
+            core: default: that of all environments.
 
         Without ``bitmaps`` (arguments ``seen`` and ``clear_mask`` of ``engine.observe``) the number
         is None.
         """
-        view = engine.observe(
-            self.core.scenery, self.core.agents, self.subsample, imu=True, **bitmaps
-        )
+        core = core or self.core
+        view = engine.observe(core.scenery, core.agents, self.subsample, imu=True, **bitmaps)
         return arrdict(images(view), imu=view.imu), view.newly_seen
 
     def state(self, e: int = 0) -> arrdict:
         """Returns the tensors of environment ``e`` that :meth:`plot_state` draws."""
         return arrdict(
             core=self.core.state(e),
-            obs=self._observation()[0][e],
+            obs=self._observation(self.core.alone(e))[0][0],
             seen=self._texels(self.seen[e, 0], e),
             visible=self._texels(self._visible_bits(e), e),
             n_seen=self.n_seen[e].clone(),

@@ -188,9 +188,10 @@ class PointGoal(SceneryEnv):
             world["privileged"] = arrdict(way=step.privileged)
         return world
 
-    def _view(self) -> arrdict:
+    def _view(self, core=None) -> arrdict:
         """Returns the observation without the goal."""
-        view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
+        core = core or self.core
+        view = engine.observe(core.scenery, core.agents, self.subsample, imu=True)
         return arrdict(images(view), imu=view.imu)
 
     def state(self, e: int = 0) -> arrdict:
@@ -198,7 +199,7 @@ class PointGoal(SceneryEnv):
         layout, goal = self.layout[e].long(), self.goal_index[e].long()
         _, _, distance, _, shortest, walked, _ = self.progress[:, e].clone()
         return arrdict(
-            self._view().map(lambda leaf: leaf[e]),
+            self._view(self.core.alone(e)).map(lambda leaf: leaf[0]),
             core=self.core.state(e),
             goal=self.goals.points[layout, goal].clone(),
             age=self.ages[e].clone(),

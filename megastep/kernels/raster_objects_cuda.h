@@ -1,0 +1,54 @@
+// Rasterises objects by warps, only those in view.
+#pragma once
+#include "raster_cuda.h"
+#include "render.h"
+
+// Rasterises objects, and draws these into `drawn`. Called after the walls: objects that are
+// off-screen or entirely behind them are skipped. Returns 1 if any was not.
+template <int is_split>
+DEVICE int raster_objects(View<is_split>& v, const RenderParams& p, const EnvScenery& scenery,
+                          int env, int layout, int a, Float4* drawn) {
+    const ObjectsParams& o = p.objects;
+    int result = 0;
+#pragma unroll 1
+    for (int start = 0; start < o.n_objects; start += WARP) {
+        int own = start + v.warp_lane;
+        Object object = {};
+        ScreenBounds bounds = {-1.f, 0.f, 0, 0};
+        if (own < o.n_objects) {
+            object = object_at(p, env, own);
+            if (a == 0)
+                settle(o, p.scenery, object, layout, env * o.n_objects + own);
+            if (is_drawn(object) && object.carrier != a)
+                bounds = bounds_of_disc(v.camera, v.screen, p.half_width, object.x, object.y,
+                                        1.42f * object.size);  // with a crate's corners
+        }
+        int is_seen = 0;
+#pragma unroll 1
+        for (int tile = 0; TILE * tile < p.res; tile++) {
+            float tile_min = __shfl_sync(FULL_WARP, v.tile_min, tile);
+            is_seen |= bounds.first / TILE <= tile && tile <= bounds.last / TILE &&
+                       bounds.max_inverse >= tile_min;
+        }
+        // a bit for each object
+        unsigned int in_view = __ballot_sync(FULL_WARP, is_seen && bounds.distance2 >= 0.f);
+        if (!in_view)
+            continue;
+        result = 1;
+        if (in_view >> v.warp_lane & 1)
+            draw_texel(p, object, env, own, drawn);
+        int end = o.line_starts[mini(start + WARP, o.n_objects)];
+#pragma unroll 1
+        for (int first = o.line_starts[start]; first < end; first += WARP) {
+            int l = first + v.warp_lane, active = 0;
+            if (l < end) {
+                int k = o.line_object[l];
+                active = in_view >> (k - start) & 1;
+                if (active)
+                    draw_line(p, object_at(p, env, k), a, k, l, drawn);
+            }
+            raster_group(v, drawn + l, scenery.n_agent_lines + first, active);
+        }
+    }
+    return result;
+}
