@@ -1,16 +1,38 @@
 """megastep: reinforcement learning in thousands of small 2D environments on one device.
 
-Importing the package loads nothing else. Its modules are imported at their first use::
+Importing the package loads nothing else. Its modules, and the functions of `agents.api`, are
+imported at their first use::
 
-    from megastep import toys, scene, cuda
-    import megastep; megastep.toys.box()
+    import megastep
+
+    env = megastep.make("explorer", n_envs=64, geometry="homes")
+    run = megastep.train(env="explorer", seconds=60)
+    megastep.toys.box()
+
+Import it before torch: OpenMP reads how its threads wait when it is loaded. Threads that spin while
+they wait for others take the cores that those others need, wherever anything else runs: with one of
+two cores taken, training was 100 times slower. Asleep, they lose a few microseconds per wait.
 """
 
 import importlib
+import os
+import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from types import ModuleType
+
+    from megastep.agents.api import Run as Run
+    from megastep.agents.api import evaluate as evaluate
+    from megastep.agents.api import load as load
+    from megastep.agents.api import make as make
+    from megastep.agents.api import record as record
+    from megastep.agents.api import runs as runs
+    from megastep.agents.api import train as train
+    from megastep.agents.errors import UserError as UserError
+
+if "torch" not in sys.modules:
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _MODULES = (
     "agents",
@@ -35,13 +57,20 @@ _MODULES = (
     "toys",
     "types",
 )
+#: What the package has from its modules.
+_NAMES = {
+    **dict.fromkeys(("Run", "evaluate", "load", "make", "record", "runs", "train"), "agents.api"),
+    "UserError": "agents.errors",
+}
 
 
 def __getattr__(name) -> "ModuleType":
     if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
+    if name in _NAMES:
+        return getattr(importlib.import_module(f"{__name__}.{_NAMES[name]}"), name)
     raise AttributeError(f"megastep has no module '{name}'; its modules are {', '.join(_MODULES)}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return sorted({*globals(), *_MODULES, *_NAMES})

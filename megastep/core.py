@@ -87,13 +87,13 @@ class Core:
         one = _ALONE.get(self)
         if one is None or (one.scenery.objects is None) != (self.scenery.objects is None):
             one = _ALONE[self] = self._one()
-        pairs = [(one.agents, self.agents, name) for name in STATE]
-        pairs.append((one.scenery, self.scenery, "layout"))
+        pairs = [(one.agents, self.agents, STATE), (one.scenery, self.scenery, ("layout",))]
         if self.scenery.objects is not None:
-            objects = one.scenery.objects, self.scenery.objects
-            pairs += [(*objects, name) for name in ("records", "lines", "texels")]
-        for own, shared, name in pairs:
-            getattr(own, name).copy_(getattr(shared, name)[[e]])
+            of_objects = "records", "lines", "texels"
+            pairs.append((one.scenery.objects, self.scenery.objects, of_objects))
+        for own, shared, names in pairs:
+            for name in names:
+                getattr(own, name).copy_(getattr(shared, name)[[e]])
         return one
 
     def _one(self) -> "Core":

@@ -532,8 +532,8 @@ class _Moment(NamedTuple):
     note: str
 
 
-def _moments(players, steps, greedy, seed, trail) -> Iterator[list[_Moment]]:
-    """The moments of all players, until the last of them is at the end."""
+def _moments(players, steps, greedy, seed, trail) -> Iterator[list]:
+    """The `_Moment`s of all players, until the last of them is at the end."""
     by_env = collections.defaultdict(list)
     for player in players:
         by_env[id(player.env)].append(player)

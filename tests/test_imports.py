@@ -1,7 +1,7 @@
 """Imports go one way.
 
-Entry scripts -> megastep.agents.cli -> launch -> evaluation -> factory -> selfplay, training ->
-runs -> algorithms -> networks, storage -> trees and spaces of megastep; environments -> modules,
+Entry scripts, megastep.agents.api -> cli -> launch -> evaluation -> factory -> selfplay, training
+-> runs -> algorithms -> networks, storage -> trees and spaces of megastep; environments -> modules,
 core, plotting -> engine -> kernels. The rules read the source files without importing them. The
 folder agents/ is read once, as megastep.agents.
 """
@@ -34,7 +34,8 @@ SIMULATOR = (
     ("capture", "contract", "env_state", "geometries", "scene"),
     ("core", "cubicasa", "toys"),
     ("cuda", "modules"),
-    ("envs",),
+    ("compat", "envs"),
+    ("demo",),
 )
 ENGINE = (
     ("checks", "outputs", "state_tree", "views"),
@@ -55,9 +56,10 @@ AGENTS = (
     ("selfplay",),
     ("factory",),
     ("evaluation", "pretrained"),
-    ("reports",),
+    ("export", "reports"),
     ("launch",),
     ("cli",),
+    ("api",),
 )
 # Modules of the simulator that every room of the learner may import: no environment, no engine.
 THREADS = "megastep.engine.devices"
@@ -83,7 +85,7 @@ SHARED_WITH_BOTS = SHARED | {
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
 # environments, keeps the global generators, writes videos and starts processes.
-UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained", "reports")
+UPPER_ROOMS = ("api", "cli", "evaluation", "export", "factory", "launch", "pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",
@@ -132,7 +134,7 @@ OUTSIDE_USERS = {
         "megastep/vector_processes.py",
         "megastep/wrapper_state.py",
     ),
-    "hydra": ("agents/cli/*.py",),
+    "hydra": ("agents/api.py", "agents/cli/*.py"),
     "hydra_plugins": ("agents/cli/*.py",),
     "loky": (
         "megastep/geometries/homes/database.py",

@@ -264,7 +264,8 @@ def names_in_list(word: str) -> str:
     """Returns `against=a,b` as the list that it means here, not the sweep that it is to Hydra; and
     `baseline=a,b`.
     """
-    return re.sub(r"^(against|baseline)=(?!\[|(?:null|none|true|false)$)(.*)", r"\1=[\2]", word)
+    pattern = r"""^(against|baseline)=(?!\[|"?(?:null|none|true|false)"?$)(.*)"""
+    return re.sub(pattern, r"\1=[\2]", word)
 
 
 TRAIN = Script("train", settings.Train, TRAIN_HELP, check_training, prepare_training)

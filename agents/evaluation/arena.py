@@ -149,11 +149,12 @@ class Stage:
         lengths = [n_steps] if is_alone else process_group.gather_objects(n_steps)
         if own is None or None in lengths:
             return None
+        longest = max(length for length in lengths if length is not None)
         if is_alone:
             return playing.Actions(own)
         wide = {}
         for name, steps in own.items():
-            steps = np.pad(steps, [(0, max(lengths) - len(steps)), *[(0, 0)] * (steps.ndim - 1)])
+            steps = np.pad(steps, [(0, longest - len(steps)), *[(0, 0)] * (steps.ndim - 1)])
             dtype = np.int64 if steps.dtype.kind in "iu" else steps.dtype  # ranks may differ
             wide[name] = torch.as_tensor(steps.astype(dtype)).transpose(0, 1)
         every = self.shard.with_others(arrdict(wide))

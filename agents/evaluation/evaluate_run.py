@@ -1,5 +1,6 @@
 """Measures a trained policy on unseen homes, or against others in duels."""
 
+import copy
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -143,15 +144,17 @@ def play_all(
         recorder: of the first player, as the environment's generators are where its seed puts them.
     """
     names = [player.name for player, _ in players]
-    state = EnvState(stage.env) if ORACLE in names else None
-    first = None if state is None else state.state_dict()
+    has_oracle = ORACLE in names
+    # a copy, as the state's tensors are the environment's own
+    state = EnvState(stage.env) if has_oracle else None
+    first = copy.deepcopy(state.state_dict()) if state is not None else {}
     all_played = []
     for number, (player, greedy) in enumerate(players):
         if state is not None:
             state.load_state_dict(first)
         own = None if number else recorder
         all_played.append(stage.play(player.policy, greedy, max_steps, own))
-    if state is not None:
+    if has_oracle:
         found = all_played[names.index(ORACLE)]["metrics"]["found"]
         for played in all_played:
             played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found

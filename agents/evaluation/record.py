@@ -12,14 +12,11 @@ from megastep import recording
 from megastep.agents import console, factory
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import arena, duels, replay
-from megastep.agents.factory import env_failures, settings
+from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.runs import folders
 from megastep.agents.runs.atomic_files import make_folders, remove_folders
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import PolicyLike, optional
-
-#: Where random actions are filmed unless geometry= says otherwise.
-HOMES = "megastep.geometries.sources:homes"
 
 
 def run(cfg: settings.Record) -> Path:
@@ -39,7 +36,7 @@ def run(cfg: settings.Record) -> Path:
         folder = folders.folder_of(runs[0].path)
     if cfg.against is not None:
         env_settings = settings.changed(env_settings, **arena.FOR_TWO)
-    geometry = geometry or settings.kind_of("geometry", HOMES)(name=HOMES)
+    geometry = geometry or settings.kind_of("geometry", components.HOMES)(name=components.HOMES)
     homes = factory.homes(env_settings, geometry, cfg.split)
     env_settings = settings.changed(env_settings, n_envs=1)
     players = []

@@ -8,7 +8,7 @@ import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from megastep.arrdict import arrdict
 from megastep.types import Env, PolicyLike, Tree, World, optional
 
 if TYPE_CHECKING:
+    from megastep.agents.runs.checkpoint import Checkpoint
     from megastep.agents.types import Row
 
 
@@ -143,7 +144,7 @@ class Table(NamedTuple):
     def plays(
         self,
         rows: "Sequence[Row]",
-        loaded: checkpoint.Checkpoint,
+        loaded: "Checkpoint",
         device: torch.device,
     ) -> "Iterator[tuple[Row, Env, PolicyLike, int]]":
         """Yields each of some rows with an environment, what plays there, and the lane in it. Rows
@@ -158,7 +159,7 @@ class Table(NamedTuple):
         with user_errors(f"{self.path.with_suffix('.npz')} cannot be used: ", (Exception,)):
             arrays = _arrays(self.path.with_suffix(".npz"))
             n_ranks = int(arrays["n_ranks"])
-            where = dict(seed=self.cfg.seed, device=device, films=True)
+            where: dict[str, Any] = dict(seed=self.cfg.seed, device=device, films=True)
             n_agents = optional(factory.make_sample(self.env, homes, **where), "n_agents")
             for row in rows:
                 part = sources.index(row["source"]) if sources != [None] else 0

@@ -26,6 +26,8 @@ from megastep.imports import import_object
 from megastep.settings import arguments_of, parameters_of
 
 POLICY = "megastep.agents.networks.policy:Policy"
+#: Floor plans unless geometry= says otherwise.
+HOMES = "megastep.geometries.sources:homes"
 FILES = "megastep.geometries.sources:files"
 MIXED = "megastep.geometries.sources:mixed"
 CHECK_PARTS = "megastep.geometries.sources:check_parts"

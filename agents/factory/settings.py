@@ -43,6 +43,20 @@ def _device(name: str) -> str:
     return name
 
 
+def _listed(names: object) -> object:
+    names = [names] if isinstance(names, str) else names
+    return tuple(names) if isinstance(names, list) else names
+
+
+def _callback(name: str) -> str:
+    kind = import_object(name)
+    try:
+        inspect.signature(kind).bind()
+    except TypeError as error:
+        raise ValueError(f"{name} must take no arguments ({error})") from None
+    return name
+
+
 def _ranks(n: int | str) -> int | str:
     if n != "all" and (isinstance(n, str) or not 1 <= n <= 10_000):
         raise ValueError(f"{n!r} is not a number of ranks; use 1 or more, or all")
@@ -70,9 +84,12 @@ def quantity(text: object, kind: str) -> object:
     return int(total) if total.is_integer() else total
 
 
+Callback = Annotated[str, AfterValidator(_callback)]
+
+
 def _every(given: int | float | str) -> int | str:
     """Returns a number of samples, or text such as `60s`."""
-    seconds, samples = (quantity(given, kind) for kind in UNITS)
+    seconds, samples = (cast("float | str", quantity(given, kind)) for kind in UNITS)
     if isinstance(given, str) and re.fullmatch(r"[\d.]+ *m", given):
         raise ValueError(f"{given!r} may be minutes or millions: write min or M")
     is_samples = isinstance(given, str) and given.endswith("M")
@@ -85,9 +102,9 @@ def _every(given: int | float | str) -> int | str:
     return int(samples)
 
 
-def every(value: int | str) -> tuple[float, str]:
+def every(value: float | str) -> tuple[float, str]:
     """Returns (number, "samples" or "seconds") of `evaluate_every`."""
-    return (value, "samples") if isinstance(value, int) else (float(value[:-1]), "seconds")
+    return (float(value[:-1]), "seconds") if isinstance(value, str) else (value, "samples")
 
 
 Above0 = Annotated[float, Field(gt=0)]
@@ -359,6 +376,9 @@ class Train(Common):
     replay_every: Count = 20
     desync: bool = True
     profile: Annotated[int, Field(ge=0, le=1000)] = 0
+    callbacks: Annotated[
+        tuple[Annotated[str, AfterValidator(_callback)], ...], BeforeValidator(_listed)
+    ] = ()
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
     restarts: Annotated[int, Field(ge=0, le=1000)] = 0

@@ -35,6 +35,7 @@ from megastep.agents.training import budget, loggers
 from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
+from megastep.imports import import_object
 from megastep.types import optional
 
 if TYPE_CHECKING:
@@ -139,6 +140,7 @@ def make_trainer(
             make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
             layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
             repeat_hint=functools.partial(repeat.hint, is_resumed=cfg.resume is not None),
+            callbacks=[import_object(name)() for name in cfg.callbacks],
             **measured,
             **writers,
         )

@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import lstm as kernels
 from megastep.agents.networks.kernels import lstm_sequence
-from megastep.agents.networks.kernels.library import aligned, check_shapes
+from megastep.agents.networks.kernels.library import aligned, check_shapes, is_plain
 from megastep.agents.networks.lstm_cpu import CpuSequence, fits
 from megastep.agents.networks.precision import cast, cast_joined, compute_dtype, product
 from megastep.arrdict import arrdict
@@ -251,6 +251,8 @@ class LSTM(nn.Module):
         """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
         compute dtype on a GPU and float32 on a CPU. ValueError if shapes or devices do not fit.
         """
+        if is_plain():
+            return self._plain(x, reset, state, is_residual)
         check_shapes(x, reset, state, ("output", "cell"))
         if len(x) == 1 and x.is_cuda and not torch.is_grad_enabled():
             return self._act(x, reset, state, is_residual)
@@ -266,6 +268,17 @@ class LSTM(nn.Module):
                 sequence = x, *weights, reset.bool(), *states, is_residual, torch.is_grad_enabled()
                 outputs, cell, last_output = _Sequence.apply(*sequence)
         return outputs, arrdict(output=last_output, cell=cell)
+
+    def _plain(self, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+        """Does the same as `forward` in float32, for exporters, which want nothing in place."""
+        output, cell, outputs = state["output"], state["cell"], []
+        for t in range(len(x)):
+            output, cell = (leaf.masked_fill(reset[t, :, None], 0.0) for leaf in (output, cell))
+            i, f, g, o = (self.input(x[t]) + self.recurrent(output)).chunk(4, -1)
+            cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
+            output = o.sigmoid() * cell.tanh()
+            outputs.append(output + x[t] if is_residual else output)
+        return torch.stack(outputs), arrdict(output=output, cell=cell)
 
     def _act(self, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
         """Does the same as `forward` for one step on a GPU, without a gradient: with one product of

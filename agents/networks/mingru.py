@@ -29,7 +29,7 @@ from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import mingru as kernels
 from megastep.agents.networks.kernels import mingru_step
-from megastep.agents.networks.kernels.library import aligned, check_shapes
+from megastep.agents.networks.kernels.library import aligned, check_shapes, is_plain
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict
@@ -171,6 +171,8 @@ class MinGRU(nn.Module):
         """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
         compute dtype. ValueError if shapes or devices do not fit.
         """
+        if is_plain():
+            return self._plain(x, reset, state, is_residual)
         check_shapes(x, reset, state, ("output",))
         x, start = x.to(compute_dtype(self.input.weight)), state["output"].float()
         sequence = x, self.input.weight, self.input.bias, reset.bool(), start, is_residual
@@ -178,3 +180,12 @@ class MinGRU(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             outputs, last = _Sequence.apply(*sequence, torch.is_grad_enabled())
         return outputs, arrdict(output=last)
+
+    def _plain(self, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+        """Does the same as `forward` in float32, for exporters, which want nothing in place."""
+        output, outputs = state["output"], []
+        for t in range(len(x)):
+            z, candidate = _split(self.input(x[t]))
+            output = (1 - z) * output.masked_fill(reset[t, :, None], 0.0) + z * candidate
+            outputs.append(output + x[t] if is_residual else output)
+        return torch.stack(outputs), arrdict(output=output)

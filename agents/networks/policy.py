@@ -70,6 +70,9 @@ class Policy(nn.Module):
         ValueError: if an argument is out of range, or a space is of an unknown kind.
     """
 
+    #: Hidden state that `act` carries.
+    _carried: arrdict | None = None
+
     @checked
     def __init__(
         self,
@@ -161,6 +164,23 @@ class Policy(nn.Module):
             logits, actions, logprobs = self.output.act(features[0], sample, generator, **options)
         decision = arrdict(actions=actions, logits=logits, logprobs=logprobs, features=features[0])
         return decision, state
+
+    @torch.no_grad()
+    def act(self, world: arrdict, greedy: bool = False) -> arrdict:
+        """Returns the decision for the world that follows the last one, whose hidden state the
+        policy carries: `world = env.step(policy.act(world))`.
+
+        Where `world.reset` is true, as in all that an environment's `reset` returns, a lane's
+        hidden state is cleared. For several environments at once use `forward`.
+
+        Args:
+            world: as for `forward`.
+            greedy: takes the most likely or best actions instead of sampling.
+        """
+        if self._carried is None or len(leaves(self._carried)[0]) != len(world["reset"]):
+            self._carried = self.initial(len(world["reset"]))
+        decision, self._carried = self(world, self._carried, sample=not greedy)
+        return decision
 
     def unroll(
         self,

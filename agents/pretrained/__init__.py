@@ -22,6 +22,7 @@ from megastep.agents.errors import UserError
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import folders
+from megastep.types import Env
 
 #: Where an agent's spaces are read from, which no floor plan changes.
 _BOX = "megastep.geometries.sources:box"
@@ -46,14 +47,26 @@ def load(name: str, device: str = "auto") -> Policy:
     Raises:
         UserError: there is none; or it names modules outside megastep and another user made it.
     """
+    return load_with_env(name, device)[0]
+
+
+def load_with_env(name: str, device: str = "auto", **options: bool) -> tuple[Policy, Env]:
+    """Returns what `load` does, and a small environment that it acts in.
+
+    Args:
+        name, device: as for `load`.
+        options: further arguments of the environment, such as `films=True`.
+    """
     device = factory.make_device(device)
     loaded = folders.load_checkpoint(folders.find(name), False, device)
     trained = factory.config_of(loaded)
     box = settings.kind_of("geometry", _BOX)(name=_BOX)
     homes = factory.homes(trained.env, box, "test")
-    env = factory.make_sample(trained.env, homes, seed=trained.seed, device=device)
+    where = dict(seed=trained.seed, device=device)
+    env = factory.make_sample(trained.env, homes, **where, **options)
     policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
-    return policy.requires_grad_(False)
+    factory.load_wrappers(env, loaded)
+    return policy.requires_grad_(False), env
 
 
 def make_env(

@@ -191,6 +191,27 @@ class Saver:
         return f"{sentence}, and {free_bytes / 1e6:.1f} MB are free in {self.folder.parent}"
 
 
+class NoSaver:
+    """Saves nothing: for a training without a run folder."""
+
+    error: str | None = None
+    lacks_replay = is_writing = False
+
+    def __init__(self) -> None:
+        self.folder, self.config = Path(), {}
+
+    def __call__(
+        self, step: int, state: StateDict, score: float | None = None, is_last: bool = False
+    ) -> None:
+        """Does nothing."""
+
+    def give_up(self) -> None:
+        """Does nothing."""
+
+    def wait(self) -> None:
+        """Does nothing."""
+
+
 class _HostCopy:
     """Copies a state to the CPU, from a GPU into pinned memory that is reused."""
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 KEY_BYTES = 32
 #: Settings groups that may contain import paths.
-GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum", "logger")
+GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum", "logger", "callbacks")
 #: Import paths of megastep's own components.
 OWN = re.compile(
     r"megastep\.(envs|geometries|agents\.(algorithms|networks|selfplay|training))(\.\w+)*:\w+"

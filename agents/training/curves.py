@@ -131,7 +131,7 @@ def panels_of(metrics: "list[Row]", perf: "list[Row]") -> dict[str, Lines]:
         if row.get("perf/rate") is not None:
             speed["samples / s"][""].append((row["samples"], row["perf/rate"]))
     first = {name: episodes.pop(name) for name in FIRST if name in episodes}
-    panels = {**first, **episodes, **losses, **speed}
+    panels: dict[str, Lines] = {**first, **episodes, **losses, **speed}
     varied = {title: lines for title, lines in panels.items() if _varies(lines)}
     return varied or panels
 

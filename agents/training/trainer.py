@@ -15,9 +15,12 @@ from megastep.agents.distributed.plan import Plan, agree
 from megastep.agents.distributed.process_group import counts, n_ranks, rank, unhurried, waiting
 from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
+from megastep.agents.runs.saver import NoSaver
 from megastep.agents.training.budget import Budget, Stopwatch, evaluation_in, reaches
+from megastep.agents.training.callbacks import Callbacks
 from megastep.agents.training.closing import close_env
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
+from megastep.agents.training.loggers import NoLogger
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import PHASES, PhaseTimer, device_memory
 from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
@@ -47,9 +50,9 @@ class Trainer:
         env: the environment.
         policy: the policy that the learner trains.
         learner: such as `PPO`.
-        logger: such as `loggers.Loggers`.
-        saver: such as `saver.Saver`.
-        budget: when the run ends and how its learning rate falls.
+        logger: such as `loggers.Loggers`; None writes nothing.
+        saver: such as `saver.Saver`; None saves nothing.
+        budget: when the run ends and how its learning rate falls; None: when `stop()` says so.
         log_every: updates between two reports.
         checkpoint_seconds: seconds between two checkpoints. One that is due while the last is still
             being written comes after it; below a second, training waits for it.
@@ -75,6 +78,7 @@ class Trainer:
         layout_sources: the name of the source of each of the environment's layouts, whose episodes
             have statistics of their own; None for none.
         profiler: profiles some of the updates, if not None.
+        callbacks: objects with methods of `callbacks.HOOKS`.
 
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
@@ -101,9 +105,9 @@ class Trainer:
         env: Env,
         policy: Policy,
         learner: Learner,
-        logger: RunLogger,
-        saver: SaverLike,
-        budget: Budget,
+        logger: RunLogger | None = None,
+        saver: SaverLike | None = None,
+        budget: Budget | None = None,
         *,
         log_every: int = 1,
         checkpoint_seconds: float = 30.0,
@@ -118,9 +122,12 @@ class Trainer:
         make_curriculum: Callable[[Env, Learner, RolloutLike], Curriculum] | None = None,
         layout_sources: Sequence[str] | None = None,
         profiler: Profiler | None = None,
+        callbacks: Sequence[object] = (),
     ):
         self.env, self.policy, self.learner = env, policy, learner
-        self.logger, self.saver, self.budget = logger, saver, budget
+        self.logger = NoLogger() if logger is None else logger
+        self.saver = NoSaver() if saver is None else saver
+        self.budget = budget = Budget() if budget is None else budget
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.on_log, self.evaluator, self.snapshot_saver = on_log, evaluator, snapshot_saver
         self.evaluate_every, self.stop = evaluate_every, dict(stop or {})
@@ -129,6 +136,7 @@ class Trainer:
         self.last_report = {"samples": 0.0, "seconds": 0.0}
         self.opponents = optional(env, "opponent_pool")
         self.annealing_record, self.profiler = annealing_record, profiler
+        self.callbacks, self.is_stopped = Callbacks(callbacks), False
         self.set_lr = with_defaults(learner, LearnerOptions).set_lr
         if budget.anneal != "never" and not self.set_lr:
             raise ValueError(
@@ -193,13 +201,16 @@ class Trainer:
         """
         try:
             self.snapshot_saver(self)
-            while (plan := self.plan(stop())).goes_on:
+            self.callbacks("on_start", self)
+            while (plan := self.plan(stop() or self.is_stopped)).goes_on:
                 if plan.saves and self.nonfinite_guard.check(self.rollout):
                     self.save_checkpoint()
                 self.start("collect")
                 self.rollout = self.collect()
+                self.callbacks("on_rollout", self, self.rollout)
                 self.start("update")
                 losses = self.update(plan.lr_fraction)
+                self.callbacks("on_update", self, losses)
                 with unhurried():
                     self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
@@ -229,6 +240,11 @@ class Trainer:
             self.wait_for_files()
         self.save_checkpoint(state, is_last=True)
         self.wait_for_files()
+        self.callbacks("on_end", self)
+
+    def end(self) -> None:
+        """Ends training after the current update, as for a callback; all ranks do if one does."""
+        self.is_stopped = True
 
     def close(self) -> None:
         """Closes the environment, which is no reason to lose what was learnt, and the files of
@@ -386,6 +402,7 @@ class Trainer:
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
         self.on_log(self)
+        self.callbacks("on_report", self, {**metrics, **perf, "samples": self.samples})
 
     def _evaluation_is_due(self) -> bool:
         assert self.evaluate_every is not None
@@ -416,6 +433,7 @@ class Trainer:
         with unhurried():
             self.saver(self.samples, state, score, is_last)
         self.updates_at_checkpoint = self.updates
+        self.callbacks("on_checkpoint", self)
 
     @unhurried()
     def wait_for_files(self) -> None:

@@ -3,6 +3,7 @@
 import functools
 import os
 import socket
+import warnings
 
 import torch
 
@@ -56,7 +57,22 @@ def _missing(count) -> str:
 
 def threads() -> int:
     """Returns the number of CPU threads per operation. Default: as many as PyTorch uses."""
-    return _n_threads or torch.get_num_threads()
+    n = _n_threads or torch.get_num_threads()
+    if n > 1 and "OMP_WAIT_POLICY" not in os.environ:  # set by megastep, unless torch came first
+        _warn_of_spinning()
+    return n
+
+
+@functools.cache
+def _warn_of_spinning() -> None:
+    """Warns once that threads spin while they wait."""
+    warnings.warn(
+        "torch was imported before megastep, so threads that wait keep their cores busy, and steps "
+        "on a CPU that does anything else are many times slower; import megastep first, or set "
+        "OMP_WAIT_POLICY=passive in the environment",
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 
 def set_threads(n: int | None) -> None:

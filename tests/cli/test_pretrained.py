@@ -6,15 +6,15 @@ import re
 import shutil
 from pathlib import Path
 
-import export_agent
 import pytest
 import safetensors.torch
 import torch
 
 from megastep import geometries
 from megastep.agents import factory, package, pretrained
-from megastep.agents.cli import evaluate, inspect, record, train
+from megastep.agents.cli import evaluate, export, inspect, record, train
 from megastep.agents.errors import UserError
+from megastep.agents.export import agent
 from megastep.agents.networks.policy import TRAINING_ONLY
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.runs import agent_file, checkpoint, folders
@@ -42,7 +42,9 @@ def exported(tmp_path_factory):
         assert train.main([*TINY, "samples=512", "snapshots=2", "folder=run"]) == 0
         for words in ([], ["against=bot"]):
             assert evaluate.main(["run=run", *SUITE, *words]) == 0
-        assert export_agent.main(["run", NAME, "--folder", "agents"]) == 0
+        assert (
+            export.main(["run=run", "format=safetensors", f"file=agents/{NAME}.safetensors"]) == 0
+        )
     return folder
 
 
@@ -87,7 +89,7 @@ def test_weights_are_float16_and_statistics_float32(file):
 def test_card_has_what_the_file_says_and_keeps_what_people_wrote(file, exported):
     card = file.with_suffix(".md")
     text = card.read_text()
-    assert text.startswith(export_agent.card(file))
+    assert text.startswith(agent.card(file))
     assert "- samples: 512\n" in text and "MB, " in text and "## Licence" in text
     written = json.loads(next((exported / "run/evaluations").glob("suite-*.json")).read_text())
     row = written["rows"][0]
@@ -96,7 +98,7 @@ def test_card_has_what_the_file_says_and_keeps_what_people_wrote(file, exported)
     assert "| bot, in braided" in text and "the agent, 512 samples, in deathmatch: 8 duels" in text
     assert f"run={NAME} geometry=suite '{PARTS}' split=test episodes=8 seed=1`" in text
     card.write_text(text.replace("It acts in", "We think that it acts in").replace("512", "513"))
-    assert export_agent.main(["--cards", "--folder", str(file.parent)]) == 0
+    assert export.main([f"run={file}", "format=safetensors", f"file={file}"]) == 0
     assert card.read_text() == text.replace("It acts in", "We think that it acts in")
 
 
@@ -110,7 +112,7 @@ def test_card_has_what_the_file_says_and_keeps_what_people_wrote(file, exported)
     ],
 )
 def test_commands_are_without_places_of_the_machine(words, command):
-    assert export_agent.command_of(words) == command
+    assert agent.command_of(words) == command
 
 
 @pytest.mark.parametrize(
@@ -118,40 +120,38 @@ def test_commands_are_without_places_of_the_machine(words, command):
     [
         (["run", "Tiny"], "not a name for an agent"),
         (["run/snapshots/step_512", NAME], "has weights only"),
-        (["run", NAME, "--max-error", "1e-9"], "acts otherwise with weights in float16"),
         (["nowhere", NAME], "nowhere is neither a run folder nor a pretrained agent"),
     ],
 )
-def test_export_refuses(words, text, exported, tmp_path, monkeypatch, capsys):
+def test_export_refuses(words, text, exported, tmp_path, monkeypatch):
     monkeypatch.chdir(exported)
-    assert export_agent.main([*words, "--folder", str(tmp_path / "new")]) == 2
-    assert text in capsys.readouterr().err and not (tmp_path / "new").exists()
+    run, name = words
+    file = f"file={tmp_path}/new/{name}.safetensors"
+    with pytest.raises(UserError, match=text):
+        export.main([f"run={run}", "format=safetensors", file])
+    assert not (tmp_path / "new").exists()
 
 
-def test_export_refuses_large_agents_and_those_without_the_suite(exported, tmp_path, monkeypatch):
+def test_export_refuses_what_acts_otherwise(exported, tmp_path, monkeypatch):
     monkeypatch.chdir(exported)
-    monkeypatch.setattr(export_agent, "MAX_BYTES", 1000)
-    with pytest.raises(UserError, match="bytes, and may have 1,000"):
-        export_agent.export("run", NAME, tmp_path)
+    with pytest.raises(UserError, match="acts otherwise with weights in float16"):
+        agent.write("run", tmp_path / "new" / f"{NAME}.safetensors", max_error=1e-9)
     assert not [*tmp_path.iterdir()]
-    shutil.copytree("run/checkpoints", tmp_path / "other/checkpoints")
-    with pytest.raises(UserError, match="no evaluation .* geometry=suite episodes=8000"):
-        export_agent.export(str(tmp_path / "other"), NAME, tmp_path)
 
 
-def test_export_refuses_modules_of_others(exported, tmp_path, monkeypatch):
-    loaded = checkpoint.load_latest(exported / "run/checkpoints")
-    loaded.config["train"]["agent"]["core"] = "mine:Core"
-    monkeypatch.setattr(folders, "load_checkpoint", lambda *args: loaded)
-    with pytest.raises(UserError, match="needs mine:Core, and agents of the package"):
-        export_agent.export(str(exported / "run"), NAME, tmp_path)
+def test_export_warns_of_what_a_card_lacks(exported, tmp_path, monkeypatch, capsys):
+    without = shutil.ignore_patterns("evaluations")
+    shutil.copytree(exported / "run", tmp_path / "other", ignore=without)
+    _, card = agent.write(str(tmp_path / "other"), tmp_path / f"{NAME}.safetensors")
+    assert "geometry=suite episodes=8000 was not run" in capsys.readouterr().err
+    assert "Not evaluated." in card.read_text()
 
 
 def test_weights_beyond_float16_are_refused(file):
     policy = pretrained.load(NAME, "cpu")
     next(policy.parameters()).view(-1)[0] = 1e5
     with pytest.raises(UserError, match="beyond 65,504"):
-        export_agent.rounded(policy)
+        agent.rounded(policy)
 
 
 # ---- Using an agent by its name ----
@@ -213,7 +213,7 @@ def test_loads_in_python_and_acts_as_the_run(folder, exported):
     assert (env.n_envs, n_lanes(env), pretrained.names()) == (3, 6, [NAME])
     policy, original = pretrained.load(NAME, "cpu"), original_of(exported, env)
     assert policy.critic is None and not any(p.requires_grad for p in policy.parameters())
-    assert 0 < export_agent.rounding_error(policy, original, env, 30) < 0.005
+    assert 0 < agent.rounding_error(policy, original, env, 30) < 0.005
     assert pretrained.load(f"package/{NAME}.safetensors", "cpu").width == 8
     with pytest.raises(UserError, match="deathmatch has no setting cameras; it has n_envs, "):
         pretrained.make_env(NAME, geometries.sample("maze", 2), cameras=3)
@@ -224,7 +224,7 @@ def test_rounding_error_sees_other_weights(folder, exported):
     policy, original = pretrained.load(NAME, "cpu"), original_of(exported, env)
     weights = policy.state_dict()  # of a policy that has hardly learnt: its actions are alike
     policy.load_state_dict({k: 30 * v if "output" in k else v for k, v in weights.items()})
-    assert export_agent.rounding_error(policy, original, env, 30) > 0.02
+    assert agent.rounding_error(policy, original, env, 30) > 0.02
 
 
 def test_inspect_prints_what_is_in_a_file(file, capsys):
@@ -410,12 +410,14 @@ def test_tensors_are_read_as_written(tmp_path):
 @torch.no_grad()
 def test_agent_of_the_package(path):
     """It loads, acts, is small, and has a card whose numbers are those of the file."""
-    assert path.stat().st_size <= export_agent.MAX_BYTES
+    assert path.stat().st_size <= 2_000_000
     assert agent_file.read(path, None).untrusted == ()
     assert agent_file.read_metadata(path)["tables"], "evaluated in the suite"
     card = path.with_suffix(".md").read_text()
-    assert card.startswith(export_agent.card(path)), "scripts/export_agent.py --cards writes it"
-    for title in (export_agent.BY_HAND, "## Limits", "## Licence"):
+    assert card.startswith(agent.card(path)), (
+        "megastep export run=NAME format=safetensors writes it"
+    )
+    for title in (agent.BY_HAND, "## Limits", "## Licence"):
         assert title in card
     env = pretrained.make_env(path.stem, geometries.sample("box", 1), n_envs=2, device="cpu")
     policy = pretrained.load(path.stem, "cpu")

@@ -1,6 +1,8 @@
 """The kernel library of the networks, for CPU and GPU, and helpers of its wrappers."""
 
+import contextlib
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -48,9 +50,33 @@ def n_threads(state: torch.Tensor) -> int:
     return state.numel() // units_per_thread(state.shape[1])
 
 
-@functools.cache
+#: Whether everything is computed by PyTorch's operations, which other runtimes have.
+_is_plain = False
+
+
+@contextlib.contextmanager
+def plain_operations() -> Iterator[None]:
+    """Has a CPU compute by PyTorch's operations alone for the duration of the context."""
+    global _is_plain
+    before, _is_plain = _is_plain, True
+    try:
+        yield
+    finally:
+        _is_plain = before
+
+
+def is_plain() -> bool:
+    """Returns whether `plain_operations` asks for operations that change nothing in place."""
+    return _is_plain
+
+
 def is_built_for_cpu() -> bool:
     """Returns whether the CPU's operations can be used, which takes a C++ compiler."""
+    return not _is_plain and _is_built()
+
+
+@functools.cache
+def _is_built() -> bool:
     try:
         return bool(cpu(LIBRARY))
     except EngineError:

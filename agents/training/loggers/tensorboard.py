@@ -57,8 +57,9 @@ class TensorBoard:
             self.error = error
 
     def _finish(self, writer: "SummaryWriter", step: int, result: RunResult) -> None:
-        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.compat.proto import summary_pb2
 
+        Summary = summary_pb2.Summary  # pyright: ignore[reportAttributeAccessIssue]
         plain = bool, int, float, str
         settings = {
             name: value if isinstance(value, plain) else str(value)
@@ -73,6 +74,7 @@ class TensorBoard:
             gif, (height, width) = video.small_gif(result.film, HEIGHT, N_FRAMES)
             shown = dict(height=height, width=width, colorspace=3, encoded_image_string=gif)
             value = Summary.Value(tag="film", image=Summary.Image(**shown))
+            assert writer.file_writer is not None
             writer.file_writer.add_summary(Summary(value=[value]), step)
 
     def finish(self, step: int, result: RunResult) -> None:

@@ -1,25 +1,17 @@
-"""Turns a run into an agent of the package: a file with its acting weights, and a card.
+"""Turns a run into an agent file with its acting weights, and a card beside it.
 
-    python scripts/export_agent.py runs/NAME pointgoal_anywhere
-    python scripts/export_agent.py --cards                       # only writes all cards again
-
-Writes pointgoal_anywhere.safetensors and pointgoal_anywhere.md into agents/pretrained/, from the
-run's newest checkpoint. Evaluate the run first, for the card's tables: `python evaluate.py
-run=runs/NAME geometry=suite episodes=8000`, and with against=bot for duels. What follows "What it
-is for" in a card is written by hand, and kept when the agent is exported again.
+Evaluate the run first, for the card's tables: `megastep evaluate run=RUN geometry=suite
+episodes=8000`, and with against=bot for duels. What follows "What it is for" in a card is written
+by hand, and kept when the agent is exported again.
 """
 
-import argparse
 import json
 import re
-import sys
 from pathlib import Path
 
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from megastep.agents import console, factory, package
+from megastep.agents import console, factory
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import tables
 from megastep.agents.factory import components, settings
@@ -29,7 +21,6 @@ from megastep.agents.runs.atomic_files import write_atomically
 from megastep.dotdict import leaves
 from megastep.types import n_lanes
 
-MAX_BYTES = 2_000_000
 #: Bound of `rounding_error`. Float16 changes a weight by at most 1 part in 2,048.
 MAX_ERROR = 0.005
 #: Environments and steps in which it is measured.
@@ -101,9 +92,9 @@ def command_of(words: str) -> str:
     )
 
 
-def tables_of(folder: Path, step: int) -> list[dict]:
-    """Returns the evaluations of a run in geometry=suite after so many samples, oldest first:
-    titles, commands without their run, and rows.
+def tables_of(folder: Path, step: int, has_homes: bool = True) -> list[dict]:
+    """Returns the evaluations of a run after so many samples, oldest first, of an environment with
+    floor plans those in geometry=suite: titles, commands without their run, and rows.
     """
     tables = []
     files = sorted((folder / "evaluations").glob("*.json"), key=lambda path: path.stat().st_mtime)
@@ -111,9 +102,10 @@ def tables_of(folder: Path, step: int) -> list[dict]:
         table = json.loads(path.read_text())
         how = table.get("evaluation", {})
         geometry = how.get("geometry") or {}
-        if table.get("step") != step or geometry.get("name") != components.SUITE:
+        is_suite = geometry.get("name") == components.SUITE
+        if table.get("step") != step or is_suite != has_homes:
             continue
-        words = ["geometry=suite", *options_of(geometry)]
+        words = ["geometry=suite", *options_of(geometry)] if is_suite else []
         words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed")]
         words += ["greedy=true"] * how["greedy"]
         words += [f"against={','.join(how['against'])}"] if how.get("against") else []
@@ -132,43 +124,37 @@ def options_of(geometry: dict) -> list[str]:
     ]
 
 
-def export(
-    run: str, name: str, folder: Path | None = None, max_error: float = MAX_ERROR
-) -> tuple[Path, Path]:
-    """Writes an agent's file and its card. Returns their paths.
+def write(run: str, file: Path, max_error: float = MAX_ERROR) -> tuple[Path, Path]:
+    """Writes an agent's file and its card. Returns their paths. Of an agent's file, only writes its
+    card again.
 
     Args:
-        run: a run's folder, or one of its checkpoints.
-        name: of the agent.
-        folder: where; default: the package's.
+        run: a run's folder, one of its checkpoints, or an agent's file.
+        file: NAME.safetensors.
         max_error: bound of `rounding_error`.
 
     Raises:
-        UserError: the run has no suite evaluation, needs modules outside megastep, is too large, or
-            acts otherwise once it is rounded. Nothing was written then.
+        UserError: the run acts otherwise once it is rounded, or cannot be written. Nothing was
+            written then.
     """
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise UserError(f"{name!r} is not a name for an agent; use small letters, digits and _")
-    folder, path = folder or package.PRETRAINED, folders.find(run)
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", file.stem):
+        raise UserError(
+            f"{file.stem!r} is not a name for an agent; use small letters, digits and _"
+        )
+    path = folders.find(run)
+    if agent_file.is_agent_file(path):
+        return path, write_card(path)
     loaded = folders.load_checkpoint(path, False, factory.make_device("cpu"))
     if not loaded.numbers:
         raise UserError(f"{loaded.path} has weights only; export a run or its checkpoint")
+    assert loaded.state is not None
     config = {**loaded.config, "train": loaded.config["train"] | PRIVATE}
-    if names := trust.foreign_names(json.dumps(config).encode()):
-        raise UserError(
-            f"{loaded.path} needs {', '.join(names)}, and agents of the package need megastep only"
-        )
-    run_folder = folders.folder_of(loaded.path)
-    if not (tables := tables_of(run_folder, loaded.step)):
-        raise UserError(
-            f"{run_folder} has no evaluation of {loaded.path.name} in the suite; "
-            f"first run python evaluate.py run={loaded.path} geometry=suite episodes=8000"
-        )
-    trained = factory.config_of(loaded)
+    trained, run_folder = factory.config_of(loaded), folders.folder_of(loaded.path)
     homes = factory.spread(factory.homes(trained.env, trained.geometry, "test"), N_ENVS)
     env = factory.construct(
         settings.changed(trained.env, n_envs=N_ENVS), geometries=homes, seed=1, device="cpu"
     )
+    factory.load_wrappers(env, loaded)
     original = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
     state, exported = rounded(original), factory.make_policy(trained.agent, env)
     exported.load_state_dict(state)
@@ -178,30 +164,18 @@ def export(
             f"{loaded.path} acts otherwise with weights in float16: its logits differ by "
             f"{error:.1%}, and may by {max_error:.1%}"
         )
+    if names := trust.foreign_names(json.dumps(config).encode()):
+        console.warn(f"{file} needs {', '.join(names)}, and of others who load it trust=true")
+    if not (rows := tables_of(run_folder, loaded.step, bool(homes))):
+        words = " geometry=suite episodes=8000" if homes else ""
+        command = f"{folders.command_of('evaluate', 'run', loaded.path)}{words}"
+        console.warn(f"the card has no results, for {command} was not run")
     facts = facts_of(run_folder, loaded)
     facts |= {"parameters": sum(v.numel() for v in state.values()), "rounding": error}
-    file = folder / f"{name}{agent_file.SUFFIX}"
-    temporary = file.with_name(f"{name}-new{agent_file.SUFFIX}")
-    with user_errors(f"{folder} cannot be written: "):
-        folder.mkdir(parents=True, exist_ok=True)
-        learnt = loaded.state.get("wrappers")
-        agent_file.write(temporary, state, config, facts, tables, learnt)
-    try:
-        check_file(temporary, state)
-        temporary.replace(file)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with user_errors(f"{file} cannot be written: "):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        agent_file.write(file, state, config, facts, rows, loaded.state.get("wrappers"))
     return file, write_card(file)
-
-
-def check_file(path: Path, state: dict[str, torch.Tensor]) -> None:
-    """Raises UserError if a file of an agent is too large or does not hold this state."""
-    if (size := path.stat().st_size) > MAX_BYTES:
-        raise UserError(f"The agent has {size:,} bytes, and may have {MAX_BYTES:,}")
-    read = folders.load_checkpoint(path, False, "cpu").state["policy"]
-    is_same = read.keys() == state.keys() and all(torch.equal(read[k], v) for k, v in state.items())
-    if not is_same:
-        raise UserError(f"{path} was not written as it should be")
 
 
 # ---- The card ----
@@ -224,6 +198,8 @@ def card(file: Path) -> str:
     facts, name = about["facts"], file.stem
     commands = "; then ".join(f"`{command}`" for command in facts["commands"]) or "unknown"
     plays = any("won" in table["rows"][0] for table in about["tables"])
+    has_homes = components.takes_geometries(about["config"]["train"]["env"]["name"])
+    suite, maze = (" geometry=suite", " geometry=maze") if has_homes else ("", "")
     against = " against=bot" if plays else ""
     gpus = f"{facts['ranks']} × {facts['device']}" if facts["ranks"] > 1 else facts["device"]
     lines = {
@@ -239,13 +215,13 @@ def card(file: Path) -> str:
     parts = [
         f"# {name}",
         "```\n"
-        f"python evaluate.py run={name} geometry=suite{against}\n"
-        f"python record.py run={name} geometry=maze{against}\n"
+        f"python evaluate.py run={name}{suite}{against}\n"
+        f"python record.py run={name}{maze}{against}\n"
         f"python train.py init={name} seconds=60\n"
         "```",
         "## Training",
         "\n".join(f"- {key}: {text}" for key, text in lines.items()),
-        "## Skill",
+        "## Skill" if about["tables"] else "Not evaluated.",
     ]
     for table in about["tables"]:
         are_duels = "won" in table["rows"][0]
@@ -263,46 +239,19 @@ def default_words(about: dict) -> str:
     """Returns what a new card says where people write."""
     train, spaces = about["config"]["train"], about["config"]["spaces"]
     spaces = "; ".join(f"`{name}` {space}" for name, space in spaces.items())
-    environment = settings.label(train["env"]["name"])
+    environment = train["env"].get("id") or settings.label(train["env"]["name"])
+    has_homes = components.takes_geometries(train["env"]["name"])
     homes = settings.label(train["geometry"]["name"])
+    where = f"in `geometry={homes}`" if has_homes else "there"
     return "\n\n".join(
         [
             BY_HAND,
             f"It acts in `env={environment}`: as a baseline, as an opponent, and as a start for "
             "training with `init=`.",
             "## Limits",
-            f"It was trained in `geometry={homes}` and measured where the tables say. Its "
+            f"It was trained {where} and measured where the tables say. Its "
             f"observations and actions must be {spaces}. It has no critic.",
             "## Licence",
             "MIT, as megastep.\n",
         ]
     )
-
-
-def main(words: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("run", nargs="?", help="a run's folder, or one of its checkpoints")
-    parser.add_argument("name", nargs="?", help="of the agent, such as pointgoal_anywhere")
-    parser.add_argument("--folder", type=Path, default=package.PRETRAINED)
-    parser.add_argument("--max-error", type=float, default=MAX_ERROR, help="of the logits")
-    parser.add_argument("--cards", action="store_true", help="only write all cards again")
-    options = parser.parse_args(words)
-    if options.cards == (options.name is not None):
-        parser.error("give a run and a name, or --cards")
-    try:
-        if options.cards:
-            paths = map(write_card, sorted(options.folder.glob(f"*{agent_file.SUFFIX}")))
-        else:
-            paths = export(options.run, options.name, options.folder, options.max_error)
-        for path in paths:
-            console.say(f"Wrote {path}")
-    except UserError as error:
-        console.say(f"export_agent.py: {error}", sys.stderr)
-        return error.code
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

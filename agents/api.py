@@ -1,0 +1,338 @@
+"""megastep from Python: `megastep.make`, `train`, `evaluate`, `record`, `load` and `runs`.
+
+Keyword arguments are the words of the command line, checked in the same way: `seconds=60`,
+`env="explorer"`, `learner={"lr": 3e-4}` or `**{"learner.lr": 3e-4}`. A class or a function stands
+for its import path, a `Run` for its folder. What would end a command with a sentence raises it
+as a `UserError`.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import inspect
+import json
+import numbers
+import os
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.types import Quote, QuotedString
+
+from megastep.agents import console
+from megastep.agents.cli import compose, scripts
+from megastep.agents.errors import ConfigErrors, UserError
+from megastep.agents.factory import components, settings
+from megastep.agents.launch import signals
+from megastep.agents.reports import runs as reported
+from megastep.agents.runs import folders
+from megastep.types import optional
+
+if TYPE_CHECKING:
+    from typing import TypeGuard
+
+    from megastep.agents.networks.policy import Policy
+    from megastep.agents.types import Config, Row
+    from megastep.recording import Film
+    from megastep.types import Env, PolicyLike
+
+__all__ = ["Run", "evaluate", "load", "make", "record", "runs", "train"]
+
+#: Keys whose dict is a group of keys; any other dict is a value.
+GROUPS = (*settings.IMPORTED, "agent", "opponents", "finish")
+#: Settings of `make` that are not the environment's.
+OF_MAKE = ("env", "geometry", "split", "seed", "device")
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run that has been trained, or a trained agent.
+
+    Attributes:
+        path: the run's folder, one of its checkpoints, or the file of an agent.
+    """
+
+    path: Path
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder; of an agent's file, the folder of its evaluations and videos."""
+        return folders.folder_of(self.path)
+
+    @functools.cached_property
+    def config(self) -> "Config":
+        """The settings of the training, as nested dicts."""
+        return folders.load_checkpoint(self.path, trust=False).config["train"]
+
+    @property
+    def metrics(self) -> dict[str, list]:
+        """The reports as columns: name -> one value per report, None where a report has none.
+
+        With pandas: `pandas.DataFrame(run.metrics)`. Raises UserError before the first report.
+        """
+        run = reported.read(self.folder)
+        perf = {row["samples"]: row for row in run.perf}
+        rows = [row | perf.get(row["samples"], {}) for row in run.metrics]
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {name: [row.get(name) for row in rows] for name in names}
+
+    @functools.cached_property
+    def policy(self) -> "Policy":
+        """The trained policy, which only acts: `decision = run.policy.act(world)`."""
+        from megastep.agents import pretrained
+
+        return pretrained.load(str(self.path))
+
+    def make(self, n_envs: int = 16, geometry: object = None, **changes: object) -> "Env":
+        """Returns an environment like the one of the training.
+
+        Args:
+            n_envs: number of environments.
+            geometry: other floor plans, as `train` takes them. Default: those of the training, in
+                the split `test`.
+            changes: `split`, `seed`, `device`, and settings of the environment.
+        """
+        own = {key: self.config[key] for key in ("env", "geometry")}
+        if geometry is not None:
+            own["geometry"] = geometry
+        return make(**{"split": "test", **own, "n_envs": n_envs, **changes})
+
+    def evaluate(self, **settings: object) -> "list[Row]":
+        """Measures the agent; see `megastep.evaluate`."""
+        return evaluate(self, **settings)
+
+    def record(self, **settings: object) -> "Film":
+        """Films the agent; see `megastep.record`."""
+        return record(self, **settings)
+
+    def export(self, format: str, file: "str | os.PathLike | None" = None) -> Path:
+        """Writes the agent for another runtime: `run.export("onnx")`. Returns the path.
+
+        Args:
+            format: "onnx", "torch", "safetensors" or "hub".
+            file: default: one in the run's folder.
+        """
+        from megastep.agents.cli.export import export
+
+        return export(str(self.path), format, None if file is None else os.fspath(file))
+
+
+def make(env: object, privileged: bool = False, **settings_of_env: object) -> "Env":
+    """Returns an environment: `megastep.make("explorer", n_envs=64, geometry="homes")`.
+
+    On a CPU this sets the number of threads as training does: the engine gets all, PyTorch one.
+
+    Args:
+        env: name, class, import path, or dict with `name` and settings.
+        privileged: worlds have what only an asymmetric critic sees, if the environment has any.
+        settings_of_env: the environment's settings, and as on the command line `geometry`, `split`
+            ("training" here), `seed` and `device`.
+
+    Raises:
+        UserError: a setting is unknown or out of range; the environment cannot be made.
+    """
+    from megastep.agents import factory  # with PyTorch
+
+    arguments = {
+        key if key.partition(".")[0] in OF_MAKE else f"env.{key}": value
+        for key, value in settings_of_env.items()
+    }
+    cfg = _settings(scripts.RECORD, {"env": env, "split": "training", **arguments})
+    geometry = cfg.geometry or settings.kind_of("geometry", components.HOMES)(name=components.HOMES)
+    device, homes = factory.make_device(cfg.device), factory.homes(cfg.env, geometry, cfg.split)
+    if device.type == "cpu":
+        factory.share_threads(1)
+    where = dict(seed=cfg.seed, device=device, privileged=privileged)
+    return factory.construct(cfg.env, geometries=homes, **where)
+
+
+def train(**settings: object) -> Run | None:
+    """Trains: `megastep.train(env="explorer", seconds=60)`. Returns the run; None for a dry run.
+
+    Args:
+        settings: words of `megastep train`, which `megastep train --help` explains.
+
+    Raises:
+        UserError: training cannot start or continue; nothing is written then, or what was learnt
+            is saved.
+        KeyboardInterrupt: Ctrl-C, or a notebook's stop button; the message says how to continue.
+    """
+    from megastep.agents.launch import rank
+    from megastep.agents.launch import train as launch_train  # with PyTorch
+
+    with rank.joined(), _interrupts():
+        cfg = rank.together(lambda: _settings(scripts.TRAIN, settings))
+        folder = launch_train.run(cfg)
+    return None if folder is None else Run(folder)
+
+
+def evaluate(
+    run: "Run | str | os.PathLike | PolicyLike", env: object = None, **settings: object
+) -> "list[Row]":
+    """Measures an agent in homes it was not trained in. Returns the rows of the table.
+
+    Args:
+        run: a run, its folder, `latest`, or the name of a packaged agent. Or a policy, with the
+            environment that it plays in, each lane one episode; nothing is written then.
+        env: as on the command line; for a policy an environment that `make` returned.
+        settings: words of `megastep evaluate`; for a policy `seed`, `greedy` and `max_steps`.
+
+    Raises:
+        UserError: there is no such run, or it cannot be evaluated so.
+    """
+    from megastep.agents.evaluation import evaluate_run, playing, statistics  # with PyTorch
+
+    if _is_policy(run):
+        played = playing.first_episodes(_played(env), run, **cast(dict, settings))
+        return statistics.summaries(played, optional(env, "roles"))
+    given = {} if env is None else {"env": env}
+    cfg = _settings(scripts.EVALUATE, {"run": run, **given, **settings})
+    with _interrupts():
+        return json.loads(evaluate_run.run(cfg).with_suffix(".json").read_text())["rows"]
+
+
+def record(
+    run: "Run | str | os.PathLike | PolicyLike | None" = None,
+    env: object = None,
+    **settings: object,
+) -> "Film":
+    """Films an agent in one home. Returns the path of the video, which a notebook shows as a film.
+
+    Args:
+        run: as for `evaluate`; None with `env` films random actions. A policy needs its
+            environment, whose first home is filmed, and `file`.
+        env: as for `evaluate`.
+        settings: words of `megastep record`; for a policy `file`, `steps`, `greedy`, `seed` and
+            the look.
+
+    Raises:
+        UserError: there is no such run, or it cannot be filmed so.
+    """
+    from megastep import recording
+    from megastep.agents.evaluation import record as filming  # with PyTorch
+
+    if _is_policy(run):
+        options = cast(dict, settings)
+        return recording.film(_played(env), run, options.pop("file"), **options)
+    given = {"run": run, "env": env}
+    given = {key: value for key, value in given.items() if value is not None}
+    cfg = _settings(scripts.RECORD, given | settings)
+    with _interrupts():
+        return recording.Film(filming.run(cfg))
+
+
+def load(run: "Run | str | os.PathLike") -> Run:
+    """Returns a run by its folder, a checkpoint of it, `latest`, or the name of a packaged agent.
+
+    Raises:
+        UserError: there is none; the message names the most similar.
+    """
+    return run if isinstance(run, Run) else Run(folders.find(os.fspath(run)))
+
+
+def runs() -> list[Run]:
+    """Returns the runs in the current folder or started from it, by their last start."""
+    return [Run(path) for path in folders.known()]
+
+
+# ---- Keyword arguments as words ----
+
+
+def words_of(arguments: Mapping[str, object]) -> list[str]:
+    """Returns keyword arguments as words of a command line.
+
+    Raises:
+        UserError: a value has no words, such as an object.
+    """
+    words = []
+    for key, value in arguments.items():
+        if key in GROUPS and isinstance(value, Mapping):
+            # the name first, which decides what other keys there are
+            inside = dict(sorted(value.items(), key=lambda item: item[0] != "name"))
+            name = {key: inside.pop("name")} if "name" in inside else {}
+            words += words_of(name | {f"{key}.{k}": v for k, v in inside.items()})
+        elif key.startswith("logger.") and isinstance(value, Mapping):
+            words += words_of({f"{key}.{k}": v for k, v in value.items()})
+        else:
+            is_member = key in settings.IMPORTED and isinstance(value, (str, list, tuple))
+            words.append(f"{key}={_text(value, key, is_member)}")
+    return words
+
+
+def _text(value, key, is_member=False) -> str:
+    """Returns a value in Hydra's grammar.
+
+    Args:
+        key: that errors name.
+        is_member: it names members of a group, which take no quotes.
+    """
+    value = getattr(value, "path", value) if isinstance(value, Run) else value
+    value = os.fspath(value) if isinstance(value, os.PathLike) else value
+    if inspect.isclass(value) or inspect.isfunction(value):
+        return _path_of(value, key)
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return value if is_member else QuotedString(value, Quote.double).with_quotes()
+    if isinstance(value, Mapping):
+        return f"{{{','.join(f'{name}:{_text(part, key)}' for name, part in value.items())}}}"
+    if isinstance(value, Sequence):
+        return f"[{','.join(_text(part, key, is_member) for part in value)}]"
+    if isinstance(value, numbers.Integral):
+        return str(int(value))
+    if isinstance(value, numbers.Real):
+        return repr(float(value))
+    problem = f"{type(value).__name__} has no words; use numbers, texts, lists, dicts, or a class"
+    raise ConfigErrors([(key, problem)])
+
+
+def _path_of(value, key) -> str:
+    if "<" in value.__qualname__:
+        problem = f"{value.__qualname__} has no import path; define it at the top of a module"
+        raise ConfigErrors([(key, problem)])
+    return f"{value.__module__}:{value.__qualname__}"
+
+
+def _settings(script: scripts.Script, arguments: Mapping[str, object]) -> Any:
+    """Returns the settings of a script that its words would give, ready to run."""
+    before = GlobalHydra.instance().hydra  # of a program of the user's
+    try:
+        composer = compose.Composer(script)
+        cfg = composer.settings([script.reword(word) for word in words_of(arguments)])
+        if composer.note:
+            console.say(composer.note)
+    finally:
+        GlobalHydra.instance().clear()
+        GlobalHydra.instance().hydra = before
+    script.ready(cfg)
+    return cfg
+
+
+# ---- Policies, and signals ----
+
+
+def _is_policy(run) -> "TypeGuard[PolicyLike]":
+    return callable(run) and hasattr(run, "initial")
+
+
+def _played(env) -> "Env":
+    """Returns the environment that a policy plays in."""
+    if not hasattr(env, "step"):
+        raise UserError("a policy needs the environment it plays in: give env=megastep.make(...)")
+    return env
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[None]:
+    """Turns `Interrupted` into what Python raises for the signal."""
+    try:
+        yield
+    except signals.Interrupted as error:
+        number, message = error.args
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt(message) from None
+        raise SystemExit(128 + number) from None

@@ -1,0 +1,89 @@
+"""megastep export run=RUN format=onnx: a trained agent for other runtimes, or in one file."""
+
+from pathlib import Path
+
+from megastep.agents import console
+from megastep.agents.cli import plain_words
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.runs import folders
+from megastep.settings import closest
+
+HELP = """Writes a trained agent for use elsewhere.
+
+  megastep export run=RUN format=onnx           one step for ONNX runtimes: policy.onnx
+  megastep export run=RUN format=torch          the same for torch.export.load: policy.pt2
+  megastep export run=RUN format=safetensors    an agent file with its card: agent.safetensors
+  megastep export run=RUN format=hub            a folder for the Hugging Face Hub: hub/
+  ... file=my_agent.onnx                        this file or folder instead of one in RUN
+
+run= takes a run, one of its checkpoints, latest, or a packaged agent."""
+#: The formats, and the file or folder of each.
+FORMATS = {
+    "onnx": "policy.onnx",
+    "torch": "policy.pt2",
+    "safetensors": "agent.safetensors",
+    "hub": "hub",
+}
+
+
+def main(words: list[str]) -> int:
+    """Exports as the words of a command line ask for. Returns the exit code."""
+    if not words or words[0] in ("-h", "--help"):
+        console.say(HELP)
+        return 0 if words else 2
+    given = plain_words.parse(words, {"run": False, "format": False, "file": False})
+    for key, cure in {"run": "latest takes the newest run", "format": ", ".join(FORMATS)}.items():
+        if key not in given:
+            raise UserError(f"{key} is missing; {key}={cure}")
+    export(given["run"][0], given["format"][0], *given.get("file", ()))
+    return 0
+
+
+def export(run: str, kind: str, file: str | None = None) -> Path:
+    """Writes an agent's file or folder, and says what was written. Returns its path.
+
+    Args:
+        run: a run, one of its checkpoints, or a packaged agent.
+        kind: a key of `FORMATS`.
+        file: default: one in the run's folder.
+
+    Raises:
+        UserError: there is no such run or format; or it cannot be written so.
+    """
+    if kind not in FORMATS:
+        raise UserError(f"format: {kind!r} is unknown; {closest(kind, FORMATS)}")
+    source, suffix = folders.find(run), Path(FORMATS[kind]).suffix
+    path = folders.folder_of(source) / FORMATS[kind] if file is None else Path(file)
+    if suffix and path.suffix != suffix:
+        raise UserError(f"file={path} must end with {suffix} for format={kind}")
+    from megastep.agents import pretrained  # with PyTorch
+    from megastep.agents.export import agent, hub, runtimes
+    from megastep.agents.export.step import Step
+
+    if kind == "safetensors":
+        for written in agent.write(run, path):
+            console.say(f"Wrote {written}")
+        return path
+    policy, env = pretrained.load_with_env(run, "cpu", films=kind == "hub")
+    name = folders.name_of(source)
+    if kind == "hub":
+        for written in hub.write(run, path, name, policy, env):
+            console.say(f"Wrote {written}")
+        return path
+    with user_errors(f"{path} cannot be written: "):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    step = Step(policy, env.obs_space)
+    write, runner = {
+        "onnx": (runtimes.write_onnx, runtimes.run_onnx),
+        "torch": (runtimes.write_torch, runtimes.run_torch),
+    }[kind]
+    with user_errors(f"{path} cannot be written: ", (OSError,)):
+        write(step, path, name)
+    found = runtimes.compare(step, runner(path), policy, env)
+    runtimes.check(path, found)
+    inputs, outputs = (", ".join(p.name for p in side) for side in (step.inputs, step.outputs))
+    console.say(
+        f"Wrote {path}: {inputs} -> {outputs}; in 1,000 steps its numbers differ from the policy's "
+        f"by at most {found.difference:.1g}"
+    )
+    return path

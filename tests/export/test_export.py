@@ -1,0 +1,182 @@
+"""A policy as a file of another runtime acts as it does in megastep."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from megastep import spaces
+from megastep.agents import pretrained
+from megastep.agents.cli import evaluate, export, train
+from megastep.agents.errors import UserError
+from megastep.agents.export import hub, runtimes
+from megastep.agents.export.step import Step
+from megastep.agents.networks.kernels.library import plain_operations
+from megastep.agents.networks.policy import Policy
+from megastep.arrdict import arrdict
+from megastep.types import n_lanes
+from tests.helpers.tiny import SHORT_EPISODES, TINY
+
+IMAGE, VECTOR = spaces.MultiImage(1, 3, 1, 64), spaces.MultiVector(1, 3)
+MANY = {"rgb": IMAGE, "self": {"imu": VECTOR, "id": spaces.MultiDiscrete(2, 4)}}
+MOVES = {"move": spaces.MultiDiscrete(2, 7), "say": spaces.MultiDiscrete(1, 3)}
+BOUNDED = spaces.MultiContinuous(1, 2, -2.0, (1.0, 3.0))
+#: Every core, output and encoder: spaces, and settings of the policy.
+KINDS = {
+    "lstm": (MANY, MOVES, {}),
+    "gru": (IMAGE, BOUNDED, dict(core="gru", encoder="conv")),
+    "mingru": (MANY, BOUNDED, dict(core="mingru", layers=2, continuous="beta", encoder="cnn")),
+    "none": (VECTOR, spaces.MultiDiscrete(1, 5), dict(core="none", output="duelling")),
+}
+
+
+class Noise:
+    """Lanes that observe noise, and whose episodes end now and then."""
+
+    n_envs, device = 3, "cpu"
+
+    def __init__(self, obs_space):
+        self.obs_space, self.generator = obs_space, torch.Generator().manual_seed(1)
+
+    def reset(self):
+        return self.step(None)
+
+    def step(self, decision):
+        def draw(space):
+            if isinstance(space, spaces.MultiDiscrete):
+                shape = self.n_envs, *space.shape
+                return torch.randint(space.n_actions, shape, generator=self.generator)
+            return 3 * torch.randn(self.n_envs, *space.shape, generator=self.generator) + 1
+
+        reset = torch.rand(self.n_envs, generator=self.generator) < 0.05
+        return arrdict(obs=spaces.map(draw, self.obs_space), reset=reset)
+
+
+def made(kind):
+    """Returns a policy with weights that matter and statistics, and the step it exports."""
+    obs_space, action_space, options = KINDS[kind]
+    policy, env = Policy(obs_space, action_space, width=32, **options), Noise(obs_space)
+    for _ in range(3):
+        policy.update_stats(env.step(None)["obs"])
+    with torch.no_grad():
+        for weight in policy.output.parameters():
+            weight.mul_(20)
+    return policy, env, Step(policy, obs_space)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_step_is_the_policys_greedy_one(kind):
+    policy, env, step = made(kind)
+
+    def plain(inputs):
+        with plain_operations():
+            return step(*inputs)
+
+    found = runtimes.compare(step, plain, policy, env, n_steps=30)
+    assert found.difference < 1e-4 and found.n_apart == 0 and found.largest > 0.2
+
+
+def test_ports_are_named_after_the_spaces():
+    _, _, step = made("lstm")
+    assert [port.name for port in step.inputs] == [
+        *("obs.rgb", "obs.self.imu", "obs.self.id", "reset", "state.0", "state.1")
+    ]
+    assert [port.name for port in step.outputs] == [
+        *("action.move", "action.say", "logits.move", "logits.say", "next_state.0", "next_state.1")
+    ]
+    assert step.inputs[2] == ("obs.self.id", (2,), "int64")
+    assert step.outputs[2] == ("logits.move", (2, 7), "float32")
+    assert [port.name for port in made("none")[2].outputs] == ["action", "logits"]
+
+
+def test_comparisons_see_a_hidden_state_that_is_never_reset():
+    policy, env, step = made("gru")
+
+    def never(inputs):
+        *obs, reset, state = inputs
+        return step(*obs, torch.zeros_like(reset), state)
+
+    found = runtimes.compare(step, never, policy, env, n_steps=100)
+    with pytest.raises(UserError, match="acts otherwise than its policy"):
+        runtimes.check(Path("x.onnx"), found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_act_as_the_policy_for_1000_steps(kind, tmp_path):
+    policy, env, step = made(kind)
+    runtimes.write_torch(step, tmp_path / "a.pt2")
+    found = [runtimes.compare(step, runtimes.run_torch(tmp_path / "a.pt2"), policy, env)]
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    runtimes.write_onnx(step, tmp_path / "a.onnx")
+    found.append(runtimes.compare(step, runtimes.run_onnx(tmp_path / "a.onnx"), policy, env))
+    for one in found:
+        assert one.difference < 1e-4 * max(1, one.largest) and one.n_apart == 0
+    model = onnx.load(tmp_path / "a.onnx")
+    assert model.opset_import[0].version >= 18
+    assert [port.name for port in model.graph.input] == [port.name for port in step.inputs]
+    (ports,) = [p.value for p in model.metadata_props if p.key == "megastep"]
+    assert json.loads(ports)["outputs"][0]["name"] == step.outputs[0].name
+
+
+class Odd(torch.nn.Module):
+    """A core that asks a tensor for its value, which no graph has."""
+
+    def __init__(self, width):
+        super().__init__()
+
+    def initial(self, n_lanes, device=None):
+        return arrdict(total=torch.zeros(n_lanes, device=device))
+
+    def forward(self, x, reset, state):
+        if x.sum().item() > 1e9:
+            x = x + 1
+        return x, state
+
+
+def test_a_core_that_cannot_be_exported_is_one_sentence(tmp_path):
+    policy = Policy(VECTOR, MOVES, width=8, core=f"{__name__}:Odd")
+    with pytest.raises(UserError, match=r"^mine cannot be exported: .*; format=safetensors"):
+        runtimes.write_torch(Step(policy, VECTOR), tmp_path / "a.pt2", "mine")
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["format=onnx"], "run is missing; run=latest takes the newest run"),
+        (["run=explorer_anywhere"], "format is missing; format=onnx, torch, safetensors, hub"),
+        (["run=explorer_anywhere", "format=onx"], "format: 'onx' is unknown; did you mean onnx"),
+        (["run=nowhere", "format=onnx"], "nowhere is neither a run folder nor a pretrained agent"),
+        (["run=explorer_anywhere", "format=onnx", "file=a.pt"], "file=a.pt must end with .onnx"),
+    ],
+)
+def test_bad_words_are_one_sentence(words, text, here):
+    with pytest.raises(UserError, match=re.escape(text)):
+        export.main(words)
+    assert not any(here.iterdir())
+
+
+def test_a_folder_for_a_hub(here, monkeypatch):
+    assert train.main([*TINY, *SHORT_EPISODES, "samples=256", "folder=run"]) == 0
+    parts = "geometry.parts={bench: 2, braided: {source: maze, n: 2, braid: 1}}"
+    assert evaluate.main(["run=run", "geometry=suite", parts, "episodes=8"]) == 0
+    monkeypatch.setattr(hub, "N_STEPS", 2)
+    assert export.main(["run=run", "format=hub", "file=mine"]) == 0
+    names = sorted(path.name for path in Path("mine").iterdir())
+    assert names == ["README.md", "agent.safetensors", "config.json", "replay.mp4"]
+    _, head, card = Path("mine/README.md").read_text().split("---\n", 2)
+    about = yaml.safe_load(head)
+    assert about["library_name"] == "megastep" and "minimal" in about["tags"]
+    metric = about["model-index"][0]["results"][0]["metrics"][0]
+    assert metric["type"] == "mean_reward" and "+/-" in metric["value"]
+    assert "# run" in card and "## Limits" in card
+    policy, env = pretrained.load_with_env("mine/agent.safetensors", "cpu")
+    assert policy(env.reset(), policy.initial(n_lanes(env)))[0]["actions"].shape == (1, 1)
+    with pytest.raises(UserError, match="The folder mine is not empty"):
+        export.main(["run=run", "format=hub", "file=mine"])
