@@ -7,7 +7,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
 
@@ -135,7 +135,7 @@ def compare(step: Step, run: Runner, policy: "Policy", env: Env, n_steps: int = 
     choices = []
     for _ in range(n_steps):
         is_random = torch.rand(len(world["reset"]), generator=generator) < RESETS
-        world = arrdict(world, reset=world["reset"] | is_random)
+        world = arrdict(cast(arrdict, world), reset=world["reset"] | is_random)
         decision, state = policy(world, state, sample=False)
         actions, logits, own = step.trees(run(step.tensors(world, own)))
         expected = [*leaves(decision["logits"]), *leaves(state)]
