@@ -5,7 +5,7 @@ No class needs to inherit from the protocols: any object with these attributes i
 environment that are controlled independently, B = N A lanes.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -13,6 +13,7 @@ import torch
 __all__ = [
     "DEFAULTS",
     "Env",
+    "Geometries",
     "PolicyLike",
     "Space",
     "Tree",
@@ -26,6 +27,8 @@ __all__ = [
 Space = Any
 #: A tensor, or a (nested) dict of tensors.
 Tree = Any
+#: Floor plans, each a dotdict; see `megastep.geometry`.
+Geometries = Sequence[Any]
 
 
 class World(Protocol):

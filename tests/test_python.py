@@ -174,6 +174,8 @@ def test_signals_raise_what_python_raises(number, kind):
 
 
 def test_names_of_the_original(recwarn):
+    for name in [name for name in sys.modules if name.startswith("megastep.demo")]:
+        del sys.modules[name]  # of other tests
     from megastep.demo.envs.minimal import Minimal
 
     from megastep.demo import learning

@@ -39,7 +39,6 @@ from megastep.agents.errors import ConfigErrors, UserError, shortened, user_erro
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
 from megastep.agents.launch.again import AUTO
-from megastep.agents.reports import statistics
 from megastep.agents.runs import folders, scores
 from megastep.agents.runs.atomic_files import make_folders, write_atomically
 
@@ -438,6 +437,8 @@ def _pooled(rows) -> tuple[list[str], list[list[str]]] | None:
             scores.setdefault(", ".join(varied) or "all", []).append(row["score"])
     if all(len(values) < 2 for values in scores.values()):
         return None
+    from megastep.agents.reports import statistics  # with NumPy, which errors do not need
+
     return [text.format("episode/return") for text in statistics.POOLED], statistics.pooled(scores)
 
 

@@ -357,7 +357,7 @@ def test_contradicting_settings():
         (
             "precision=high",
             "precision",
-            "no such key; there are agent, checkpoint_s",
+            "no such key; there are agent, callbacks, checkpoint_s",
         ),
         ("learner.learning_rate=1", "learner.learning_rate", "no such key; learner has anneal, "),
         ("init=[a]", "init", "expected a word, got ['a']"),
@@ -531,7 +531,7 @@ def test_glob_sweep():
 def test_help_lists_groups_and_members(capsys):
     assert train.main(["--help"]) == 0
     text = capsys.readouterr().out
-    assert "explorer, gymnasium, minimal, pettingzoo" in text
+    assert "explorer, gymnasium, keys, memory, minimal, pettingzoo" in text
     assert "quickstart" in text and "--multirun" in text
 
 

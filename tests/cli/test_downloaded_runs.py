@@ -16,7 +16,7 @@ from megastep.agents.runs import checkpoint, trust
 from tests.helpers.tiny import TINY, changed, settings
 
 KEYS = ("env.name", "geometry.name", "learner.name", "curriculum.name", "opponents.bot_class")
-KEYS += ("agent.core", "agent.encoder", "logger.tensorboard.name")
+KEYS += ("agent.core", "agent.encoder", "logger.tensorboard.name", "callbacks")
 IMPORTED = pathlib.Path("imported")  # written by the planted module
 
 

@@ -372,7 +372,7 @@ def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
     players = []
     monkeypatch.setattr(recording, "film_all", lambda both, *_, **look: players.extend(both))
     assert record.main(["run=lone", "against=bot", "device=cpu"]) == 0
-    ((env, both, _),) = players
+    ((env, both, *_),) = players
     assert env.n_agents == 2 and isinstance(both.policies[1], Tracker)
 
 

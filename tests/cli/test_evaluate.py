@@ -334,7 +334,7 @@ def test_evaluate_is_reproducible(trained):
     evaluate.run(configured(run=str(trained), split="training", baseline=False))
     names = {path.name for path in (trained / "evaluations").iterdir()}
     tables = "box-test-32", "box-training-32", "bench-test-32-greedy"
-    assert names == {f"{name}.{kind}" for name in tables for kind in ("json", "md", "csv")}
+    assert names == {f"{name}.{kind}" for name in tables for kind in ("json", "md", "csv", "npz")}
 
 
 def test_evaluate_in_homes_from_a_file(trained, tmp_path):

@@ -521,6 +521,7 @@ def test_progress_says_how_many_episodes_a_return_is_of():
         latest_stats={"episode/return": 26.34, "episode/window": 1312, "episode/won/past": 0.6},
         episode_stats=SimpleNamespace(metrics=(), groups=()),
         budget=Budget(),
+        evaluate_every=None,
     )
     fraction, words = progress_of(running)
     assert fraction is None

@@ -3,8 +3,8 @@
 N environments of A agents. Each agent is a lane: B = N A.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from pydantic import Field
@@ -20,6 +20,7 @@ from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import MAX_AGENTS, TALLY_ROWS, deathmatch_step, privileged_size
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+from megastep.types import Geometries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,7 +109,7 @@ class Deathmatch(SceneryEnv):
     def __init__(
         self,
         n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
-        geometries: Sequence[Any] | None = None,
+        geometries: Geometries | None = None,
         *,
         n_agents: Annotated[int, Field(ge=2, le=MAX_AGENTS)] = 4,
         seed: int = 1,

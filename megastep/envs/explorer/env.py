@@ -1,7 +1,7 @@
 """Explorer: see as much of a home as possible. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -16,6 +16,7 @@ from megastep.envs.explorer.step import N_BINS, N_EPISODE, explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+from megastep.types import Geometries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,7 +78,7 @@ class Explorer(SceneryEnv):
     def __init__(
         self,
         n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
-        geometries: Sequence[Any] | None = None,
+        geometries: Geometries | None = None,
         *,
         seed: int = 1,
         device: torch.device | str | None = None,

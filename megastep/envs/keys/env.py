@@ -1,7 +1,7 @@
 """Keys: open the doors of a home to reach a goal. N environments of one agent, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -17,6 +17,7 @@ from megastep.envs.keys.step import keys_step
 from megastep.modules.objects import REACH
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+from megastep.types import Geometries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,7 +95,7 @@ class Keys(SceneryEnv):
     def __init__(
         self,
         n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
-        geometries: Sequence[Any] | None = None,
+        geometries: Geometries | None = None,
         *,
         seed: int = 1,
         device: torch.device | str | None = None,

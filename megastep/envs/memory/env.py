@@ -1,7 +1,7 @@
 """Memory: find coloured objects in a maze, again and again. N environments of one agent."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -17,6 +17,7 @@ from megastep.envs.memory.step import N_GOAL, memory_step
 from megastep.modules.objects import REACH
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+from megastep.types import Geometries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,7 +90,7 @@ class Memory(SceneryEnv):
     def __init__(
         self,
         n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
-        geometries: Sequence[Any] | None = None,
+        geometries: Geometries | None = None,
         *,
         seed: int = 1,
         device: torch.device | str | None = None,

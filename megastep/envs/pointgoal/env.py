@@ -4,7 +4,7 @@ N environments of one agent, so B = N lanes.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -19,6 +19,7 @@ from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
+from megastep.types import Geometries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -92,7 +93,7 @@ class PointGoal(SceneryEnv):
     def __init__(
         self,
         n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
-        geometries: Sequence[Any] | None = None,
+        geometries: Geometries | None = None,
         *,
         seed: int = 1,
         device: torch.device | str | None = None,
