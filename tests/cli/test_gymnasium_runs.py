@@ -91,7 +91,7 @@ def test_learns_in_small_units():
     ]
     assert train.main(words) == 0
     last = json_lines.read("run/metrics.jsonl")[-1]
-    assert last["episode/true_return"] > 60
+    assert last["episode/true_return"] > 35
     assert last["episode/return"] == pytest.approx(1e-5 * last["episode/true_return"], rel=1e-3)
 
 
