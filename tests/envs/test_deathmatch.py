@@ -637,7 +637,7 @@ def test_train_evaluate_and_record_in_self_play(tmp_path, monkeypatch):
     assert Path("run/video.mp4").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_recipe_learns_to_hit(tmp_path, monkeypatch):
     """With a quarter of its samples, five times as many as it needs to show."""
     monkeypatch.chdir(tmp_path)

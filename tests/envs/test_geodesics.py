@@ -153,7 +153,7 @@ def walk(g, route):
     [
         *(
             pytest.param(source, n, marks=pytest.mark.slow)
-            for source, n in [("homes", 8), ("bench", 1), ("maze", 2)]
+            for source, n in [("homes", 8), ("maze", 2)]
         ),
         pytest.param("bench", 4, marks=pytest.mark.nightly),
     ],

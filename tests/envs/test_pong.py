@@ -339,7 +339,7 @@ def test_evaluation_refuses_other_spaces(tmp_path, monkeypatch, capsys):
     assert "was trained in another environment: obs was" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_recipe_beats_the_tracker(tmp_path, monkeypatch):
     """Random actions win 0.15 of the points, following the ball 0.7, the whole recipe 0.98."""
     monkeypatch.chdir(tmp_path)

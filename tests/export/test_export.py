@@ -104,8 +104,13 @@ def test_comparisons_see_a_hidden_state_that_is_never_reset():
         runtimes.check(Path("x.onnx"), found)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow if kind == "lstm" else pytest.mark.nightly)
+        for kind in KINDS
+    ],
+)
 def test_files_act_as_the_policy_for_1000_steps(kind, tmp_path):
     policy, env, step = made(kind)
     runtimes.write_torch(step, tmp_path / "a.pt2")
