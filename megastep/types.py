@@ -13,7 +13,6 @@ import torch
 __all__ = [
     "DEFAULTS",
     "Env",
-    "Geometries",
     "PolicyLike",
     "Space",
     "Tree",
