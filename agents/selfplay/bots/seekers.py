@@ -23,10 +23,13 @@ class Oracle:
 
     Args:
         env: a Memory.
+        otherwise: what decides while it does not know where the object is.
     """
 
-    def __init__(self, env: Any):
-        self.steering = Steering(env)
+    def __init__(self, env: Any, otherwise: Any = None):
+        self.steering, self.otherwise = Steering(env), otherwise
+        if otherwise is not None:
+            otherwise.steering = self.steering
         if not hasattr(env, "cue"):
             raise ValueError(f"it finds the object of env.cue, and {type(env).__name__} has no cue")
         self.cue, self.positions = env.cue, env.objects.all.positions
@@ -35,6 +38,9 @@ class Oracle:
         """Returns one that plays in lanes (n,) int64 of the environment."""
         seeker = copy.copy(self)
         seeker.steering = self.steering.in_lanes(lanes)
+        if self.otherwise is not None:
+            seeker.otherwise = copy.copy(self.otherwise)
+            seeker.otherwise.steering = seeker.steering
         return seeker
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
@@ -103,22 +109,12 @@ class Mapper(Oracle):
     """
 
     def __init__(self, env: Any):
-        super().__init__(env)
-        self.explorer = Explorer(env)
-        self.explorer.steering = self.steering
-
-    def in_lanes(self, lanes: torch.Tensor) -> "Mapper":
-        """Returns one that plays in lanes (n,) int64 of the environment."""
-        mapper = copy.copy(self)
-        mapper.steering = self.steering.in_lanes(lanes)
-        mapper.explorer = copy.copy(self.explorer)
-        mapper.explorer.steering = mapper.steering
-        return mapper
+        super().__init__(env, Explorer(env))
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the initial state: that of an `Explorer`, and `known` (n, K) bool."""
         known = torch.zeros(n_lanes, self.positions.shape[1], dtype=torch.bool, device=device)
-        return arrdict(self.explorer.initial(n_lanes, device), known=known)
+        return arrdict(self.otherwise.initial(n_lanes, device), known=known)
 
     def __call__(
         self,
@@ -132,17 +128,12 @@ class Mapper(Oracle):
         near = self.steering.near(pose)
         at, metres, landmark = self.ways(pose, near)
         known = state["known"] & ~world["reset"][:, None] | self.in_view(pose, at, metres)
-        explored = self.explorer.explore(world["reset"], state, pose, near)
+        explored = self.otherwise.explore(world["reset"], state, pose, near)
         to_object = self.walk_to(k, at, metres, landmark, pose, near)
         aim = self.steering.aim(pose, near, explored["target"])
         to_frontier = self.steering.decide(pose, aim, aim)
-        knows = known.gather(1, k[:, None])
-        actions = torch.where(
-            knows.view(-1, *[1] * (to_object["actions"].ndim - 1)),
-            to_object["actions"],
-            to_frontier["actions"],
-        )
-        return arrdict(actions=actions), arrdict(explored, known=known)
+        decision = _chosen(known.gather(1, k[:, None]), to_object, to_frontier)
+        return decision, arrdict(explored, known=known)
 
 
 class Wanderer(Oracle):
@@ -151,21 +142,11 @@ class Wanderer(Oracle):
     """
 
     def __init__(self, env: Any):
-        super().__init__(env)
-        self.walker = Walker(env)
-        self.walker.steering = self.steering
-
-    def in_lanes(self, lanes: torch.Tensor) -> "Wanderer":
-        """Returns one that plays in lanes (n,) int64 of the environment."""
-        wanderer = copy.copy(self)
-        wanderer.steering = self.steering.in_lanes(lanes)
-        wanderer.walker = copy.copy(self.walker)
-        wanderer.walker.steering = wanderer.steering
-        return wanderer
+        super().__init__(env, Walker(env))
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the initial state, that of a `Walker`."""
-        return self.walker.initial(n_lanes, device)
+        return self.otherwise.initial(n_lanes, device)
 
     def __call__(
         self,
@@ -178,8 +159,14 @@ class Wanderer(Oracle):
         pose, k = self.steering.pose(), self.cued()
         near = self.steering.near(pose)
         ways = self.ways(pose, near)
-        to_object = self.walk_to(k, *ways, pose, near)["actions"]
-        wandering, state = self.walker(world, state, sample, generator)
+        to_object = self.walk_to(k, *ways, pose, near)
+        wandering, state = self.otherwise(world, state, sample, generator)
         sees = self.in_view(pose, *ways[:2]).gather(1, k[:, None])
-        sees = sees.view(-1, *[1] * (to_object.ndim - 1))
-        return arrdict(actions=torch.where(sees, to_object, wandering["actions"])), state
+        return _chosen(sees, to_object, wandering), arrdict(state)
+
+
+def _chosen(condition, decision, other) -> arrdict:
+    """Returns a decision where the condition, (n, 1) bool, is true, and the other elsewhere."""
+    actions = decision["actions"]
+    condition = condition.view(-1, *[1] * (actions.ndim - 1))
+    return arrdict(actions=torch.where(condition, actions, other["actions"]))
