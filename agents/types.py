@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 
+from megastep.coefficients import Coefficients
 from megastep.types import Env, PolicyLike
 
 __all__ = [
@@ -163,6 +164,11 @@ class LearnerOptions(Protocol):
         n_steps: T, for `dry_run=true`.
         n_minibatches: minibatches of an update, for the same.
         gamma, lambda_: of its generalised advantages, for `curriculum=plr`.
+        coefficients: the `megastep.coefficients.Coefficients` that it uses, which follow their
+            schedules. None: it has none.
+        warmup: updates over which the learning rate rises to the initial one.
+        read_lr: reads the learning rate, if the learner changes it itself.
+        extra: parameters that it trains besides the policy's.
     """
 
     set_lr: Callable[[float], None] | None = None
@@ -170,8 +176,12 @@ class LearnerOptions(Protocol):
     replay_buffer: Any = None
     n_steps: int | None = None
     n_minibatches: int | None = None
-    gamma: float | None = None
-    lambda_: float | None = None
+    gamma: float | torch.Tensor | None = None
+    lambda_: float | torch.Tensor | None = None
+    coefficients: Coefficients | None = None
+    warmup: int = 0
+    read_lr: Callable[[], float] | None = None
+    extra: Sequence[torch.Tensor] = ()
 
     @staticmethod
     def bytes_per_env(env: Env) -> float:

@@ -249,6 +249,9 @@ def sentence(error: Mapping, field: FieldInfo | None, value: object) -> str:
     allowed, and what was given.
     """
     kind, got = error["type"], "nothing" if value is None else repr(value)
+    is_schedule = isinstance(value, Mapping) and value.keys() == {"from", "to"}
+    if is_schedule and kind != "value_error":
+        return f"is one value, not a schedule, got {got}"
     if kind == "missing":
         return "is missing"
     if kind == "located":
@@ -275,7 +278,7 @@ def allowed(field: FieldInfo | None) -> str:
         key: getattr(extra, key)
         for extra in (_metadata(field) if field else ())
         for key in BOUNDS
-        if isinstance(extra, annotated_types.BaseMetadata) and hasattr(extra, key)
+        if isinstance(extra, annotated_types.BaseMetadata) and getattr(extra, key, None) is not None
     }
     words = RANGES if len(bounds) == 2 else BOUNDS
     texts = [words[key].format(bounds[key]) for key in BOUNDS if key in bounds]

@@ -79,6 +79,8 @@ class Env(Protocol):
             ``against=bot``. Default: none.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``. Default: None, there is none.
+        coefficients: a tuple of `megastep.coefficients.Coefficients`, such as weights of rewards,
+            which training has follow their schedules. Default: none.
         close(): ends what it started, such as processes. Called after training. Default: none.
         pop_restarts(): returns how many environments were made anew after an error since the last
             call, which reports have as ``episode/restarts``. Default: None, none ever is.
@@ -112,6 +114,7 @@ DEFAULTS: dict[str, Any] = {
     "n_agents": 1,
     "fps": 10.0,
     "capturable": True,
+    "coefficients": (),
     "resumable": True,
     "close": lambda: None,
     "pop_restarts": lambda: None,

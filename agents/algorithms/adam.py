@@ -35,6 +35,8 @@ class Adam:
             subtracts step size x decay x parameter; 0 for the others.
     """
 
+    capturable = True
+
     def __init__(
         self,
         parameters: Iterable[torch.nn.Parameter],

@@ -1,19 +1,25 @@
 """The gradient steps of an update. Non-finite steps are skipped and counted."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 
 import torch
 
 from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
+from megastep.agents.algorithms.optimizers import make_optimizer
 from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
 from megastep.agents.types import StateDict
 from megastep.kernels.build.launch import Blocks, launch
 
+#: Bounds of a step size that follows the KL divergence, those of rsl_rl.
+ADAPTIVE_LR = 1e-5, 1e-2
+_NONE = MappingProxyType({})
+
 
 class GradientSteps:
-    """Takes Adam steps on some parameters. Skips steps with non-finite numbers.
+    """Takes an optimizer's steps on some parameters. Skips steps with non-finite numbers.
 
         is_finite, _ = steps.begin(rollout.floats())
         for batch in minibatches:
@@ -29,10 +35,11 @@ class GradientSteps:
 
     Args:
         parameters: parameters to optimise.
-        lr: Adam's step size.
+        lr: step size, a number, or a tensor () on the device, which is changed in place.
         max_grad_norm: longer gradients are scaled down to this norm.
         device: device of the parameters.
-        options: further arguments of `Adam`, such as `lr_factors`.
+        optimizer: its name, see `make_optimizer`.
+        lr_factors, weight_decays: as for `Adam`.
 
     Attributes:
         check: the first non-finite number, and how many updates were skipped in a row.
@@ -41,14 +48,16 @@ class GradientSteps:
     def __init__(
         self,
         parameters: Iterable[torch.nn.Parameter],
-        lr: float,
+        lr: float | torch.Tensor,
         max_grad_norm: float,
         device: torch.device,
-        **options,
+        optimizer: str = "adam",
+        lr_factors: Mapping[torch.nn.Parameter, float] = _NONE,
+        weight_decays: Mapping[torch.nn.Parameter, float] = _NONE,
     ):
         self.max_grad_norm = max_grad_norm
-        self._lr = torch.tensor(lr, device=device)
-        self.optimizer = Adam(parameters, self._lr, **options)
+        self._lr = torch.as_tensor(lr, device=device)
+        self.optimizer = make_optimizer(optimizer, parameters, self._lr, lr_factors, weight_decays)
         self.check = NonFiniteCheck(device)
         # of the update in progress; totals are those of metrics, then steps taken and skipped
         self._is_finite: torch.Tensor | None = None
@@ -56,8 +65,24 @@ class GradientSteps:
         self._metrics: dict[str, torch.Tensor] = {}
 
     def set_lr(self, lr: float) -> None:
-        """Changes Adam's step size, also for a captured update."""
+        """Changes the step size, also for a captured update."""
         self._lr.fill_(lr)
+
+    def follow_kl(self, kl: torch.Tensor, desired: float) -> None:
+        """Changes the step size so that updates have about a desired KL divergence: where it is
+        above twice as much, the step size is divided by 1.5; below half, multiplied (rsl_rl, Rudin
+        et al. 2022). It stays between `ADAPTIVE_LR`.
+
+        Args:
+            kl: (), of a minibatch, in nats.
+            desired: the one to have.
+        """
+        least, most = ADAPTIVE_LR
+        lower, higher = (self._lr / 1.5).clamp(min=least), (self._lr * 1.5).clamp(max=most)
+        lr = torch.where((kl < desired / 2) & (kl > 0), higher, self._lr)
+        lr = torch.where(kl > 2 * desired, lower, lr)
+        assert self._is_finite is not None
+        self._lr.copy_(torch.where(self._is_finite, lr, self._lr))
 
     def begin(
         self, floats: dict[str, torch.Tensor], *moments: Moments
@@ -106,7 +131,8 @@ class GradientSteps:
             () bool, whether the step was taken.
         """
         max_metrics = LIBRARY.constants["JUDGED_METRICS"]
-        if self.optimizer.is_fused and len(self._metrics) <= max_metrics:
+        is_fused = isinstance(self.optimizer, Adam) and self.optimizer.is_fused
+        if is_fused and len(self._metrics) <= max_metrics:
             grad_norm, is_taken = self._judge_on_gpu(is_enabled)
             self.optimizer.step_on_gpu(is_taken, grad_norm, self.max_grad_norm)
         else:

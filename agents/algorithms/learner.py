@@ -37,23 +37,40 @@ Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_r
 `cuda_graph.CudaGraphUpdate`, `masked_stats` and `returns`.
 """
 
+import functools
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated
 
 import torch
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from megastep.agents.algorithms import optimizers
 from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.gradient_steps import GradientSteps
+from megastep.agents.algorithms.masked_stats import masked_mean
+from megastep.agents.errors import UserError, shortened
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import VERSION
-from megastep.agents.storage.rollout import Rollout
+from megastep.agents.storage.rollout import Rollout, without_last
 from megastep.agents.types import StateDict
+from megastep.arrdict import arrdict
+from megastep.coefficients import Coefficients
+from megastep.imports import known_name
+from megastep.schedules import Number, Scheduled
 
 # Types of settings that several learners have.
 Coefficient = Annotated[float, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0, le=10**6)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+# Those that may be schedules.
+ScheduledCoefficient = Annotated[Number, Scheduled(ge=0, le=10**6)]
+ScheduledPositive = Annotated[Number, Scheduled(gt=0, le=10**6)]
+ScheduledFraction = Annotated[Number, Scheduled(ge=0, le=1)]
+Warmup = Annotated[int, Field(ge=0, le=10**9)]
+OptimizerName = Annotated[
+    str, AfterValidator(functools.partial(known_name, names=optimizers.NAMES))
+]
 
 _ATTRIBUTES = {
     "collector": "a method collector(env) that returns a collector",
@@ -90,53 +107,83 @@ class GradientLearner:
     A subclass adds its settings, `collector`, `bytes_per_env` and `_update`, and sets
     `n_minibatches` if it splits lanes into minibatches.
 
+    A subclass of one of the learners adds a loss of its own, such as that of an auxiliary head, by
+    `extra_loss` and, for weights that acting does not need, `extra_parameters`.
+
     Args:
         policy: the policy to improve, in place.
-        lr: Adam's step size.
+        lr: step size.
         max_grad_norm: longer gradients are scaled down to this norm.
         graph: on a GPU, captures updates as a CUDA graph.
         seed: seed of the learner's own generator.
-        critic_lr: Adam's step size of the critic's parameters. None: `lr`.
-        weight_decay: Adam's weight decay, of parameters of two or more axes whose name contains
+        critic_lr: step size of the critic's parameters, which falls with `lr`. None: `lr`.
+        weight_decay: weight decay, of parameters of two or more axes whose name contains
             "weight": those of layers, but no biases and no standard deviations.
+        optimizer: a name in `optimizers.NAMES`, or the import path of a class.
+        warmup: updates over which the step size rises to `lr`.
+        desired_kl: KL divergence of a minibatch that the step size follows; None: it does not.
+        coefficients: numbers and schedules that the loss uses, by name.
 
     Metrics:
         loss/grad_norm: norm of the gradient before it is clipped.
         loss/skipped_steps: gradient steps skipped because of non-finite numbers.
 
+    Raises:
+        ValueError: `warmup` or a schedule of `lr` is combined with `desired_kl`.
+
     Attributes:
+        coefficients: the `Coefficients` of the loss, and `lr`.
         steps: the `GradientSteps` of the policy's parameters.
         check: finds non-finite numbers in rollouts and counts skipped updates.
         generator: the `SeededGenerator` of all random numbers in an update.
     """
 
     n_minibatches = 1
+    #: Reads the learning rate from the device, if the learner changes it itself.
+    read_lr: Callable[[], float] | None = None
+    _is_checked = False
 
     def __init__(
         self,
         policy: Policy,
-        lr: float,
+        lr: Number,
         max_grad_norm: float,
         graph: bool,
         seed: int,
         critic_lr: float | None = None,
         weight_decay: float = 0.0,
+        optimizer: str = "adam",
+        warmup: int = 0,
+        desired_kl: float | None = None,
+        coefficients: Mapping[str, Number] = arrdict(),
     ):
-        self.policy, self.device, self.lr = policy, policy.device, lr
+        self.policy, self.device = policy, policy.device
+        self.coefficients = Coefficients(policy.device, lr=lr, **coefficients)
+        self.lr, self.warmup, self.desired_kl = self.coefficients.values["lr"], warmup, desired_kl
+        if desired_kl is not None:
+            if warmup or "lr" in self.coefficients.schedules:
+                raise ValueError(
+                    "desired_kl changes the learning rate, so it cannot be combined with warmup "
+                    "or a schedule of lr"
+                )
+            self.read_lr = self.coefficients.tensors["lr"].item
         factors = {}
         if critic_lr is not None and policy.critic is not None:
-            factors = dict.fromkeys(policy.critic.parameters(), critic_lr / lr)
+            factors = dict.fromkeys(policy.critic.parameters(), critic_lr / self.lr)
         layers = (p for name, p in policy.named_parameters() if p.ndim > 1 and "weight" in name)
+        self.extra = self._make_extra()
         self.steps = GradientSteps(
-            policy.parameters(),
-            lr,
+            [*policy.parameters(), *self.extra],
+            self.coefficients.tensors["lr"],
             max_grad_norm,
             self.device,
+            optimizer,
             lr_factors=factors,
             weight_decays=dict.fromkeys(layers, weight_decay),
         )
         self.check, self.optimizer = self.steps.check, self.steps.optimizer
         self.generator = SeededGenerator(stream_seed(seed, "learner"))
+        graph = graph and self.optimizer.capturable
         self.cuda_graph = CudaGraphUpdate(self._update, self.device, graph, (self.generator,))
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
@@ -156,8 +203,106 @@ class GradientLearner:
         raise NotImplementedError
 
     def set_lr(self, lr: float) -> None:
-        """Changes Adam's step size, the critic's by the same factor, also for a captured update."""
-        self.steps.set_lr(lr)
+        """Changes the step size, the critic's by the same factor, also for a captured update."""
+        self.coefficients.set(lr=lr)
+
+    # ---- A loss of one's own ----
+
+    def extra_parameters(self) -> Iterable[torch.nn.Parameter]:
+        """Returns parameters that only `extra_loss` needs, which are none here.
+
+        Called once, before the optimizer is made, with a seed that all ranks share; they are moved
+        to the policy's device. They train with the policy's, and are part of the learner's state:
+        checkpoints have them, while acting, exporting and `init` do without.
+        """
+        return ()
+
+    def extra_loss(
+        self, features: torch.Tensor, batch: arrdict
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Returns a loss () that is added to the learner's, and metrics () by name.
+
+        Here it is the error of predicting privileged observations, if the critic is asymmetric, and
+        0 else; `super().extra_loss(features, batch)` keeps it.
+
+        Args:
+            features: (T, M, width) of the actor, from which gradients flow into it.
+            batch: T steps of M lanes as `Rollout.sequences` has them, `obs`, `starts` and
+                `privileged` with a last row more, and `valid` (T, M), the steps to average over.
+        """
+        if not self.policy.privileged_space:
+            return features.new_zeros((), dtype=torch.float32), {}
+        privileged = without_last(batch["privileged"])
+        errors = self.policy.prediction_error(features, privileged)
+        error = masked_mean(errors, batch["valid"])
+        return self.coefficients["auxiliary_coef"] * error, {"auxiliary": error}
+
+    @property
+    def has_extra_loss(self) -> bool:
+        """Whether a subclass has an `extra_loss` of its own."""
+        return type(self).extra_loss is not GradientLearner.extra_loss
+
+    def _make_extra(self) -> list[torch.nn.Parameter]:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(stream_seed(self.policy.seed, "extra"))
+            parameters = [*self.extra_parameters()]
+        for parameter in parameters:
+            if not isinstance(parameter, torch.nn.Parameter):
+                raise UserError(
+                    f"{type(self).__name__}.extra_parameters must return parameters, not "
+                    f"{type(parameter).__name__}; use module.parameters()"
+                )
+            parameter.data = parameter.data.to(self.device)
+        return parameters
+
+    def extra_terms(
+        self, features: torch.Tensor, batch: arrdict, taken: Iterable[str] = ()
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Returns `extra_loss`, checked, and its metrics without gradients.
+
+        Args:
+            features, batch: as for `extra_loss`.
+            taken: names of the learner's own metrics.
+
+        Raises:
+            UserError: it fails, is no scalar, has the name of another metric, or has no gradient.
+        """
+        name = f"{type(self).__name__}.extra_loss"
+        try:
+            extra, own = self.extra_loss(features, batch)
+        except Exception as error:
+            problem = f"{type(error).__name__}: {shortened(error, 300)}"
+            raise UserError(f"{name} failed ({problem}); it returns (loss, metrics)") from error
+        for key, value in {"loss": extra, **own}.items():
+            if not isinstance(value, torch.Tensor) or value.shape != ():
+                given = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
+                raise UserError(
+                    f"{name} must return tensors of shape (), such as means over batch.valid, but "
+                    f"{key} is {given}"
+                )
+            if key in taken:
+                raise UserError(f"{name}: the learner has a metric {key} itself; use another name")
+        if self.has_extra_loss:
+            self._check_gradients(name, extra)
+        return extra, {key: value.detach() for key, value in own.items()}
+
+    def _check_gradients(self, name, extra) -> None:
+        """Checks once that a loss depends on what it is to train."""
+        if self._is_checked:
+            return
+        self._is_checked = True
+        targets = self.extra or [p for p in self.policy.parameters() if p.requires_grad]
+        gradients = (None,)
+        if extra.requires_grad:
+            gradients = torch.autograd.grad(
+                extra, targets, retain_graph=True, allow_unused=True, materialize_grads=False
+            )
+        if all(gradient is None for gradient in gradients):
+            what = "of extra_parameters()" if self.extra else "of the policy"
+            raise UserError(
+                f"{name} touches no parameter {what}, so it teaches nothing: compute it from "
+                "features and from your parameters, without detach() or no_grad"
+            )
 
     def state_dict(self) -> StateDict:
         """Returns optimizer, learning rate and generators as plain tensors and numbers.
@@ -168,6 +313,7 @@ class GradientLearner:
             learner=type(self).__name__,
             normalisation=VERSION,
             **self.steps.state_dict(),
+            **({"extra": [parameter.detach() for parameter in self.extra]} if self.extra else {}),
             generator=self.generator.state_dict(),
             policy_generator=self.policy.generator.state_dict(),
         )
@@ -187,6 +333,13 @@ class GradientLearner:
                 "this run: continue it with the version that began it, or start from its weights "
                 "(init=RUN)"
             )
+        saved_extra = [tuple(leaf.shape) for leaf in state.get("extra", [])]
+        own_extra = [tuple(leaf.shape) for leaf in self.extra]
+        if saved_extra != own_extra:
+            raise ValueError(
+                f"extra_parameters() have shapes {own_extra}, and those saved have {saved_extra}: "
+                f"continue with the same {name}"
+            )
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`, which may come from another device.
@@ -197,6 +350,9 @@ class GradientLearner:
         """
         self.check_state(state)
         self.steps.load_state_dict(state)
+        with torch.no_grad():
+            for parameter, saved in zip(self.extra, state.get("extra", []), strict=True):
+                parameter.copy_(saved)
         self.generator.load_state_dict(state["generator"], self.device)
         self.policy.generator.load_state_dict(state["policy_generator"], self.device)
         self.cuda_graph.restart()

@@ -11,14 +11,28 @@ import torch
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
+from megastep.agents.algorithms.learner import (
+    Coefficient,
+    GradientLearner,
+    OptimizerName,
+    Positive,
+    ScheduledCoefficient,
+    ScheduledFraction,
+    ScheduledPositive,
+    Warmup,
+)
 from megastep.agents.algorithms.masked_stats import pooled_normalise
 from megastep.agents.algorithms.order import random_order
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.agents.storage.rollout import (
+    SEQUENCES,
+    bytes_per_step,
+    make_rollout,
+    without_last,
+)
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
@@ -31,8 +45,9 @@ class PPO(GradientLearner):
     Args:
         policy: a policy with a critic.
         n_steps: steps of a rollout, T.
-        lr: Adam's step size.
-        critic_lr: Adam's step size of the critic's own parameters, those under "critic."; it falls
+        lr: step size. Like `gamma`, `lambda_`, `clip` and the coefficients of the loss it is a
+            number or a schedule.
+        critic_lr: step size of the critic's own parameters, those under "critic."; it falls
             with `lr`. None: `lr`.
         weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
         gamma: discount per step.
@@ -48,6 +63,11 @@ class PPO(GradientLearner):
         max_grad_norm: longer gradients are scaled down to this norm.
         n_epochs: passes over a rollout.
         n_minibatches: minibatches per pass; lanes are divided among them.
+        optimizer: `adam` or `adamw`, one kernel on a GPU; `sgd`; or the import path of a class like
+            those of `torch.optim`.
+        warmup: updates over which the step size rises linearly to `lr`.
+        desired_kl: changes the step size after each minibatch so that its KL divergence stays near
+            this many nats (as in rsl_rl). None: it does not.
         target_kl: ends an update early, once the KL divergence of a minibatch from the acting
             policy exceeds this many nats. None: never.
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
@@ -73,30 +93,34 @@ class PPO(GradientLearner):
         policy: Policy,
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: Positive = 1e-3,
+        lr: ScheduledPositive = 1e-3,
         critic_lr: Positive | None = None,
         weight_decay: Coefficient = 0.0,
-        gamma: Fraction = 0.995,
-        lambda_: Fraction = 0.95,
-        clip: Positive = 0.2,
+        gamma: ScheduledFraction = 0.995,
+        lambda_: ScheduledFraction = 0.95,
+        clip: ScheduledPositive = 0.2,
         value_clip: Positive | None = None,
         normalise_advantage: Literal["rollout", "minibatch", "none"] = "rollout",
-        entropy_coef: Coefficient = 0.01,
-        value_coef: Coefficient = 0.5,
-        auxiliary_coef: Coefficient = 0.5,
+        entropy_coef: ScheduledCoefficient = 0.01,
+        value_coef: ScheduledCoefficient = 0.5,
+        auxiliary_coef: ScheduledCoefficient = 0.5,
         max_grad_norm: Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
         n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
         target_kl: Positive | None = None,
+        optimizer: OptimizerName = "adam",
+        warmup: Warmup = 0,
+        desired_kl: Positive | None = None,
         graph: bool = False,
         seed: int = 1,
     ):
         if policy.critic is None:
             raise ValueError("PPO needs a policy with a critic: use agent.output=softmax")
-        super().__init__(policy, lr, max_grad_norm, graph, seed, critic_lr, weight_decay)
-        self.critic = policy.critic
-        self.n_steps, self.gamma, self.lambda_ = n_steps, gamma, lambda_
-        self.coefficients = Coefficients(clip, value_clip, value_coef, entropy_coef, auxiliary_coef)
+        coefficients = dict(gamma=gamma, lambda_=lambda_, clip=clip, value_coef=value_coef)
+        coefficients |= dict(entropy_coef=entropy_coef, auxiliary_coef=auxiliary_coef)
+        settings = critic_lr, weight_decay, optimizer, warmup, desired_kl, coefficients
+        super().__init__(policy, lr, max_grad_norm, graph, seed, *settings)
+        self.critic, self.value_clip, self.n_steps = policy.critic, value_clip, n_steps
         self.normalise_advantage = normalise_advantage
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.target_kl = target_kl
@@ -105,6 +129,16 @@ class PPO(GradientLearner):
         """Returns a collector of rollouts of `n_steps` steps."""
         self.policy.clear_stats()
         return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps))
+
+    @property
+    def gamma(self) -> float | torch.Tensor:
+        """The present discount; on a GPU a tensor () that a graph may read."""
+        return self.coefficients["gamma"]
+
+    @property
+    def lambda_(self) -> float | torch.Tensor:
+        """The present lambda of GAE, likewise."""
+        return self.coefficients["lambda_"]
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""
@@ -132,7 +166,7 @@ class PPO(GradientLearner):
         self.critic.output.add(of_targets, is_finite)
         if self.normalise_advantage == "rollout":
             estimates["advantages"] = normalise_masked(advantages, valid, of_advantages)
-        if self.coefficients.value_clip is not None:
+        if self.value_clip is not None:
             estimates["old_value"] = transitions["value"]
 
         is_enabled = True
@@ -140,7 +174,8 @@ class PPO(GradientLearner):
             generator = self.generator.on(self.device)
             order = random_order(rollout.n_lanes, generator, self.device)
             for lanes in order.tensor_split(self.n_minibatches):
-                batch = rollout.sequences(lanes, _PARTS, estimates)
+                parts = SEQUENCES if self.has_extra_loss else _PARTS
+                batch = rollout.sequences(lanes, parts, estimates)
                 batch["n_valid"] = batch.valid.sum()
                 if self.normalise_advantage == "minibatch":
                     batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)
@@ -148,6 +183,8 @@ class PPO(GradientLearner):
                 kl = self.steps.backward(loss, metrics, batch.n_valid)["kl"]
                 if self.target_kl is not None:
                     is_enabled = is_enabled & ~(kl > self.target_kl)
+                if self.desired_kl is not None:
+                    self.steps.follow_kl(kl, self.desired_kl)
                 self.steps.take(is_enabled)
         # Observation statistics change only now, so the whole update saw the normalisation that
         # acted.
@@ -165,10 +202,19 @@ class PPO(GradientLearner):
         policy, privileged = self.policy, without_last(rollout.privileged)
         starts = without_last(batch.starts)
         sequence = without_last(rollout.obs), starts, batch.state, batch.actions
-        terms = policy.terms(*sequence, privileged, lanes)
-        return ppo_loss(
+        terms = policy.terms(*sequence, privileged, lanes, has_errors=not self.has_extra_loss)
+        features, numbers = terms.pop("features"), self.coefficients
+        names = "value_coef", "entropy_coef", "auxiliary_coef"
+        loss, metrics = ppo_loss(
             **terms,
             batch=batch,
             value_scale=self.critic.output.scale,
-            coefficients=self.coefficients,
+            coefficients=Coefficients(
+                numbers["clip"], self.value_clip, *map(numbers.__getitem__, names)
+            ),
         )
+        if self.has_extra_loss:  # which has that of the privileged observations, too
+            with policy.compute_dtype():
+                extra, own = self.extra_terms(features, batch, metrics)
+            loss, metrics = loss + extra, metrics | own
+        return loss, metrics

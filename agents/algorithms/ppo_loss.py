@@ -13,19 +13,22 @@ from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.agents.private_ops import scale_all
 from megastep.arrdict import arrdict
+from megastep.coefficients import on_device
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
 METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
 
 
 class Coefficients(NamedTuple):
-    """The settings of the loss; see `PPO`."""
+    """The settings of the loss; see `PPO`. Tensors () on the device may change between replays of a
+    graph.
+    """
 
-    clip: float
+    clip: float | torch.Tensor
     value_clip: float | None
-    value_coef: float
-    entropy_coef: float
-    auxiliary_coef: float
+    value_coef: float | torch.Tensor
+    entropy_coef: float | torch.Tensor
+    auxiliary_coef: float | torch.Tensor
 
 
 def ppo_loss(
@@ -101,7 +104,8 @@ class _FusedLoss(torch.autograd.Function):
     def forward(
         ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
+        numbers = coefficients._asdict()
+        value_clip, device = numbers.pop("value_clip"), logprobs.device
         inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
         n_rows = logprobs.numel()
@@ -109,7 +113,7 @@ class _FusedLoss(torch.autograd.Function):
         sums = logprobs.new_empty(blocks.x, LIBRARY.constants["N_SUMS"])
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         launch(
-            *(LIBRARY, "ppo_loss", logprobs.device, blocks),
+            *(LIBRARY, "ppo_loss", device, blocks),
             logprobs=logprobs.contiguous(),
             **dict(zip(("entropies", "values", "errors"), inputs, strict=True)),
             old_logprobs=batch.logprobs.contiguous(),
@@ -121,12 +125,9 @@ class _FusedLoss(torch.autograd.Function):
             value_scale=value_scale,
             **{**dict.fromkeys(names), **dict(zip(names, gradients))},
             sums=sums,
+            **{name: on_device(number, device) for name, number in numbers.items()},
             n_rows=n_rows,
-            clip=clip,
             value_clip=value_clip or 0.0,
-            value_coef=value_coef,
-            entropy_coef=entropy_coef,
-            auxiliary_coef=auxiliary_coef,
         )
         ctx.save_for_backward(*gradients)
         means = sums.sum(0)

@@ -9,7 +9,16 @@ from typing import Annotated
 import torch
 from pydantic import Field
 
-from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
+from megastep.agents.algorithms.learner import (
+    Coefficient,
+    Fraction,
+    GradientLearner,
+    OptimizerName,
+    Positive,
+    ScheduledFraction,
+    ScheduledPositive,
+    Warmup,
+)
 from megastep.agents.algorithms.td_loss import Result, Settings, td_loss
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.policy import Policy
@@ -77,7 +86,7 @@ class R2D2(GradientLearner):
     Args:
         policy: a policy with `output="duelling"`.
         n_steps: steps of a rollout, T.
-        lr: Adam's step size.
+        lr: step size. Like `gamma` it is a number or a schedule.
         weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
         gamma: discount per step.
         return_steps: n of the n-step returns, the rewards summed before bootstrapping.
@@ -86,6 +95,9 @@ class R2D2(GradientLearner):
         epsilon_spread: lane i of B uses epsilon ** (1 + epsilon_spread i / (B - 1)).
         eta: weight of the largest error in a sequence's priority; the mean error has 1 - eta.
         max_grad_norm: longer gradients are scaled down to this norm.
+        optimizer: `adam` or `adamw`, one kernel on a GPU; `sgd`; or the import path of a class like
+            those of `torch.optim`.
+        warmup: updates over which the step size rises linearly to `lr`.
         gradient_steps: gradient steps per rollout. Together they draw `replay.ratio` x B sequences.
         replay: settings of the replay buffer.
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
@@ -111,15 +123,17 @@ class R2D2(GradientLearner):
         policy: Policy,
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: Positive = 1e-3,
+        lr: ScheduledPositive = 1e-3,
         weight_decay: Coefficient = 0.0,
-        gamma: Fraction = 0.995,
+        gamma: ScheduledFraction = 0.995,
         return_steps: Annotated[int, Field(ge=1, le=1000)] = 10,
         target_period: Annotated[int, Field(ge=1, le=10**6)] = 200,
         epsilon: Annotated[float, Field(gt=0, le=1)] = 0.4,
         epsilon_spread: Annotated[float, Field(ge=0, le=100)] = 3.0,
         eta: Fraction = 0.9,
         max_grad_norm: Positive = 10.0,
+        optimizer: OptimizerName = "adam",
+        warmup: Warmup = 0,
         gradient_steps: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 16,
         replay: Annotated[ReplaySettings, defaults_from(REPLAY)] = REPLAY,
         graph: bool = False,
@@ -127,9 +141,10 @@ class R2D2(GradientLearner):
     ):
         if policy.output_kind != "duelling":
             raise ValueError("R2D2 needs a policy of action values: use agent.output=duelling")
-        super().__init__(policy, lr, max_grad_norm, graph, seed, weight_decay=weight_decay)
+        settings = None, weight_decay, optimizer, warmup, None, dict(gamma=gamma)
+        super().__init__(policy, lr, max_grad_norm, graph, seed, *settings)
         self.n_steps, self.target_period = n_steps, target_period
-        self.loss_settings = Settings(gamma, return_steps, eta)
+        self.return_steps, self.eta = return_steps, eta
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread
         self.gradient_steps, self.replay_settings = gradient_steps, replay
         self.length = replay.sequence_steps(n_steps)
@@ -223,7 +238,8 @@ class R2D2(GradientLearner):
             self._beside.wait_stream(torch.cuda.current_stream(self.device))
         with torch.no_grad(), torch.cuda.stream(self._beside):
             target_q = self.target.unroll(*sequence, burn_in=burn_in).logits
-        q = self.policy.unroll(*sequence, burn_in=burn_in).logits
+        now = self.policy.unroll(*sequence, burn_in=burn_in)
+        q = now.logits
         if self._beside is not None:
             torch.cuda.current_stream(self.device).wait_stream(self._beside)
         steps = arrdict({name: batch[name] for name in _STEPS})
@@ -231,8 +247,15 @@ class R2D2(GradientLearner):
         scale = self.reward_scale.masked_fill(self.reward_scale == 0, 1.0)
         steps["reward"] = steps.reward / scale
         learned = arrdict({**steps, "weight": batch.weight, "age": batch.age})
-        result = td_loss(q, target_q, learned, self.policy.output, self.loss_settings)
+        settings = Settings(self.coefficients["gamma"], self.return_steps, self.eta)
+        result = td_loss(q, target_q, learned, self.policy.output, settings)
         result.metrics["q"] = result.metrics["q"] * scale
+        if self.has_extra_loss:
+            learned["obs"] = mapping(lambda leaf: leaf[burn_in:])(batch.obs)
+            learned["valid"] = ~learned.starts[1:] & learned.learns[:-1]
+            with self.policy.compute_dtype():
+                extra, own = self.extra_terms(now.features[:-1], learned, result.metrics)
+            result = result._replace(loss=result.loss + extra, metrics=result.metrics | own)
         return result
 
     def state_dict(self) -> StateDict:

@@ -3,7 +3,8 @@
 T time, B lanes; tensors are (T, B) unless noted. Row t is the action of time t. `reward`, `reset`,
 `terminal` and `truncated` at row t come from the world that followed it, t+1. `value` at row t is
 V_t, the value of the observation *before* the action; `last_value` (B,) is V_T, the value of the
-last observation.
+last observation. `gamma`, `lambda_` and the clips are numbers, or tensors () on the device, which
+may change between the replays of a graph.
 
 An action is *valid* if the environment took it: valid_t = not reset_{t+1}. After a terminal step
 the value is 0; after a truncated step returns bootstrap from V. No sum crosses an episode's end.
@@ -14,6 +15,7 @@ import torch
 from megastep import arrdict
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.networks.scan import linear_scan
+from megastep.coefficients import on_device
 from megastep.kernels.build.launch import launch
 
 
@@ -38,8 +40,8 @@ def gae(
     truncated: torch.Tensor,
     learns: torch.Tensor | None = None,
     *,
-    gamma: float,
-    lambda_: float,
+    gamma: float | torch.Tensor,
+    lambda_: float | torch.Tensor,
 ) -> arrdict.arrdict:
     """Computes generalised advantage estimates (GAE, Schulman et al. 2016, eq. 16).
 
@@ -58,9 +60,8 @@ def gae(
         return _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_)
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
-    discounts = torch.full_like(value, gamma * lambda_).masked_fill_(
-        terminal | truncated | reset, 0.0
-    )
+    ends = terminal | truncated | reset
+    discounts = (torch.ones_like(value) * (gamma * lambda_)).masked_fill(ends, 0.0)
     advantages = discounted_sum(delta, discounts)
     valid = ~reset if learns is None else ~reset & learns
     return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=valid)
@@ -80,10 +81,10 @@ def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_) -> arrdict.arr
         advantages=advantages,
         targets=targets,
         valid=valid,
+        gamma=on_device(gamma, value.device),
+        lambda_=on_device(lambda_, value.device),
         n_steps=n_steps,
         n_lanes=n_lanes,
-        gamma=gamma,
-        lambda_=lambda_,
     )
     return arrdict.arrdict(advantages=advantages, targets=targets, valid=valid)
 
@@ -97,10 +98,10 @@ def vtrace(
     terminal: torch.Tensor,
     truncated: torch.Tensor,
     *,
-    gamma: float,
-    lambda_: float = 1.0,
-    rho_clip: float = 1.0,
-    c_clip: float = 1.0,
+    gamma: float | torch.Tensor,
+    lambda_: float | torch.Tensor = 1.0,
+    rho_clip: float | torch.Tensor = 1.0,
+    c_clip: float | torch.Tensor = 1.0,
 ) -> arrdict.arrdict:
     """Computes V-trace returns and advantages of a policy pi from actions of another policy, mu
     (IMPALA, Espeholt et al. 2018, section 4.1).
@@ -153,9 +154,9 @@ def _vtrace_on_gpu(steps, value, last_value, settings) -> arrdict.arrdict:
         values=torch.cat([value, last_value[None]]),
         advantages=advantages,
         targets=targets,
+        **{name: on_device(number, value.device) for name, number in settings.items()},
         n_steps=n_steps,
         n_lanes=n_lanes,
-        **settings,
     )
     return arrdict.arrdict(advantages=advantages, targets=targets, valid=~steps["reset"])
 
@@ -168,7 +169,7 @@ def n_step_returns(
     terminal: torch.Tensor,
     truncated: torch.Tensor,
     *,
-    gamma: float,
+    gamma: float | torch.Tensor,
     n: int,
 ) -> torch.Tensor:
     """Computes n-step returns (T, B), G^n in

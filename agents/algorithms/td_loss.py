@@ -15,6 +15,7 @@ from megastep.agents.algorithms.masked_stats import effective_sample_size, maske
 from megastep.agents.networks.outputs import Output
 from megastep.agents.storage.rollout import without_last
 from megastep.arrdict import arrdict
+from megastep.coefficients import on_device
 from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Tree
 
@@ -29,7 +30,7 @@ _N_SUMS, _N_METRICS = (LIBRARY.constants[f"N_TD_{name}"] for name in ("SUMS", "M
 class Settings(NamedTuple):
     """The settings of the loss; see `R2D2`."""
 
-    gamma: float
+    gamma: float | torch.Tensor
     return_steps: int
     eta: float
 
@@ -123,6 +124,7 @@ class _FusedLoss(torch.autograd.Function):
             q=q.contiguous(),
             target_q=target_q.contiguous(),
             **tensors,
+            gamma=on_device(settings.gamma, q.device),
             values=values,
             d_q=d_q,
             priorities=priorities,
@@ -132,7 +134,6 @@ class _FusedLoss(torch.autograd.Function):
             n_agents=n_agents,
             n_choices=n_choices,
             n_return_steps=settings.return_steps,
-            gamma=settings.gamma,
             eta=settings.eta,
             eps=_EPS,
         )

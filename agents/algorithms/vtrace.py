@@ -13,7 +13,16 @@ import torch
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
+from megastep.agents.algorithms.learner import (
+    Coefficient,
+    GradientLearner,
+    OptimizerName,
+    Positive,
+    ScheduledCoefficient,
+    ScheduledFraction,
+    ScheduledPositive,
+    Warmup,
+)
 from megastep.agents.algorithms.masked_stats import (
     effective_sample_size,
     explained_variance,
@@ -39,6 +48,9 @@ if TYPE_CHECKING:
 # Metrics count larger ratios as e^20, so that their squares stay finite.
 _MAX_LOG_RATIO = 20.0
 _REPLAY = ReplaySettings()
+_TRACES = "gamma", "lambda_", "rho_clip", "c_clip"
+# Names that an `extra_loss` cannot have.
+_METRICS = "policy", "value", "entropy", "kl", "rho", "advantage", "clip_fraction"
 
 
 class VTrace(GradientLearner):
@@ -52,8 +64,9 @@ class VTrace(GradientLearner):
     Args:
         policy: a policy with a critic.
         n_steps: steps of a rollout, T.
-        lr: Adam's step size.
-        critic_lr: Adam's step size of the critic's own parameters, those under "critic."; it falls
+        lr: step size. Like `gamma`, `lambda_`, the clips and the coefficients of the loss it is a
+            number or a schedule.
+        critic_lr: step size of the critic's own parameters, those under "critic."; it falls
             with `lr`. None: `lr`.
         weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
         gamma: discount per step.
@@ -69,6 +82,11 @@ class VTrace(GradientLearner):
         max_grad_norm: longer gradients are scaled down to this norm.
         n_epochs: passes over a rollout.
         n_minibatches: minibatches per pass; lanes are divided among them.
+        optimizer: `adam` or `adamw`, one kernel on a GPU; `sgd`; or the import path of a class like
+            those of `torch.optim`.
+        warmup: updates over which the step size rises linearly to `lr`.
+        desired_kl: changes the step size after each minibatch so that its KL divergence stays near
+            this many nats (as in rsl_rl). None: it does not.
         lag: how many updates old the acting weights are. With 1 or 2, a GPU collects on a second
             stream while the learner updates (`storage.async_collector`).
         buffer: "rollout" learns from each rollout once; "replay" adds sequences of a replay buffer
@@ -106,20 +124,23 @@ class VTrace(GradientLearner):
         policy: Policy,
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: Positive = 1e-3,
+        lr: ScheduledPositive = 1e-3,
         critic_lr: Positive | None = None,
         weight_decay: Coefficient = 0.0,
-        gamma: Fraction = 0.995,
-        lambda_: Fraction = 0.95,
-        rho_clip: Positive = 1.0,
-        c_clip: Positive = 1.0,
+        gamma: ScheduledFraction = 0.995,
+        lambda_: ScheduledFraction = 0.95,
+        rho_clip: ScheduledPositive = 1.0,
+        c_clip: ScheduledPositive = 1.0,
         advantage_floor: Positive = 0.1,
-        entropy_coef: Coefficient = 0.01,
-        value_coef: Coefficient = 0.5,
-        auxiliary_coef: Coefficient = 0.5,
+        entropy_coef: ScheduledCoefficient = 0.01,
+        value_coef: ScheduledCoefficient = 0.5,
+        auxiliary_coef: ScheduledCoefficient = 0.5,
         max_grad_norm: Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
         n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
+        optimizer: OptimizerName = "adam",
+        warmup: Warmup = 0,
+        desired_kl: Positive | None = None,
         lag: Annotated[int, Field(ge=0, le=2)] = 0,
         buffer: Literal["rollout", "replay"] = "rollout",
         replay: ReplaySettings = _REPLAY,
@@ -136,11 +157,13 @@ class VTrace(GradientLearner):
                 f"with rollouts, so after their burn-in they must have n_steps={n_steps} steps; "
                 "leave replay.length out"
             )
-        super().__init__(policy, lr, max_grad_norm, graph, seed, critic_lr, weight_decay)
+        coefficients = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
+        coefficients |= dict(entropy_coef=entropy_coef, value_coef=value_coef)
+        coefficients["auxiliary_coef"] = auxiliary_coef
+        settings = critic_lr, weight_decay, optimizer, warmup, desired_kl, coefficients
+        super().__init__(policy, lr, max_grad_norm, graph, seed, *settings)
         self.critic, self.n_steps, self.lag = policy.critic, n_steps, lag
-        self.traces = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
-        self.advantage_floor, self.entropy_coef = advantage_floor, entropy_coef
-        self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
+        self.advantage_floor = advantage_floor
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.replay_settings = replay if buffer == "replay" else None
         self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
@@ -196,7 +219,9 @@ class VTrace(GradientLearner):
             order = random_order(rollout.n_lanes, generator, self.device)
             for lanes in order.tensor_split(self.n_minibatches):
                 loss, metrics, estimates = self._losses(self._batch(rollout, lanes), len(lanes))
-                self.steps.backward(loss, metrics, estimates.valid.sum())
+                kl = self.steps.backward(loss, metrics, estimates.valid.sum())["kl"]
+                if self.desired_kl is not None:
+                    self.steps.follow_kl(kl, self.desired_kl)
                 self.steps.take(is_enabled)
                 all_estimates.append(estimates)
         # Statistics change only now, so the whole update saw the normalisation that acted. One row
@@ -228,16 +253,16 @@ class VTrace(GradientLearner):
         Args:
             n_fresh: number of lanes from the rollout; the others are replayed.
         """
-        policy, privileged, errors = self.policy, batch.get("privileged"), None
+        policy, privileged, numbers = self.policy, batch.get("privileged"), self.coefficients
+        reset, weight = batch.starts[1:], batch.weight
+        batch["valid"] = valid = ~reset & batch.learns[:-1]
+        extra, own = None, {}
         with policy.compute_dtype():  # one, so that weights are cast once
             now = policy.unroll(batch.obs, batch.starts, batch.state)
             logprobs, entropies = policy.output.terms(without_last(now.logits), batch.actions)
             value = policy.value(now.features, privileged)
-            if policy.privileged_space:
-                features = without_last(now.features)
-                errors = policy.prediction_error(features, without_last(privileged))
-        reset, weight = batch.starts[1:], batch.weight
-        valid = ~reset & batch.learns[:-1]
+            if policy.privileged_space or self.has_extra_loss:
+                extra, own = self.extra_terms(without_last(now.features), batch, _METRICS)
         # traces pass through invalid steps as if the current policy had acted there
         log_ratio = (logprobs.detach() - batch.logprobs).masked_fill(~valid, 0.0)
         estimates = returns.vtrace(
@@ -245,7 +270,7 @@ class VTrace(GradientLearner):
             batch.reward,
             *(value[:-1].detach(), value[-1].detach()),
             *(reset, batch.terminal, batch.truncated),
-            **self.traces,
+            **{name: numbers[name] for name in _TRACES},
         )
         estimates["valid"] = valid
         scale = self.critic.output.scale
@@ -263,12 +288,11 @@ class VTrace(GradientLearner):
         )
         loss = (
             metrics["policy"]
-            + self.value_coef * metrics["value"]
-            - self.entropy_coef * metrics["entropy"]
+            + numbers["value_coef"] * metrics["value"]
+            - numbers["entropy_coef"] * metrics["entropy"]
         )
-        if errors is not None:
-            metrics["auxiliary"] = masked_mean(errors, valid)
-            loss = loss + self.auxiliary_coef * metrics["auxiliary"]
+        if extra is not None:
+            loss, metrics = loss + extra, metrics | own
         if self.replay_buffer is not None:
             replayed = self._ratio_metrics(log_ratio[:, n_fresh:], valid[:, n_fresh:])
             metrics |= {f"replayed_{name}": value for name, value in replayed.items()}
@@ -281,7 +305,7 @@ class VTrace(GradientLearner):
     def _ratio_metrics(self, log_ratio, valid) -> dict[str, torch.Tensor]:
         """Returns how far the current policy is from the one that acted, by several measures."""
         log_ratio = log_ratio.clamp(max=_MAX_LOG_RATIO)
-        ratio, rho_clip = log_ratio.exp(), self.traces["rho_clip"]
+        ratio, rho_clip = log_ratio.exp(), self.coefficients["rho_clip"]
         return dict(
             kl=masked_mean(ratio - 1 - log_ratio, valid),
             rho=masked_mean(ratio.clamp(max=rho_clip), valid),

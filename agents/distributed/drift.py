@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 
@@ -17,8 +17,12 @@ class DriftError(RuntimeError):
     """The ranks' weights differ, so they no longer train one policy."""
 
 
-def first_difference(policy: torch.nn.Module) -> str | None:
+def first_difference(policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()) -> str | None:
     """Compares the weights of all ranks. Synchronises, and waits for the other ranks.
+
+    Args:
+        policy: its parameters and buffers are compared.
+        extra: what else a learner trains.
 
     Returns:
         The first parameter or buffer with different bits, such as `policy.core.bias differs on rank
@@ -27,6 +31,7 @@ def first_difference(policy: torch.nn.Module) -> str | None:
     if n_ranks() == 1:
         return None
     tensors = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
+    tensors |= {f"extra.{i}": tensor for i, tensor in enumerate(extra)}
     with waiting():
         rows = all_gather(checksums(tensors.values())).T.tolist()
     for name, sums in zip(tensors, rows, strict=True):
@@ -35,13 +40,13 @@ def first_difference(policy: torch.nn.Module) -> str | None:
     return None
 
 
-def check_drift(policy: torch.nn.Module) -> None:
+def check_drift(policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()) -> None:
     """Checks that all ranks have the same weights. Synchronises, and waits for the other ranks.
 
     Raises:
         DriftError: on all ranks, naming the first parameter or buffer that differs.
     """
-    if difference := first_difference(policy):
+    if difference := first_difference(policy, extra):
         raise DriftError(
             f"The ranks drift apart: {difference}; a learner averages gradients with "
             "megastep.agents.distributed.pooling.average_gradients"

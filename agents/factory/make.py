@@ -47,6 +47,8 @@ PROBE = 65
 LARGE, FEW = 2**28, 4096
 #: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
+#: Stands for a learner of a user's, where it does not learn.
+UNNEEDED = "megastep.agents.algorithms.ppo:PPO"
 #: What the library raises for bad arguments, files and devices, and for too little memory.
 KINDS = (
     ValueError,
@@ -352,9 +354,12 @@ def in_env(bot: PolicyLike, settings: Env, env: types.Env) -> PolicyLike:
 
 def config_of(loaded: checkpoint.Checkpoint) -> Train:
     """Returns the settings that a checkpoint was trained with. UserError if they cannot be used."""
+    train = loaded.config["train"] | {"logger": {}, "callbacks": []}
+    # who plays needs no learner and no loggers, and classes of another user's may not be here
+    if not str(train["learner"]["name"]).startswith("megastep."):
+        train["learner"] = {"name": UNNEEDED}
     with user_errors(f"{loaded.path} cannot be used: ", (ConfigErrors,)):
-        # without loggers: who plays needs none, and a class of another user's may not be here
-        return check.check(Train, loaded.config["train"] | {"logger": {}})
+        return check.check(Train, train)
 
 
 def spaces_of(env: types.Env) -> dict[str, str]:

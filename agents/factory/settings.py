@@ -19,6 +19,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_
 
 from megastep.agents.factory import components
 from megastep.imports import import_object
+from megastep.schedules import Scheduled
 from megastep.settings import (
     AtMost,
     closest,
@@ -318,6 +319,23 @@ def too_large(group: Any, tree: object) -> Iterator[tuple[str, str]]:
                 yield name, f"{value} is more than {limit.key}={most}"
 
 
+def schedules_of(cfg: "Train") -> list[str]:
+    """Returns the keys of settings that have a schedule."""
+    return [
+        f"{group}.{name}"
+        for group in ("learner", "env")
+        for name, field in getattr(cfg, group).__pydantic_fields__.items()
+        if any(isinstance(extra, Scheduled) for extra in field.metadata)
+        and not isinstance(getattr(getattr(cfg, group), name), float)
+    ]
+
+
+def changes_lr(learner: "Learner") -> bool:
+    """Returns whether the learning rate has a schedule, or follows the KL divergence."""
+    is_constant = isinstance(getattr(learner, "lr", 0.0), (int, float))
+    return not is_constant or getattr(learner, "desired_kl", None) is not None
+
+
 # ---- Scripts ----
 
 
@@ -410,8 +428,22 @@ class Train(Common):
             and "opponents change with every update, so nothing can be collected ahead of it; use "
             "learner.lag=0, or no opponents",
             "learner.anneal": over in ("samples", "seconds")
-            and getattr(self, over) is None
-            and f"is {over}, and no {over}= is given for the learning rate to fall over",
+            and (
+                (
+                    getattr(self, over) is None
+                    and f"is {over}, and no {over}= is given for the learning rate to fall over"
+                )
+                or (
+                    changes_lr(self.learner)
+                    and f"is {over}, but learner.lr is a schedule or follows learner.desired_kl; "
+                    "leave learner.anneal out"
+                )
+            ),
+            **{
+                key: "is a schedule over the budget; give samples= or seconds="
+                for key in schedules_of(self)
+                if (self.samples, self.seconds, self.rerun, self.resume) == (None,) * 4
+            },
             **{
                 f"more_{name}": self.resume is None
                 and getattr(self, f"more_{name}") is not None

@@ -218,13 +218,19 @@ def budget_of(
         if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
             assert loaded.state is not None
             recorded = recorded[: loaded.state["updates"]]
-    return budget.Budget(*limits, recorded, is_rerun=cfg.rerun is not None)
+    is_scheduled = bool(settings.schedules_of(cfg))
+    return budget.Budget(*limits, recorded, cfg.rerun is not None, is_scheduled)
 
 
 def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
     """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
-    limited, else by never; by never if the learner has no `set_lr`.
+    limited, else by never; by never if the learner has no `set_lr`, or lr does not stay constant.
     """
-    limits = [n for n in ("samples", "seconds") if has_set_lr and getattr(cfg, n) is not None]
+    changes_itself = settings.changes_lr(cfg.learner)
+    limits = [
+        name
+        for name in ("samples", "seconds")
+        if has_set_lr and not changes_itself and getattr(cfg, name) is not None
+    ]
     anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
     return settings.changed(cfg, learner=settings.changed(cfg.learner, anneal=anneal))

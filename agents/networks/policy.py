@@ -92,7 +92,7 @@ class Policy(nn.Module):
         seed: int = 1,
     ):
         super().__init__()
-        critic = None if output == "duelling" else critic
+        critic, self.seed = None if output == "duelling" else critic, seed
         self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None
         self.generator = SeededGenerator(stream_seed(seed, "policy"))
@@ -270,31 +270,35 @@ class Policy(nn.Module):
         actions: Tree,
         privileged: Tree | None = None,
         lanes: torch.Tensor | None = None,
+        has_errors: bool = True,
     ) -> arrdict:
         """Returns what a loss needs of a sequence, (T, B) float32 each: `logprobs` of the actions,
         `entropies` of the policy, `values`, and without a `privileged_space` None, with one the
-        `errors` of `prediction_error`. On a GPU the heads are computed together, if they can.
+        `errors` of `prediction_error`; and `features` (T, B, width). On a GPU the heads are
+        computed together, if they can.
 
         Args:
             obs: as for `unroll`, as `reset`, `state` and `lanes`.
             actions: (T, B, ...); (T, M, ...) with `lanes`.
             privileged: as for `value`.
+            has_errors: false leaves the errors out, None.
         """
-        names = "logprobs", "entropies", "errors", "values"
+        names = "logprobs", "entropies", "errors", "values", "features"
         with self.compute_dtype():
             features, _ = self._features(obs, reset, state, lanes)
             encoded = errors = None
             if self.privileged_space:
                 encoded = self._critic.encode(privileged, lanes)
-                if joint_heads.fit(self.output, self._critic, features, encoded):
+                if has_errors and joint_heads.fit(self.output, self._critic, features, encoded):
                     output = cast(MultiDiscreteOutput, self.output)
                     heads_of = output, self._critic, self.prediction
                     terms = joint_heads.joint_terms(*heads_of, features, encoded, actions)
-                    return arrdict(zip(names, terms, strict=True))
-                errors = self._prediction_error(features, encoded)
+                    return arrdict(zip(names, (*terms, features), strict=True))
+                if has_errors:
+                    errors = self._prediction_error(features, encoded)
             logprobs, entropies = self.output.terms(self.output(features), actions)
             values = self._critic.from_encoded(features, encoded)
-        return arrdict(zip(names, (logprobs, entropies, errors, values), strict=True))
+        return arrdict(zip(names, (logprobs, entropies, errors, values, features), strict=True))
 
     def _prediction_error(self, features, encoded) -> torch.Tensor:
         target = encoded[..., : self._critic.intake.n_features].detach()

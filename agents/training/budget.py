@@ -22,6 +22,7 @@ class Budget:
         recorded: the factors of the learning rate in the first updates, as an earlier run of the
             same configuration recorded them (`annealing`). They replace the clock's.
         is_rerun: the run ends after the updates that are recorded.
+        is_scheduled: settings follow the budget, even if the learning rate does not.
     """
 
     samples: int | None = None
@@ -29,6 +30,7 @@ class Budget:
     anneal: str = "never"
     recorded: Sequence[float] = ()
     is_rerun: bool = False
+    is_scheduled: bool = False
 
     @property
     def is_limited(self) -> bool:
@@ -47,12 +49,17 @@ class Budget:
         return min(_fraction_left(samples, self.samples), seconds_left)
 
     def lr_fraction(self, updates: int, samples: int, seconds: float) -> float:
-        """Returns the factor for the learning rate in the next update, from 1 to 0."""
+        """Returns the fraction of the budget that is left for the next update, from 1 to 0: the
+        factor of the learning rate if it is annealed, and what schedules follow. Else 1.
+        """
         if updates < len(self.recorded) and not math.isnan(self.recorded[updates]):
             return self.recorded[updates]
-        if self.anneal == "never":
-            return 1.0
-        if self.anneal == "samples":
+        over = self.anneal
+        if over == "never":
+            if not self.is_scheduled:
+                return 1.0
+            over = "samples" if self.samples is not None else "seconds"
+        if over == "samples":
             return max(0.0, _fraction_left(samples, self.samples))
         return max(0.0, _fraction_left(seconds, self.seconds))
 

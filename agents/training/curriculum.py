@@ -256,13 +256,12 @@ class PLR(Curriculum):
     ):
         super().__init__(env, rollout, sources, lr, every)
         self.score, self.temperature, self.mix = score, temperature, staleness
-        options = with_defaults(learner, LearnerOptions)
+        self.learner, options = learner, with_defaults(learner, LearnerOptions)
         if rollout.values is None or options.gamma is None or options.lambda_ is None:
             raise ValueError(
                 "curriculum=plr needs values at the time of acting, which learner=ppo stores; use "
                 "curriculum=sfl"
             )
-        self.gamma, self.lambda_ = options.gamma, options.lambda_
 
     def probabilities(self) -> torch.Tensor:
         scores = torch.where(self.n_episodes > 0, self.scores, torch.inf)
@@ -273,7 +272,9 @@ class PLR(Curriculum):
 
     def _rescore(self, rollout, n, homes, ended) -> None:
         steps = rollout.transitions()
-        advantages = returns.gae(**steps, gamma=self.gamma, lambda_=self.lambda_).advantages
+        options = with_defaults(self.learner, LearnerOptions)
+        assert options.gamma is not None and options.lambda_ is not None
+        advantages = returns.gae(**steps, gamma=options.gamma, lambda_=options.lambda_).advantages
         is_absolute = self.score == "absolute"
         magnitudes = advantages.abs() if is_absolute else advantages.clamp(min=0.0)
         # of the episode so far: cumulative sums, minus those at the last episode's end

@@ -14,6 +14,7 @@ from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
 from megastep.agents.distributed.process_group import counts, n_ranks, rank, unhurried, waiting
 from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
+from megastep.agents.errors import user_errors
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.runs.saver import NoSaver
 from megastep.agents.training.budget import Budget, Stopwatch, evaluation_in, reaches
@@ -137,7 +138,14 @@ class Trainer:
         self.opponents = optional(env, "opponent_pool")
         self.annealing_record, self.profiler = annealing_record, profiler
         self.callbacks, self.is_stopped = Callbacks(callbacks), False
-        self.set_lr = with_defaults(learner, LearnerOptions).set_lr
+        options = with_defaults(learner, LearnerOptions)
+        self.set_lr, self.read_lr = options.set_lr, options.read_lr
+        self.warmup, self.extra = options.warmup, options.extra
+        self.coefficients = [*optional(env, "coefficients")]
+        self.has_env_schedules = any(one.schedules for one in self.coefficients)
+        if options.coefficients is not None:
+            self.coefficients.append(options.coefficients)
+        self.scheduled: dict[str, float] = {}
         if budget.anneal != "never" and not self.set_lr:
             raise ValueError(
                 f"{type(learner).__name__} has no set_lr(lr), so its learning rate cannot fall "
@@ -206,6 +214,7 @@ class Trainer:
                 if plan.saves and self.nonfinite_guard.check(self.rollout):
                     self.save_checkpoint()
                 self.start("collect")
+                self.follow_schedules(1 - plan.lr_fraction)
                 self.rollout = self.collect()
                 self.callbacks("on_rollout", self, self.rollout)
                 self.start("update")
@@ -295,9 +304,7 @@ class Trainer:
         rollout = cast("Rollout", self.rollout)
         if self.annealing_record is not None:
             self.annealing_record.append(lr_fraction)
-        if self.set_lr and self.budget.anneal != "never":
-            self.lr = self.learner.lr * lr_fraction
-            self.set_lr(self.lr)
+        self._set_lr(lr_fraction)
         losses = self.learner.update(rollout)
         self.start("rest")
         self.episode_stats.add(
@@ -323,6 +330,34 @@ class Trainer:
             self.timer.pop()
         return losses
 
+    def follow_schedules(self, fraction: float) -> None:
+        """Sets what has a schedule, of the learner and of the environment.
+
+        Args:
+            fraction: of the budget that is spent.
+
+        Raises:
+            UserError: a schedule of the user's fails.
+        """
+        if self.has_env_schedules:
+            self.wait_for_collector()  # which reads them
+        for one in self.coefficients:
+            if one.schedules:
+                with user_errors("", (ValueError,)):
+                    self.scheduled |= one.follow(fraction)
+
+    def _set_lr(self, lr_fraction) -> None:
+        """Sets the learning rate of an update, if it changes and the learner does not do so."""
+        is_annealed = self.budget.anneal != "never"
+        if not self.set_lr or self.read_lr:
+            return
+        if is_annealed or self.warmup or "lr" in self.scheduled:
+            lr = self.scheduled.get("lr", self.learner.lr) * (lr_fraction if is_annealed else 1)
+            if self.updates < self.warmup:
+                lr *= (self.updates + 1) / self.warmup
+            self.lr = lr
+            self.set_lr(lr)
+
     def log(self, losses: dict[str, torch.Tensor]) -> None:
         """Writes the metrics of all ranks since the last report. Synchronises.
 
@@ -334,6 +369,7 @@ class Trainer:
             updates: updates so far.
             lr: learning rate.
             anneal: what the learning rate falls with.
+            schedule/NAME: a setting of the learner or the environment that has a schedule.
             eval/NAME: what an evaluation in training measured: `return`, `length`, and each metric
                 of the environment, means over episodes in unseen homes.
             perf/rate: samples per second since the last report.
@@ -351,7 +387,7 @@ class Trainer:
         """
         self.wait_for_collector()
         optional(self.env, "check")()
-        check_drift(self.policy)
+        check_drift(self.policy, self.extra)
         loss_values = [torch.as_tensor(loss, device=self.env.device) for loss in losses.values()]
         loss_values = torch.stack(loss_values).tolist() if losses else []
         loss_values = dict(zip(losses, loss_values, strict=True))
@@ -374,9 +410,13 @@ class Trainer:
             n_restarts = torch.tensor([n_restarts], device=self.env.device)
             stats["episode/restarts"] = int(sum_over_ranks(n_restarts))
         self.latest_stats.update(stats)
+        if self.read_lr:
+            self.lr = self.read_lr()
+        schedules = (name for name in self.scheduled if name != "lr")
         metrics = {
             **stats,
             **means,
+            **{f"schedule/{name}": self.scheduled[name] for name in schedules},
             "updates": self.updates,
             "lr": self.lr,
             "anneal": self.budget.anneal,

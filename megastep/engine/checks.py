@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from megastep.coefficients import on_device
 from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor
 from megastep.types import is_stored
@@ -66,6 +67,16 @@ def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: 
         range_ = range_ if min > -math.inf else "that is finite"
         raise ValueError(f"{name} must be {kind} {range_}{hint}, but {_described(value)} was given")
     return float(value)
+
+
+def weight(name: str, value: Any, device: torch.device) -> torch.Tensor:
+    """Returns a finite number, or a tensor () float32 with one, as such a tensor, which a kernel
+    reads when it runs. TypeError or ValueError for anything else.
+    """
+    if isinstance(value, torch.Tensor):
+        address(name, value, (), torch.float32, device)
+        return value
+    return on_device(number(name, value, -math.inf, math.inf), device)
 
 
 def flag(name: str, value: object) -> bool:

@@ -1,7 +1,7 @@
 """Members that the environments share."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 
@@ -9,11 +9,15 @@ from megastep import engine
 from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
 from megastep.modules import RandomSpawns
+from megastep.schedules import Number, Scheduled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DisplayedEnv", "SceneryEnv", "images"]
+__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "images"]
+
+#: Weight of a part of a reward, a number or a schedule.
+Weight = Annotated[Number, Scheduled(ge=0, le=1000)]
 
 
 def images(view: engine.Observation) -> arrdict:

@@ -69,9 +69,15 @@ CASES = {
     "gymnasium": [
         *("env=gymnasium", "env.id=CartPole-v1", *SMALL[1:], "learner.n_minibatches=2"),
     ],
+    "hooks": [
+        *tiny.TINY,
+        *("learner=tests.helpers.headed:Headed", "learner.optimizer=torch.optim:RMSprop"),
+        *("learner.entropy_coef={from:0.02,to:0.001}", "learner.warmup=9"),
+        *("learner.lambda_=tests.helpers.headed:falling", "env=pointgoal", "env.cost={from:0,to:1}"),
+    ],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[2:]],
 }
-FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger", "beta", "plr"
+FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger", "beta", "plr", "hooks"
 
 
 class Drifting:

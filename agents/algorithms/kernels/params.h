@@ -15,10 +15,10 @@ struct GaeParams {
     float* advantages;               // (T, B)
     float* targets;                  // (T, B)
     unsigned char* valid;            // (T, B)
+    const float* gamma;              // ()
+    const float* lambda_;            // ()
     int n_steps;
     int n_lanes;
-    float gamma;
-    float lambda_;
 };
 
 struct OrderParams {
@@ -36,12 +36,12 @@ struct VtraceParams {
     const unsigned char* truncated;  // (T, B)
     float* advantages;               // (T, B)
     float* targets;                  // (T, B)
+    const float* gamma;              // ()
+    const float* lambda_;            // ()
+    const float* rho_clip;           // ()
+    const float* c_clip;             // ()
     int n_steps;
     int n_lanes;
-    float gamma;
-    float lambda_;
-    float rho_clip;
-    float c_clip;
 };
 
 struct PpoLossParams {
@@ -63,12 +63,12 @@ struct PpoLossParams {
     // (P, n_blocks, N_SUMS), shares of means: policy, value, entropy, kl, clip_fraction, auxiliary,
     // loss
     float* sums;
+    const float* clip;            // (P)
+    const float* value_coef;      // (P)
+    const float* entropy_coef;    // (P)
+    const float* auxiliary_coef;  // (P)
     int n_rows;
-    float clip;
     float value_clip;
-    float value_coef;
-    float entropy_coef;
-    float auxiliary_coef;
 };
 
 // M sequences of T steps after the burn-in, A agents per lane, n choices.
@@ -87,12 +87,12 @@ struct TdLossParams {
     float* d_q;                      // (P, T + 1, M, A, n), of the sum over valid steps
     float* priorities;               // (P, M)
     float* sums;  // (P, n_blocks, 7): loss, |error|, q, valid steps; age, weight, weight^2
+    const float* gamma;  // (P)
     int n_steps;
     int n_sequences;
     int n_agents;
     int n_choices;
     int n_return_steps;
-    float gamma;
     float eta;
     float eps;  // of `returns.rescale`
 };

@@ -10,12 +10,14 @@ KERNEL ppo_loss(PpoLossParams p) {
     int of_policy = blockIdx.x * blockDim.x + threadIdx.x;
     long long policy = blockIdx.y, row = policy * p.n_rows + of_policy;
     float sums[N_SUMS] = {};
+    float clip = p.clip[policy], value_coef = p.value_coef[policy];
+    float entropy_coef = p.entropy_coef[policy], auxiliary_coef = p.auxiliary_coef[policy];
     if (of_policy < p.n_rows) {
         float weight = p.valid[row] ? 1.f / (float)max(p.n_valid[policy], 1ll) : 0.f;
         float d_logprob = 0.f, d_value = 0.f;
         if (p.valid[row]) {
             float log_ratio = p.logprobs[row] - p.old_logprobs[row], ratio = expf(log_ratio);
-            float clipped = fminf(fmaxf(ratio, 1.f - p.clip), 1.f + p.clip);
+            float clipped = fminf(fmaxf(ratio, 1.f - clip), 1.f + clip);
             float advantage = p.advantages[row], surrogate = ratio * advantage;
             float scale = p.value_scale[policy], error = (p.values[row] - p.targets[row]) / scale;
             // a NaN fails both comparisons and stays
@@ -33,23 +35,23 @@ KERNEL ppo_loss(PpoLossParams p) {
                 }
             }
             d_logprob = is_clipped ? 0.f : -surrogate * weight;
-            d_value = is_limited ? 0.f : p.value_coef * 2.f * error / scale * weight;
+            d_value = is_limited ? 0.f : value_coef * 2.f * error / scale * weight;
             sums[0] = -(is_clipped ? clipped * advantage : surrogate);
             sums[1] = squared;
             sums[2] = p.entropies[row];
             sums[3] = ratio - 1.f - log_ratio;
             sums[4] = ratio != clipped ? 1.f : 0.f;
             sums[5] = p.errors ? p.errors[row] : 0.f;
-            sums[6] = sums[0] + p.value_coef * sums[1] - p.entropy_coef * sums[2] +
-                      p.auxiliary_coef * sums[5];
+            sums[6] = sums[0] + value_coef * sums[1] - entropy_coef * sums[2] +
+                      auxiliary_coef * sums[5];
             for (int i = 0; i < N_SUMS; i++)
                 sums[i] *= weight;
         }
         p.d_logprobs[row] = d_logprob;
         p.d_values[row] = d_value;
-        p.d_entropies[row] = -p.entropy_coef * weight;
+        p.d_entropies[row] = -entropy_coef * weight;
         if (p.errors)
-            p.d_errors[row] = p.auxiliary_coef * weight;
+            p.d_errors[row] = auxiliary_coef * weight;
     }
     __shared__ float of_warps[BLOCK / WARP][N_SUMS];
     for (int i = 0; i < N_SUMS; i++) {

@@ -28,6 +28,7 @@ struct Tensors {
     const long long* actions;
     const unsigned char *starts, *learns, *terminal, *truncated;
     float *values, *d_q;
+    float gamma;
 };
 
 DEVICE Tensors of_policy(const TdLossParams& p, long long policy) {
@@ -42,7 +43,8 @@ DEVICE Tensors of_policy(const TdLossParams& p, long long policy) {
             p.terminal + rows,
             p.truncated + rows,
             p.values + with_last,
-            p.d_q + with_last * n_outputs};
+            p.d_q + with_last * n_outputs,
+            p.gamma[policy]};
 }
 
 // The target network's value of the online network's best actions, in units of reward.
@@ -66,7 +68,7 @@ DEVICE float n_step_return(const TdLossParams& p, const Tensors& tensors, int t,
         if (tensors.starts[next])
             return total + discount * tensors.values[row];
         total += discount * tensors.reward[row];
-        discount *= p.gamma;
+        discount *= tensors.gamma;
         if (tensors.terminal[row])
             return total;
         if (tensors.truncated[row] || s + 1 == t + p.n_return_steps || s + 1 == p.n_steps)

@@ -10,19 +10,20 @@ KERNEL vtrace(VtraceParams p) {
         return;
     float next_value = p.values[p.n_steps * (long long)p.n_lanes + lane];
     float next_target = next_value, correction = 0.f;  // of the value, v - V
+    float gamma = *p.gamma, lambda_ = *p.lambda_, rho_clip = *p.rho_clip, c_clip = *p.c_clip;
 #pragma unroll 4
     for (int t = p.n_steps - 1; t >= 0; t--) {
         long long at = t * (long long)p.n_lanes + lane;
         float value = p.values[at], reward = p.reward[at], ratio = expf(p.log_ratio[at]);
         bool reset = p.reset[at], terminal = p.terminal[at], truncated = p.truncated[at];
         // a NaN stays
-        float rho = ratio > p.rho_clip ? p.rho_clip : ratio;
-        float c = ratio > p.c_clip ? p.c_clip : ratio;
-        float delta = rho * (reward + p.gamma * (terminal ? 0.f : next_value) - value);
+        float rho = ratio > rho_clip ? rho_clip : ratio;
+        float c = ratio > c_clip ? c_clip : ratio;
+        float delta = rho * (reward + gamma * (terminal ? 0.f : next_value) - value);
         float beyond = terminal ? 0.f : truncated ? next_value : next_target;
-        p.advantages[at] = reset ? 0.f : rho * (reward + p.gamma * beyond - value);
+        p.advantages[at] = reset ? 0.f : rho * (reward + gamma * beyond - value);
         bool ends = terminal || truncated || reset;
-        correction = (reset ? 0.f : delta) + (ends ? 0.f : p.gamma * p.lambda_ * c * correction);
+        correction = (reset ? 0.f : delta) + (ends ? 0.f : gamma * lambda_ * c * correction);
         next_target = value + correction;
         p.targets[at] = next_target;
         next_value = value;

@@ -12,6 +12,7 @@ from pydantic import Field
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
 from megastep.arrdict import arrdict
+from megastep.coefficients import Coefficients
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
@@ -19,6 +20,7 @@ from megastep.envs.common import SceneryEnv
 from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import MAX_AGENTS, TALLY_ROWS, deathmatch_step, privileged_size
 from megastep.scene import scenery, spread
+from megastep.schedules import Number, Scheduled
 from megastep.settings import MAX_ENVS, checked
 from megastep.types import Geometries
 
@@ -33,6 +35,7 @@ SPAWNS_PER_AGENT = 16  # at least, so that one is likely hidden from the other a
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Reward = Annotated[float, Field(ge=-1000, le=1000)]
+ScheduledReward = Annotated[Number, Scheduled(ge=-1000, le=1000)]
 
 
 class Deathmatch(SceneryEnv):
@@ -82,7 +85,8 @@ class Deathmatch(SceneryEnv):
         drain: health lost per second.
         health_per_hit: health gained by an agent that hits.
         limit: steps after which an episode is truncated.
-        hit_reward: reward per hit, a step with another agent at the middle ray of the view.
+        hit_reward: reward per hit, a step with another agent at the middle ray of the view. As the
+            next four it is a number or a schedule.
         wound_cost: cost per wound, a hit received.
         kill_reward: reward per kill.
         death_cost: cost of a death, also of one by drain.
@@ -119,11 +123,11 @@ class Deathmatch(SceneryEnv):
         drain: Fraction = 0.0,
         health_per_hit: Fraction = 0.0,
         limit: Annotated[int, Field(ge=1, le=10**6)] = 500,
-        hit_reward: Reward = 1.0,
-        wound_cost: Reward = 1.0,
-        kill_reward: Reward = 0.0,
-        death_cost: Reward = 0.0,
-        aim_reward: Reward = 0.0,
+        hit_reward: ScheduledReward = 1.0,
+        wound_cost: ScheduledReward = 1.0,
+        kill_reward: ScheduledReward = 0.0,
+        death_cost: ScheduledReward = 0.0,
+        aim_reward: ScheduledReward = 0.0,
         search_reward: Reward = 0.0,
         hearing: Annotated[float, Field(ge=0, le=1000)] = 0.0,
         res: Annotated[int, Field(ge=1, le=1024)] = 512,
@@ -165,13 +169,17 @@ class Deathmatch(SceneryEnv):
             drain=drain / fps,
             health_per_hit=health_per_hit,
             limit=limit,
+            hearing=hearing,
+        )
+        self.weights = Coefficients(
+            self.device,
             hit_reward=hit_reward,
             wound_cost=wound_cost,
             kill_reward=kill_reward,
             death_cost=death_cost,
             aim_reward=aim_reward,
-            hearing=hearing,
         )
+        self.coefficients, self.has_aim = (self.weights,), aim_reward != 0
         words = -(-homes.layouts.max_texels // 32) if search_reward else 0
         bytes_per_lane = 8 * pixels + 4 * n_privileged * privileged + 4 * words + 128
         engine.fit(n_envs, n_agents * bytes_per_lane, self.device)
@@ -224,6 +232,7 @@ class Deathmatch(SceneryEnv):
             self.ended,
             privileged=self.privileged_space is not None,
             **self.rules,
+            **self.weights.tensors,
         )
         reward = step.reward
         if self.seen is not None:
@@ -279,7 +288,7 @@ class Deathmatch(SceneryEnv):
             self.subsample,
             imu=True,
             centre_line=True,
-            agent_ray=self.rules["aim_reward"] != 0,
+            agent_ray=self.has_aim,
             **search,
         )
 

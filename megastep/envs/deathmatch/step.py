@@ -59,11 +59,11 @@ def deathmatch_step(
     drain: float = 0.0,
     health_per_hit: float = 0.0,
     limit: int = 1000,
-    hit_reward: float = 1.0,
-    wound_cost: float = 1.0,
-    kill_reward: float = 0.0,
-    death_cost: float = 0.0,
-    aim_reward: float = 0.0,
+    hit_reward: float | torch.Tensor = 1.0,
+    wound_cost: float | torch.Tensor = 1.0,
+    kill_reward: float | torch.Tensor = 0.0,
+    death_cost: float | torch.Tensor = 0.0,
+    aim_reward: float | torch.Tensor = 0.0,
     hearing: float = 0.0,
     privileged: bool = False,
 ) -> DeathmatchStep:
@@ -84,7 +84,7 @@ def deathmatch_step(
         drain: health lost in every step.
         health_per_hit: health gained by an agent that hits.
         limit: steps after which an episode is truncated.
-        hit_reward: per hit.
+        hit_reward: per hit; as the other rewards a number, or a tensor () on the device.
         wound_cost: per hit received.
         kill_reward: per kill, shared among the agents that hit the target in that step.
         death_cost: per death.
@@ -109,13 +109,15 @@ def deathmatch_step(
     rewards = dict(hit_reward=hit_reward, wound_cost=wound_cost, kill_reward=kill_reward)
     rewards |= dict(death_cost=death_cost, aim_reward=aim_reward)
     not_negative = dict(health_rules, hearing=hearing)
-    for name, value in {**not_negative, **rewards}.items():
+    for name, value in not_negative.items():
         checks.number(name, value, -math.inf, math.inf)
+    rewards = {name: checks.weight(name, value, device) for name, value in rewards.items()}
     for name, value in not_negative.items():
         if value < 0:
             raise ValueError(f"{name} must be at least 0, not {value:g}")
     agent_ray, poses = 0, dict(positions=0, angles=0)
-    if aim_reward:
+    is_scheduled = isinstance(aim_reward, torch.Tensor)
+    if view.agent_ray is not None if is_scheduled else aim_reward:
         agent_ray = checks.address("view.agent_ray", view.agent_ray, lanes, torch.int32, device)
     if checks.flag("privileged", privileged) or hearing:
         poses = state_params(scenery, agents, "positions", "angles")

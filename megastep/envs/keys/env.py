@@ -9,9 +9,10 @@ from pydantic import Field
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
 from megastep.arrdict import arrdict
+from megastep.coefficients import Coefficients
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.envs.common import SceneryEnv, images
+from megastep.envs.common import SceneryEnv, Weight, images
 from megastep.envs.keys.episodes import episodes
 from megastep.envs.keys.step import keys_step
 from megastep.modules.objects import REACH
@@ -74,8 +75,8 @@ class Keys(SceneryEnv):
         device: where the tensors are. Default: a GPU if there is one.
         doors: shut doors with a key, at most; a home with fewer parts has fewer.
         limit: steps after which an episode is truncated.
-        key_reward: reward for a key that is picked up.
-        door_reward: reward for a door that is opened.
+        key_reward: reward for a key that is picked up, a number or a schedule.
+        door_reward: reward for a door that is opened, likewise.
         res: rays per camera.
         subsample: rays per pixel; divides ``res``.
         fov: field of view of a camera, degrees.
@@ -101,8 +102,8 @@ class Keys(SceneryEnv):
         device: torch.device | str | None = None,
         doors: Annotated[int, Field(ge=1, le=MAX_DOORS)] = 3,
         limit: Annotated[int, Field(ge=1, le=10**6)] = 1000,
-        key_reward: Annotated[float, Field(ge=0, le=1000)] = 0.1,
-        door_reward: Annotated[float, Field(ge=0, le=1000)] = 0.3,
+        key_reward: Weight = 0.1,
+        door_reward: Weight = 0.3,
         res: Annotated[int, Field(ge=1, le=1024)] = 256,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
@@ -121,7 +122,8 @@ class Keys(SceneryEnv):
         self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample = subsample
-        self.rules: dict = dict(limit=limit, key_reward=key_reward, door_reward=door_reward)
+        self.weights = Coefficients(self.device, key_reward=key_reward, door_reward=door_reward)
+        self.coefficients, self.rules = (self.weights,), dict(limit=limit)
         self.spawner = modules.RandomSpawns(geometries, self.core, resample=resample)
         self.movement = modules.MomentumMovement(self.core, control=control)
         kinds = {
@@ -184,6 +186,7 @@ class Keys(SceneryEnv):
             reach=REACH,
             privileged=self.privileged_space is not None,
             **self.rules,
+            **self.weights.tensors,
         )
         world = arrdict(
             obs=arrdict(self._view(), keys=step.keys_obs),

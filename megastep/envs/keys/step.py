@@ -57,8 +57,8 @@ def keys_step(
     seed: int = 1,
     limit: int = 1000,
     reach: float = 0.05,
-    key_reward: float = 0.0,
-    door_reward: float = 0.0,
+    key_reward: float | torch.Tensor = 0.0,
+    door_reward: float | torch.Tensor = 0.0,
     privileged: bool = False,
 ) -> KeysStep:
     """Has each agent pick up the keys and open the doors that it touches, and ends its episode at
@@ -82,8 +82,8 @@ def keys_step(
         seed: the generator's key.
         limit: steps after which an episode is truncated.
         reach: metres between surfaces at which an agent touches an object.
-        key_reward: for a key that is picked up.
-        door_reward: for a door that is opened.
+        key_reward: for a key that is picked up; a number, or a tensor () on the device.
+        door_reward: for a door that is opened, likewise.
         privileged: compute the privileged observation.
 
     Raises:
@@ -138,8 +138,8 @@ def keys_step(
         n_doorways=n_doorways,
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
         reach=checks.number("reach", reach, 0, checks.LIMIT, "metres"),
-        key_reward=checks.number("key_reward", key_reward, -checks.LIMIT, checks.LIMIT),
-        door_reward=checks.number("door_reward", door_reward, -checks.LIMIT, checks.LIMIT),
+        key_reward=checks.weight("key_reward", key_reward, device),
+        door_reward=checks.weight("door_reward", door_reward, device),
     )
     check_on_cpu(agents)
     return out

@@ -12,9 +12,10 @@ from pydantic import Field
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
 from megastep.arrdict import arrdict
+from megastep.coefficients import Coefficients
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.envs.common import SceneryEnv, images
+from megastep.envs.common import SceneryEnv, Weight, images
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery, spread
@@ -72,7 +73,7 @@ class PointGoal(SceneryEnv):
         nearest: minimum length of the shortest path to a goal, in metres.
         furthest: maximum length of the shortest path to a goal, in metres.
         limit: steps after which an episode is truncated.
-        bonus: reward for success.
+        bonus: reward for success. As the costs it is a number or a schedule.
         cost: subtracted from the reward of every step.
         walk_cost: subtracted from the reward per metre walked. SPL counts metres, ``cost`` steps.
         res: rays of each camera.
@@ -100,9 +101,9 @@ class PointGoal(SceneryEnv):
         nearest: Annotated[float, Field(ge=0, le=1000)] = 1.0,
         furthest: Annotated[float, Field(gt=0, le=1000)] = 15.0,
         limit: Annotated[int, Field(ge=1, le=10**6)] = 500,
-        bonus: Annotated[float, Field(ge=0, le=1000)] = 5.0,
-        cost: Annotated[float, Field(ge=0, le=1000)] = 0.02,
-        walk_cost: Annotated[float, Field(ge=0, le=1000)] = 0.0,
+        bonus: Weight = 5.0,
+        cost: Weight = 0.02,
+        walk_cost: Weight = 0.0,
         res: Annotated[int, Field(ge=1, le=1024)] = 256,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
@@ -119,9 +120,9 @@ class PointGoal(SceneryEnv):
         self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
-        self.rules: dict = dict(
-            bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH
-        )
+        self.weights = Coefficients(self.device, bonus=bonus, cost=cost, walk_cost=walk_cost)
+        self.coefficients = (self.weights,)
+        self.rules: dict = dict(limit=limit, reach=REACH)
         self.goals = goal_fields(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns
@@ -176,6 +177,7 @@ class PointGoal(SceneryEnv):
             seed=self.seed,
             privileged=self.privileged_space is not None,
             **self.rules,
+            **self.weights.tensors,
         )
         world = arrdict(
             obs=arrdict(obs, goal=step.goal_obs),

@@ -51,9 +51,9 @@ def pointgoal_step(
     *,
     seed: int = 1,
     reach: float = 0.2,
-    bonus: float = 5.0,
-    cost: float = 0.02,
-    walk_cost: float = 0.0,
+    bonus: float | torch.Tensor = 5.0,
+    cost: float | torch.Tensor = 0.02,
+    walk_cost: float | torch.Tensor = 0.0,
     limit: int = 500,
     privileged: bool = False,
 ) -> PointGoalStep:
@@ -75,7 +75,7 @@ def pointgoal_step(
             was taken.
         seed: the generator's key.
         reach: metres; an agent this close to its goal succeeds.
-        bonus: reward for success.
+        bonus: reward for success; as the costs a number, or a tensor () on the device.
         cost: subtracted from the reward of every step.
         walk_cost: subtracted from the reward per metre walked.
         limit: steps after which an episode is truncated.
@@ -95,8 +95,8 @@ def pointgoal_step(
             f"but they are for {goals.n_layouts} on {goals.device}"
         )
     rewards = dict(bonus=bonus, cost=cost, walk_cost=walk_cost)
-    for name, value in dict(rewards, reach=reach).items():
-        checks.number(name, value, -math.inf, math.inf)
+    rewards = {name: checks.weight(name, value, device) for name, value in rewards.items()}
+    checks.number("reach", reach, -math.inf, math.inf)
     flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
     privileged_out = None
     if checks.flag("privileged", privileged):

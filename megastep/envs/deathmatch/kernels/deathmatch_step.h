@@ -96,8 +96,8 @@ HD void finish_step(const DeathmatchStepParams& p, int first, int a, const Hits&
     int dies = hits.dies[a], age = reset ? 0 : p.ages[i] + 1;
     int ends = !reset && (dies || age >= p.limit);
     float wounds = (float)hits.wounds[a];
-    float reward = p.hit_reward * hit - p.wound_cost * wounds + p.kill_reward * kill -
-                   p.death_cost * (float)dies + p.aim_reward * gain_of_aim(p, i);
+    float reward = *p.hit_reward * hit - *p.wound_cost * wounds + *p.kill_reward * kill -
+                   *p.death_cost * (float)dies + *p.aim_reward * gain_of_aim(p, i);
     p.reward[i] = reset ? 0.f : reward;
     p.reset[i] = (unsigned char)reset;
     p.terminal[i] = (unsigned char)(ends && dies);

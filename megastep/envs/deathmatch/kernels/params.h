@@ -24,11 +24,11 @@ struct DeathmatchStepParams {
     float recovery;         // health regained in a step without a wound
     float drain;            // health lost in every step
     float health_per_hit;   // health gained by an agent that hits
-    float hit_reward;
-    float wound_cost;
-    float kill_reward;
-    float death_cost;
-    float aim_reward;  // for bringing an agent from the edge of the view to its centre
+    const float* hit_reward;
+    const float* wound_cost;
+    const float* kill_reward;
+    const float* death_cost;
+    const float* aim_reward;  // for bringing an agent from the edge of the view to its centre
     float hearing;     // metres at which sounds fade
     int limit;         // steps per episode
     int res;           // rays per view

@@ -90,7 +90,7 @@ HD void keys_env(const KeysStepParams& p, int env) {
         for (int k = 0; k < n; k++)
             if (touches(p, things[k], x, y, 0)) {
                 things[k].carrier = 0;
-                reward += p.key_reward;
+                reward += *p.key_reward;
             }
         for (int k = n + 1; k < n + 1 + p.n_doorways; k++) {
             int colour = things[k].colour;
@@ -100,7 +100,7 @@ HD void keys_env(const KeysStepParams& p, int env) {
             things[k].open = 1;
             things[colour].visible = 0;
             things[colour].carrier = -1;
-            reward += p.door_reward;
+            reward += *p.door_reward;
             opened++;
         }
         success = touches(p, things[n], x, y, 0);

@@ -35,6 +35,6 @@ struct KeysStepParams {
     int n_doorways;     // K
     int limit;          // steps per episode
     float reach;        // metres between surfaces at which an agent touches an object
-    float key_reward;   // for a key that is picked up
-    float door_reward;  // for a door that is opened
+    const float* key_reward;   // (), for a key that is picked up
+    const float* door_reward;  // (), for a door that is opened
 };

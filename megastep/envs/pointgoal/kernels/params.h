@@ -35,9 +35,9 @@ struct PointgoalStepParams {
     unsigned int key1;
     float per_cell;   // cells per metre
     float reach;      // metres: success within this distance of the goal
-    float bonus;      // reward for success
-    float cost;       // reward subtracted per step
-    float walk_cost;  // reward subtracted per metre walked
+    const float* bonus;      // (), reward for success
+    const float* cost;       // (), reward subtracted per step
+    const float* walk_cost;  // (), reward subtracted per metre walked
     int limit;        // steps per episode
     int n_goals;      // per layout
     int n_spawns;     // per layout

@@ -127,8 +127,8 @@ HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
 
     int age = reset ? 0 : p.ages[agent] + 1, success = straight <= p.reach;
     int ends = !reset && (success || age >= p.limit);
-    float cost = p.cost + p.walk_cost * moved;
-    p.reward[agent] = reset ? 0.f : before - distance + (success ? p.bonus : 0.f) - cost;
+    float cost = *p.cost + *p.walk_cost * moved;
+    p.reward[agent] = reset ? 0.f : before - distance + (success ? *p.bonus : 0.f) - cost;
     p.reset[agent] = (unsigned char)reset;
     p.terminal[agent] = (unsigned char)(ends && success);
     p.truncated[agent] = (unsigned char)(ends && !success);

@@ -1,0 +1,80 @@
+"""Numbers that may change while training, on the device where kernels read them."""
+
+import math
+import numbers
+from typing import cast
+
+import torch
+
+from megastep.schedules import Number, called, schedule_of
+
+__all__ = ["Coefficients", "on_device"]
+
+
+class Coefficients:
+    """Numbers that may change while training, also those that a CUDA graph reads.
+
+        coefficients = Coefficients(device, gamma=0.99, entropy_coef={"from": 0.02, "to": 0.001})
+        coefficients.follow(0.5)  # half of the budget is spent
+        coefficients.set(gamma=0.995)  # from outside
+
+    Args:
+        device: where the tensors are.
+        settings: numbers and schedules by name.
+
+    Attributes:
+        values: the present numbers by name.
+        tensors: the same as tensors (), float32, which keep their place in memory.
+        schedules: functions of the fraction of the budget, of those that have one.
+    """
+
+    IS_STATELESS = True  # whatever sets them does so again; see `megastep.engine.state_tree`
+
+    def __init__(self, device: torch.device | str, **settings: Number):
+        pairs = ((name, schedule_of(value)) for name, value in settings.items())
+        self.schedules = {name: function for name, function in pairs if function is not None}
+        self.values = {
+            name: called(self.schedules[name], 0.0)
+            if name in self.schedules
+            else float(cast(float, value))
+            for name, value in settings.items()
+        }
+        vector = torch.tensor([*self.values.values()], dtype=torch.float32, device=device)
+        self.tensors = dict(zip(self.values, vector.unbind()))
+        self.is_on_gpu = vector.is_cuda
+
+    def __getitem__(self, name: str) -> "float | torch.Tensor":
+        """The number for an update: on a GPU the tensor, which a graph reads, on a CPU a float."""
+        return self.tensors[name] if self.is_on_gpu else self.values[name]
+
+    def set(self, **values: float) -> None:
+        """Changes numbers, without waiting for the device. Raises ValueError for other names."""
+        for name, value in values.items():
+            if name not in self.values:
+                raise ValueError(f"{name} is no coefficient; there are {', '.join(self.values)}")
+            self.values[name] = value
+            self.tensors[name].fill_(value)
+
+    def follow(self, fraction: float) -> dict[str, float]:
+        """Sets those with a schedule, and returns them by name.
+
+        Args:
+            fraction: of the budget that is spent, from 0 to 1.
+
+        Raises:
+            ValueError: a function fails, or gives no finite number.
+        """
+        values = {name: called(function, fraction) for name, function in self.schedules.items()}
+        for name, value in values.items():
+            if not isinstance(value, numbers.Real) or not math.isfinite(value):
+                raise ValueError(f"the schedule of {name} gave {value!r} at {fraction:g}")
+        values = {name: float(value) for name, value in values.items()}
+        self.set(**values)
+        return values
+
+
+def on_device(number: "float | torch.Tensor", device: torch.device) -> torch.Tensor:
+    """Returns a number as a tensor () float32 on a device, where a kernel reads it."""
+    if isinstance(number, torch.Tensor):
+        return number
+    return torch.full((), number, dtype=torch.float32, device=device)
