@@ -131,6 +131,13 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
     )
     if "learns" in world:
         _check_per_lane(env, "learns", world["learns"], torch.bool)
+    _require(
+        env,
+        last is None or ("mask" in world) == ("mask" in last),
+        "mask must be in every world or in none",
+    )
+    if "mask" in world:
+        _check_mask(env, world["mask"])
 
 
 def _check_tensor(env, path, values, shape, dtypes, kind=None) -> None:
@@ -194,6 +201,18 @@ def _check_privileged(env, world) -> None:
         _require(env, bool(values.isfinite().all()), f"{path} must be finite")
 
 
+def _check_mask(env, mask) -> None:
+    """Requires a bool per action of discrete spaces, of which at least one is true."""
+    actions, masks = spaces.leaves(env.action_space, "mask"), spaces.leaves(mask, "mask")
+    for path, values in masks.items():
+        space = actions.get(path)
+        is_discrete = isinstance(space, spaces.MultiDiscrete)
+        _require(env, is_discrete, f"{path} is of no discrete action space: leave it out")
+        shape = n_lanes(env), *space.shape, space.n_actions
+        _check_tensor(env, path, values, shape, (torch.bool,))
+        _require(env, bool(values.any(-1).all()), f"{path} must allow at least one action")
+
+
 def _check_episodes(env, world, last) -> None:
     """Requires finite rewards, and flags that agree with those of the last step."""
     reward, (reset, terminal, truncated) = world["reward"], (world[key] for key in FLAGS)
@@ -242,15 +261,15 @@ def _check_metrics(env, world, last) -> None:
 # ---- Stepping ----
 
 
-def random_actions(env: Env, generator: torch.Generator) -> Tree:
+def random_actions(env: Env, generator: torch.Generator, mask: Tree = None) -> Tree:
     """Returns uniformly random actions, (B, ...) per leaf of the action space, on the environment's
-    device. ``generator`` is a CPU generator, so the actions are the same on every device.
+    device. ``generator`` is a CPU generator, so the actions are the same on every device. ``mask``
+    is a world's, or None.
     """
-
-    def draw(space) -> torch.Tensor:
-        return spaces.random_actions(space, n_lanes(env), generator=generator).to(env.device)
-
-    return spaces.map(draw, env.action_space)
+    actions = spaces.random_action_tree(
+        env.action_space, n_lanes(env), generator=generator, mask=mask
+    )
+    return spaces.map(lambda _, leaf: leaf.to(env.device), env.action_space, actions)
 
 
 def rollout(env: Env, n_steps: int, seed: int = 1, check: bool = True) -> list[arrdict]:
@@ -276,7 +295,8 @@ def rollout(env: Env, n_steps: int, seed: int = 1, check: bool = True) -> list[a
 
     add(env.reset())
     for _ in range(n_steps):
-        add(env.step(arrdict(actions=random_actions(env, generator))))
+        actions = random_actions(env, generator, worlds[-1].get("mask"))
+        add(env.step(arrdict(actions=actions)))
     if check:
         optional(env, "check")()
     return worlds

@@ -29,11 +29,13 @@ class Probe(NamedTuple):
             `TRUE_RETURN`, if wrappers change rewards.
         generators: kinds of global generators that the environment draws from.
         learnt: paths of what wrappers keep beyond an episode, see `wrapper_state`.
+        n_masked: actions of the mask in ``info["action_mask"]``; 0 if there is none.
     """
 
     names: tuple[str, ...] = ()
     generators: tuple[str, ...] = ()
     learnt: tuple[str, ...] = ()
+    n_masked: int = 0
 
 
 def play(env, seed: int) -> Iterator[tuple]:
@@ -67,13 +69,13 @@ def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
     Args:
         play: takes random actions, as `play` does.
     """
-    names, first, last, is_changed = (), {}, {}, False
+    names, first, last, is_changed, n_masked = (), {}, {}, False, 0
     with global_generators.kept():
         env = make()
         global_generators.seed_all(seed)
         before = global_generators.states()
         with contextlib.suppress(Exception):
-            env.reset(seed=seed)
+            n_masked = _masked_actions(env, env.reset(seed=seed))
             first, end = wrapper_state(env), time.monotonic() + MAX_SECONDS
             recorder = RewardRecorder.inside(env)
             for reward, is_over, info in itertools.islice(play(env, seed), MAX_STEPS):
@@ -91,4 +93,12 @@ def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
     learnt = (p for p in last if p not in first or not np.array_equal(last[p], first[p]))
     names = [name for name in names if name != TRUE_RETURN]
     names = [TRUE_RETURN, *names] if is_changed else names
-    return Probe(tuple(names), generators, tuple(learnt))
+    return Probe(tuple(names), generators, tuple(learnt), n_masked)
+
+
+def _masked_actions(env, result) -> int:
+    """Returns the number of actions of the mask that came with a reset, 0 without."""
+    info = result[1] if isinstance(result, tuple) else None
+    mask = info.get("action_mask") if isinstance(info, Mapping) else None
+    n = int(getattr(getattr(env, "action_space", None), "n", 0))
+    return n if mask is not None and np.shape(mask) == (n,) else 0

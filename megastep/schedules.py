@@ -55,7 +55,8 @@ class Scheduled(annotated_types.BaseMetadata):
                 self._bounded(called(function, fraction))
             return value
         raise ValueError(
-            f"expected a number, {{from: 1, to: 0.1}} or module:function, got {value!r}"
+            f"expected a number, got {value!r}; a schedule is {{from: 1, to: 0.1}} or "
+            "module:function"
         )
 
     def _bounded(self, value) -> float:

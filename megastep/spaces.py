@@ -11,7 +11,7 @@ would replace Python's.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -159,18 +159,43 @@ def random_actions(
     n_lanes: int,
     device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
+    mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Returns uniformly random actions of a leaf space for B lanes: (B, ...).
 
     Args:
         generator: on the same device.
+        mask: (B, A, n) bool, the allowed ones of integers. None: all.
     """
     options: dict = dict(device=device, generator=generator)
     shape = n_lanes, *space.shape
     if isinstance(space, MultiContinuous):
         low, high = space.tensors(device)
         return (low + (high - low) * torch.rand(shape, **options)).clamp(low, high)
+    if mask is not None:
+        scores = torch.rand((*shape, space.n_actions), **options)
+        return scores.masked_fill_(~mask.to(scores.device), -1.0).argmax(-1)
     return torch.randint(space.n_actions, shape, **options)
+
+
+def random_action_tree(
+    space: object,
+    n_lanes: int,
+    device: torch.device | str | None = None,
+    generator: torch.Generator | None = None,
+    mask: object = None,
+) -> Any:
+    """Returns `random_actions` of a leaf space, or of each leaf of nested dicts of them."""
+    if not isinstance(space, Mapping):
+        leaf = cast("MultiDiscrete | MultiContinuous", space)
+        return random_actions(leaf, n_lanes, device, generator, cast("torch.Tensor | None", mask))
+    masks = mask if isinstance(mask, Mapping) else {}
+    return arrdict(
+        {
+            key: random_action_tree(child, n_lanes, device, generator, masks.get(key))
+            for key, child in space.items()
+        }
+    )
 
 
 def are_actions(space: MultiDiscrete | MultiContinuous, values: torch.Tensor) -> bool:

@@ -143,6 +143,7 @@ class SyncEnvs(WrappedEnvs):
         generators: kinds of global generators that the environments draw from.
         learnt: paths of what their wrappers have learnt.
         check: checks the form of what the environments return in their first `CHECKED_STEPS`.
+        n_masked: actions of the mask in ``info["action_mask"]``; 0 if there is none.
 
     Attributes:
         restarts: (N,) int64, how often each was made anew.
@@ -164,6 +165,7 @@ class SyncEnvs(WrappedEnvs):
         generators: Collection[str] = KINDS,
         learnt: Collection[str] = (),
         check: bool = True,
+        n_masked: int = 0,
     ):
         from gymnasium.vector.utils import batch_space, create_empty_array
 
@@ -172,7 +174,7 @@ class SyncEnvs(WrappedEnvs):
         self.generators = [GlobalGenerators([seed, first + i]) for i in range(n_envs)]
         self.kinds = KINDS
         self.envs = [self._make(i) for i in range(n_envs)]
-        self.use(names, generators, learnt)
+        self.use(names, generators, learnt, n_masked)
         self.checks = check
         self.n_checked, self.true_returns = np.zeros(n_envs, np.int64), np.zeros(n_envs)
         example = self.envs[0]
@@ -191,8 +193,16 @@ class SyncEnvs(WrappedEnvs):
         self.is_new = np.zeros(n_envs, bool)  # made anew, and not seeded yet
         self._failures = []
 
-    def use(self, names: Sequence[str], kinds: Collection[str], learnt: Collection[str]) -> None:
+    def use(
+        self,
+        names: Sequence[str],
+        kinds: Collection[str],
+        learnt: Collection[str],
+        n_masked: int = 0,
+    ) -> None:
         """Sets what a `Probe` has told, see above."""
+        self.n_masked = n_masked
+        self.masks = np.ones((len(self.envs), n_masked), bool)
         self.names, self.learnt, self.kinds = tuple(names), tuple(learnt), tuple(kinds)
         for generators in self.generators:
             generators.drop({*KINDS} - {*kinds})  # which checkpoints need not hold
@@ -215,6 +225,7 @@ class SyncEnvs(WrappedEnvs):
 
         - `numbers`: name -> (N,), of the last `info` where episodes end; else nan
         - `failures`: the EnvErrors after which environments were made anew
+        - `masks`: (N, n) bool, allowed actions, in every step if there are masks
         """
         from gymnasium.vector.utils import iterate
 
@@ -227,6 +238,7 @@ class SyncEnvs(WrappedEnvs):
             try:
                 result = self._call(i, "step", action)
                 obs, reward, terminated, truncated, info = result
+                self._read_mask(i, info)
                 if self.recorders:
                     self.true_returns[i] += self.recorders[i].recorded_reward
             except Exception as error:
@@ -285,7 +297,16 @@ class SyncEnvs(WrappedEnvs):
     def _news(self, numbers) -> dict[str, np.ndarray]:
         failures, self._failures = self._failures, []
         news = {"numbers": numbers, "failures": failures}
-        return {key: value for key, value in news.items() if value}
+        news = {key: value for key, value in news.items() if value}
+        return {**news, "masks": self.masks.copy()} if self.n_masked else news
+
+    def _read_mask(self, i, info) -> None:
+        """Keeps an environment's mask. One that allows nothing, as at an episode's end, counts as
+        one that allows all.
+        """
+        if self.n_masked:
+            mask = np.asarray(info.get("action_mask", 1), bool)
+            self.masks[i] = mask if mask.any() else True
 
     def _last(self, i) -> object:
         """Returns a copy of the last observation of an environment."""
@@ -300,7 +321,8 @@ class SyncEnvs(WrappedEnvs):
                 number = [int(self.seeds[i]), int(self.restarts[i])]
                 seed = int(np.random.SeedSequence(number).generate_state(1)[0])
             try:
-                obs, _ = self._call(i, "reset", **{} if seed is None else {"seed": seed})
+                obs, info = self._call(i, "reset", **{} if seed is None else {"seed": seed})
+                self._read_mask(i, info)
             except Exception as error:
                 self._begin_anew(i, error)
             else:

@@ -44,6 +44,8 @@ class World(Protocol):
     Optional keys:
         metrics: dict of (B,) float32, statistics of an episode, read on its last step only.
         learns: (B,) bool, lanes whose transitions are used for learning. Default: all.
+        mask: per discrete action space (B, A, n) bool, the actions allowed in the state that `obs`
+            shows, at least one.
         privileged: per ``env.privileged_space``, inputs of the critic that no agent observes.
     """
 

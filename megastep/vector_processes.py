@@ -80,6 +80,7 @@ class VectorProcesses:
         found = self._receive(0)
         found = Probe() if isinstance(found, Exception) else found
         self.names, self.learnt, self.latest_state = found.names, found.learnt, {}
+        self.n_masked = found.n_masked
         self._ask("use", [found for _ in self.pipes])
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
@@ -185,7 +186,10 @@ class VectorProcesses:
             for rows, part in zip(self.rows, of_processes):
                 for name, values in part.get("numbers", {}).items():
                     news["numbers"][name][rows] = values
-        return {key: value for key, value in news.items() if value}
+        news = {key: value for key, value in news.items() if value}
+        if self.n_masked:
+            news["masks"] = np.concatenate([part["masks"] for part in of_processes])
+        return news
 
 
 def start_rendering(vector) -> None:

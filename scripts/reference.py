@@ -36,6 +36,7 @@ from megastep.agents.errors import EXIT_CODES
 from megastep.agents.factory import check, components, settings
 from megastep.agents.networks.cores import CORES
 from megastep.imports import import_object
+from megastep.schedules import Scheduled
 from megastep.settings import AtMost, allowed
 
 #: The dataclasses of the scripts' settings.
@@ -405,7 +406,10 @@ def kind_of(field: FieldInfo) -> str:
     if typing.get_origin(field.annotation) in (typing.Union, types.UnionType):
         options = typing.get_args(field.annotation)
     names = {name for one in _validators(field) for name in one}
-    words = [_word(one, names) for one in options if one is not NoneType]
+    if any(isinstance(one, Scheduled) for one in field.metadata):
+        words = ["number", "schedule"]
+    else:
+        words = [_word(one, names) for one in options if one is not NoneType]
     text, bounds = " or ".join(words), re.sub(r"\d+(,\d{3}){3,}", _power, allowed(field))
     bounds = "" if bounds == "any finite number" else f", {bounds}"
     limits = [f", at most `{one.key}`" for one in field.metadata if isinstance(one, AtMost)]

@@ -31,7 +31,11 @@ def test_settings_are_described():
 def test_settings_say_what_applies():
     """On both devices, from the constructor, from configs/ and from nested settings."""
     rows = {row.key: row for row in reference.settings_of("learner", "r2d2")}
-    assert rows["`learner.lr`"][1:4] == ("number, above 0 to 1,000,000", "0.001", "0.0005")
+    assert rows["`learner.lr`"][1:4] == (
+        "number or schedule, above 0 to 1,000,000",
+        "0.001",
+        "0.0005",
+    )
     capacity = rows["`learner.replay.capacity`"]
     assert capacity[1:4] == ("integer, from 1 to 10^12", "8,000,000", "100,000")
     rows = {row.key: row for row in reference.settings_of("env", "explorer")}

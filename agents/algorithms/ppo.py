@@ -36,7 +36,7 @@ from megastep.agents.storage.rollout import (
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
-_PARTS = "starts", "actions", "logprobs"  # of a rollout, that a minibatch copies
+_PARTS = "starts", "actions", "logprobs", "mask"  # of a rollout, that a minibatch copies
 
 
 class PPO(GradientLearner):
@@ -202,7 +202,8 @@ class PPO(GradientLearner):
         policy, privileged = self.policy, without_last(rollout.privileged)
         starts = without_last(batch.starts)
         sequence = without_last(rollout.obs), starts, batch.state, batch.actions
-        terms = policy.terms(*sequence, privileged, lanes, has_errors=not self.has_extra_loss)
+        options = dict(has_errors=not self.has_extra_loss, mask=without_last(batch.get("mask")))
+        terms = policy.terms(*sequence, privileged, lanes, **options)
         features, numbers = terms.pop("features"), self.coefficients
         names = "value_coef", "entropy_coef", "auxiliary_coef"
         loss, metrics = ppo_loss(

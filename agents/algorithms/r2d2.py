@@ -175,11 +175,12 @@ class R2D2(GradientLearner):
                 f"replay.ratio={ratio:g} of {n_lanes:,} lanes is less than a sequence for each of "
                 f"{self.gradient_steps:,} gradient steps: use fewer gradient_steps or more lanes"
             )
-        self.replay_buffer = ReplayBuffer(
+        epsilon = epsilons(n_lanes, self.epsilon, self.epsilon_spread).to(self.device)
+        collect = Collector(env, EpsilonGreedy(self.policy, epsilon), rollout)
+        self.replay_buffer = ReplayBuffer(  # which knows the rollout's optional parts
             rollout, env.obs_space, env.action_space, self.replay_settings, logprobs=False
         )
-        epsilon = epsilons(n_lanes, self.epsilon, self.epsilon_spread).to(self.device)
-        return Collector(env, EpsilonGreedy(self.policy, epsilon), rollout)
+        return collect
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""
@@ -238,7 +239,7 @@ class R2D2(GradientLearner):
             self._beside.wait_stream(torch.cuda.current_stream(self.device))
         with torch.no_grad(), torch.cuda.stream(self._beside):
             target_q = self.target.unroll(*sequence, burn_in=burn_in).logits
-        now = self.policy.unroll(*sequence, burn_in=burn_in)
+        now = self.policy.unroll(*sequence, burn_in=burn_in, mask=batch.get("mask"))
         q = now.logits
         if self._beside is not None:
             torch.cuda.current_stream(self.device).wait_stream(self._beside)

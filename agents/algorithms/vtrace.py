@@ -177,12 +177,14 @@ class VTrace(GradientLearner):
         """
         self.policy.clear_stats()
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
-        if self.replay_settings:
+        if self.lag:
+            collect = AsyncCollector(env, self.policy, rollout, self.lag)
+        else:
+            collect = Collector(env, self.policy, rollout)
+        if self.replay_settings:  # which knows the rollout's optional parts
             env_spaces = env.obs_space, env.action_space
             self.replay_buffer = ReplayBuffer(rollout, *env_spaces, self.replay_settings)
-        if self.lag:
-            return AsyncCollector(env, self.policy, rollout, self.lag)
-        return Collector(env, self.policy, rollout)
+        return collect
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes the rollouts and a minibatch take per environment."""
@@ -258,7 +260,7 @@ class VTrace(GradientLearner):
         batch["valid"] = valid = ~reset & batch.learns[:-1]
         extra, own = None, {}
         with policy.compute_dtype():  # one, so that weights are cast once
-            now = policy.unroll(batch.obs, batch.starts, batch.state)
+            now = policy.unroll(batch.obs, batch.starts, batch.state, mask=batch.get("mask"))
             logprobs, entropies = policy.output.terms(without_last(now.logits), batch.actions)
             value = policy.value(now.features, privileged)
             if policy.privileged_space or self.has_extra_loss:

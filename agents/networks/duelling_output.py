@@ -14,7 +14,7 @@ from megastep import spaces
 from megastep.agents.networks.kernels import duelling as kernels
 from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
-from megastep.agents.networks.outputs import Output, gather
+from megastep.agents.networks.outputs import FORBIDDEN, Output, gather
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.private_ops import linear_relu
 
@@ -64,18 +64,27 @@ class DuellingOutput(Output):
         x: torch.Tensor,
         sample: bool = True,
         generator: torch.Generator | None = None,
+        mask: torch.Tensor | None = None,
         epsilon: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Does the same as `Output.act`, on a GPU in one kernel after the hidden layer's."""
-        if torch.is_grad_enabled() or not self._is_fused(x):
+        """Does the same as `Output.act`, without a mask on a GPU in one kernel after the hidden
+        layer's.
+        """
+        if torch.is_grad_enabled() or not self._is_fused(x) or mask is not None:
             options = {} if epsilon is None else dict(epsilon=epsilon)
-            return super().act(x, sample, generator, **options)
+            if mask is not None:
+                options["is_masked"] = True
+            return super().act(x, sample, generator, mask, **options)
         hidden = linear(x, self.hidden, torch.relu)
         noise = self._noise((len(x), self.shape[0]), generator, x.device) if sample else None
         parameters = [aligned(p.detach()) for p in self._values()]
         if epsilon is not None:
             epsilon = epsilon.float().contiguous()
         return kernels.act(hidden, parameters, self.shape, noise, epsilon, self.epsilon)
+
+    def masked(self, logits: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns values with which only allowed actions are the best."""
+        return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN)
 
     def _is_fused(self, x) -> bool:
         return (
@@ -98,12 +107,23 @@ class DuellingOutput(Output):
         logits: torch.Tensor,
         generator: torch.Generator | None = None,
         epsilon: torch.Tensor | None = None,
+        is_masked: bool = False,
     ) -> torch.Tensor:
-        """Returns the best actions, or random ones with probability epsilon (...,) per lane."""
+        """Returns the best actions, or random ones with probability epsilon (...,) per lane.
+
+        Args:
+            is_masked: some of the logits are those that `masked` forbids.
+        """
         limit = self.epsilon if epsilon is None else epsilon[..., None]
         best, n = self.greedy(logits), logits.shape[-1]
         which, whether = self._noise(best.shape, generator, logits.device)
-        random = (which * n).long().clamp(max=n - 1)  # the product may round up to n
+        if is_masked:
+            rank = (logits > FORBIDDEN / 2).cumsum(-1)  # of each allowed action, from 1
+            n = rank[..., -1].clamp(min=1)
+            chosen = (which * n).long().clamp(max=n - 1) + 1
+            random = (rank >= chosen[..., None]).int().argmax(-1)
+        else:
+            random = (which * n).long().clamp(max=n - 1)  # the product may round up to n
         return torch.where(whether < limit, random, best)
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:

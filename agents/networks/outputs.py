@@ -19,6 +19,8 @@ from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.arrdict import arrdict
 from megastep.types import Tree
 
+#: Score of an action that a mask forbids: its probability is 0, and no sum with it is NaN.
+FORBIDDEN = -1e9
 # below the smallest exponential sample in float32, and far from underflow
 _TINY = 1e-20
 
@@ -41,6 +43,7 @@ class Output(nn.Module):
         x: torch.Tensor,
         sample: bool = True,
         generator: torch.Generator | None = None,
+        mask: Tree = None,
         **options: torch.Tensor,
     ) -> tuple[Tree, Tree, torch.Tensor]:
         """Returns logits, actions and the actions' log-probability (B,).
@@ -49,11 +52,22 @@ class Output(nn.Module):
             x: features (B, width).
             sample: samples; if false, takes the most likely or best actions.
             generator: generator of the samples.
+            mask: allowed actions, as for `masked`. None: all.
             options: further arguments of `sample`.
         """
-        logits = self(x)
+        logits = self.masked(self(x), mask)
         actions = self.sample(logits, generator, **options) if sample else self.greedy(logits)
         return logits, actions, self.logprob(logits, actions)
+
+    def masked(self, logits: Tree, mask: Tree = None) -> Tree:
+        """Returns logits with which only allowed actions are chosen.
+
+        Args:
+            logits: of `forward`.
+            mask: (..., A, n) bool, true for the allowed actions; ignored if actions are continuous.
+                None: all are.
+        """
+        return logits
 
     def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the log-probability of actions and the entropy, (...,) each."""
@@ -84,14 +98,22 @@ class MultiDiscreteOutput(Output):
         scores = linear(x, self.linear).float()
         return scores.unflatten(-1, self.shape).log_softmax(-1)
 
+    def masked(self, logits: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns log-probabilities among the allowed actions."""
+        return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN).log_softmax(-1)
+
     def act(
-        self, x: torch.Tensor, sample: bool = True, generator: torch.Generator | None = None
+        self,
+        x: torch.Tensor,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+        mask: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Does the same as `Output.act`, on a GPU in one kernel."""
+        """Does the same as `Output.act`, without a mask on a GPU in one kernel."""
         dtype = compute_dtype(self.linear.weight)
-        is_fused = x.is_cuda and dtype in DTYPES and not torch.is_grad_enabled()
+        is_fused = x.is_cuda and dtype in DTYPES and not torch.is_grad_enabled() and mask is None
         if not is_fused or self.shape[1] > kernels.MAX_CHOICES or x.shape[-1] % 8:
-            return super().act(x, sample, generator)
+            return super().act(x, sample, generator, mask)
         noise = None
         if sample:
             noise = torch.empty(len(x), *self.shape, device=x.device)
@@ -156,14 +178,25 @@ class DictOutput(Output):
         x: torch.Tensor,
         sample: bool = True,
         generator: torch.Generator | None = None,
+        mask: Tree = None,
         **options: torch.Tensor,
     ) -> tuple[arrdict, arrdict, torch.Tensor]:
-        """Acts key by key."""
+        """Acts key by key. Keys that a mask has not are not masked."""
+        mask = {} if mask is None else mask
         parts = {
-            key: output.act(x, sample, generator, **options) for key, output in self._outputs()
+            key: output.act(x, sample, generator, mask.get(key), **options)
+            for key, output in self._outputs()
         }
         logits, actions, logprobs = zip(*parts.values())
         return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), _total(logprobs)
+
+    def masked(self, logits: Tree, mask: Tree = None) -> Tree:
+        """Masks key by key."""
+        if mask is None:
+            return logits
+        return arrdict(
+            {key: one.masked(logits[key], mask.get(key)) for key, one in self._outputs()}
+        )
 
     def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """Sums the outputs' terms."""

@@ -137,7 +137,8 @@ class Policy(nn.Module):
         """Acts for one step.
 
         Args:
-            world: has `obs`, and `reset` (B,), which clears a lane's hidden state.
+            world: has `obs`, and `reset` (B,), which clears a lane's hidden state. Actions that its
+                `mask`, if it has one, forbids are not taken.
             state: hidden state.
             sample: samples actions; if false, takes the most likely or best ones.
             generator: generator of the actions. Default: the policy's.
@@ -161,6 +162,8 @@ class Policy(nn.Module):
             generator = self.generator.on(self.device)
         with self.compute_dtype():
             features, state = self._features(obs, reset, state)
+            if (mask := world.get("mask")) is not None:
+                options["mask"] = mask
             logits, actions, logprobs = self.output.act(features[0], sample, generator, **options)
         decision = arrdict(actions=actions, logits=logits, logprobs=logprobs, features=features[0])
         return decision, state
@@ -189,6 +192,7 @@ class Policy(nn.Module):
         state: arrdict,
         lanes: torch.Tensor | None = None,
         burn_in: int = 0,
+        mask: Tree = None,
     ) -> arrdict:
         """Runs over a sequence without acting.
 
@@ -199,6 +203,7 @@ class Policy(nn.Module):
             lanes: (M,) int64, the lanes of `obs` to run over. None: all.
             burn_in: steps at the start, fewer than T, that only warm up the hidden state. They have
                 no gradients, and the result leaves them out.
+            mask: (T, M, A, n) bool per discrete action space, allowed actions. None: all.
 
         Returns:
             arrdict(logits (T, B, ...), features (T, B, width) that they were computed from, state
@@ -212,7 +217,10 @@ class Policy(nn.Module):
                 obs, reset = mapping(lambda leaf: leaf[n_apart:])(obs), reset[n_apart:]
             features, state = self._features(obs, reset, state, lanes)
             features = features[burn_in - n_apart :]
-            return arrdict(logits=self.output(features), features=features, state=state)
+            logits = self.output(features)
+            if mask is not None:
+                logits = self.output.masked(logits, mapping(lambda leaf: leaf[burn_in:])(mask))
+            return arrdict(logits=logits, features=features, state=state)
 
     @torch.no_grad()
     def warm_up(
@@ -271,6 +279,7 @@ class Policy(nn.Module):
         privileged: Tree | None = None,
         lanes: torch.Tensor | None = None,
         has_errors: bool = True,
+        mask: Tree = None,
     ) -> arrdict:
         """Returns what a loss needs of a sequence, (T, B) float32 each: `logprobs` of the actions,
         `entropies` of the policy, `values`, and without a `privileged_space` None, with one the
@@ -282,6 +291,7 @@ class Policy(nn.Module):
             actions: (T, B, ...); (T, M, ...) with `lanes`.
             privileged: as for `value`.
             has_errors: false leaves the errors out, None.
+            mask: (T, M, A, n) bool per discrete action space, allowed actions. None: all.
         """
         names = "logprobs", "entropies", "errors", "values", "features"
         with self.compute_dtype():
@@ -289,14 +299,16 @@ class Policy(nn.Module):
             encoded = errors = None
             if self.privileged_space:
                 encoded = self._critic.encode(privileged, lanes)
-                if has_errors and joint_heads.fit(self.output, self._critic, features, encoded):
+                is_joint = has_errors and mask is None
+                if is_joint and joint_heads.fit(self.output, self._critic, features, encoded):
                     output = cast(MultiDiscreteOutput, self.output)
                     heads_of = output, self._critic, self.prediction
                     terms = joint_heads.joint_terms(*heads_of, features, encoded, actions)
                     return arrdict(zip(names, (*terms, features), strict=True))
                 if has_errors:
                     errors = self._prediction_error(features, encoded)
-            logprobs, entropies = self.output.terms(self.output(features), actions)
+            logits = self.output.masked(self.output(features), mask)
+            logprobs, entropies = self.output.terms(logits, actions)
             values = self._critic.from_encoded(features, encoded)
         return arrdict(zip(names, (logprobs, entropies, errors, values, features), strict=True))
 

@@ -65,8 +65,11 @@ class MixedPolicy:
         return arrdict(actions=select_tree(actions, self.order)), state
 
     def select_lanes(self, world: World) -> arrdict:
-        """Returns a copy of `obs` and `reset` in the lanes of the policies, in their order."""
-        return select_tree(arrdict(obs=world["obs"], reset=world["reset"]), self.lanes)
+        """Returns a copy of `obs`, `reset` and, if there is one, `mask`, in the lanes of the
+        policies, in their order.
+        """
+        parts = {key: world[key] for key in ("obs", "reset", "mask") if key in world}
+        return select_tree(arrdict(parts), self.lanes)
 
     def start(
         self,

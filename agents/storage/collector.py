@@ -19,18 +19,18 @@ from megastep.types import Env, Tree, optional
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
 
-_STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
+_STORED = "obs", "reset", "learns", "privileged", "mask"  # what `Rollout.store_world` reads
 
 
 def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
-    """Resets an environment and allocates the rollout's metrics.
+    """Resets an environment and allocates the rollout's metrics and mask.
 
     Returns:
         The actor state for `collect`: arrdict(world, state), with a copy of the parts of the
         current world that rollouts store, and the policy's initial hidden state.
     """
     first = rollout.select_lanes(env.reset())
-    rollout.allocate_metrics(first)
+    rollout.allocate_optional(first)
     world = _stored(first).map(torch.clone)
     return arrdict(world=world, state=policy.initial(len(world.reset)))
 

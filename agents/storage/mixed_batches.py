@@ -13,7 +13,7 @@ from megastep.dotdict import mapping
 
 # keys with a time axis
 _IN_TIME = (
-    *("obs", "privileged", "starts", "learns"),
+    *("obs", "privileged", "starts", "learns", "mask"),
     *("actions", "logprobs", "reward", "terminal", "truncated"),
 )
 

@@ -27,7 +27,7 @@ from megastep.types import Env, Space, Tree
 #: Bool tensors of a row, stored as one bit each.
 _FLAGS = "starts", "learns", "terminal", "truncated"
 #: Tensors of which a sequence has L + 1 rows instead of L.
-_WITH_LAST = "obs", "privileged", "starts", "learns"
+_WITH_LAST = "obs", "privileged", "starts", "learns", "mask"
 #: Smallest priority before it is raised to alpha, so that sequences of zero error can be drawn.
 _MIN_PRIORITY = 1e-6
 
@@ -80,6 +80,8 @@ class ReplayBuffer:
             self.columns["logprobs"] = column(rollout.logprobs)
         if rollout.privileged is not None:
             self.columns["privileged"] = mapping(column)(rollout.privileged)
+        if rollout.mask is not None:
+            self.columns["mask"] = mapping(column)(rollout.mask)
         self.flags = Column(n_rows, (self.n_lanes,), torch.uint8, None, device)
         self.state = mapping(column_of_state)(rollout.state)
         self.tree = SumTree(self.n_rollouts * self.n_lanes, device)
@@ -136,7 +138,9 @@ class ReplayBuffer:
         rows = slot * self.n_steps + steps
         for name, columns in self.columns.items():
             spaces.map(
-                lambda column, leaf: column.write(rows, torch.where(is_finite, leaf, 0)),
+                lambda column, leaf: column.write(
+                    rows, torch.where(is_finite, leaf, leaf.new_zeros(()))
+                ),
                 *(columns, getattr(rollout, name)),
             )
         bits = [getattr(rollout, name)[: self.n_steps].byte() << i for i, name in enumerate(_FLAGS)]

@@ -24,7 +24,7 @@ from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
 
 #: Parts of a rollout that `Rollout.sequences` selects from.
-SEQUENCES = "obs starts learns actions logprobs reward terminal truncated privileged".split()
+SEQUENCES = "obs starts learns actions logprobs reward terminal truncated privileged mask".split()
 _BYTES_OF_THE_REST = 64  # of a step: everything except observations
 
 
@@ -47,6 +47,8 @@ class Rollout:
     Attributes:
         obs: (T+1, B, ...). The last row is the observation that the next rollout starts from.
         privileged: (T+1, B, ...) float32, or None without a `privileged_space`.
+        mask: (T+1, B, A, n) bool per discrete action space, allowed actions, or None if worlds have
+            none.
         starts: (T+1, B) bool, whether the observation is its episode's first.
         learns: (T+1, B) bool, whether to learn from the lane at that time. True unless worlds
             have `learns`.
@@ -99,13 +101,17 @@ class Rollout:
         self.logprobs = torch.zeros(rows, device=device)
         self.reward = torch.zeros(rows, device=device)
         self.metrics = arrdict()
+        self.mask: Tree = None
         self.layouts: torch.Tensor | None = None
         self.state = clone(state)
 
     # ---- Writing ----
 
-    def allocate_metrics(self, world: arrdict) -> None:
-        """Allocates the metrics that this world has. Call once, before the first step."""
+    def allocate_optional(self, world: arrdict) -> None:
+        """Allocates the metrics and the mask that this world has. Call it before the first step."""
+        if "mask" in world:
+            rows = self.n_steps + 1
+            self.mask = mapping(lambda leaf: leaf.new_ones(rows, *leaf.shape))(world["mask"])
         for name in world.get("metrics", {}):
             self.metrics[name] = torch.zeros_like(self.reward)
 
@@ -155,6 +161,8 @@ class Rollout:
             pairs.append((self.learns[t], world["learns"]))
         if self.privileged is not None:
             pairs += _pairs(self.privileged, t, world["privileged"])
+        if self.mask is not None:
+            pairs += _pairs(self.mask, t, world["mask"])
         return pairs
 
     def _of_transition(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
@@ -204,10 +212,14 @@ class Rollout:
         return self.starts[1:]
 
     def world(self, t: int) -> arrdict:
-        """Returns the policy's input at time t: arrdict(obs, reset), and privileged if stored."""
+        """Returns the policy's input at time t: arrdict(obs, reset), and privileged and mask if
+        stored.
+        """
         world = arrdict(obs=self.obs[t], reset=self.starts[t])
         if self.privileged is not None:
             world["privileged"] = self.privileged[t]
+        if self.mask is not None:
+            world["mask"] = mapping(lambda leaf: leaf[t])(self.mask)
         return world
 
     def floats(self) -> dict[str, torch.Tensor]:
@@ -247,7 +259,7 @@ class Rollout:
             others: further tensors (T, B, ...) to return, by name.
 
         Returns:
-            arrdict of obs, starts, learns and privileged (if stored), each (T+1, M, ...); actions,
+            arrdict of obs, starts, learns, privileged and mask (if stored), (T+1, M, ...); actions,
             logprobs, reward, terminal and truncated, each (T, M, ...); `others`; and state
             (M, ...), the hidden state before row 0.
         """

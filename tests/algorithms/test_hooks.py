@@ -188,7 +188,7 @@ def test_weights_of_rewards_follow_schedules(here):
         ("learner.n_steps={from:1,to:2}", "learner.n_steps: is one value, not a schedule"),
         ("learner.max_grad_norm={from:1,to:2}", "max_grad_norm: is one value, not a schedule"),
         ("learner.gamma={from:0.9,to:1.5}", "gamma: 1.5 is out of range: allowed is from 0 to 1"),
-        ("learner.gamma={from:0.9}", "expected a number, {from: 1, to: 0.1} or module:function"),
+        ("learner.gamma={from:0.9}", "expected a number, got {'from': 0.9}; a schedule is"),
         ("learner.gamma=tests.helpers.headed:rises", "1.5 is out of range"),
         ("learner.gamma=tests.helpers.headed:nothing", "has no nothing"),
         ("learner.gamma=fast", "expected a number"),

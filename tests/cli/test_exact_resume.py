@@ -73,7 +73,11 @@ CASES = {
         *tiny.TINY,
         *("learner=tests.helpers.headed:Headed", "learner.optimizer=torch.optim:RMSprop"),
         *("learner.entropy_coef={from:0.02,to:0.001}", "learner.warmup=9"),
-        *("learner.lambda_=tests.helpers.headed:falling", "env=pointgoal", "env.cost={from:0,to:1}"),
+        *(
+            "learner.lambda_=tests.helpers.headed:falling",
+            "env=pointgoal",
+            "env.cost={from:0,to:1}",
+        ),
     ],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[2:]],
 }

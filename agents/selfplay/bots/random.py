@@ -8,7 +8,7 @@ from megastep.types import Space, Tree, World
 
 
 class RandomActions:
-    """A policy that samples actions uniformly: the baseline for a trained one."""
+    """A policy that samples allowed actions uniformly: the baseline for a trained one."""
 
     def __init__(self, action_space: Space):
         self.action_space = action_space
@@ -25,8 +25,7 @@ class RandomActions:
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, Tree]:
         n_lanes, device = len(state["lane"]), state["lane"].device
-
-        def draw(space) -> torch.Tensor:
-            return spaces.random_actions(space, n_lanes, device, generator)
-
-        return arrdict(actions=spaces.map(draw, self.action_space)), state
+        actions = spaces.random_action_tree(
+            self.action_space, n_lanes, device, generator, world.get("mask")
+        )
+        return arrdict(actions=actions), state

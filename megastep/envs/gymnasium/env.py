@@ -35,7 +35,8 @@ class Gymnasium(VectorizedEnv):
     Actions:
         Discrete: (B, 1) integers from 0. MultiDiscrete: (B, k), or a dict if the ranges differ.
         MultiBinary: (B, k), 0 or 1. Box with bounds: (B, 1, n) float32 within them. Tuple and Dict:
-        a dict.
+        a dict. A mask in ``info["action_mask"]``, a number per action of a Discrete space, becomes
+        ``world.mask``: actions with 0 are not taken.
 
     Reward:
         The environment's own.

@@ -72,8 +72,7 @@ def vector_env(
             SyncEnvs, make_one, restart_failed=restart_failed, seed=seed, check=check
         )
         if vectorization == "sync":
-            names, generators, learnt = probe(make_one)
-            vector = make(n_envs=n_envs, names=names, generators=generators, learnt=learnt)
+            vector = make(n_envs=n_envs, **probe(make_one)._asdict())
         else:  # a fault may end the process that it happens in
             vector = VectorProcesses(make, n_envs)
         vector.max_episode_steps = max_steps

@@ -24,6 +24,7 @@ class HostBuffers:
         device: where worlds go and actions come from.
         metrics: names of the metrics in worlds.
         flags: names of the bools in worlds.
+        n_masked: actions of the mask in worlds; 0 without.
     """
 
     IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
@@ -36,6 +37,7 @@ class HostBuffers:
         device: torch.device,
         metrics: Sequence[str] = (),
         flags: Sequence[str] = FLAGS,
+        n_masked: int = 0,
     ):
         self.device, self.on_gpu = device, device.type == "cuda"
 
@@ -53,6 +55,8 @@ class HostBuffers:
         )
         if metrics:
             self.world["metrics"] = arrdict({name: empty(torch.float32) for name in metrics})
+        if n_masked:
+            self.world["mask"] = empty(torch.bool, 1, n_masked)
         self.actions = spaces.map(of_space, action_space)
         self.arrays = [leaf.numpy() for leaf in leaves(self.world)]
         self.copied = torch.cuda.Event() if self.on_gpu else None

@@ -98,6 +98,7 @@ class VectorizedEnv:
         self._buffers = HostBuffers(
             *(n_lanes, self.obs_space, self.action_space, self.device, [*self._metrics]),
             flags=(*FLAGS, *["learns"] * hasattr(vector, "present")),
+            n_masked=getattr(vector, "n_masked", 0),
         )
         self._ended = np.ones(n_lanes, bool)
         self._n_restarts = np.zeros(1, np.int64)  # an array, so that checkpoints hold it
@@ -273,6 +274,8 @@ class VectorizedEnv:
             world["learns"] = present.copy()
         if self._metrics:
             world["metrics"] = arrdict({name: of[1] for name, of in self._metrics.items()})
+        if getattr(self.vector, "n_masked", 0):
+            world["mask"] = news["masks"][:, None]
         return self._buffers.send(world)
 
 
