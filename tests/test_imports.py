@@ -41,7 +41,7 @@ SIMULATOR = (
 )
 ENGINE = (
     ("checks", "outputs", "state_tree", "views"),
-    ("objects",),
+    ("objects", "resets"),
     ("agents", "devices", "scenery"),
     ("launch_params",),
     ("lighting", "movement", "object_updates", "spawning", "texels"),
