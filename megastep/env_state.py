@@ -291,7 +291,9 @@ class EnvState:
             return _is_savable(node)
         if isinstance(node, _CONSTANT):
             return self._first_constants.get(path, node) == node
-        is_known = isinstance(node, (*_STATEFUL, *_NUMBERS, list, tuple, dict, collections.deque))
+        is_known = isinstance(
+            node, (Resets, *_STATEFUL, *_NUMBERS, list, tuple, dict, collections.deque)
+        )
         return is_known or _is_plain(node) or hasattr(node, "__dict__")
 
     def _plain_values(self) -> Iterator[tuple[str, Any]]:

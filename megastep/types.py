@@ -161,7 +161,10 @@ def optional(owner: object, name: str, defaults: Mapping[str, Any] = DEFAULTS) -
 
 def takes_masks(env: Env) -> bool:
     """Returns whether an environment has ``reset(seed=None, mask=None)``."""
-    return {"seed", "mask"} <= {*inspect.signature(env.reset).parameters}
+    own = getattr(env, "takes_masks", None)  # of a wrapper, which depends on what is inside
+    return (
+        own if own is not None else {"seed", "mask"} <= {*inspect.signature(env.reset).parameters}
+    )
 
 
 def n_lanes(env: Env) -> int:

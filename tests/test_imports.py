@@ -36,7 +36,7 @@ SIMULATOR = (
     ("capture", "contract", "env_state", "geometries", "scene"),
     ("core", "cubicasa", "toys"),
     ("cuda", "modules"),
-    ("compat", "envs"),
+    ("compat", "envs", "wrappers"),
     ("demo",),
 )
 ENGINE = (

@@ -14,16 +14,25 @@ import pkgutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import pydantic
 import yaml
+from pydantic import BeforeValidator
 
 import megastep
 from megastep import cache
 from megastep.agents import package
 from megastep.imports import import_object
 from megastep.settings import arguments_of, parameters_of
+
+
+def _wrappers(value: object) -> object:
+    """Checks names and settings of wrappers. Raises ValueError naming what is wrong."""
+    from megastep.agents.factory import settings
+
+    return settings.checked_wrappers(value)
+
 
 POLICY = "megastep.agents.networks.policy:Policy"
 #: Floor plans unless geometry= says otherwise.
@@ -35,15 +44,19 @@ SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
 #: Where components are found without a file in configs/.
 ENVS, SOURCES = "megastep.envs", "megastep.geometries.sources"
+WRAPPERS = "megastep.wrappers"
 LEARNERS, LOGGERS = "megastep.agents.algorithms", "megastep.agents.training.loggers"
 #: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
 #: are passed by megastep, `missing` are defaults, and the others are settings beside them.
 ARGUMENTS = {
     "env": dict(
-        reserved=("geometries", "seed", "device", "privileged", "films"),
+        # wrappers of a package are the environment's own argument, those of megastep are not
+        reserved=("geometries", "seed", "device", "privileged", "films", "wrappers"),
         missing={"n_envs": 128},
         name=str,
+        wrappers=(Annotated[tuple, BeforeValidator(_wrappers)], ()),
     ),
+    "wrapper": dict(reserved=("env", "seed"), name=str),
     "geometry": dict(reserved=("split",), missing={"n": 512, "seed": 1}, name=str),
     "learner": dict(
         reserved=("policy", "seed", "graph"),
@@ -102,12 +115,15 @@ def cached() -> Components:
 
 def read() -> Components:
     """Imports every component of megastep."""
-    envs, sources = map(importlib.import_module, (ENVS, SOURCES))
+    envs, sources, wrappers = map(importlib.import_module, (ENVS, SOURCES, WRAPPERS))
     found = {
         "env": {name: f"{ENVS}.{name}:{kind.__name__}" for name, kind in envs.ENVS.items()},
         "geometry": {name: f"{SOURCES}:{name}" for name in sources.__all__},
         "learner": {k: v for k, v in _classes(LEARNERS) if hasattr(import_object(v), "collector")},
         "logger": dict(_classes(LOGGERS)),
+        "wrapper": {
+            name: f"{WRAPPERS}:{kind.__name__}" for name, kind in wrappers.WRAPPERS.items()
+        },
     }
     names = [("agent", POLICY), ("opponents", OPPONENTS)]
     for group in ARGUMENTS:

@@ -24,7 +24,9 @@ from megastep.agents.factory.settings import (
     env_name,
     label,
     takes_geometries,
+    wrapper_settings,
 )
+from megastep.agents.generator import stream_seed
 from megastep.agents.networks.policy import TRAINING_ONLY, Policy
 from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
 from megastep.agents.selfplay.bots import BOTS
@@ -35,6 +37,7 @@ from megastep.capture import state_tree
 from megastep.imports import import_object
 from megastep.settings import parameters_of
 from megastep.types import PolicyLike, n_lanes, optional
+from megastep.wrappers import Wrapper
 
 if TYPE_CHECKING:
     from megastep.agents import types as agent_types
@@ -76,6 +79,7 @@ def construct(settings: "Member", constructor: Callable | None = None, **argumen
         constructor: default: the one at the import path in `settings.name`.
     """
     with errors():
+        is_env = constructor is None and hasattr(settings, "wrappers")
         constructor = constructor or import_object(settings.name)
         taken, own = parameters_of(constructor), inspect.signature(constructor).parameters
         values = {
@@ -87,13 +91,52 @@ def construct(settings: "Member", constructor: Callable | None = None, **argumen
         # an environment may change a list that it is given, and the next one is to get it whole
         values = {k: copy.deepcopy(v) if type(v) in (dict, list) else v for k, v in values.items()}
         values |= {key: value for key, value in arguments.items() if key in taken}
+        inside, outside = _wrappers_of(settings, taken) if is_env else ([], [])
+        if is_env and "wrappers" in taken:
+            values["wrappers"] = tuple(inside)
         try:
-            return constructor(**values)
+            made = constructor(**values)
+            for number, wrapper in enumerate(outside):
+                seed = stream_seed(arguments.get("seed", 1), f"wrapper {number}")
+                made = construct(wrapper, env=made, seed=seed)
+            return made
         except TypeError as error:
             if "multiple values" not in str(error):
                 raise
             cure = "an argument that it sets itself belongs in its own signature"
             raise ValueError(f"{settings.name} cannot be made: {error}; {cure}") from error
+
+
+def _wrappers_of(settings, taken) -> tuple[list[str], list]:
+    """Returns the wrappers of an environment's own package, and the settings of megastep's. They
+    are told apart by their base class.
+
+    Args:
+        taken: arguments that the environment takes.
+
+    Raises:
+        ValueError: a wrapper has no environment that it fits around.
+    """
+    inside, outside = [], []
+    for item in settings.wrappers:
+        name = item["name"] if isinstance(item, dict) else item
+        kind = import_object(name) if ":" in name else Wrapper
+        is_ours = inspect.isclass(kind) and issubclass(kind, Wrapper)
+        if is_ours:
+            outside.append(wrapper_settings(item))
+        elif "wrappers" not in taken:
+            raise ValueError(
+                f"env.wrappers: {name} is no megastep.wrappers.Wrapper, and "
+                f"{env_name(settings)} takes no wrappers of another package"
+            )
+        elif isinstance(item, dict):
+            raise ValueError(
+                f"env.wrappers: {name} is no megastep.wrappers.Wrapper, so it takes no settings "
+                "here; derive a class that has them"
+            )
+        else:
+            inside.append(name)
+    return inside, outside
 
 
 def make_device(name: str, index: int | None = None) -> torch.device:
@@ -142,7 +185,8 @@ def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
     Raises:
         UserError: naming the clause of the contract that a class of the user's breaks.
     """
-    is_ours = env.name.startswith("megastep.")
+    names = [item["name"] if isinstance(item, dict) else item for item in env.wrappers]
+    is_ours = all(":" not in name for name in names) and env.name.startswith("megastep.")
     n_envs = 1 if is_ours else min(SAMPLE, env.n_envs)
     sample = construct(changed(env, n_envs=n_envs), geometries=geometries[:1], **arguments)
     if not is_ours:

@@ -15,7 +15,14 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
-from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from megastep.agents.factory import components
 from megastep.imports import import_object
@@ -26,6 +33,7 @@ from megastep.settings import (
     frozen,
     located,
     parameters_of,
+    sentence,
     settings_class,
     settings_of,
 )
@@ -153,7 +161,8 @@ def kind_of(group: str, name: str) -> type:
     constructor, spec = import_object(name), components.ARGUMENTS[group]
     try:
         taken = parameters_of(constructor)
-        if missing := [f"{k}, {text}" for k, text in IMPORTED[group].items() if k not in taken]:
+        needed = IMPORTED.get(group, {"env": "the environment inside"})
+        if missing := [f"{k}, {text}" for k, text in needed.items() if k not in taken]:
             raise ValueError(f"it has no argument {missing[0]}")
         methods = METHODS.get(group, ()) if inspect.isclass(constructor) else ()
         if absent := [method for method in methods if not hasattr(constructor, method)]:
@@ -194,6 +203,52 @@ def _group(group: str) -> object:
         return as_typed(kind_of(group, str(value["name"])), value)
 
     return Annotated[Any, BeforeValidator(settings)]
+
+
+def checked_wrappers(value: object) -> tuple[object, ...]:
+    """Returns the wrappers of an environment, names and dicts of `name` and settings, checked as
+    far as no package is imported.
+
+    Raises:
+        ValueError: naming what is wrong.
+    """
+    items = [value] if isinstance(value, (str, dict)) else value
+    if not isinstance(items, (list, tuple)):
+        raise ValueError(f"expected a list of wrappers, got {value!r}")
+    for item in items:
+        name = item.get("name") if isinstance(item, dict) else item
+        known = components.members("wrapper")
+        if not isinstance(name, str):
+            raise ValueError(f"a wrapper is a name or {{name: ..., setting: ...}}, got {item!r}")
+        if ":" not in name and name not in known:
+            raise ValueError(f"{name!r} is no wrapper; {closest(name, known)}, or module:Class")
+        if name in known or isinstance(item, dict):
+            wrapper_settings(item)
+    return tuple(items)
+
+
+def wrapper_settings(item: "str | dict") -> object:
+    """Returns the settings of a wrapper, with the import path of its class as `name`.
+
+    Raises:
+        ValueError: they are not those of the class.
+    """
+    tree = {"name": item} if isinstance(item, str) else dict(item)
+    label = tree["name"]
+    tree["name"] = components.members("wrapper").get(label, label)
+    kind = kind_of("wrapper", tree["name"])
+    try:
+        return as_typed(kind, tree)
+    except ValidationError as error:
+        (line, *_) = error.errors()
+        key = str(line["loc"][0])
+        fields = kind.__pydantic_fields__
+        if key not in fields:
+            raise ValueError(
+                f"{label} has no setting {key!r}; {closest(key, fields.keys() - {'name'})}"
+            ) from None
+        text = sentence(line, fields[key], line["input"])
+        raise ValueError(f"{label}: {key}: {text}") from None
 
 
 def changed(settings: T, **changes: object) -> T:
@@ -321,12 +376,15 @@ def too_large(group: Any, tree: object) -> Iterator[tuple[str, str]]:
 
 def schedules_of(cfg: "Train") -> list[str]:
     """Returns the keys of settings that have a schedule."""
+    parts: list = [("learner.", cfg.learner), ("env.", cfg.env)]
+    own = (item for item in cfg.env.wrappers if isinstance(item, dict))
+    parts += [("env.wrappers", wrapper_settings(item)) for item in own]
     return [
-        f"{group}.{name}"
-        for group in ("learner", "env")
-        for name, field in getattr(cfg, group).__pydantic_fields__.items()
+        key if key == "env.wrappers" else f"{key}{name}"
+        for key, part in parts
+        for name, field in part.__pydantic_fields__.items()
         if any(isinstance(extra, Scheduled) for extra in field.metadata)
-        and not isinstance(getattr(getattr(cfg, group), name), float)
+        and not isinstance(getattr(part, name), float)
     ]
 
 

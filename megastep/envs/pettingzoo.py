@@ -6,7 +6,7 @@ They step on the CPU, one after the other, even if the learner is on a GPU. B = 
 import copy
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -56,6 +56,8 @@ class PettingZoo(VectorizedEnv):
         id: import path of the function that makes one, such as
             ``pettingzoo.sisl.multiwalker_v9:parallel_env``.
         kwargs: arguments of that function.
+        wrappers: import paths of PettingZoo's parallel wrappers, ``package.module:Wrapper``, put
+            around every environment in this order.
         seed: each environment is reset with a seed of its own, which derives from this one.
         check: as for Gymnasium.
         device: where worlds and actions are. Default: a GPU if there is one.
@@ -68,6 +70,7 @@ class PettingZoo(VectorizedEnv):
         *,
         id: str | None = None,
         kwargs: dict[str, Any] | None = None,
+        wrappers: tuple[str, ...] = (),
         seed: int = 1,
         check: bool = True,
         device: torch.device | str | None = None,
@@ -81,9 +84,9 @@ class PettingZoo(VectorizedEnv):
             import gymnasium.vector  # noqa: F401
         except ImportError:
             raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
-        make = import_object(id)
+        make, functions = import_object(id), [import_object(name) for name in wrappers]
         try:
-            vector = ParallelEnvs(make, n_envs, kwargs or {}, check)
+            vector = ParallelEnvs(make, n_envs, kwargs or {}, check, functions)
         except Exception as error:  # whatever another's constructor raises
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
             line = (str(error).splitlines() or [""])[0]
@@ -101,6 +104,7 @@ class ParallelEnvs(WrappedEnvs):
         n_envs: number of environments, N.
         kwargs: arguments of ``make``.
         check: checks the form of what the environments return in their first `CHECKED_STEPS`.
+        wrappers: put around each, in this order.
 
     Attributes:
         present: (N, A) bool, agents that act in the next step. An agent is not if the reset left it
@@ -110,7 +114,14 @@ class ParallelEnvs(WrappedEnvs):
         ValueError: it is turn-based, or the spaces of two agents differ.
     """
 
-    def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, object], check: bool = True):
+    def __init__(
+        self,
+        make: Callable,
+        n_envs: int,
+        kwargs: dict[str, object],
+        check: bool = True,
+        wrappers: Sequence[Callable] = (),
+    ):
         from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 
         parameters = inspect.signature(make).parameters
@@ -118,7 +129,10 @@ class ParallelEnvs(WrappedEnvs):
             kwargs = {"render_mode": "rgb_array", **kwargs}
 
         def make_one() -> Any:
-            return _parallel(make(**kwargs))
+            env = _parallel(make(**kwargs))
+            for wrapper in wrappers:
+                env = wrapper(env)
+            return env
 
         self.envs = [make_one() for _ in range(n_envs)]
         self.render_mode, env = kwargs.get("render_mode"), self.envs[0]

@@ -1,0 +1,36 @@
+"""Wrappers around any environment, on its device: `env.wrappers=[sticky_actions]`."""
+
+from megastep.wrappers.actions import ActionRepeat, NoisyActions, StickyActions
+from megastep.wrappers.base import Wrapper
+from megastep.wrappers.observations import DropSensor, FrameStack, NoisySensor
+from megastep.wrappers.rewards import ClipReward, ScaleReward, ShapeReward
+from megastep.wrappers.time_limit import TimeLimit
+
+__all__ = [
+    "WRAPPERS",
+    "ActionRepeat",
+    "ClipReward",
+    "DropSensor",
+    "FrameStack",
+    "NoisyActions",
+    "NoisySensor",
+    "ScaleReward",
+    "ShapeReward",
+    "StickyActions",
+    "TimeLimit",
+    "Wrapper",
+]
+
+#: Wrappers by their names in settings.
+WRAPPERS = {
+    "action_repeat": ActionRepeat,
+    "clip_reward": ClipReward,
+    "drop_sensor": DropSensor,
+    "frame_stack": FrameStack,
+    "noisy_actions": NoisyActions,
+    "noisy_sensor": NoisySensor,
+    "scale_reward": ScaleReward,
+    "shape_reward": ShapeReward,
+    "sticky_actions": StickyActions,
+    "time_limit": TimeLimit,
+}

@@ -1,0 +1,182 @@
+"""Wrappers that change actions."""
+
+from collections.abc import Mapping
+from typing import Annotated, cast
+
+import torch
+from pydantic import Field
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.settings import checked
+from megastep.types import Env, Tree, n_lanes, optional
+from megastep.wrappers.base import Draws, Wrapper
+
+__all__ = ["ActionRepeat", "NoisyActions", "StickyActions"]
+
+Probability = Annotated[float, Field(ge=0, le=1)]
+
+
+def _along(values: torch.Tensor, leaf: torch.Tensor) -> torch.Tensor:
+    return values.view(-1, *[1] * (leaf.ndim - 1))
+
+
+class _Random(Wrapper):
+    """Base of the two below, which know no masks."""
+
+    def after(self, world: arrdict) -> arrdict:
+        if "mask" in world:
+            raise ValueError(
+                f"{type(self).__name__} would take actions that the environment's mask forbids"
+            )
+        return world
+
+
+class StickyActions(_Random):
+    """Repeats a lane's last action with a probability, whatever the policy chose (Machado et al.
+    2018). The first action of an episode is always the policy's.
+
+    Args:
+        env: the environment inside.
+        probability: of repeating, in each step.
+        seed: of the draws.
+
+    Raises:
+        ValueError: worlds have action masks.
+    """
+
+    @checked
+    def __init__(self, env: Env, *, probability: Probability = 0.25, seed: int = 1):
+        super().__init__(env)
+        self.probability, self.draws = probability, Draws(env, (), seed)
+        self.is_first = torch.ones(n_lanes(env), dtype=torch.bool, device=env.device)
+
+        def zeros(space) -> torch.Tensor:
+            dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
+            return torch.zeros(n_lanes(env), *space.shape, dtype=dtype, device=env.device)
+
+        self.last = spaces.map(zeros, env.action_space)
+
+    def before(self, actions: Tree) -> Tree:
+        """Returns the last actions in lanes that repeat them."""
+        repeats = (self.draws()[:, 0] < self.probability) & ~self.is_first
+
+        def stick(_, last, new) -> torch.Tensor:
+            return last.copy_(torch.where(_along(repeats, new), last, new)).clone()
+
+        return spaces.map(stick, self.action_space, self.last, actions)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Notes where episodes begin."""
+        self.is_first.copy_(world.reset)
+        return super().after(world)
+
+
+class NoisyActions(_Random):
+    """Replaces discrete actions by random ones with a probability, and adds noise to continuous
+    ones.
+
+    Args:
+        env: the environment inside.
+        probability: of a random action, in each step, per agent of a lane.
+        std: standard deviation of the noise, in units of half the range of an action. Actions stay
+            within their bounds.
+        seed: of the draws.
+
+    Raises:
+        ValueError: worlds have action masks.
+    """
+
+    @checked
+    def __init__(
+        self,
+        env: Env,
+        *,
+        probability: Probability = 0.1,
+        std: Annotated[float, Field(ge=0, le=10)] = 0.1,
+        seed: int = 1,
+    ):
+        super().__init__(env)
+        self.probability, self.std = probability, std
+        leaves = spaces.leaves(env.action_space).values()
+        self.draws = [Draws(env, space.shape, seed + (i << 40)) for i, space in enumerate(leaves)]
+
+    def before(self, actions: Tree) -> Tree:
+        """Returns the actions with noise."""
+        draws = iter(self.draws)
+
+        def disturb(space, leaf) -> torch.Tensor:
+            numbers = next(draws)()
+            if isinstance(space, spaces.MultiDiscrete):
+                n = space.n_actions
+                others = (numbers[..., 1] * n).to(leaf.dtype).clamp(max=n - 1)
+                return torch.where(numbers[..., 0] < self.probability, others, leaf)
+            low, high = space.tensors(leaf.device)
+            noise = self.std * (high - low) / 2 * normal(numbers)
+            return torch.minimum(torch.maximum(leaf + noise, low), high)
+
+        return spaces.map(disturb, self.action_space, actions)
+
+
+def normal(numbers: torch.Tensor) -> torch.Tensor:
+    """Returns numbers of mean 0 and standard deviation 1 from four uniform ones each, (..., 4) ->
+    (...): their sum, which is nearly Gaussian, and has the same bits on CPU and GPU.
+    """
+    a, b, c, d = numbers.unbind(-1)
+    return ((a + b) + (c + d) - 2.0) * 3**0.5
+
+
+class ActionRepeat(Wrapper):
+    """Takes each action several times, and returns the last world with the sum of the rewards. An
+    episode that ends in between ends there.
+
+    Args:
+        env: the environment inside, with ``reset(seed=None, mask=None)``.
+        n: steps of the environment inside per step.
+
+    Raises:
+        ValueError: the environment cannot begin episodes of some lanes alone.
+    """
+
+    @checked
+    def __init__(self, env: Env, *, n: Annotated[int, Field(ge=1, le=1000)] = 4):
+        super().__init__(env)
+        self.require_masks("begins episodes of lanes that ended before the others")
+        self.n = n
+        self.ended = torch.zeros(n_lanes(env), dtype=torch.bool, device=env.device)
+
+    @property
+    def fps(self) -> float:
+        """Steps per second of simulated time."""
+        return optional(self.env, "fps") / self.n
+
+    def step(self, decision: Mapping) -> arrdict:
+        """Takes n steps. Returns a world."""
+        is_over, total = self.ended.clone(), torch.zeros(n_lanes(self.env), device=self.device)
+        kept = world = None
+        for _ in range(self.n):
+            world = self.env.step(arrdict(actions=decision["actions"]))
+            total = total + world.reward.masked_fill(is_over, 0.0)
+            ends = (world.terminal | world.truncated) & ~is_over
+            is_over = is_over | ends
+            kept = world.clone() if kept is None else _where(ends, world, kept)
+        assert kept is not None
+        ended_now = is_over & ~self.ended
+        world = self.env.reset(mask=self.ended)
+        world = _where(ended_now, kept, world)
+        world = arrdict(world, reward=total.masked_fill(world.reset, 0.0))
+        self.ended.copy_(world.terminal | world.truncated)
+        return self._resets.keep(world)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Notes that no episode has ended, at a reset."""
+        self.ended.copy_(world.terminal | world.truncated)
+        return world
+
+
+def _where(condition, chosen, other) -> arrdict:
+    """Returns the lanes of one world where a condition (B,) is true, those of another else."""
+    if isinstance(chosen, Mapping):
+        parts = {key: _where(condition, part, other[key]) for key, part in chosen.items()}
+        return arrdict(parts)
+    return cast(arrdict, torch.where(_along(condition, chosen), chosen, other))

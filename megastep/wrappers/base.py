@@ -1,0 +1,135 @@
+"""The base class of wrappers around environments."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from megastep import engine, spaces
+from megastep.arrdict import arrdict
+from megastep.coefficients import Coefficients
+from megastep.modules.lifecycle import CounterGenerator
+from megastep.settings import closest
+from megastep.types import Env, Space, Tree, n_lanes, takes_masks
+
+__all__ = ["Draws", "Wrapper", "chosen", "replaced"]
+
+
+class Wrapper:
+    """An environment around another one, which changes its actions, worlds or both. All other
+    attributes are those of the environment inside.
+
+    A subclass has `before`, `after` or both, sets `obs_space` or `action_space` if it changes them,
+    and keeps whatever changes in tensors with a row per lane, which it changes in place:
+    checkpoints hold them, and CUDA graphs repeat them. Its other constructor arguments are
+    settings.
+
+    Args:
+        env: the environment inside.
+    """
+
+    env: Any
+    #: Its own numbers that may have schedules.
+    own_coefficients: tuple[Coefficients, ...] = ()
+
+    def __init__(self, env: Env):
+        self.env = env
+        inside = getattr(env, "_resets", None)
+        last = tuple(f"env.{name}" for name in getattr(inside, "lanes_last", ()))
+        self._resets = engine.Resets(last, getattr(inside, "draws", None))
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "env" or name.startswith("_"):  # not set yet while the object is being copied
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def before(self, actions: Tree) -> Tree:
+        """Returns the actions that the environment inside gets, (B, ...) per leaf."""
+        return actions
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns a world from that of the environment inside, which stays as it is. Where
+        `world.reset` is true an episode begins.
+        """
+        return world
+
+    def reset(
+        self, seed: "int | torch.Tensor | None" = None, mask: torch.Tensor | None = None
+    ) -> arrdict:
+        """Starts new episodes, as the environment inside does. Returns a world."""
+        if (seed is not None or mask is not None) and not self.takes_masks:
+            raise TypeError(f"{type(self.env).__name__} has no reset(seed=None, mask=None)")
+        if mask is not None:
+            return self._resets(
+                self, lambda chosen: self.after(self.env.reset(mask=chosen)), seed, mask
+            )
+        return self._resets(self, lambda _: self.after(self.env.reset()), seed)
+
+    def step(self, decision: Mapping) -> arrdict:
+        """Takes one step by ``decision["actions"]``. Returns a world."""
+        world = self.env.step(arrdict(actions=self.before(decision["actions"])))
+        return self._resets.keep(self.after(world))
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether `reset` takes a seed and a mask, as that of the environment inside."""
+        return takes_masks(self.env)
+
+    @property
+    def coefficients(self) -> tuple[Coefficients, ...]:
+        """Numbers that may have schedules, of the environment inside and its own."""
+        return *getattr(self.env, "coefficients", ()), *self.own_coefficients
+
+    def require_masks(self, why: str) -> None:
+        """Raises ValueError if the environment inside cannot begin episodes of some lanes alone."""
+        if not takes_masks(self.env):
+            raise ValueError(
+                f"{type(self).__name__} {why}, for which {type(self.env).__name__} needs "
+                "reset(seed=None, mask=None); wrap it with a wrapper of its own package, if it has "
+                "one"
+            )
+
+
+class Draws:
+    """Uniform numbers in [0, 1), equal on CPU and GPU.
+
+    Args:
+        env: their number of lanes, B, and device.
+        shape: of the numbers of a lane.
+        seed: from 0 to 2**64 - 1.
+    """
+
+    def __init__(self, env: Env, shape: tuple[int, ...], seed: int):
+        n = int(torch.Size(shape).numel()) * n_lanes(env)
+        self.shape = n_lanes(env), *shape, 4
+        self.generator = CounterGenerator(n, seed, env.device)
+        self.all = torch.ones(n, dtype=torch.bool, device=env.device)
+
+    def __call__(self) -> torch.Tensor:
+        """Returns (B, *shape, 4) float32, valid until the next call."""
+        return self.generator(self.all).view(self.shape)
+
+
+def chosen(wrapper: Wrapper, space: Space, sensor: str, kinds: tuple[type, ...]) -> Any:
+    """Returns the leaf of an observation space by its dotted path, "" for one that is no dict.
+
+    Raises:
+        ValueError: there is none of that name, or it is of another kind.
+    """
+    leaves = spaces.leaves(space)
+    name = type(wrapper).__name__
+    if sensor not in leaves:
+        hint = "leave sensor out" if "" in leaves else closest(sensor, leaves)
+        raise ValueError(f"{name}: there is no sensor {sensor!r}; {hint}")
+    if not isinstance(leaves[sensor], kinds):
+        words = " or ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{name}: {sensor or 'obs'} is {leaves[sensor]!r}, and not {words}")
+    return leaves[sensor]
+
+
+def replaced(tree: Tree, path: str, value: object) -> Tree:
+    """Returns a tree with another leaf at a dotted path."""
+    if not path:
+        return value
+    key, _, rest = path.partition(".")
+    return type(tree)({**tree, key: replaced(tree[key], rest, value)})
