@@ -3,6 +3,7 @@ a full disk or a closed pipe, never ends the work.
 """
 
 import contextlib
+import html
 import os
 import re
 import shutil
@@ -160,8 +161,17 @@ def restore() -> None:
         sys.stdout.flush()
 
 
+def _notebook() -> Any:
+    """Returns IPython's module of what a notebook shows; None outside notebooks."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython and ipython.get_ipython()
+    return getattr(ipython, "display", None) if hasattr(shell, "kernel") else None
+
+
 class Progress:
-    """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
+    """A context: a bar with a line of text on a terminal and in a notebook, elsewhere a line every
+    10 seconds.
+    """
 
     def __init__(self) -> None:
         from rich import progress  # only for those who wait
@@ -174,6 +184,7 @@ class Progress:
             disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
         )
         self.task = self.bar.add_task("starting", total=1)
+        self.notebook, self.cell = None if prefix or is_silent else _notebook(), None
 
     def __enter__(self) -> "Progress":
         self.bar.start()
@@ -186,9 +197,20 @@ class Progress:
         """Shows words on one line; `fraction` of the work is done, None if it has no end."""
         text, total = (" · " if is_unicode() else "  ").join(words), None if fraction is None else 1
         self.bar.update(self.task, completed=fraction or 0, total=total, description=text)
-        if self.bar.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
+        if self.notebook is not None:
+            self._show_in_notebook(fraction, text)
+        elif self.bar.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
             self.shown_at = time.monotonic()
             say(text)
+
+    def _show_in_notebook(self, fraction, text) -> None:
+        """Replaces what the notebook's cell shows."""
+        done = "" if fraction is None else f' value="{min(max(fraction, 0), 1):.4f}"'
+        shown = self.notebook.HTML(f"<progress{done}></progress> {html.escape(visible(text))}")
+        if self.cell is None:
+            self.cell = self.notebook.display(shown, display_id=True)
+        else:
+            self.cell.update(shown)
 
 
 def number(value: float) -> str:

@@ -25,7 +25,7 @@ from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.imports import known_name
 from megastep.settings import checked
-from megastep.types import Space, Tree
+from megastep.types import Env, Space, Tree, optional
 
 #: Prefixes of the weights that acting does not need, in a policy's `state_dict`.
 TRAINING_ONLY = ("critic.", "prediction.")
@@ -44,8 +44,9 @@ class Policy(nn.Module):
     `prediction_error` can teach the core to infer them.
 
     Args:
-        obs_space: the environment's observation space.
-        action_space: the environment's action space.
+        obs_space: the environment's observation space; or the environment, whose spaces it takes,
+            and whose device it is on.
+        action_space: the environment's action space; None with an environment.
         privileged_space: space of what only the critic sees, or None.
         width: units of the recurrent core and of all features.
         core: a name in `cores.CORES`, or an import path.
@@ -76,8 +77,8 @@ class Policy(nn.Module):
     @checked
     def __init__(
         self,
-        obs_space: Space,
-        action_space: Space,
+        obs_space: Space | Env,
+        action_space: Space | None = None,
         privileged_space: Space | None = None,
         *,
         width: Annotated[int, Field(ge=1, le=8192)] = 256,
@@ -92,6 +93,13 @@ class Policy(nn.Module):
         seed: int = 1,
     ):
         super().__init__()
+        device = None
+        if hasattr(obs_space, "obs_space"):
+            env = cast(Env, obs_space)
+            obs_space, action_space, device = env.obs_space, env.action_space, env.device
+            privileged_space = optional(env, "privileged_space")
+        elif action_space is None:
+            raise ValueError("a policy needs an action space too: Policy(env), or both spaces")
         critic, self.seed = None if output == "duelling" else critic, seed
         self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None
@@ -104,6 +112,8 @@ class Policy(nn.Module):
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:
                 self.prediction = nn.Linear(width, self._critic.intake.n_features)
+        if device is not None:
+            self.to(device)
 
     @property
     def device(self) -> torch.device:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
+from exported_agents import exported
 from films import films
 from nsight_counters import counters
 from peers import peers
@@ -33,6 +34,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "paths": paths,
     "checkpoints": checkpoints,
     "films": films,
+    "exported": exported,
     "compile": compile_kernels,
     "first": first_step,
     "startup": startup,

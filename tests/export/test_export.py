@@ -129,6 +129,21 @@ def test_files_act_as_the_policy_for_1000_steps(kind, tmp_path):
     assert json.loads(ports)["outputs"][0]["name"] == step.outputs[0].name
 
 
+@pytest.mark.nightly
+def test_an_agent_of_gymnasium_is_exported(here):
+    """With the normalisation of observations inside, and named after its spaces."""
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(name)
+    words = [*TINY[2:3], *TINY[4:], "env=gymnasium", "env.id=CartPole-v1", "samples=256"]
+    assert train.main([*words, "env.wrappers=[{name:frame_stack,n:2}]", "folder=run"]) == 0
+    assert export.main(["run=run", "format=onnx", "file=a.onnx"]) == 0
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession("a.onnx")
+    inputs = {port.name: port.shape[1:] for port in session.get_inputs()}
+    assert inputs == {"obs": [1, 8], "reset": [], "state.0": [8], "state.1": [8]}
+
+
 class Odd(torch.nn.Module):
     """A core that asks a tensor for its value, which no graph has."""
 
