@@ -184,7 +184,8 @@ class Progress:
             disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
         )
         self.task = self.bar.add_task("starting", total=1)
-        self.notebook, self.cell = None if prefix or is_silent else _notebook(), None
+        self.notebook: Any = None if prefix or is_silent else _notebook()
+        self.cell = None
 
     def __enter__(self) -> "Progress":
         self.bar.start()

@@ -40,7 +40,7 @@ class Coefficients:
             for name, value in settings.items()
         }
         vector = torch.tensor([*self.values.values()], dtype=torch.float32, device=device)
-        self.tensors = dict(zip(self.values, vector.unbind()))
+        self.tensors: dict = dict(zip(self.values, vector.unbind()))
         self.is_on_gpu = vector.is_cuda
 
     def __getitem__(self, name: str) -> "float | torch.Tensor":

@@ -215,7 +215,7 @@ def _check_mask(env, mask) -> None:
     """Requires a bool per action of discrete spaces, of which at least one is true."""
     actions, masks = spaces.leaves(env.action_space, "mask"), spaces.leaves(mask, "mask")
     for path, values in masks.items():
-        space = actions.get(path)
+        space: Any = actions.get(path)
         is_discrete = isinstance(space, spaces.MultiDiscrete)
         _require(env, is_discrete, f"{path} is of no discrete action space: leave it out")
         shape = n_lanes(env), *space.shape, space.n_actions

@@ -131,10 +131,10 @@ class GradientSteps:
             () bool, whether the step was taken.
         """
         max_metrics = LIBRARY.constants["JUDGED_METRICS"]
-        is_fused = isinstance(self.optimizer, Adam) and self.optimizer.is_fused
-        if is_fused and len(self._metrics) <= max_metrics:
-            grad_norm, is_taken = self._judge_on_gpu(is_enabled)
-            self.optimizer.step_on_gpu(is_taken, grad_norm, self.max_grad_norm)
+        adam = self.optimizer
+        if isinstance(adam, Adam) and adam.is_fused and len(self._metrics) <= max_metrics:
+            grad_norm, is_taken = self._judge_on_gpu(adam, is_enabled)
+            adam.step_on_gpu(is_taken, grad_norm, self.max_grad_norm)
         else:
             grad_norm, is_taken = self._judge(is_enabled)
             self.optimizer.step(is_taken, grad_norm, self.max_grad_norm)
@@ -155,9 +155,9 @@ class GradientSteps:
         self._totals = row if self._totals is None else self._totals + row
         return grad_norm, is_taken
 
-    def _judge_on_gpu(self, is_enabled) -> tuple[torch.Tensor, torch.Tensor]:
+    def _judge_on_gpu(self, adam, is_enabled) -> tuple[torch.Tensor, torch.Tensor]:
         """Does `_judge` in two kernels, and counts the step."""
-        sums, device = self.optimizer.squared_norms(), self._lr.device
+        sums, device = adam.squared_norms(), self._lr.device
         metrics = [value.float() for value in self._metrics.values()]
         pack = LIBRARY.params.MetricParams
         assert self._is_finite is not None

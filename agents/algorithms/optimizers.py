@@ -1,7 +1,6 @@
 """Optimizers by name: Adam, plain gradient descent, and those of other packages."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Protocol
 
 import torch
 
@@ -12,36 +11,6 @@ from megastep.imports import import_object
 #: Adam's weight decay is decoupled, so that with one it is AdamW.
 NAMES = ("adam", "adamw", "sgd")
 _Factors = Mapping[torch.nn.Parameter, float]
-
-
-class Optimizer(Protocol):
-    """What `GradientSteps` needs of an optimizer; `Adam` has it.
-
-    Attributes:
-        parameters: what it optimises.
-        n_steps: (), steps taken.
-        is_fused: whether kernels take the step, with Adam's `squared_norms` and `step_on_gpu`.
-        capturable: whether a CUDA graph can repeat a step.
-    """
-
-    parameters: list[torch.nn.Parameter]
-    n_steps: torch.Tensor
-    capturable: bool
-
-    @property
-    def is_fused(self) -> bool: ...
-
-    def grad_norm(self) -> torch.Tensor: ...
-
-    def step(
-        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0
-    ) -> None: ...
-
-    def zero_grad(self) -> None: ...
-
-    def state_dict(self) -> StateDict: ...
-
-    def load_state_dict(self, state: StateDict) -> None: ...
 
 
 def make_optimizer(

@@ -71,7 +71,7 @@ class DuellingOutput(Output):
         layer's.
         """
         if torch.is_grad_enabled() or not self._is_fused(x) or mask is not None:
-            options = {} if epsilon is None else dict(epsilon=epsilon)
+            options: dict = {} if epsilon is None else dict(epsilon=epsilon)
             if mask is not None:
                 options["is_masked"] = True
             return super().act(x, sample, generator, mask, **options)

@@ -1,7 +1,7 @@
 """The base class of wrappers around environments."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -59,11 +59,11 @@ class Wrapper:
         """Starts new episodes, as the environment inside does. Returns a world."""
         if (seed is not None or mask is not None) and not self.takes_masks:
             raise TypeError(f"{type(self.env).__name__} has no reset(seed=None, mask=None)")
-        if mask is not None:
-            return self._resets(
-                self, lambda chosen: self.after(self.env.reset(mask=chosen)), seed, mask
-            )
-        return self._resets(self, lambda _: self.after(self.env.reset()), seed)
+
+        def begin(chosen) -> arrdict:
+            return self.after(self.env.reset() if mask is None else self.env.reset(mask=chosen))
+
+        return self._resets(cast(Env, self), begin, seed, mask)
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world."""
