@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from io import StringIO
+from types import ModuleType
 from typing import Any, TextIO
 
 from megastep.agents.errors import UserError
@@ -161,7 +162,7 @@ def restore() -> None:
         sys.stdout.flush()
 
 
-def _notebook() -> Any:
+def _notebook() -> ModuleType | None:
     """Returns IPython's module of what a notebook shows; None outside notebooks."""
     ipython = sys.modules.get("IPython")
     shell = ipython and ipython.get_ipython()
@@ -184,7 +185,7 @@ class Progress:
             disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
         )
         self.task = self.bar.add_task("starting", total=1)
-        self.notebook: Any = None if prefix or is_silent else _notebook()
+        self.notebook = None if prefix or is_silent else _notebook()
         self.cell = None
 
     def __enter__(self) -> "Progress":
@@ -206,6 +207,7 @@ class Progress:
 
     def _show_in_notebook(self, fraction, text) -> None:
         """Replaces what the notebook's cell shows."""
+        assert self.notebook is not None
         done = "" if fraction is None else f' value="{min(max(fraction, 0), 1):.4f}"'
         shown = self.notebook.HTML(f"<progress{done}></progress> {html.escape(visible(text))}")
         if self.cell is None:

@@ -215,9 +215,10 @@ def _check_mask(env, mask) -> None:
     """Requires a bool per action of discrete spaces, of which at least one is true."""
     actions, masks = spaces.leaves(env.action_space, "mask"), spaces.leaves(mask, "mask")
     for path, values in masks.items():
-        space: Any = actions.get(path)
+        space = actions.get(path)
         is_discrete = isinstance(space, spaces.MultiDiscrete)
         _require(env, is_discrete, f"{path} is of no discrete action space: leave it out")
+        assert space is not None
         shape = n_lanes(env), *space.shape, space.n_actions
         _check_tensor(env, path, values, shape, (torch.bool,))
         _require(env, bool(values.any(-1).all()), f"{path} must allow at least one action")

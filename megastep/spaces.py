@@ -13,11 +13,14 @@ would replace Python's.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
 from megastep.arrdict import arrdict
+
+if TYPE_CHECKING:
+    from megastep.types import Tree
 
 __all__ = ["MultiContinuous", "MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector"]
 
@@ -217,7 +220,7 @@ def random_action_tree(
     device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
     mask: object = None,
-) -> Any:
+) -> "Tree":
     """Returns `random_actions` of a leaf space, or of each leaf of nested dicts of them."""
     if not isinstance(space, Mapping):
         leaf = cast("MultiDiscrete | MultiContinuous", space)

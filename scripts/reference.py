@@ -45,6 +45,8 @@ SCRIPTS = {"train": settings.Train, "evaluate": settings.Evaluate, "record": set
 SINGLE = {"agent": components.POLICY, "opponents": components.OPPONENTS}
 #: Settings that no docstring describes, since they are no arguments of the constructor.
 ADDED = {
+    "env.wrappers": "wrappers around the environment, names or `{name: ..., setting: ...}`; see "
+    "[wrappers](../wrappers.md)",
     "learner.anneal": "budget over which the learning rate falls linearly to 0; `auto` takes "
     "`samples` if given, else `seconds`",
     "opponents.bot_class": "name or import path of the bot; null: the environment's own",
@@ -443,7 +445,8 @@ def _word(hint, names):
         return "keys with values"
     if inner:
         return f"list of {_word(inner[0], ())}s"
-    return {bool: "true or false", int: "integer", float: "number", str: "word"}[origin]
+    words = {bool: "true or false", int: "integer", float: "number", str: "word", tuple: "list"}
+    return words[origin]
 
 
 def unexplained() -> list[str]:

@@ -99,6 +99,7 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.scene",
     "megastep.sync_envs",
     "megastep.workers",
+    "megastep.wrappers",
 }
 # Rooms whose subject ranks are, and how many files elsewhere may know of them.
 ROOMS_WITH_RANKS = ("distributed", "storage", "algorithms", "launch")

@@ -29,9 +29,7 @@ from megastep.settings import arguments_of, parameters_of
 
 def _wrappers(value: object) -> object:
     """Checks names and settings of wrappers. Raises ValueError naming what is wrong."""
-    from megastep.agents.factory import settings
-
-    return settings.checked_wrappers(value)
+    return import_object("megastep.agents.factory.settings:checked_wrappers")(value)
 
 
 POLICY = "megastep.agents.networks.policy:Policy"

@@ -69,7 +69,7 @@ def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: 
     return float(value)
 
 
-def weight(name: str, value: Any, device: torch.device) -> torch.Tensor:
+def weight(name: str, value: object, device: torch.device) -> torch.Tensor:
     """Returns a finite number, or a tensor () float32 with one, as such a tensor, which a kernel
     reads when it runs. TypeError or ValueError for anything else.
     """

@@ -162,8 +162,7 @@ class ActionRepeat(Wrapper):
             kept = world.clone() if kept is None else _where(ends, world, kept)
         assert kept is not None
         ended_now = is_over & ~self.ended
-        world = self.env.reset(mask=self.ended)
-        world = _where(ended_now, kept, world)
+        world = _where(ended_now, kept, self.restarted(self.ended))
         world = arrdict(world, reward=total.masked_fill(world.reset, 0.0))
         self.ended.copy_(world.terminal | world.truncated)
         return self._resets.keep(world)

@@ -1,7 +1,7 @@
 """The base class of wrappers around environments."""
 
-from collections.abc import Mapping
-from typing import Any, cast
+from collections.abc import Callable, Mapping
+from typing import cast
 
 import torch
 
@@ -28,7 +28,11 @@ class Wrapper:
         env: the environment inside.
     """
 
-    env: Any
+    env: Env
+    n_envs: int
+    device: torch.device
+    obs_space: Space
+    action_space: Space
     #: Its own numbers that may have schedules.
     own_coefficients: tuple[Coefficients, ...] = ()
 
@@ -38,7 +42,7 @@ class Wrapper:
         last = tuple(f"env.{name}" for name in getattr(inside, "lanes_last", ()))
         self._resets = engine.Resets(last, getattr(inside, "draws", None))
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         if name == "env" or name.startswith("_"):  # not set yet while the object is being copied
             raise AttributeError(name)
         return getattr(self.env, name)
@@ -61,14 +65,22 @@ class Wrapper:
             raise TypeError(f"{type(self.env).__name__} has no reset(seed=None, mask=None)")
 
         def begin(chosen) -> arrdict:
-            return self.after(self.env.reset() if mask is None else self.env.reset(mask=chosen))
+            whole: Callable = self.env.reset
+            return self.after(whole() if mask is None else self.restarted(chosen))
 
-        return self._resets(cast(Env, self), begin, seed, mask)
+        return self._resets(self, begin, seed, mask)
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world."""
         world = self.env.step(arrdict(actions=self.before(decision["actions"])))
-        return self._resets.keep(self.after(world))
+        return self._resets.keep(self.after(cast(arrdict, world)))
+
+    def restarted(self, mask: torch.Tensor) -> arrdict:
+        """Returns the last world of the environment inside, in which the lanes of a mask (B,) have
+        begun new episodes.
+        """
+        reset: Callable = self.env.reset
+        return reset(mask=mask)
 
     @property
     def takes_masks(self) -> bool:
@@ -110,7 +122,7 @@ class Draws:
         return self.generator(self.all).view(self.shape)
 
 
-def chosen(wrapper: Wrapper, space: Space, sensor: str, kinds: tuple[type, ...]) -> Any:
+def chosen(wrapper: Wrapper, space: Space, sensor: str, kinds: tuple[type, ...]) -> Space:
     """Returns the leaf of an observation space by its dotted path, "" for one that is no dict.
 
     Raises:

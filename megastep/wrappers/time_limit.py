@@ -38,7 +38,7 @@ class TimeLimit(Wrapper):
     def step(self, decision) -> arrdict:
         """Takes one step. Returns a world."""
         self.env.step(decision)
-        return self._resets.keep(self.after(self.env.reset(mask=self.is_cut)))
+        return self._resets.keep(self.after(self.restarted(self.is_cut)))
 
     def after(self, world: arrdict) -> arrdict:
         """Returns the world, truncated where an episode is at its limit."""
