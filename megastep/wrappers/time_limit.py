@@ -17,7 +17,8 @@ class TimeLimit(Wrapper):
     """Truncates episodes after a number of steps. The next step begins a new one, which costs a
     second rendering of every step.
 
-    Metrics of an episode that it truncates are what the environment gives at that step.
+    Metrics of an episode that it truncates are what the environment gives at that step: 0, where it
+    computes them at the end of its own episodes.
 
     Args:
         env: the environment inside, with ``reset(seed=None, mask=None)``.

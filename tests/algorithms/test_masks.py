@@ -150,12 +150,13 @@ def test_a_wrong_mask_breaks_the_contract(change, message):
         contract.rollout(Wrong(), 2)
 
 
-def test_masks_of_gymnasium_reach_training_and_evaluation(here):
+@pytest.mark.parametrize(
+    "vectorization", ["sync", pytest.param("async", marks=pytest.mark.nightly)]
+)
+def test_masks_of_gymnasium_reach_training_and_evaluation(vectorization, here):
     """The environment raises an error if a forbidden action is taken."""
     name = "env.id=tests.helpers.masked_gym:Strict-v0"
     words = [*TINY[2:3], *TINY[4:], "env=gymnasium", name]
-    for vectorization in ("sync", "async"):
-        folder = f"folder={vectorization}"
-        more = "samples=640", f"env.vectorization={vectorization}", folder
-        assert train.main([*words, *more]) == 0
-    assert evaluate.main(["run=sync", "episodes=4", "device=cpu", "baseline=random"]) == 0
+    more = "samples=640", f"env.vectorization={vectorization}", "folder=run"
+    assert train.main([*words, *more]) == 0
+    assert evaluate.main(["run=run", "episodes=4", "device=cpu", "baseline=random"]) == 0

@@ -86,7 +86,7 @@ struct TdLossParams {
     float* values;                   // (P, T + 1, M), written
     float* d_q;                      // (P, T + 1, M, A, n), of the sum over valid steps
     float* priorities;               // (P, M)
-    float* sums;  // (P, n_blocks, 7): loss, |error|, q, valid steps; age, weight, weight^2
+    float* sums;         // (P, n_blocks, 7): loss, |error|, q, valid steps; age, weight, weight^2
     const float* gamma;  // (P)
     int n_steps;
     int n_sequences;

@@ -42,8 +42,8 @@ KERNEL ppo_loss(PpoLossParams p) {
             sums[3] = ratio - 1.f - log_ratio;
             sums[4] = ratio != clipped ? 1.f : 0.f;
             sums[5] = p.errors ? p.errors[row] : 0.f;
-            sums[6] = sums[0] + value_coef * sums[1] - entropy_coef * sums[2] +
-                      auxiliary_coef * sums[5];
+            sums[6] =
+                sums[0] + value_coef * sums[1] - entropy_coef * sums[2] + auxiliary_coef * sums[5];
             for (int i = 0; i < N_SUMS; i++)
                 sums[i] *= weight;
         }

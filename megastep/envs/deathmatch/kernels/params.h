@@ -29,13 +29,13 @@ struct DeathmatchStepParams {
     const float* kill_reward;
     const float* death_cost;
     const float* aim_reward;  // for bringing an agent from the edge of the view to its centre
-    float hearing;     // metres at which sounds fade
-    int limit;         // steps per episode
-    int res;           // rays per view
-    int n_envs;        // N
-    int n_agents;      // A
-    int n_model;       // M
-    int n_threads;     // CPU threads
+    float hearing;            // metres at which sounds fade
+    int limit;                // steps per episode
+    int res;                  // rays per view
+    int n_envs;               // N
+    int n_agents;             // A
+    int n_model;              // M
+    int n_threads;            // CPU threads
 };
 
 // B lanes, R pixels.

@@ -30,11 +30,11 @@ struct KeysStepParams {
     float* privileged;         // (N, 2 C + 3) for a critic; null: none
     unsigned int key0;         // the seed
     unsigned int key1;
-    int n_episodes;     // M
-    int n_colours;      // C
-    int n_doorways;     // K
-    int limit;          // steps per episode
-    float reach;        // metres between surfaces at which an agent touches an object
+    int n_episodes;            // M
+    int n_colours;             // C
+    int n_doorways;            // K
+    int limit;                 // steps per episode
+    float reach;               // metres between surfaces at which an agent touches an object
     const float* key_reward;   // (), for a key that is picked up
     const float* door_reward;  // (), for a door that is opened
 };

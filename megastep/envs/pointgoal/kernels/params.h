@@ -33,14 +33,14 @@ struct PointgoalStepParams {
     float* privileged;         // (N, A, N_PRIVILEGED) for a critic; null: none
     unsigned int key0;         // the seed
     unsigned int key1;
-    float per_cell;   // cells per metre
-    float reach;      // metres: success within this distance of the goal
+    float per_cell;          // cells per metre
+    float reach;             // metres: success within this distance of the goal
     const float* bonus;      // (), reward for success
     const float* cost;       // (), reward subtracted per step
     const float* walk_cost;  // (), reward subtracted per metre walked
-    int limit;        // steps per episode
-    int n_goals;      // per layout
-    int n_spawns;     // per layout
+    int limit;               // steps per episode
+    int n_goals;             // per layout
+    int n_spawns;            // per layout
 };
 
 // Homes, and the points where shortest paths may bend: D homes, K groups of walls, V corners, G
