@@ -262,3 +262,25 @@ def test_trains_and_evaluates(tmp_path, monkeypatch):
     assert evaluate.main(["run=run", "episodes=30", "baseline=false"]) == 0
     (path,) = (tmp_path / "run" / "evaluations").glob("[!d]*.json")
     assert json.loads(path.read_text())["rows"][0]["lanes"] == 30, "of ten environments"
+
+
+class Doubled:
+    """A wrapper as PettingZoo's: rewards count twice."""
+
+    def __init__(self, env):
+        self.env = self.unwrapped = env
+
+    def __getattr__(self, name):
+        return getattr(self.env, name)
+
+    def step(self, actions):
+        seen, rewards, *others = self.env.step(actions)
+        return seen, {agent: 2 * reward for agent, reward in rewards.items()}, *others
+
+
+def test_wrappers_of_the_package_are_around_each_environment():
+    plain, doubled = PettingZoo(2, id=ID), PettingZoo(2, id=ID, wrappers=(f"{__name__}:Doubled",))
+    decision = arrdict(actions=torch.arange(3).repeat(2)[:, None])
+    plain.reset(), doubled.reset()
+    reward = plain.step(decision).reward
+    assert bool(reward.any()) and torch.equal(doubled.step(decision).reward, 2 * reward)
