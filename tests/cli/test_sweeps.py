@@ -307,7 +307,7 @@ def test_preempted_submitit_job_continues_its_checkpoint(here):
 
 
 @pytest.mark.slow
-def test_job_in_a_process_of_its_own_that_ends_leaves_the_others(here):
+def test_job_that_ends_its_process_leaves_the_others(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     code, out, err = finished("train", *SHORT, "-m", "env.mood=dead,fine", "env.pay=2", *JOBLIB)
     assert code == 1 and f"Job 0 {sweeps.LOST}" in err and "Traceback" not in err
