@@ -28,7 +28,6 @@ _MODULES = {
     "TorchRLEnv": "torchrl",
     "check_vector_env": "vector_checks",
 }
-__all__ = [*_MODULES]
 
 
 def __getattr__(name) -> object:

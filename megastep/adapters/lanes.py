@@ -12,15 +12,15 @@ from torch.utils import _pytree
 
 from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.capture import Captured, capture
-from megastep.types import Env, Tree, n_lanes, optional, takes_masks
+from megastep.capture import Captured, Graph, capture
+from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
 __all__ = ["Lanes", "ended", "fresh"]
 
 WORD = 4  # bytes
 
 
-def ended(world: arrdict) -> torch.Tensor:
+def ended(world: World) -> torch.Tensor:
     """Returns (B,) bool: where a world ends an episode."""
     return world["terminal"] | world["truncated"]
 
@@ -32,7 +32,8 @@ def fresh(tree: Tree) -> Tree:
     pairs = [*zip(copies, leaves)]
     words = [pair for pair in pairs if pair[0].is_cuda and all(map(_is_words, pair))]
     if words:
-        torch._foreach_copy_(*([_words(leaf) for leaf in side] for side in zip(*words)))
+        into, given = ([_words(leaf) for leaf in side] for side in zip(*words))
+        torch._foreach_copy_(into, given)  # pyright: ignore[reportPrivateImportUsage]
         pairs = [pair for pair in pairs if not all(map(_is_words, pair))]
     for copy, leaf in pairs:
         copy.copy_(leaf)
@@ -86,13 +87,14 @@ class Lanes:
         self.env, self.n_lanes, self.device = env, n_lanes(env), torch.device(env.device)
         self.takes_masks, self._is_same_step = takes_masks(env), same_step
         on_gpu = self.device.type == "cuda" and optional(env, "capturable")
-        self._captured = Captured(env) if on_gpu else env
+        self._on_gpu, self._captured = on_gpu, Captured(env)  # plain steps on a CPU
         self._both, self._reset = None, cast(Callable, env.reset)
+        self._resets: dict[int, Callable] = {}  # by their number of arguments
 
     @_in_plain_tensors
     def reset(
         self, seed: int | Sequence[int | None] | None = None, mask: torch.Tensor | None = None
-    ) -> arrdict:
+    ) -> World:
         """Returns the first world, or with a mask the last one with new rows.
 
         Args:
@@ -102,14 +104,28 @@ class Lanes:
         Raises:
             ValueError: naming what does not fit.
         """
-        if seed is None and mask is None:
+        is_recorded = any(isinstance(step, Graph) for step in (self._captured._step, self._both))
+        if not self.takes_masks and seed is None and mask is None:
             return self.env.reset()
         if not self.takes_masks:
             raise ValueError(
                 f"{type(self.env).__name__} takes neither seeds nor masks: it has no "
                 "reset(seed=None, mask=None), see megastep.types.Env"
             )
-        return self._reset(seed=self._seeds(seed), mask=mask)
+        seeds = self._seeds(seed)
+        if not is_recorded:
+            return self._reset(seed=seeds, mask=mask)
+        # into the world that the graph of a step returns, by a graph too
+        mask = (
+            torch.ones(self.n_lanes, dtype=torch.bool, device=self.device) if mask is None else mask
+        )
+        arguments = (mask,) if seeds is None else (mask, seeds)
+        if len(arguments) not in self._resets:
+            self._resets[len(arguments)] = capture(self._masked_reset, arguments, (self.env,))
+        return self._resets[len(arguments)](*arguments)
+
+    def _masked_reset(self, mask, seeds=None) -> World:
+        return self._reset(seed=seeds, mask=mask)
 
     def _seeds(self, seed) -> torch.Tensor | None:
         if seed is None:
@@ -145,12 +161,12 @@ class Lanes:
         def converted(space, values) -> torch.Tensor:
             dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
             values = torch.as_tensor(values).to(self.device, dtype, non_blocking=True)
-            return values.reshape(self.n_lanes, *space.shape)
+            return values.reshape(self.n_lanes, *space.shape).contiguous()
 
         return arrdict(actions=spaces.map(converted, self.env.action_space, actions))
 
     @_in_plain_tensors
-    def step(self, actions: Tree) -> tuple[arrdict, arrdict]:
+    def step(self, actions: Tree) -> tuple[World, World]:
         """Returns (world, final world). With ``same_step``, the first has the first observation
         where an episode ended, and the final world its last one; otherwise both are the same.
         """
@@ -158,13 +174,13 @@ class Lanes:
         if not self._is_same_step:
             world = self._captured.step(decision)
             return world, world
-        if self._captured is self.env:
+        if not self._on_gpu:
             return self._same_step(decision, bool)
         if self._both is None:
             self._both = capture(self._same_step, (decision,), (self.env,))
         return self._both(decision)
 
-    def _same_step(self, decision, is_needed=lambda any_ended: True) -> tuple[arrdict, arrdict]:
+    def _same_step(self, decision, is_needed=lambda any_ended: True) -> tuple[World, World]:
         world = self.env.step(decision)
         over = ended(world)
         if not is_needed(over.any()):

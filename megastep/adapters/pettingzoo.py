@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """An environment of several agents as PettingZoo's parallel environment."""
 
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from megastep.types import Env, Tree, optional
 __all__ = ["ParallelEnv"]
 
 
-class ParallelEnv(pettingzoo.ParallelEnv):
+class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeIssues]
     """An environment of megastep with N = 1 as a `pettingzoo.ParallelEnv`, in NumPy.
 
     All agents leave together, when the game is over: ``env.game_over``, or by default where the
@@ -85,13 +86,15 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         for i, agent in enumerate(self.agents):
             flags = {name: True for name in names[1:] if values[name][i]}
             infos[agent] = flags and flags | {k: float(v[i]) for k, v in metrics.items()}
-        by_agent = [dict(zip(self.agents, values[name].tolist())) for name in names]
+        rewards, terminations, truncations = (
+            dict(zip(self.agents, values[name].tolist())) for name in names
+        )
         if not is_over:
-            by_agent[1:] = [dict.fromkeys(self.agents, False) for _ in range(2)]
+            terminations, truncations = (dict.fromkeys(self.agents, False) for _ in range(2))
         observations = self._observations(world)
         if is_over:
             self.agents = []
-        return observations, *by_agent, infos
+        return observations, rewards, terminations, truncations, infos
 
     def _observations(self, world) -> dict[str, Tree]:
         batch = to_numpy(without_agents(self.env.obs_space, world["obs"], torch.float32))

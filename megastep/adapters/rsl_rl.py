@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """An environment of megastep as rsl_rl's vector environment."""
 
 import torch
@@ -49,7 +50,7 @@ class RslRlVecEnv(VecEnv):
     def reset(self) -> tuple[TensorDict, dict]:
         """Begins episodes in all lanes. Returns (observations, extras)."""
         self._world = self.lanes.reset()
-        self.episode_length_buf.zero_()
+        self.episode_length_buf = torch.zeros_like(self.episode_length_buf)
         return self.get_observations(), {}
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:

@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """An environment of megastep as Stable-Baselines3's vector environment."""
 
 import warnings

@@ -62,7 +62,7 @@ def to_numpy(tree: Tree) -> Tree:
     return tree.detach().to("cpu", copy=True).numpy()
 
 
-def row(tree: Tree, lane: int) -> Tree:
+def row(tree: Tree, lane: int | np.integer) -> Tree:
     """Returns one lane's values of a batch."""
     if isinstance(tree, Mapping):
         return {key: row(part, lane) for key, part in tree.items()}

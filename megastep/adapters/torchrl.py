@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false, reportArgumentType=false
 """An environment of megastep as TorchRL's."""
 
 from collections.abc import Mapping

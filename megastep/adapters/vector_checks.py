@@ -114,7 +114,10 @@ class _Record:
 class _Checker:
     def __init__(self, env, faults, seed, n_steps, reuses_buffers) -> None:
         self.env, self.faults, self.seed, self.n_steps = env, faults, seed, n_steps
-        self.reuses_buffers = reuses_buffers
+        self.reuses_buffers, self.n, self.limit = reuses_buffers, env.num_envs, None
+        self.mode, self.is_tensor, self.device = AutoresetMode.NEXT_STEP, False, None
+        # whether a final observation was the first one, and whether a reset lane did not move
+        self.equal_finals, self.unmoved = [], []
 
     def fault(self, kind: str, sentence: str) -> None:
         self.faults.setdefault(kind, sentence)
@@ -142,7 +145,7 @@ class _Checker:
 
     def check_attributes(self) -> None:
         env = self.env
-        self.n = n = getattr(env, "num_envs", None)
+        n = env.num_envs
         if not isinstance(n, int) or n < 1:
             self.fault("num_envs", f"num_envs must be a positive integer, but it is {n!r}.")
             raise _Unusable
@@ -159,14 +162,14 @@ class _Checker:
                     f"{name}_space must be single_{name}_space batched {n} times, {expected}, but "
                     f"it is {batch}.",
                 )
-        self.mode = env.metadata.get("autoreset_mode")
-        if not isinstance(self.mode, AutoresetMode):
+        mode = env.metadata.get("autoreset_mode")
+        self.mode = mode if isinstance(mode, AutoresetMode) else AutoresetMode.NEXT_STEP
+        if mode is not self.mode:
             self.fault(
                 "mode",
-                f"metadata['autoreset_mode'] must be an AutoresetMode, but it is {self.mode!r}; "
+                f"metadata['autoreset_mode'] must be an AutoresetMode, but it is {mode!r}; "
                 "checked as NEXT_STEP.",
             )
-            self.mode = AutoresetMode.NEXT_STEP
         self.limit = getattr(getattr(env, "spec", None), "max_episode_steps", None)
 
     # ---- One run ----
@@ -406,7 +409,6 @@ class _Checker:
                 f"but in lane {wrong[0]} it is {bool(_array(mask)[wrong[0]])} at step {step}.",
             )
             return
-        self.equal_finals = getattr(self, "equal_finals", [])
         for lane in np.flatnonzero(over):
             final = _leaves(_row(record.infos["final_obs"], lane), "observations")
             final = {path: _array(leaf) for path, leaf in final.items()}
@@ -463,8 +465,8 @@ class _Checker:
                     f"changed in the reset after step {step}.",
                 )
             if mask[lane]:
-                self.unmoved = [*getattr(self, "unmoved", []), is_same]
-        if len(getattr(self, "unmoved", [])) >= 3 and all(self.unmoved):
+                self.unmoved.append(is_same)
+        if len(self.unmoved) >= 3 and all(self.unmoved):
             lane = int(mask.argmax())
             self.fault(
                 "mask ignored",
@@ -686,9 +688,10 @@ def _map(function, tree, *others) -> object:
 
 def _like(actions, is_tensor, device) -> object:
     """Returns a copy of actions, as tensors if observations are."""
-    if not is_tensor:
+    if not is_tensor or torch is None:
         return _copied(actions)
-    return _map(lambda leaf: torch.tensor(leaf, device=device), actions)
+    tensor = torch.tensor
+    return _map(lambda leaf: tensor(leaf, device=device), actions)
 
 
 def _where(mask, actions, others) -> object:
