@@ -225,7 +225,8 @@ class Keys(SceneryEnv):
         and the goal in a ring, and the agent's RGB and depth.
         """
         carried = [name for name, has in zip(modules.COLOURS, state.carried) if has]
-        title = f"step {state.age} · {state.opened} doors opened"
+        doors = "door" if state.opened == 1 else "doors"
+        title = f"step {state.age} · {state.opened} {doors} opened"
         title += f" · carries {', '.join(carried)}" if carried else ""
         yaws = state.core.yaws
         figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))
