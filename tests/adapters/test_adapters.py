@@ -324,7 +324,10 @@ def test_tensors_are_those_of_the_cpu_and_do_not_synchronise(mode):
     assert all(torch.equal(obs[key], on_gpu[key].cpu()) for key in obs)
     actions = [action[:, 0] for action in moves(cpu.env, 60)]
     gpu.step(actions[0].cuda())  # which records a CUDA graph
-    cpu.step(actions[0])
+    _, _, won, cut, _ = cpu.step(actions[0])
+    if mode is OFF:  # and another
+        gpu.reset(options={"reset_mask": (won | cut).cuda()})
+        cpu.reset(options={"reset_mask": won | cut})
     kept = []
     for action in actions[1:]:
         given = action.cuda()
@@ -371,6 +374,7 @@ def test_libraries_train_agents_above_random(name, package):
     assert trained[0] - trained[1] > random[0] + random[1], (random, trained)
 
 
+@pytest.mark.slow
 def test_the_code_of_the_page_runs():
     """In order. What needs a library that is not installed is left out."""
     names, n_run = {}, 0
