@@ -305,7 +305,8 @@ class GradientLearner:
             )
 
     def state_dict(self) -> StateDict:
-        """Returns optimizer, learning rate and generators as plain tensors and numbers.
+        """Returns optimizer, learning rate, coefficients and generators as plain tensors and
+        numbers.
 
         Does not include the policy's weights, rollouts or what a replay buffer holds.
         """
@@ -313,6 +314,7 @@ class GradientLearner:
             learner=type(self).__name__,
             normalisation=VERSION,
             **self.steps.state_dict(),
+            coefficients={k: v for k, v in self.coefficients.values.items() if k != "lr"},
             **({"extra": [parameter.detach() for parameter in self.extra]} if self.extra else {}),
             generator=self.generator.state_dict(),
             policy_generator=self.policy.generator.state_dict(),
@@ -350,6 +352,8 @@ class GradientLearner:
         """
         self.check_state(state)
         self.steps.load_state_dict(state)
+        saved = state.get("coefficients", {})  # which earlier versions could not change
+        self.coefficients.set(**{k: v for k, v in saved.items() if k in self.coefficients.values})
         with torch.no_grad():
             for parameter, saved in zip(self.extra, state.get("extra", []), strict=True):
                 parameter.copy_(saved)

@@ -132,7 +132,10 @@ def updated(device, values, graph=False, **settings):
 
 def test_an_update_follows_a_coefficient_that_is_set_from_outside():
     constant, _ = updated("cpu", [0.0] * 3)
-    changed, _ = updated("cpu", [0.0, 0.0, 1.0])
+    changed, learner = updated("cpu", [0.0, 0.0, 1.0])
+    _, other, _ = make()
+    other.load_state_dict(learner.state_dict())
+    assert other.coefficients["entropy_coef"] == 1
     assert torch.equal(constant[1], changed[1]) and not torch.equal(constant[2], changed[2])
 
 
