@@ -172,7 +172,7 @@ def test_step_matches_twin(seed, device, monkeypatch):
         things = {name: getattr(objects, name).cpu().clone() for name in keys_twin.THINGS}
         expected, positions, things, state = keys_twin.keys_step(
             *(agents.positions[:, 0].cpu(), agents.radius, things, env.layout.cpu(), tables, state),
-            **(env.rules | {"seed": env.seed, "reach": REACH}),
+            **(env.rules | env.weights.values | {"seed": env.seed, "reach": REACH}),
         )
         poison = Poison(torch.empty)
         with monkeypatch.context() as patch:
@@ -181,7 +181,7 @@ def test_step_matches_twin(seed, device, monkeypatch):
                 *(env.core.scenery, agents),
                 **env.tables,
                 **{name: getattr(env, name) for name in names},
-                **(env.rules | {"seed": env.seed, "reach": REACH}),
+                **(env.rules | env.weights.tensors | {"seed": env.seed, "reach": REACH}),
             )
         poison.check(reward=out.reward, metrics=out.metrics, keys_obs=out.keys_obs)
         for name, value in expected.items():
