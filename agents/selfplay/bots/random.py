@@ -25,7 +25,6 @@ class RandomActions:
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, Tree]:
         n_lanes, device = len(state["lane"]), state["lane"].device
-        actions = spaces.random_action_tree(
-            self.action_space, n_lanes, device, generator, world.get("mask")
-        )
+        mask = None if world is None else world.get("mask")
+        actions = spaces.random_action_tree(self.action_space, n_lanes, device, generator, mask)
         return arrdict(actions=actions), state
