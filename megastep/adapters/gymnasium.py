@@ -1,5 +1,6 @@
 """Environments of megastep as Gymnasium's: a vector environment on the device, and one of N = 1."""
 
+import inspect
 from collections.abc import Mapping
 
 import gymnasium
@@ -257,12 +258,19 @@ def make_vector(
     """Returns a :class:`VectorEnv` by its class name, for ``gymnasium.make_vec``. ``settings`` are
     the environment's. ``num_envs`` counts environments; several agents are that many lanes.
     """
-    env = envs.ENVS[name.lower()](num_envs, **settings)
+    env = _made(name, num_envs, settings)
     options: dict[str, Tree] = dict(to_numpy=to_numpy, dtype=dtype, copy=copy)
     return VectorEnv(env, autoreset_mode, render_mode=render_mode, **options)
 
 
 def make_single(name: str, render_mode: str | None = None, **settings: Tree) -> SingleEnv:
     """Returns a :class:`SingleEnv` by its class name, on the CPU, for ``gymnasium.make``."""
-    env = envs.ENVS[name.lower()](1, **{"device": "cpu"} | settings)
-    return SingleEnv(env, render_mode)
+    return SingleEnv(_made(name, 1, {"device": "cpu"} | settings), render_mode)
+
+
+def _made(name, n_envs, settings) -> Env:
+    kind = envs.ENVS[name.lower()]
+    names = [*inspect.signature(kind).parameters][1:]
+    if unknown := sorted(settings.keys() - {*names}):
+        raise ValueError(f"{name} has no setting {unknown[0]}: it has {', '.join(names)}")
+    return kind(n_envs, **settings)
