@@ -9,7 +9,7 @@ SEED ?= 1
 
 # Neighbouring tests share a process, and what they prepare. Tests start many processes, which
 # import faster from bytecode.
-PYTEST = MAKEFLAGS= PYTHONDONTWRITEBYTECODE= $(PYTHON) -m pytest -q -n $(WORKERS) --dist worksteal
+PYTEST = PYTHONDONTWRITEBYTECODE= $(PYTHON) -m pytest -q -n $(WORKERS) --dist worksteal
 
 # Create the virtual environment only if it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
@@ -17,18 +17,15 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train ci test test-slow test-nightly test-gpu lint docs pictures image wheel setup lock clean
+.PHONY: train test test-slow test-nightly test-gpu lint docs pictures image wheel setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
 
-ci: $(SETUP)               ## lint, and run the fast and slow tests together, as .ci/run does
-	$(MAKE) --jobs=2 lint test MARKS="not nightly"
-
 test: $(SETUP)             ## run the fast tests: 4 to 11 minutes on two cores
-	$(PYTEST) $(if $(MARKS),-m "$(MARKS)")
+	$(PYTEST)
 
-test-slow: $(SETUP)        ## run the thorough tests: 6 to 14 minutes
+test-slow: $(SETUP)        ## run the thorough tests: 6 to 14 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 
 test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour; SEED=2 makes others

@@ -26,6 +26,8 @@ FILMS = {
     "pointgoal.png": "run=pointgoal_anywhere home=4 steps=30",
     "homes.png": "run=pointgoal_anywhere homes=[1,2,3,4] steps=25 theme=dark dpi=70",
     "deathmatch.png": "run=deathmatch_anywhere against=hunter home=27 steps=60",
+    "memory.gif": "run=memory_9 steps=240 dpi=70 speed=2 seed=2",
+    "keys.png": "run=keys_anywhere steps=60",
     "minimal.png": "env=minimal geometry=box steps=20",
     "pong-court.png": "env=pong steps=30",
 }

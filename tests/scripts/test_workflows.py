@@ -42,10 +42,10 @@ def test_make_targets_and_scripts_exist(path):
 
 
 def test_all_of_ci_runs_on_github_too():
-    assert re.findall(r"^make (.*)", (ROOT / ".ci/run").read_text(), re.M) == ["ci"]
+    targets = re.findall(r"^make (.*)", (ROOT / ".ci/run").read_text(), re.M)
     matrix = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
     matrix = matrix["jobs"]["make"]["strategy"]["matrix"]
-    assert {"lint", "test", "test-slow"} <= {*matrix["target"]}
+    assert {*targets} <= {*matrix["target"]}
     assert matrix["python"] == ["3.10", "3.11", "3.12", "3.13"]
 
 
