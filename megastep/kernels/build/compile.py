@@ -15,7 +15,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +23,15 @@ import torch
 
 from megastep import cache
 from megastep.kernels.build.forks import end_threads_at_forks
-from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
+from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary
 
 if TYPE_CHECKING:
     from ctypes import CDLL
 
-__all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
+__all__ = [
+    *("EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"),
+    *("wasm", "wasm_key", "wasm_tools"),
+]
 
 
 class EngineError(RuntimeError):
@@ -148,6 +151,88 @@ def _load(name, body, path) -> "CDLL":
             f"({error}): set MEGASTEP_CACHE to a private folder with free space on a mount that is "
             f"not noexec."
         ) from None
+
+
+# ---- WebAssembly ----
+
+#: Name of the section of a module that holds its `wasm_key`.
+WASM_SECTION = b"megastep"
+
+
+def wasm_key(libraries: Sequence[KernelLibrary], flags: tuple[str, ...] = WASM_FLAGS) -> str:
+    """Returns a hash of what a module is built from, but for the compiler."""
+    parts = [part for library in libraries for part in library.sources(".h", ".cpp").items()]
+    return _key(*(text for part in parts for text in part), *flags)
+
+
+def wasm(libraries: Sequence[KernelLibrary], flags: tuple[str, ...] = WASM_FLAGS) -> bytes:
+    """Returns the CPU operations of several libraries as one WebAssembly module, which imports
+    nothing, and exports them, `malloc` and its memory.
+
+    It computes the same bits as the CPU. Structs hold pointers of 4 bytes, see
+    :func:`~megastep.kernels.build.headers.words`.
+
+    Raises:
+        EngineError: if clang or its libraries for WebAssembly are missing, or cannot build them.
+    """
+    command, version = wasm_tools()
+    key = wasm_key(libraries, flags)
+    body, _ = cache.fetch(
+        f"wasm-{_key(key, command, version)}.wasm", lambda: _build_wasm(libraries, command, flags)
+    )
+    name = bytes([len(WASM_SECTION)]) + WASM_SECTION
+    content = name + key.encode()
+    return body + bytes([0, len(content)]) + content  # a custom section, shorter than 128 bytes
+
+
+def wasm_tools() -> tuple[str, str]:
+    """Returns the path of a clang++ that builds WebAssembly, and its version as text.
+
+    Raises:
+        EngineError: if there is none.
+    """
+    folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
+    names = {"clang++": 0, **{f"clang++-{version}": version for version in range(14, 40)}}
+    found = [folder / name for name in names for folder in folders if (folder / name).is_file()]
+    for path in found:
+        suffix = path.name.removeprefix("clang++")
+        if any(shutil.which(name) for name in (f"wasm-ld{suffix}", "wasm-ld")):
+            return str(path), _run([str(path), "--version"]).stdout
+    raise EngineError(
+        "Kernels for a browser are built by clang, and clang++ or wasm-ld is missing: install them "
+        "with WebAssembly's libraries (Debian: apt install clang lld wasi-libc libc++-dev-wasm32 "
+        "libclang-rt-dev-wasm32)."
+    )
+
+
+def _build_wasm(libraries, command, flags) -> bytes:
+    exports = [name for library in libraries for name in library.cpu_operations]
+    if len({*exports}) < len(exports):
+        twice = sorted({name for name in exports if exports.count(name) > 1})
+        raise EngineError(f"Two kernel libraries define the operation {twice[0]}: rename one.")
+    linked = [f"-Wl,--export={name}" for name in ("malloc", *exports)]
+    with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+        objects = []
+        for i, library in enumerate(libraries):
+            for name in library.sources(".cpp"):
+                objects.append(str(Path(folder) / f"{i}-{name.replace('/', '-')}.o"))
+                source = str(library.folder / name)
+                _run_clang([command, *flags, f"-I{KERNELS}", "-c", source, "-o", objects[-1]])
+        out = Path(folder) / "kernels.wasm"
+        # without -O: clang would have a wasm-opt that it finds change what it built
+        options = "--target=wasm32-wasi", "-mexec-model=reactor", "-Wl,--strip-all"
+        _run_clang([command, *options, *linked, *objects, "-o", str(out)])
+        return out.read_bytes()
+
+
+def _run_clang(command) -> None:
+    process = _run(command)
+    if process.returncode:
+        raise EngineError(
+            f"{command[0]} could not build kernels for a browser; it needs lld and WebAssembly's "
+            f"libraries (Debian: apt install lld wasi-libc libc++-dev-wasm32 "
+            f"libclang-rt-dev-wasm32). Its output: {' '.join(process.stderr.split())[:500]}"
+        )
 
 
 # ---- The GPU ----
