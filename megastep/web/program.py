@@ -36,10 +36,17 @@ class Launch(NamedTuple):
 
 
 class Buffer(NamedTuple):
-    """A part of a program's memory: its size, and what it holds at the start (None: anything)."""
+    """A part of a program's memory.
+
+    Attributes:
+        n_bytes: its size.
+        contents: what it holds at the start; None: anything.
+        is_float: whether that is float32 alone.
+    """
 
     n_bytes: int
     contents: bytes | None = None
+    is_float: bool = False
 
 
 class Leaf(NamedTuple):
@@ -78,7 +85,8 @@ class Program:
 
     def add(self, tensor: torch.Tensor) -> Ref:
         """Adds a buffer with a tensor's numbers. Returns its place."""
-        self.buffers.append(Buffer(tensor.nbytes, tensor.contiguous().numpy().tobytes()))
+        contents = tensor.contiguous().numpy().tobytes()
+        self.buffers.append(Buffer(tensor.nbytes, contents, tensor.dtype == torch.float32))
         return Ref(len(self.buffers) - 1)
 
     @property

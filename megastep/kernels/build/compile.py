@@ -8,6 +8,7 @@ flags, compiler and processor.
 import ctypes
 import functools
 import hashlib
+import json
 import os
 import platform
 import re
@@ -15,7 +16,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"),
-    *("wasm", "wasm_key", "wasm_tools"),
+    *("wasm", "wasm_key", "wasm_keys", "wasm_tools"),
 ]
 
 
@@ -155,19 +156,21 @@ def _load(name, body, path) -> "CDLL":
 
 # ---- WebAssembly ----
 
-#: Name of the section of a module that holds its `wasm_key`.
-WASM_SECTION = b"megastep"
+#: Name of the section of a module that holds {operation: the `wasm_key` of its library}.
+WASM_SECTION = "megastep"
 
 
-def wasm_key(libraries: Sequence[KernelLibrary], flags: tuple[str, ...] = WASM_FLAGS) -> str:
-    """Returns a hash of what a module is built from, but for the compiler."""
-    parts = [part for library in libraries for part in library.sources(".h", ".cpp").items()]
-    return _key(*(text for part in parts for text in part), *flags)
+def wasm_key(library: KernelLibrary) -> str:
+    """Returns a hash of a library's sources for the CPU and of clang's flags."""
+    files = library.sources(".h", ".cpp")
+    return _key(*files, *files.values(), *WASM_FLAGS)
 
 
-def wasm(libraries: Sequence[KernelLibrary], flags: tuple[str, ...] = WASM_FLAGS) -> bytes:
-    """Returns the CPU operations of several libraries as one WebAssembly module, which imports
-    nothing, and exports them, `malloc` and its memory.
+def wasm(
+    operations: Mapping[KernelLibrary, Sequence[str]], flags: tuple[str, ...] = WASM_FLAGS
+) -> bytes:
+    """Returns CPU operations of several libraries as one WebAssembly module, which imports nothing,
+    and exports them, `malloc` and its memory.
 
     It computes the same bits as the CPU. Structs hold pointers of 4 bytes, see
     :func:`~megastep.kernels.build.headers.words`.
@@ -176,13 +179,20 @@ def wasm(libraries: Sequence[KernelLibrary], flags: tuple[str, ...] = WASM_FLAGS
         EngineError: if clang or its libraries for WebAssembly are missing, or cannot build them.
     """
     command, version = wasm_tools()
-    key = wasm_key(libraries, flags)
-    body, _ = cache.fetch(
-        f"wasm-{_key(key, command, version)}.wasm", lambda: _build_wasm(libraries, command, flags)
-    )
-    name = bytes([len(WASM_SECTION)]) + WASM_SECTION
-    content = name + key.encode()
-    return body + bytes([0, len(content)]) + content  # a custom section, shorter than 128 bytes
+    keys = {name: wasm_key(library) for library, names in operations.items() for name in names}
+    if len(keys) < sum(map(len, operations.values())):
+        names = sorted(name for names in operations.values() for name in names)
+        twice = next(name for name, other in zip(names, names[1:]) if name == other)
+        raise EngineError(f"Two kernel libraries define the operation {twice}: rename one.")
+    key = _key(json.dumps(keys), *flags, command, version)
+    return cache.fetch(f"wasm-{key}.wasm", lambda: _build_wasm(operations, command, flags, keys))[0]
+
+
+def wasm_keys(module: bytes) -> dict[str, str]:
+    """Returns {operation: the `wasm_key` of its library} of a module that `wasm` built."""
+    head = WASM_SECTION.encode()
+    start = module.rindex(bytes([len(head)]) + head) + 1 + len(head)
+    return json.loads(module[start:])
 
 
 def wasm_tools() -> tuple[str, str]:
@@ -205,15 +215,11 @@ def wasm_tools() -> tuple[str, str]:
     )
 
 
-def _build_wasm(libraries, command, flags) -> bytes:
-    exports = [name for library in libraries for name in library.cpu_operations]
-    if len({*exports}) < len(exports):
-        twice = sorted({name for name in exports if exports.count(name) > 1})
-        raise EngineError(f"Two kernel libraries define the operation {twice[0]}: rename one.")
-    linked = [f"-Wl,--export={name}" for name in ("malloc", *exports)]
+def _build_wasm(operations, command, flags, keys) -> bytes:
+    linked = [f"-Wl,--export={name}" for name in ("malloc", *keys)]
     with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
         objects = []
-        for i, library in enumerate(libraries):
+        for i, library in enumerate(operations):
             for name in library.sources(".cpp"):
                 objects.append(str(Path(folder) / f"{i}-{name.replace('/', '-')}.o"))
                 source = str(library.folder / name)
@@ -222,7 +228,17 @@ def _build_wasm(libraries, command, flags) -> bytes:
         # without -O: clang would have a wasm-opt that it finds change what it built
         options = "--target=wasm32-wasi", "-mexec-model=reactor", "-Wl,--strip-all"
         _run_clang([command, *options, *linked, *objects, "-o", str(out)])
-        return out.read_bytes()
+        return out.read_bytes() + _section(WASM_SECTION.encode(), json.dumps(keys).encode())
+
+
+def _section(name: bytes, content: bytes) -> bytes:
+    """Returns a custom section of a WebAssembly module."""
+    content = bytes([len(name)]) + name + content
+    size, length = [], len(content)
+    while not size or length:  # seven bits a byte, the lowest first
+        size.append(length % 128 | (128 if length > 127 else 0))
+        length >>= 7
+    return bytes([0, *size]) + content
 
 
 def _run_clang(command) -> None:

@@ -28,11 +28,11 @@ CPU_FLAGS = (
     "-shared",
     "-fPIC",
 )
-#: clang's flags for WebAssembly without vectors. As the CPU's, with one thread.
+#: clang's flags for WebAssembly without vectors. As the CPU's, with one thread, and small.
 SCALAR_WASM_FLAGS = (
     "--target=wasm32-wasi",
     "-std=c++17",
-    "-O3",
+    "-Os",
     "-ffp-contract=off",
     "-fno-math-errno",
     "-fno-trapping-math",
