@@ -1,130 +1,5 @@
-// Plays a program of kernels in a page. The program is data: lists of launches, the memory that they
-// read and write, and where in it the world lies. Nothing here knows how an environment works, only how
-// to draw what some fields of kernels hold.
+// The page: plays a program of program.js, and draws what some fields of kernels hold.
 "use strict";
-
-// ---- The program: kernels in WebAssembly, and the memory of one environment ----
-
-const HALVES = Float32Array.from({ length: 65536 }, (_, bits) => {
-  const exponent = (bits >> 10) & 31, fraction = bits & 1023, sign = bits & 32768 ? -1 : 1;
-  if (exponent === 31) return fraction ? NaN : sign * Infinity;
-  return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : fraction / 2 ** 24);
-});
-const ARRAYS = {
-  float16: Uint16Array, float32: Float32Array, uint8: Uint8Array, bool: Uint8Array, int32: Int32Array,
-  int64: BigInt64Array,
-};
-
-// Returns the parts of a page's data: what JSON says, the compiled module, and the memory at the start.
-async function unpacked(text) {
-  const bytes = Uint8Array.from(atob(text), letter => letter.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const body = await new Response(stream).arrayBuffer();
-  const [nData, nCode] = new Uint32Array(body, 0, 2), start = 12 + nData + nCode;
-  const data = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 12, nData)));
-  const module = await WebAssembly.compile(body.slice(12 + nData, start)), memory = body.slice(start);
-  const contents = data.buffers.map(([size, at, packed]) => (packed !== 2 ? new Uint8Array(memory, at, packed && size)
-    : new Uint8Array(Float32Array.from(new Uint16Array(memory, at, size / 4), bits => HALVES[bits]).buffer)));
-  return { data, module, contents };
-}
-
-class Simulation {
-  constructor({ data, module, contents }) {
-    Object.assign(this, { data, contents, calls: {} });
-    this.kernels = new WebAssembly.Instance(module, {}).exports;
-    this.kernels._initialize();
-    this.addresses = data.buffers.map(([size]) => this.reserve(size));
-    for (const [name, launches] of Object.entries(data.sections)) {
-      this.calls[name] = launches.map(launch => this.call(...launch));
-    }
-  }
-
-  reserve(size) {
-    return (this.kernels.malloc(size + 31) + 15) & ~15;
-  }
-
-  // A launch whose struct lies in memory: pointers and numbers are words of 4 bytes.
-  call(operation, values) {
-    const address = this.reserve(4 * values.length);
-    const words = values.map(value => (Array.isArray(value) ? this.addresses[value[0]] + value[1] : value ?? 0));
-    new Uint32Array(this.kernels.memory.buffer, address, words.length).set(words);
-    return { operation, values, address, run: this.kernels[operation] };
-  }
-
-  run(section) {
-    for (const { run, address } of this.calls[section]) run(address);
-  }
-
-  // Sets the word `name` of all launches of a section that have it, by a function of its first value.
-  change(section, name, changed) {
-    for (const { operation, values, address } of this.calls[section]) {
-      const i = this.data.names[operation].indexOf(name);
-      if (i >= 0) new Uint32Array(this.kernels.memory.buffer, address + 4 * i, 1)[0] = changed(values[i]);
-    }
-  }
-
-  // Returns the word `name` of the first launch of a step that has it: a number, or [buffer, offset].
-  word(name) {
-    const at = ([operation, values]) => values[this.data.names[operation].indexOf(name)] ?? null;
-    return this.data.sections.step.map(at).find(value => value !== null);
-  }
-
-  array([buffer, offset = 0], size, kind = Float32Array) {
-    return new kind(this.kernels.memory.buffer, this.addresses[buffer] + offset, size);
-  }
-
-  // Returns numbers of the field `name` from its first on, or undefined.
-  field(name, size, kind) {
-    const pointer = this.word(name);
-    return pointer && this.array(pointer, size, kind);
-  }
-
-  // Returns a lane's numbers of a leaf [buffer, offset, shape, strides, dtype].
-  leaf([buffer, offset, shape, strides, dtype], lane) {
-    const kind = ARRAYS[dtype], start = offset + lane * strides[0] * kind.BYTES_PER_ELEMENT;
-    const indices = shape.slice(1).reduce((all, n, axis) => (
-      all.flatMap(index => Array.from({ length: n }, (_, i) => index + i * strides[axis + 1]))), [0]);
-    const numbers = this.array([buffer, start], Math.max(...indices) + 1, kind);
-    return indices.map(i => (dtype === "float16" ? HALVES[numbers[i]] : Number(numbers[i])));
-  }
-
-  world(path, lane) {
-    return this.leaf(this.data.world[path], lane);
-  }
-
-  get layout() {
-    return this.field("scenery.layout", 1, Int32Array)?.[0] ?? 0;
-  }
-
-  // Begins anew, as the environment with this seed does, or in the home of the number `home`.
-  reset(seed, home = null) {
-    this.contents.forEach((bytes, i) => {
-      const memory = this.array([i], this.data.buffers[i][0], Uint8Array);
-      bytes.length ? memory.set(bytes) : memory.fill(0);
-    });
-    for (const section of Object.keys(this.calls)) {
-      this.change(section, "key0", key => (key + seed - this.data.seed) >>> 0);
-    }
-    this.change("reset", "resample", resample => (home === null ? resample : 0));
-    if (home !== null) this.field("scenery.layout", 1, Int32Array)[0] = home;
-    this.run("reset");
-    for (const [source, target] of this.data.copies) {
-      const size = this.data.buffers[source][0];
-      this.array([target], size, Uint8Array).set(this.array([source], size, Uint8Array));
-    }
-  }
-
-  // Takes a step by the policies' actions, but those of the lanes in `given` {lane: action}.
-  step(given) {
-    for (const { section } of this.data.policies) this.run(section);
-    const [buffer, offset, , strides, dtype] = this.data.actions, kind = ARRAYS[dtype];
-    for (const [lane, action] of Object.entries(given)) {
-      const values = [action].flat(), start = offset + lane * strides[0] * kind.BYTES_PER_ELEMENT;
-      this.array([buffer, start], values.length, kind).set(dtype === "int64" ? values.map(BigInt) : values);
-    }
-    this.run("step");
-  }
-}
 
 // ---- The game: one environment, or two to race in, and what happened there ----
 
@@ -189,23 +64,23 @@ const disc = (context, [x, y], radius, ...look) => shape(context, c => c.arc(x, 
 // The floor and the walls of a home, drawn once, and completed as the agent looks around.
 class Plan {
   constructor(simulation, width, height, ratio) {
-    const { layout } = simulation, size = { width: width * ratio, height: height * ratio };
+    const { layout, data } = simulation, n_words = simulation.word("n_words");
     const [first, end] = simulation.field("scenery.wall_starts", layout + 2, Int32Array).subarray(layout);
     this.walls = simulation.field("scenery.walls", 4 * end).slice(4 * first);
     this.starts = simulation.field("scenery.texel_starts", end + 1, Int32Array).slice(first);
     this.texels = simulation.field("scenery.texels", 4 * this.starts.at(-1));
-    const n_words = simulation.word("n_words");
-    this.seen = simulation.data.n_lanes === 1 && n_words && simulation.field("seen", n_words, Uint32Array);
+    this.seen = data.n_lanes === 1 && n_words && simulation.field("seen", n_words, Uint32Array);
     this.drawn = new Set();
     const of = axis => this.walls.filter((_, i) => i % 2 === axis);
     const [x0, y0, x1, y1] = [Math.min, Math.max].flatMap(most => [0, 1].map(axis => most(...of(axis))));
     this.scale = Math.min(width / (x1 - x0 + 0.5), height / (y1 - y0 + 0.5));
     this.at = ([x, y]) => [width / 2 + this.scale * (x - (x0 + x1) / 2), height / 2 - this.scale * (y - (y0 + y1) / 2)];
-    const layer = () => Object.assign(document.createElement("canvas"), size).getContext("2d");
-    [this.floor, this.wall] = [layer(), layer()];
-    for (const context of [this.floor, this.wall]) context.scale(ratio, ratio);
-    const rooms = new Path2D(), { rooms: all } = simulation.data;
-    all[layout].forEach(room => rooms.addPath(new Path2D(`M${room.map(this.at).join("L")}Z`)));
+    [this.floor, this.wall] = [0, 1].map(() => {
+      const canvas = Object.assign(document.createElement("canvas"), { width: width * ratio, height: height * ratio });
+      return canvas.getContext("2d");
+    });
+    for (const layer of [this.floor, this.wall]) layer.scale(ratio, ratio);
+    const rooms = new Path2D(data.rooms[layout].map(room => `M${room.map(this.at).join("L")}Z`).join(""));
     this.floor.fillStyle = css(this.seen ? "--unseen" : "--floor");
     this.floor.fill(rooms, "evenodd");
     this.floor.clip(rooms, "evenodd");
@@ -213,12 +88,12 @@ class Plan {
     this.draw(true);
   }
 
-  // Draws the texels that were seen since the last call, grey where they were not, or all.
+  // Draws the texels that were seen since the last call, or all, grey where they were not seen.
   draw(isAll) {
     const [low, high] = [css("--wall-low"), css("--wall-high")].map(Number), grey = css("--unseen-wall");
     for (let wall = 0; wall < this.starts.length - 1; wall++) {
       const [ax, ay, bx, by] = this.walls.subarray(4 * wall), [start, end] = this.starts.subarray(wall);
-      const point = i => this.at([ax + (i - start) / (end - start) * (bx - ax), ay + (i - start) / (end - start) * (by - ay)]);
+      const point = i => [(i - start) / (end - start)].flatMap(t => this.at([ax + t * (bx - ax), ay + t * (by - ay)]));
       for (let i = start; i < end; i++) {
         const bit = i - this.starts[0], isSeen = !this.seen || this.seen[bit >> 5] >>> (bit & 31) & 1;
         if (!(isAll || isSeen) || this.drawn.has(i)) continue;
@@ -232,8 +107,8 @@ class Plan {
 }
 
 // Returns the corners of what an agent sees, in metres, by its depth image; none without one.
-function sight({ simulation: { data, ...rest }, simulation, lane }) {
-  const depth = data.world["obs.d"];
+function sight({ simulation, lane }) {
+  const { data } = simulation, depth = data.world["obs.d"];
   if (!depth || depth[2][3] > 1) return [];
   const [x, y] = simulation.field("positions", 2 * lane + 2).subarray(2 * lane);
   const angle = simulation.field("angles", lane + 1)[lane] * Math.PI / 180;
@@ -265,7 +140,7 @@ function drawObjects(simulation, plan, context) {
 let plan = null;
 
 function drawPlan(game, context, width, height, ratio) {
-  const [{ simulation, trail }] = game.players, { data } = game, { layout } = simulation;
+  const [{ simulation }] = game.players, { data } = game, { layout } = simulation;
   const key = [layout, width, height, css("--page"), game.seed, game.players[0].number].join();
   if (plan?.key !== key) plan = Object.assign(new Plan(simulation, width, height, ratio), { key });
   const sights = game.players.map(player => sight(player).map(plan.at));
@@ -301,18 +176,16 @@ function drawPlan(game, context, width, height, ratio) {
 // Draws a court of 40 x 30 cells: megastep/envs/pong.
 function drawPong(game, context, width, height) {
   const state = game.running[0].field("games", 13, Int32Array), scale = Math.min(width / 42, height / 32);
-  const [left, top] = [(width - 40 * scale) / 2, (height - 30 * scale) / 2], cell = i => Math.floor(state[i] / 256);
-  const box = (x, y, w, h, fill) => {
+  const cells = [...state].map(x => Math.floor(x / 256)), { colours } = game.data;
+  context.translate((width - 40 * scale) / 2, (height - 30 * scale) / 2);
+  for (const [fill, ...box] of [[css("--floor"), 0, 0, 40, 30], [css("--hatch"), 19.95, 0, 0.1, 30],
+    [css("--unseen-wall"), cells[4], cells[5], 1, 1], [css("--text"), cells[0], cells[1], 1, 1],
+    [colours[0], 0, cells[6], 1, 4], [colours[1], 39, cells[7], 1, 4]]) {
     context.fillStyle = fill;
-    context.fillRect(left + x * scale, top + y * scale, w * scale, h * scale);
-  };
-  box(0, 0, 40, 30, css("--floor"));
-  box(19.95, 0, 0.1, 30, css("--hatch"));
-  box(cell(4), cell(5), 1, 1, css("--unseen-wall"));
-  box(cell(0), cell(1), 1, 1, css("--text"));
-  [0, 1].forEach(side => box(39 * side, cell(6 + side), 1, 4, game.data.colours[side]));
+    context.fillRect(...box.map(x => x * scale));
+  }
   Object.assign(context, { font: `${1.6 * scale}px sans-serif`, textAlign: "center", fillStyle: css("--faint") });
-  context.fillText(`${state[8]} : ${state[9]}`, width / 2, top + 2 * scale);
+  context.fillText(`${state[8]} : ${state[9]}`, 20 * scale, 2 * scale);
 }
 
 // Draws rows of [red, green, blue] from 0 to 255 as pixels.
@@ -322,52 +195,38 @@ function drawPixels(canvas, rows) {
   canvas.getContext("2d").putImageData(new ImageData(Uint8ClampedArray.from(bytes), rows[0].length), 0, 0);
 }
 
-// Draws what a player sees and remembers.
-function drawPlayer(player) {
-  const { simulation, lane, own, element } = player, { world } = simulation.data, texts = [];
-  const [name, score, small] = element.querySelectorAll("span, b, p");
-  const canvases = [...element.querySelectorAll("canvas")];
-  const leaves = Object.keys(world).filter(path => path.startsWith("obs"));
-  for (const path of leaves) {
+// Draws what a player sees and remembers: images, other numbers, and the hidden state in colours.
+function drawPlayer({ simulation, lane, own, isHuman, element, name, score, number, length }) {
+  const { world } = simulation.data, canvases = [...element.querySelectorAll("canvas")], texts = [];
+  for (const path of Object.keys(world).filter(path => path.startsWith("obs"))) {
     const [, , [, , n, height, width], , dtype] = world[path], values = simulation.world(path, lane);
-    if (width === undefined) {
-      texts.push(`${path.slice(4) || "sees"} ${values.map(x => x.toFixed(2)).join(" ")}`);
-      continue;
-    }
-    const at = (c, y, x) => values[(Math.min(c, n - 1) * height + y) * width + x];
-    const shown = x => (dtype === "uint8" ? x : n === 1 ? 255 * x : encode(x));
-    drawPixels(canvases.shift(), Array.from({ length: height }, (_, y) => Array.from({ length: width }, (_, x) => (
-      [0, 1, 2].map(c => shown(at(c, y, x)))))));
+    if (width === undefined) texts.push(` · ${path.slice(4) || "sees"} ${values.map(x => x.toFixed(2)).join(" ")}`);
+    else drawPixels(canvases.shift(), Array.from({ length: height }, (_, y) => Array.from({ length: width }, (_, x) => (
+      [0, 1, 2].map(c => values[(Math.min(c, n - 1) * height + y) * width + x]).map(value => (
+        dtype === "uint8" ? value : n === 1 ? 255 * value : encode(value)))))));
   }
-  if (own && own.states.length) {
-    const unit = x => [128 + 120 * x, 128, 128 - 120 * x];
-    drawPixels(canvases[0], own.states.map(leaf => simulation.leaf(leaf, lane - own.lanes[0]).map(x => unit(Math.tanh(x)))));
-  }
-  name.textContent = player.name;
-  score.textContent = player.score.toFixed(2);
-  small.textContent = `episode ${player.number}, step ${player.length} · ${texts.join(" · ")}`;
+  const unit = x => [128 + 120 * Math.tanh(x), 128, 128 - 120 * Math.tanh(x)];
+  const states = isHuman || !own ? [] : own.states.map(leaf => simulation.leaf(leaf, lane - own.lanes[0]).map(unit));
+  if (states.length) drawPixels(canvases[0], states);
+  const [title, sum, small] = element.querySelectorAll("span, b, p");
+  [title.textContent, sum.textContent] = [name, score.toFixed(2)];
+  small.textContent = `episode ${number}, step ${length}${texts.join("")}`;
 }
 
 // ---- The page ----
 
 async function main() {
-  const problem = byId("problem");
   if (typeof WebAssembly !== "object" || typeof DecompressionStream !== "function") {
-    problem.textContent = "This page needs WebAssembly, which browsers have since 2023: open it in a newer one.";
-    return;
+    throw new Error("it needs WebAssembly and DecompressionStream, which browsers have since 2023; open a newer one");
   }
-  const game = new Game(await unpacked(byId("data").textContent.trim())), { data } = game;
-  const canvas = byId("plan"), held = new Set(), hasHomes = data.homes.length > 1;
+  const game = new Game(await unpacked(byId("data").textContent.trim())), { data } = game, held = new Set();
+  const keys = Object.keys(data.controls), hasHomes = data.homes.length > 1, canvas = byId("plan");
+  const symbols = { ArrowUp: "▲", ArrowDown: "▼", ArrowLeft: "◀", ArrowRight: "▶" }, sign = key => symbols[key] ?? key;
   let isPlaying = true, isDirty = true, owed = 0, before = performance.now();
-  const speed = () => Number(byId("speed").value);
-  problem.textContent = "";
-  document.querySelector("h1").textContent = data.title;
-  byId("about").textContent = data.about;
-  byId("home").hidden = !hasHomes;
 
   function action() {
-    const keys = [...held], values = keys.map(key => data.controls[key]);
-    if (!Array.isArray(data.rest)) return keys.length ? values[game.steps % keys.length] : data.rest;
+    const values = [...held].map(key => data.controls[key]);
+    if (!Array.isArray(data.rest)) return values.length ? values[game.steps % values.length] : data.rest;
     return data.rest.map((rest, i) => values.reduce((sum, value) => sum + value[i], rest));
   }
   function step(n = 1) {
@@ -382,71 +241,72 @@ async function main() {
     game.reset(seed, home);
     byId("seed").value = seed;
     byId("players").replaceChildren(...game.players.map((player, i) => {
-      const rows = Object.entries(data.world).filter(([path, leaf]) => path.startsWith("obs") && leaf[2].length > 4);
+      const images = Object.entries(data.world).filter(([path, leaf]) => path.startsWith("obs") && leaf[2].length > 4);
+      const n = images.length + (!player.isHuman && player.own?.states.length ? 1 : 0);
       player.element = Object.assign(document.createElement("div"), { className: "player" });
-      player.element.innerHTML = `<header><span></span><b></b></header>${"<canvas></canvas>".repeat(
-        rows.length + (player.own?.states.length ? 1 : 0))}<p class="small"></p>`;
-      player.element.querySelector("span").style.color = data.colours[i % data.colours.length];
+      player.element.innerHTML = `<header><span style="color:${data.colours[i % data.colours.length]}"></span><b></b></header>${
+        "<canvas></canvas>".repeat(n)}<p class="small"></p>`;
       return player.element;
     }));
     isDirty = true;
   }
   function drive(yes = true) {
+    held.clear();
     if (yes === game.isDriving) return;
     game.isDriving = yes;
-    held.clear();
     document.body.classList.toggle("driving", yes);
     byId("drive").textContent = yes ? "Hand back" : data.n_lanes === 1 ? "Race it" : "Take over";
     byId("drive").setAttribute("aria-pressed", yes);
     reset(game.seed, hasHomes ? game.running[0].layout : null);
   }
   function press(key, isDown) {
-    if (!(key in data.controls)) return false;
-    if (isDown) drive();
+    if (isDown && !game.isDriving) drive();
     isDown ? held.add(key) : held.delete(key);
-    return true;
   }
-  const nextHome = () => hasHomes && reset(game.seed, (game.running[0].layout + 1) % data.homes.length);
   const commands = {
-    " ": () => play(!isPlaying), ".": () => { play(false); step(); }, t: () => drive(!game.isDriving), n: nextHome,
-    r: () => reset(), Escape: () => drive(false),
+    " ": () => play(!isPlaying), ".": () => { play(false); step(); }, t: () => drive(!game.isDriving),
+    n: () => hasHomes && reset(game.seed, (game.running[0].layout + 1) % data.homes.length), r: () => reset(),
+    Escape: () => drive(false),
   };
   for (const [id, key] of Object.entries({ play: " ", one: ".", drive: "t", home: "n", restart: "r" })) {
     byId(id).onclick = () => commands[key]();
   }
   byId("seed").onchange = event => reset(Math.min(Math.max(Math.trunc(event.target.value), 0), 2 ** 32 - 1));
   addEventListener("keydown", event => {
-    if (event.target.matches("input, select") || event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.target.matches("button") && event.key === " ") return;
-    if (press(event.key, true)) event.preventDefault();
-    else if (commands[event.key] && !event.repeat) { event.preventDefault(); commands[event.key](); }
+    const { key, target, repeat } = event, isTyping = target.matches("input, select") || event.ctrlKey || event.metaKey;
+    if (isTyping || (target.matches("button") && key === " ") || !(keys.includes(key) || commands[key])) return;
+    event.preventDefault();
+    if (keys.includes(key)) press(key, true);
+    else if (!repeat) commands[key]();
   });
-  addEventListener("keyup", event => press(event.key, false));
+  addEventListener("keyup", event => held.delete(event.key));
   addEventListener("blur", () => held.clear());
-  const symbols = { ArrowUp: "▲", ArrowDown: "▼", ArrowLeft: "◀", ArrowRight: "▶" };
-  byId("pad").append(...Object.keys(data.controls).map(key => {
-    const button = Object.assign(document.createElement("button"), { textContent: symbols[key] ?? key });
-    button.onpointerdown = event => { event.preventDefault(); press(key, true); };
+  byId("pad").append(...keys.map(key => {
+    const button = Object.assign(document.createElement("button"), { textContent: sign(key), ariaLabel: key });
+    button.onpointerdown = () => press(key, true);
     for (const end of ["pointerup", "pointerleave", "pointercancel"]) button[`on${end}`] = () => press(key, false);
     return button;
   }));
-  byId("keys").textContent = `Space plays and pauses, . steps, T takes over (${Object.keys(data.controls).map(
-    key => symbols[key] ?? key).join(" ")} drive), Escape hands back, ${hasHomes ? "N next home, " : ""}R begins anew.`;
 
   function draw() {
-    const ratio = devicePixelRatio, { clientWidth: width, clientHeight: height } = canvas;
+    const { clientWidth: width, clientHeight: height } = canvas, ratio = devicePixelRatio, { episodes } = game;
     Object.assign(canvas, { width: width * ratio, height: height * ratio });
-    const context = canvas.getContext("2d");
+    const context = canvas.getContext("2d"), last = episodes.at(-1);
     context.scale(ratio, ratio);
     if (data.rooms) drawPlan(game, context, width, height, ratio);
     else if (game.running[0].word("games")) drawPong(game, context, width, height);
     game.players.forEach(drawPlayer);
-    const { length } = game.episodes, last = game.episodes[length - 1];
-    byId("log").textContent = last ? `Last of ${length} episodes: ${last.name}, return ${last.return.toFixed(2)} after ${
+    Object.assign(context, { font: "600 14px system-ui, sans-serif", textAlign: "left" });
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    game.players.forEach(({ name, score }, i) => {
+      context.fillStyle = data.colours[i % data.colours.length];
+      context.fillText(`${name} ${score.toFixed(2)}`, 10, 20 + 18 * i);
+    });
+    byId("log").textContent = last ? `Last of ${episodes.length} episodes: ${last.name}, return ${last.return.toFixed(2)} after ${
       last.length} steps; ${Object.entries(last.metrics).map(([key, x]) => `${key} ${x.toFixed(2)}`).join(", ")}.` : "";
   }
   function frame(now) {
-    owed = isPlaying ? owed + Math.min(now - before, 200) / 1000 * data.fps * speed() : 0;
+    owed = isPlaying ? owed + Math.min(now - before, 200) / 1000 * data.fps * Number(byId("speed").value) : 0;
     before = now;
     for (const end = performance.now() + 12; owed >= 1; owed--) {
       step();
@@ -458,8 +318,13 @@ async function main() {
   }
   addEventListener("resize", () => { isDirty = true; });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { isDirty = true; });
-  drive.call(null, false);
+
+  document.querySelector("h1").textContent = data.title;
+  byId("about").textContent = data.about;
+  byId("home").hidden = !hasHomes;
   byId("drive").textContent = data.n_lanes === 1 ? "Race it" : "Take over";
+  byId("keys").textContent = `Space plays and pauses, . steps, T takes over, ${keys.map(sign).join(" ")} drive, Escape hands back, ${
+    hasHomes ? "N shows the next home, " : ""}R begins anew.`;
   reset();
   globalThis.megastep = {
     game, play, pause: () => play(false), step, reset, drive, press,
@@ -467,9 +332,8 @@ async function main() {
     get returns() { return game.players.map(player => player.score); },
     get episodes() { return game.episodes; },
   };
+  byId("problem").textContent = "";
   requestAnimationFrame(frame);
 }
 
-if (typeof document === "object") {
-  main().catch(error => { byId("problem").textContent = `This page cannot be played here: ${error.message}`; });
-}
+main().catch(error => { byId("problem").textContent = `This page cannot be played here: ${error.message}.`; });

@@ -82,6 +82,7 @@ def page(program: Program, about: Mapping[str, Any], code: bytes) -> str:
     fields = {
         "title": html.escape(about["title"]),
         "themes": _themes(),
+        "program": (FOLDER / "program.js").read_text(),
         "script": (FOLDER / "page.js").read_text(),
         "data": base64.b64encode(body).decode(),
     }

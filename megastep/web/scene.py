@@ -15,23 +15,23 @@ __all__ = ["controls", "scene"]
 
 OBJECT_BYTES = ENGINE.constants["OBJECT_BYTES"]
 
-#: Actions of `megastep.modules.MOVES` by key.
+#: Actions of `megastep.modules.MOVES` by key, in the order of two rows of buttons.
 MOVE_KEYS = {
-    "ArrowUp": 3,
-    "ArrowDown": 4,
-    "ArrowLeft": 5,
-    "ArrowRight": 6,
     "a": 1,
+    "ArrowUp": 3,
     "d": 2,
+    "ArrowLeft": 5,
+    "ArrowDown": 4,
+    "ArrowRight": 6,
 }
 #: The same for continuous actions: ahead, left, turn left.
 PUSH_KEYS = {
-    "ArrowUp": [1, 0, 0],
-    "ArrowDown": [-1, 0, 0],
-    "ArrowLeft": [0, 0, 1],
-    "ArrowRight": [0, 0, -1],
     "a": [0, 1, 0],
+    "ArrowUp": [1, 0, 0],
     "d": [0, -1, 0],
+    "ArrowLeft": [0, 0, 1],
+    "ArrowDown": [-1, 0, 0],
+    "ArrowRight": [0, 0, -1],
 }
 
 
