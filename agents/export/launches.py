@@ -59,11 +59,12 @@ def add_policy(
     Raises:
         UserError: it has a core or an encoder of the user's.
     """
-    return _Lowering(program, policy, lanes, section, seed).acting()
+    with torch.no_grad():
+        return _Lowering(program, policy, lanes, section, seed).acting()
 
 
 class _Lowering:
-    def __init__(self, program, policy, lanes, section, seed):
+    def __init__(self, program, policy, lanes, section, seed) -> None:
         self.program, self.policy, self.lanes = program, policy.actor(), lanes
         self.section, self.seed, self.n = section, seed, len(lanes)
         self.launches: list[Launch] = []
@@ -98,15 +99,13 @@ class _Lowering:
     def weights(self, tensor: torch.Tensor | None) -> Ref | None:
         return None if tensor is None else self.program.add(tensor.detach().float().cpu())
 
-    def linear(self, x, layer, out, n_in, n_out, activation=0, adds=0) -> None:
+    def linear(self, x, layer: nn.Linear, out, n_in, n_out, activation=0, adds=0) -> None:
         """Adds a linear layer."""
-        weight = layer.weight if isinstance(layer, nn.Module) else layer[0]
-        bias = layer.bias if isinstance(layer, nn.Module) else layer[1]
         self.launch(
             "policy_linear",
             x=x,
-            weight=self.weights(weight),
-            bias=self.weights(bias),
+            weight=self.weights(layer.weight),
+            bias=self.weights(layer.bias),
             out=out,
             n_in=n_in,
             n_out=n_out,
@@ -176,11 +175,11 @@ class _Lowering:
         x = self.scratch(n)
         self.normalise(leaf, norm, encoder, x, n)
         for i, layer in enumerate(layers):
+            own = layer.kernel_size, layer.stride, cast("tuple[int, ...]", layer.padding)
+            rows = 1, 1, 0  # of a convolution of rows
             kernel, stride, padding = (
-                (1, *pair) if len(pair) == 1 else pair
-                for pair in (layer.kernel_size, layer.stride, layer.padding)
+                (row, *pair) if len(pair) == 1 else pair for row, pair in zip(rows, own)
             )
-            padding = (0, padding[1]) if len(layer.padding) == 1 else padding
             sizes = [
                 (size + 2 * pad - k) // step + 1
                 for size, pad, k, step in zip(shape[1:], padding, kernel, stride)
@@ -262,7 +261,9 @@ class _Lowering:
     def output(self, x: Ref, width: int) -> Leaf:
         """Adds the output. Returns the logits."""
         output = self.policy.output
-        if not isinstance(output, (MultiDiscreteOutput, DuellingOutput, GaussianOutput, BetaOutput)):
+        if not isinstance(
+            output, (MultiDiscreteOutput, DuellingOutput, GaussianOutput, BetaOutput)
+        ):
             raise UserError("a page has one kind of actions, not a dict of them")
         n_agents, n = output.shape
         n_logits = n if isinstance(output, (MultiDiscreteOutput, DuellingOutput)) else 2 * n
@@ -273,9 +274,10 @@ class _Lowering:
             self.linear(x, output.hidden, hidden, width, 2 * width, ACTIVATIONS[torch.relu])
             # value and advantage each read their half of the hidden layer
             for layer, out, half in ((output.value, value, 0), (output.advantage, scores, 1)):
-                weight = layer.weight.new_zeros(len(layer.weight), 2 * width)
-                weight[:, half * width : (half + 1) * width] = layer.weight
-                self.linear(hidden, (weight, layer.bias), out, 2 * width, len(weight))
+                whole = nn.Linear(2 * width, len(layer.weight))
+                whole.weight.zero_()[:, half * width : (half + 1) * width] = layer.weight
+                whole.bias = layer.bias
+                self.linear(hidden, whole, out, 2 * width, len(layer.weight))
             values = dict(values=value, epsilon=output.epsilon)
             operation = "policy_duelling"
         else:

@@ -7,13 +7,12 @@ import json
 import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from megastep.kernels.build.compile import EngineError, wasm, wasm_key, wasm_keys, wasm_tools
 from megastep.plotting.styles import AGENTS, THEMES
-from megastep.web.program import Buffer, Launch, Leaf, Program
+from megastep.web.program import Buffer, Launch, Leaf, Program, Ref
 
 __all__ = ["SHIPPED", "module", "page"]
 
@@ -43,7 +42,7 @@ def module(program: Program) -> bytes:
     return wasm(operations)
 
 
-def page(program: Program, about: Mapping[str, Any], code: bytes) -> str:
+def page(program: Program, about: Mapping, code: bytes) -> str:
     """Returns an HTML page that plays a program.
 
     Args:
@@ -60,15 +59,13 @@ def page(program: Program, about: Mapping[str, Any], code: bytes) -> str:
         size += len(body)
     data = json.dumps(
         {
-            **_plain(about),
+            **{key: _plain(value) for key, value in about.items()},
             "colours": AGENTS,
             "buffers": buffers,
             "copies": program.copies,
             "world": {path: _leaf(leaf) for path, leaf in program.world.items()},
             "actions": _leaf(program.actions),
-            "names": {
-                launch.operation: [*launch.values] for launch in program.launches
-            },
+            "names": {launch.operation: [*launch.values] for launch in program.launches},
             "sections": {
                 name: [[launch.operation, _values(launch)] for launch in launches]
                 for name, launches in program.sections.items()
@@ -117,15 +114,15 @@ def _values(launch: Launch) -> list:
     values = []
     for word in words:
         value = launch.values[word.name]
-        if word.kind == "P":
-            values.append(None if value is None else [*value])
+        if value is None or isinstance(value, Ref):
+            values.append(value and [*value])
         else:
             value = 1 if word.name.endswith("n_threads") else value
             values.append(struct.unpack("<I", struct.pack(f"<{word.kind}", value))[0])
     return values
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     """Returns what JSON can hold: leaves as lists, ranges as their ends."""
     if isinstance(value, Leaf):
         return _leaf(value)
@@ -147,4 +144,3 @@ def _themes() -> str:
         rule = f":root{{{body}}}"
         rules.append(rule if name == "light" else f"@media (prefers-color-scheme:{name}){{{rule}}}")
     return "".join(rules)
-

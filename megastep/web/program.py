@@ -2,7 +2,7 @@
 
 import ctypes
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -116,9 +116,7 @@ class Replay:
         self.memory = [bytearray(buffer.n_bytes) for buffer in program.buffers]
         self.start()
         self._addresses = [
-            ctypes.addressof((ctypes.c_char * max(len(part), 1)).from_buffer(part))
-            if part
-            else 0
+            ctypes.addressof((ctypes.c_char * max(len(part), 1)).from_buffer(part)) if part else 0
             for part in self.memory
         ]
         self._calls = {
@@ -151,14 +149,15 @@ class Replay:
         """Returns the leaves of the world by path."""
         return {path: self.tensor(leaf) for path, leaf in self.program.world.items()}
 
-    def _call(self, launch):
+    def _call(self, launch: Launch) -> tuple[Callable[[bytes], None], bytes]:
         library, name, values = launch
         words = library.words[library.cpu_operations[name]]
         end = max(word.offset + struct.calcsize(word.kind) for word in words)
         packed = bytearray(-8 * (-end // 8))
         for word in words:
             value = values[word.name]
-            if word.kind == "P":
-                value = 0 if value is None else self._addresses[value.buffer] + value.offset
+            if isinstance(value, Ref):
+                value = self._addresses[value.buffer] + value.offset
+            value = 0 if value is None else value
             struct.pack_into(word.kind, packed, word.offset, value)
         return cpu(library)[name], bytes(packed)

@@ -108,7 +108,11 @@ class Tape(TorchDispatchMode):
         self.made: dict[int, None] = {}
         self.written: list[Written] = []
 
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # otherwise PyTorch imports its compiler, which takes seconds
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None) -> object:
         result = func(*args, **(kwargs or {}))
         name, returns = func._schema.name.rpartition("::")[2], func._schema.returns
         aliases = [one.alias_info for one in returns]
@@ -193,7 +197,7 @@ class Recorder:
     def launches(self, tape: Tape) -> list[Launch]:
         """Returns launches of a tape with places in buffers."""
 
-        def place(value):
+        def place(value: int | float | Ref | None) -> int | float | Ref | None:
             return Ref(self.index[value.buffer], value.offset) if isinstance(value, Ref) else value
 
         return [
@@ -203,7 +207,8 @@ class Recorder:
 
     def leaf(self, tensor: torch.Tensor) -> Leaf:
         """Returns a tensor as a leaf of the program."""
-        ref = Ref(self.use(self.memory.add(tensor)), tensor.storage_offset() * tensor.itemsize)
+        offset = int(tensor.storage_offset()) * tensor.itemsize
+        ref = Ref(self.use(self.memory.add(tensor)), offset)
         return Leaf(ref, tuple(tensor.shape), tensor.stride(), tensor.dtype)
 
 

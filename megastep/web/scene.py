@@ -1,7 +1,6 @@
 """What a page shows of an environment beside its numbers: floor plans, keys that drive an agent."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from megastep import spaces
 from megastep.core import AGENT_RADIUS
@@ -35,7 +34,7 @@ PUSH_KEYS = {
 }
 
 
-def controls(env: Env) -> dict[str, Any]:
+def controls(env: Env) -> dict[str, object]:
     """Returns {key of a keyboard: action} of one lane: what the environment's ``controls`` say,
     movement by arrow keys, or digits.
     """
@@ -44,13 +43,13 @@ def controls(env: Env) -> dict[str, Any]:
     if own is not None:
         return dict(own)
     if isinstance(space, spaces.MultiContinuous):
-        return PUSH_KEYS if hasattr(env, "movement") and space.dim == 3 else {}
+        return {**PUSH_KEYS} if hasattr(env, "movement") and space.dim == 3 else {}
     if hasattr(env, "movement") and space.n_actions == len(MOVES):
-        return MOVE_KEYS
+        return {**MOVE_KEYS}
     return {str(digit): digit for digit in range(min(space.n_actions, 10))}
 
 
-def scene(env: Env, program: Program, homes: Sequence[str] = ()) -> dict[str, Any]:
+def scene(env: Env, program: Program, homes: Sequence[str] = ()) -> dict:
     """Returns what a page shows of an environment: JSON's types.
 
     Args:
@@ -59,7 +58,7 @@ def scene(env: Env, program: Program, homes: Sequence[str] = ()) -> dict[str, An
     """
     space = env.action_space
     is_discrete = isinstance(space, spaces.MultiDiscrete)
-    shown: dict[str, Any] = {
+    shown: dict = {
         "env": type(env).__name__,
         "fps": optional(env, "fps"),
         "n_lanes": n_lanes(env),
@@ -83,13 +82,13 @@ def scene(env: Env, program: Program, homes: Sequence[str] = ()) -> dict[str, An
     return shown
 
 
-def goal(program: Program) -> dict[str, Any] | None:
+def goal(program: Program) -> dict | None:
     """Returns where in memory the place is that the agent is to go to, of the environments that
     have one: x and y are at ``base``, ``per_layout`` numbers times the layout and ``stride``
     numbers times ``index`` further, which is a number or where one is.
     """
     for launch in program.sections["step"]:
-        values = launch.values
+        values: dict = launch.values
         if launch.operation == "pointgoal_step":
             base, index = values["points"], values["goal_index"]
             return _goal(base, 2 * values["n_goals"], 2, index, 0.2)
@@ -99,5 +98,5 @@ def goal(program: Program) -> dict[str, Any] | None:
     return None
 
 
-def _goal(base, per_layout, stride, index, radius) -> dict[str, Any]:
+def _goal(base, per_layout, stride, index, radius) -> dict:
     return dict(base=base, per_layout=per_layout, stride=stride, index=index, radius=radius)

@@ -94,7 +94,11 @@ def test_step_matches_twin_on_every_bit(rules, n_agents, device):
     for inputs, outputs, positions, angles in fight(device, 5, n_agents, **rules):
         for e in range(5):
             lanes = slice(e * n_agents, (e + 1) * n_agents)
-            state = {k: v[..., lanes] for k, v in inputs.items() if k not in ("line", "ray", "newly_seen")}
+            state = {
+                k: v[..., lanes]
+                for k, v in inputs.items()
+                if k not in ("line", "ray", "newly_seen")
+            }
             expected = hits_of(
                 inputs["line"][e], inputs["ray"][e], **state, n_model=8, res=512, rules=ALL | rules
             )

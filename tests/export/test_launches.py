@@ -49,7 +49,9 @@ def made(kind):
         for weight in policy.output.parameters():
             weight.mul_(20)
     program = program_of(env, action_space, env.n_envs)
-    acting = [add_policy(program, policy, lanes, f"p{lanes.start}") for lanes in (range(1), range(1, 3))]
+    acting = [
+        add_policy(program, policy, lanes, f"p{lanes.start}") for lanes in (range(1), range(1, 3))
+    ]
     return policy, env, program, acting
 
 
@@ -79,7 +81,10 @@ def test_launches_act_as_the_policy(kind):
             best = decision.logits.topk(2).values
             is_clear = best[..., 0] - best[..., 1] > 2e-5 * scale
             assert torch.equal(actions[is_clear], decision.actions[is_clear])
-        hidden = [torch.cat(parts) for parts in zip(*([replay.tensor(s) for s in p.states] for p in acting))]
+        hidden = [
+            torch.cat(parts)
+            for parts in zip(*([replay.tensor(s) for s in p.states] for p in acting))
+        ]
         for own, theirs in zip(hidden, leaves(state), strict=True):
             torch.testing.assert_close(own, theirs, rtol=0, atol=1e-5)
 

@@ -1,4 +1,4 @@
-"""Chromium without a window, driven by the DevTools protocol through a pipe: no package is needed."""
+"""Chromium without a window, driven by the DevTools protocol through a pipe."""
 
 import base64
 import json

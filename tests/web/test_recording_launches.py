@@ -1,5 +1,6 @@
-"""A recorded environment is its kernels: replayed, they give the same bits; what PyTorch computes in
-between is refused by name."""
+"""A recorded environment is its kernels: replayed, they give the same bits. What PyTorch computes
+in between is refused by name.
+"""
 
 import re
 

@@ -76,7 +76,9 @@ def test_shipped_module_is_of_these_kernels():
         for name in names
         if keys.get(name) != wasm_key(library)
     }
-    assert not stale, f"kernels have changed: run scripts/build_wasm.py ({', '.join(sorted(stale))})"
+    assert not stale, (
+        f"kernels have changed: run scripts/build_wasm.py ({', '.join(sorted(stale))})"
+    )
     assert SHIPPED.stat().st_size <= 100_000
 
 
@@ -103,11 +105,11 @@ def test_modules_compute_the_same_bits_for_1000_steps(name, modules, tmp_path):
         world = env.step(arrdict(actions=drawn))
     expected.append(digest(replay, hashed))
     text = page(program, ABOUT, SHIPPED.read_bytes())
-    results = run_page(
-        tmp_path, text, modules=[None, *modules], actions=actions, hashed=hashed
-    )
+    results = run_page(tmp_path, text, modules=[None, *modules], actions=actions, hashed=hashed)
     for result in results:
-        different = [t for t, pair in enumerate(zip(result["hashes"], expected)) if len({*pair}) > 1]
+        different = [
+            t for t, pair in enumerate(zip(result["hashes"], expected)) if len({*pair}) > 1
+        ]
         assert not different, f"in step {different[0]}"
     assert len(results) == 3 and n_ended > 0
 
@@ -162,7 +164,9 @@ def test_a_page_plays_in_a_browser(agent_page, tmp_path):
     with Browser(tmp_path) as browser:
         browser.send("Page.navigate", url=f"file://{tmp_path}/page.html")
         browser.until("globalThis.megastep?.steps > 0")
-        assert browser.value("performance.timing.domComplete - performance.timing.fetchStart") < 1000
+        assert (
+            browser.value("performance.timing.domComplete - performance.timing.fetchStart") < 1000
+        )
         assert browser.value("performance.getEntriesByType('resource').length") == 0
         assert browser.value("byId('problem').textContent") == ""
         browser.value("byId('speed').value = '20'")
@@ -181,8 +185,8 @@ def test_a_page_plays_in_a_browser(agent_page, tmp_path):
         home = browser.value("megastep.game.running[0].layout")
         browser.key("n", True)
         assert browser.value("megastep.game.running[0].layout") == (home + 1) % 3
-        rate = "(() => { const t = performance.now(); megastep.step(300); return performance.now() - t; })()"
-        assert 300 / browser.value(rate) * 1000 > 300  # steps per second
+        browser.value("started = performance.now(), megastep.step(300)")
+        assert browser.value("performance.now() - started") < 1000  # milliseconds
         browser.key("ArrowUp", True)  # drives, in a race
         names = browser.value("megastep.game.players.map(player => player.name)")
         before = browser.value("[...megastep.game.players[0].trail.at(-1)]")

@@ -148,8 +148,7 @@ KERNEL policy_lstm(const PolicyCellParams& p) {
 KERNEL policy_gru(const PolicyCellParams& p) {
     int width = p.width;
     for (int lane = 0; lane < p.n_lanes; lane++) {
-        const float *input = p.gates + 3ll * lane * width,
-                    *last = p.recurrent + 3ll * lane * width;
+        const float *input = p.gates + 3ll * lane * width, *last = p.recurrent + 3ll * lane * width;
         for (int i = 0; i < width; i++) {
             long long at = (long long)lane * width + i;
             float reset = sigmoid(input[i] + last[i]);

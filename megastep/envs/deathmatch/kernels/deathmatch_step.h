@@ -156,7 +156,8 @@ HD void write_privileged(const DeathmatchStepParams& p, int first, int a) {
     }
 }
 
-// Counts a step of the round. At its end, ends the episodes of all agents, but not while one begins.
+// Counts a step of the round. At its end, ends the episodes of all agents, but not while one
+// begins.
 HD void end_round(const DeathmatchStepParams& p, int env) {
     int first = env * p.n_agents, is_over = ++p.round_ages[env] >= p.limit;
     long long n = (long long)p.n_envs * p.n_agents;

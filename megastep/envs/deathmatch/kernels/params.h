@@ -30,15 +30,15 @@ struct DeathmatchStepParams {
     float wound_cost;
     float kill_reward;
     float death_cost;
-    float aim_reward;  // for bringing an agent from the edge of the view to its centre
+    float aim_reward;     // for bringing an agent from the edge of the view to its centre
     float search_reward;  // per newly seen texel
     float hearing;        // metres at which sounds fade
-    int limit;         // steps per episode
-    int res;           // rays per view
-    int n_envs;        // N
-    int n_agents;      // A
-    int n_model;       // M
-    int n_threads;     // CPU threads
+    int limit;            // steps per episode
+    int res;              // rays per view
+    int n_envs;           // N
+    int n_agents;         // A
+    int n_model;          // M
+    int n_threads;        // CPU threads
 };
 
 // The actions of B lanes as the step takes them: 0 where an episode has ended.
