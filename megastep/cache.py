@@ -48,8 +48,9 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
 def warn(problem: str) -> None:
     """Warns that the cache is not used."""
     warnings.warn(
-        f"the cache is not used, so kernels, spawn points, shortest paths and visible texels are "
-        f"computed at each start: {problem}; set MEGASTEP_CACHE to a folder of your own",
+        f"the cache is not used, so kernels, spawn points, shortest paths, visible texels and the "
+        f"episodes of Keys are computed at each start: {problem}; set MEGASTEP_CACHE to a folder "
+        "of your own",
         stacklevel=2,
     )
 

@@ -157,7 +157,7 @@ def play_all(
     if has_oracle:
         found = all_played[names.index(ORACLE)]["metrics"]["found"]
         for played in all_played:
-            played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found
+            played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found.clamp(min=1)
     return all_played
 
 

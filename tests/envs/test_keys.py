@@ -6,7 +6,7 @@ import torch
 
 from megastep import contract, envs, toys
 from megastep.arrdict import arrdict
-from megastep.envs.keys.episodes import OPEN, Areas, episodes
+from megastep.envs.keys.episodes import OPEN, Areas, cached_episodes, episodes
 from megastep.geometries import sample
 
 N_COLOURS = 3
@@ -137,3 +137,13 @@ def test_a_key_that_is_not_used_is_wasted():
 
 def test_contract(device):
     contract.rollout(make_env(device, limit=12, resample=True, privileged=True), 40)
+
+
+def test_cached_episodes_are_those_that_were_drawn(tmp_path, monkeypatch):
+    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
+    homes = sample("homes", 32)
+    drawn = episodes(homes, 2, N_COLOURS, 3)
+    for _ in range(2):  # made, then read
+        for cached, part in zip(cached_episodes(homes, 2, N_COLOURS, 3), drawn):
+            np.testing.assert_array_equal(cached, part, strict=True)
+    assert len([*tmp_path.glob("keys-*")]) == 1

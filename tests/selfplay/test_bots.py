@@ -118,6 +118,15 @@ def test_an_oracle_finds_an_object_every_few_seconds(device):
     assert env.found.float().mean() > 3 and env.found.min() > 0
 
 
+def test_a_mapper_explores_until_it_has_found():
+    """In each of 24 mazes. Places that it took for seen, although it had not been there, made it
+    turn where it stood in every fifth maze.
+    """
+    env = envs.Memory(24, sample("memory_maze", 24, split="test"), device="cpu", res=8, subsample=1)
+    play(env, Mapper(env), 350)
+    assert env.found.min() > 0
+
+
 @pytest.mark.nightly
 def test_what_a_seeker_remembers_is_worth_finds():
     """Over whole episodes. The oracle's are within 20 % of Memory Maze's, 34.8."""
@@ -127,7 +136,8 @@ def test_what_a_seeker_remembers_is_worth_finds():
         env = envs.Memory(48, mazes, device="cpu", res=8, subsample=1)
         found[kind] = float(first_episodes(env, kind(env)).metrics.found.mean())
     assert abs(found[Oracle] / 34.8 - 1) < 0.2
-    assert found[Oracle] > 1.02 * found[Mapper] and found[Mapper] > 1.3 * found[Wanderer], found
+    assert found[Oracle] > 1.02 * found[Mapper] and found[Mapper] > 0.85 * found[Oracle], found
+    assert found[Mapper] > 3 * found[Wanderer], found
 
 
 @pytest.mark.slow

@@ -4,8 +4,8 @@ D layouts, P plans, M nodes of all plans, L targets per plan, K exits per
 node, n lanes.
 
 A plan is divided into squares of 0.3 m. The spot of a square that is furthest from walls is a node,
-if an agent fits there. Ways lead from nodes to targets: landmarks, the nodes of 4 x 4 squares that
-are furthest from walls, or the goals of PointGoal.
+if an agent fits there. Ways lead from nodes to targets: landmarks, the nodes of blocks of squares
+that are furthest from walls, or the goals of PointGoal.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from megastep.dotdict import dotdict
 from megastep.envs.pointgoal.path_graph import MAX_GOALS, PathGraph
 
 CELL = 0.05  # metres, of the grid of clearances
-SQUARE, BLOCK = 6, 4  # cells per side of a square, squares per side of a landmark's block
+SQUARE, BLOCK = 6, 4  # cells per side of a square, squares per side of a block, by default
 CLEAR = 0.005  # metres between walls and an agent on a node
 MOST = 0.5  # metres; clearances beyond are not told apart
 LEVELS = 255 / MOST  # of clearances, per metre
@@ -39,6 +39,7 @@ class Plans:
         spawns: (D, S, 2) metres, where agents begin. Nodes can be reached from there.
         radius: of the agents, in metres.
         goals: (D, L, 2) metres, the targets. Default: landmarks.
+        block: squares per side of a landmark's block.
 
     Attributes:
         of_layout: (D,) int64, the plan of each layout; layouts with the same walls share one.
@@ -65,6 +66,7 @@ class Plans:
         spawns: torch.Tensor,
         radius: float,
         goals: torch.Tensor | None = None,
+        block: int = BLOCK,
     ):
         device, lines = scenery.device, scenery.layouts.lines
         walls = [lines[d].cpu().numpy() for d in range(len(lines))]
@@ -82,7 +84,7 @@ class Plans:
             chunk = layouts[first : first + AT_ONCE]
             graph = PathGraph([dotdict(walls=walls[d], id=d) for d in chunk], radius, device)
             targets = None if goals is None else [*goals[chunk]]
-            surveys += _surveys(graph, [*spawns[chunk, :MAX_GOALS]], targets)
+            surveys += _surveys(graph, [*spawns[chunk, :MAX_GOALS]], targets, block)
         origins, clearances, squares, nodes, targets, lengths = zip(*surveys)
         self.nodes, self._radius = torch.cat(nodes), radius
         firsts = np.cumsum([0, *map(len, nodes)]).tolist()
@@ -162,13 +164,13 @@ def _stack(tensors, value=0) -> torch.Tensor:
     return torch.stack([pad(tensor, end, value=value) for tensor, end in zip(tensors, ends)])
 
 
-def _surveys(graph, spawns, targets) -> list[tuple]:
+def _surveys(graph, spawns, targets, block) -> list[tuple]:
     """Returns for each home of a graph origin (2,), clearances (H, W) uint8, squares (h, w) int64,
     nodes (m, 2), targets (l, 2) and lengths (m, l). Nodes are numbered from 0.
 
     A node can be reached from one of the spawn points (S, 2) of the home.
     """
-    grids, landmarks = [_grid(graph, d) for d in range(len(graph.geometries))], []
+    grids, landmarks = [_grid(graph, d, block) for d in range(len(graph.geometries))], []
     spots = [points[fits] for _, _, _, fits, points in grids]
     reached = [part.isfinite().any(1) for part in _lengths(graph, spawns, spots)]
     nodes, all_squares = [part[is_node] for part, is_node in zip(spots, reached)], []
@@ -176,7 +178,7 @@ def _surveys(graph, spawns, targets) -> list[tuple]:
         is_node = fits.masked_scatter(fits, is_reached)
         squares = is_node.flatten().cumsum(0).view(fits.shape) - 1
         all_squares.append(squares.masked_fill(~is_node, -1))
-        room, square = _best(room.masked_fill(~is_node, 0), BLOCK)
+        room, square = _best(room.masked_fill(~is_node, 0), block)
         landmarks.append(points.view(-1, 2)[square[room > 0]])
     targets = landmarks if targets is None else targets
     lengths = [part.half() for part in _lengths(graph, targets, nodes)]
@@ -184,13 +186,13 @@ def _surveys(graph, spawns, targets) -> list[tuple]:
     return [*zip(origins, clearances, all_squares, nodes, targets, lengths)]
 
 
-def _grid(graph, d) -> tuple[torch.Tensor, ...]:
+def _grid(graph, d, block) -> tuple[torch.Tensor, ...]:
     """Returns origin and clearances of a home's plan, and of its squares the spot furthest from
     walls: its clearance (h, w), whether an agent fits there (h, w), and where it is (h, w, 2).
     """
     walls, side, device = graph.geometries[d].walls, CELL * SQUARE, graph.device
     low, high = walls.min((0, 1)) - side, walls.max((0, 1))  # the first squares are outside
-    columns, rows = BLOCK * (np.ceil((high - low) / side / BLOCK).astype(int) + 1)
+    columns, rows = block * (np.ceil((high - low) / side / block).astype(int) + 1)
     x, y = (CELL * (np.arange(SQUARE * n) + 0.5) for n in (columns, rows))
     points = graph.tensor(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) + low, np.float32)
     home = torch.full((len(points),), d, dtype=torch.int32, device=device)

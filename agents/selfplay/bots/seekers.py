@@ -14,6 +14,7 @@ from megastep.agents.selfplay.bots.steering import REACH, Pose, Steering
 from megastep.agents.selfplay.bots.walker import Walker
 from megastep.arrdict import arrdict
 
+BLOCK = 2  # squares of 0.3 m per side of a landmark's block: a maze's cell has a landmark
 LAST = 1.5  # metres, at most, of the last leg of a way: from a landmark straight to an object
 FAR = 100.0  # metres that a longer last leg is worth
 
@@ -23,13 +24,12 @@ class Oracle:
 
     Args:
         env: a Memory.
-        otherwise: what decides while it does not know where the object is.
+        otherwise: class of the bot that decides while it does not know where the object is.
     """
 
     def __init__(self, env: Any, otherwise: Any = None):
-        self.steering, self.otherwise = Steering(env), otherwise
-        if otherwise is not None:
-            otherwise.steering = self.steering
+        self.steering = Steering(env, block=BLOCK)
+        self.otherwise = None if otherwise is None else otherwise(env, self.steering)
         if not hasattr(env, "cue"):
             raise ValueError(f"it finds the object of env.cue, and {type(env).__name__} has no cue")
         self.cue, self.positions = env.cue, env.objects.all.positions
@@ -109,7 +109,7 @@ class Mapper(Oracle):
     """
 
     def __init__(self, env: Any):
-        super().__init__(env, Explorer(env))
+        super().__init__(env, Explorer)
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the initial state: that of an `Explorer`, and `known` (n, K) bool."""
@@ -142,7 +142,7 @@ class Wanderer(Oracle):
     """
 
     def __init__(self, env: Any):
-        super().__init__(env, Walker(env))
+        super().__init__(env, Walker)
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the initial state, that of a `Walker`."""

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 
 from megastep import spaces
-from megastep.agents.selfplay.bots.plans import NEAR, Plans
+from megastep.agents.selfplay.bots.plans import BLOCK, NEAR, Plans
 from megastep.arrdict import arrdict
 from megastep.modules.movement import to_global
 from megastep.types import n_lanes
@@ -42,12 +42,13 @@ class Steering:
     Args:
         env: an environment with `core`, `movement` and `spawner`, as megastep's have.
         goals: (D, L, 2) metres, where ways lead. Default: landmarks, see :mod:`plans`.
+        block: squares of 0.3 m per side of the block that has a landmark.
 
     Raises:
         ValueError: it is another kind of environment.
     """
 
-    def __init__(self, env: Any, goals: torch.Tensor | None = None):
+    def __init__(self, env: Any, goals: torch.Tensor | None = None, block: int = BLOCK):
         missing = {"core", "movement", "spawner"} - {*dir(env)}
         if missing:
             raise ValueError(
@@ -63,7 +64,9 @@ class Steering:
         else:
             self.actions = torch.arange(len(moves), device=moves.device)
         self.moves, self.retained = moves, 1 - env.movement.damping
-        self.plans = Plans(env.core.scenery, env.spawner.points, env.core.agents.radius, goals)
+        self.plans = Plans(
+            env.core.scenery, env.spawner.points, env.core.agents.radius, goals, block
+        )
 
     def in_lanes(self, lanes: torch.Tensor) -> "Steering":
         """Returns one that steers lanes (n,) int64 of the environment."""

@@ -21,11 +21,13 @@ class Walker:
 
     Args:
         env: the environment that it plays in.
+        steering: how it walks there. Default: to the goals of PointGoal, elsewhere to landmarks.
     """
 
-    def __init__(self, env: Any):
+    def __init__(self, env: Any, steering: Steering | None = None):
         self.goal_index = getattr(env, "goal_index", None)
-        self.steering = Steering(env, env.goals.points if hasattr(env, "goal_index") else None)
+        goals = env.goals.points if hasattr(env, "goal_index") else None
+        self.steering = steering or Steering(env, goals)
 
     def in_lanes(self, lanes: torch.Tensor) -> "Walker":
         """Returns one that plays in lanes (n,) int64 of the environment."""

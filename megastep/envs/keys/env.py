@@ -12,7 +12,7 @@ from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv, images
-from megastep.envs.keys.episodes import episodes
+from megastep.envs.keys.episodes import cached_episodes
 from megastep.envs.keys.step import keys_step
 from megastep.modules.objects import REACH
 from megastep.scene import scenery, spread
@@ -116,7 +116,7 @@ class Keys(SceneryEnv):
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
         geometries = geometries if resample else spread(geometries, n_envs)
         self.seed = seed + (7 << 32)  # not the spawns'
-        tables = episodes(geometries, N_EPISODES, doors, self.seed)
+        tables = cached_episodes(geometries, N_EPISODES, doors, self.seed)
         homes = scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device)
         self.core = Core(homes, res, fov, fps, cameras, seed)
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
