@@ -327,7 +327,7 @@ async function main() {
     hasHomes ? "N shows the next home, " : ""}R begins anew.`;
   reset();
   globalThis.megastep = {
-    game, play, pause: () => play(false), step, reset, drive, press,
+    game, play, pause: () => play(false), step, reset, drive, press, started: performance.now(),
     get steps() { return game.steps; },
     get returns() { return game.players.map(player => player.score); },
     get episodes() { return game.episodes; },
