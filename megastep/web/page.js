@@ -14,7 +14,7 @@ class Game {
     if (isRace) this.simulations[1] ??= new Simulation(this.parts);
     this.running = this.simulations.slice(0, isRace ? 2 : 1);
     this.running.forEach(simulation => simulation.reset(seed, home));
-    Object.assign(this, { seed, steps: 0, episodes: [] });
+    Object.assign(this, { seed, steps: 0, episodes: [], n_resets: (this.n_resets ?? 0) + 1 });
     this.players = this.running.flatMap((simulation, i) => Array.from({ length: n }, (_, lane) => {
       const isHuman = this.isDriving && !i && !lane, own = policies.find(({ lanes: [a, b] }) => a <= lane && lane < b);
       return { simulation, lane, isHuman, own, name: isHuman ? "you" : own?.name ?? "nobody", number: 0 };
@@ -64,12 +64,12 @@ const disc = (context, [x, y], radius, ...look) => shape(context, c => c.arc(x, 
 // The floor and the walls of a home, drawn once, and completed as the agent looks around.
 class Plan {
   constructor(simulation, width, height, ratio) {
-    const { layout, data } = simulation, n_words = simulation.word("n_words");
+    const { layout, data } = simulation;
+    this.simulation = simulation;
     const [first, end] = simulation.field("scenery.wall_starts", layout + 2, Int32Array).subarray(layout);
     this.walls = simulation.field("scenery.walls", 4 * end).slice(4 * first);
     this.starts = simulation.field("scenery.texel_starts", end + 1, Int32Array).slice(first);
-    this.texels = simulation.field("scenery.texels", 4 * this.starts.at(-1));
-    this.seen = data.n_lanes === 1 && n_words && simulation.field("seen", n_words, Uint32Array);
+    this.n_words = data.n_lanes === 1 ? simulation.word("n_words") : 0;  // of a bit per texel that was seen
     this.drawn = new Set();
     const of = axis => this.walls.filter((_, i) => i % 2 === axis);
     const [x0, y0, x1, y1] = [Math.min, Math.max].flatMap(most => [0, 1].map(axis => most(...of(axis))));
@@ -81,7 +81,7 @@ class Plan {
     });
     for (const layer of [this.floor, this.wall]) layer.scale(ratio, ratio);
     const rooms = new Path2D(data.rooms[layout].map(room => `M${room.map(this.at).join("L")}Z`).join(""));
-    this.floor.fillStyle = css(this.seen ? "--unseen" : "--floor");
+    this.floor.fillStyle = css(this.n_words ? "--unseen" : "--floor");
     this.floor.fill(rooms, "evenodd");
     this.floor.clip(rooms, "evenodd");
     this.wall.lineCap = "square";
@@ -91,14 +91,16 @@ class Plan {
   // Draws the texels that were seen since the last call, or all, grey where they were not seen.
   draw(isAll) {
     const [low, high] = [css("--wall-low"), css("--wall-high")].map(Number), grey = css("--unseen-wall");
+    const texels = this.simulation.field("scenery.texels", 4 * this.starts.at(-1));
+    const seen = this.n_words && this.simulation.field("seen", this.n_words, Uint32Array);
     for (let wall = 0; wall < this.starts.length - 1; wall++) {
       const [ax, ay, bx, by] = this.walls.subarray(4 * wall), [start, end] = this.starts.subarray(wall);
       const point = i => [(i - start) / (end - start)].flatMap(t => this.at([ax + t * (bx - ax), ay + t * (by - ay)]));
       for (let i = start; i < end; i++) {
-        const bit = i - this.starts[0], isSeen = !this.seen || this.seen[bit >> 5] >>> (bit & 31) & 1;
+        const bit = i - this.starts[0], isSeen = !seen || seen[bit >> 5] >>> (bit & 31) & 1;
         if (!(isAll || isSeen) || this.drawn.has(i)) continue;
         if (isSeen) this.drawn.add(i);
-        const light = this.texels.subarray(4 * i, 4 * i + 3), peak = Math.max(...light, 1e-6);
+        const light = texels.subarray(4 * i, 4 * i + 3), peak = Math.max(...light, 1e-6);
         const shown = colour(light.map(x => x / peak), low + (high - low) * encode(2.5 * peak) / 255);
         shape(this.wall, [point(i), point(i + 1)], null, isSeen ? shown : grey, 3.4);
       }
@@ -141,10 +143,10 @@ let plan = null;
 
 function drawPlan(game, context, width, height, ratio) {
   const [{ simulation }] = game.players, { data } = game, { layout } = simulation;
-  const key = [layout, width, height, css("--page"), game.seed, game.players[0].number].join();
+  const key = [layout, width, height, css("--page"), game.n_resets, game.players[0].number].join();
   if (plan?.key !== key) plan = Object.assign(new Plan(simulation, width, height, ratio), { key });
   const sights = game.players.map(player => sight(player).map(plan.at));
-  if (plan.seen) {
+  if (plan.n_words) {
     plan.draw(false);
     shape(plan.floor, sights[0], css("--floor"));
   }
