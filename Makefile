@@ -3,11 +3,13 @@
 BASE ?= python3
 PYTHON ?= .venv/bin/python
 CORES := $(shell nproc 2>/dev/null || echo 1)
+# Some tests wait, for a time limit or another process, so there is a worker more than there are cores.
+WORKERS := $(shell expr $(CORES) + 1)
 SEED ?= 1
 
 # Neighbouring tests share a process, and what they prepare. Tests start many processes, which
 # import faster from bytecode.
-PYTEST = PYTHONDONTWRITEBYTECODE= $(PYTHON) -m pytest -q -n $(CORES) --dist worksteal
+PYTEST = PYTHONDONTWRITEBYTECODE= $(PYTHON) -m pytest -q -n $(WORKERS) --dist worksteal
 
 # Create the virtual environment only if it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
@@ -47,7 +49,7 @@ wasm: $(SETUP)             ## build the kernels of web pages again, megastep/web
 	$(PYTHON) scripts/build_wasm.py
 
 docs: $(SETUP)             ## build the site in docs/_build; warnings are errors
-	test -d docs/play || $(PYTHON) scripts/pictures.py explorer.html deathmatch.html pointgoal.html
+	test -d docs/play || $(PYTHON) scripts/pictures.py gallery
 	$(PYTHON) -m sphinx -W --keep-going -q docs docs/_build
 
 image:                     ## build the container image with buildah, try it; IMAGE_OPTIONS=--stand-in

@@ -35,6 +35,7 @@ if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _MODULES = (
+    "adapters",
     "agents",
     "arrdict",
     "capture",

@@ -5,19 +5,21 @@ the first world that breaks a clause. Axes: N environments, A agents, B = N A la
 """
 
 import numbers
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
 
 from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.types import Env, Space, Tree, World, n_lanes, optional
+from megastep.engine.state_tree import restore, snapshot
+from megastep.types import Env, Space, Tree, World, n_lanes, optional, takes_masks
 
 __all__ = [
     "ATTRIBUTES",
     "ContractError",
     "check_environment",
+    "check_resets",
     "check_world",
     "random_actions",
     "rollout",
@@ -124,6 +126,7 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
     _check_privileged(env, world)
     _check_episodes(env, world, last)
     _check_metrics(env, world, last)
+    _check_game_over(env, world)
     _require(
         env,
         last is None or ("learns" in world) == ("learns" in last),
@@ -176,6 +179,13 @@ def _check_observation(env, path, space, values) -> None:
     dtype = getattr(space, "dtype", None)
     _check_tensor(env, path, values, shape, (dtype,) if dtype else FLOATS)
     _require(env, bool(values.isfinite().all()), f"{path} must be finite")
+    if getattr(space, "low", None) is not None or getattr(space, "high", None) is not None:
+        low, high = space.bounds(values.device)
+        inside = (values >= low) & (values <= high)
+        outside = values[~inside].float().tolist()[:1]
+        _require(
+            env, not outside, f"{path} must be within {space.low} and {space.high}, not {outside}"
+        )
 
 
 def _check_privileged(env, world) -> None:
@@ -239,7 +249,54 @@ def _check_metrics(env, world, last) -> None:
         _check_per_lane(env, f"metrics.{name}", values, torch.float32)
 
 
+def _check_game_over(env, world) -> None:
+    over = optional(env, "game_over")
+    if over is None:
+        return
+    _check_tensor(env, "game_over", over, (env.n_envs,), (torch.bool,))
+    ended = (world["terminal"] | world["truncated"]).view(env.n_envs, -1).all(1)
+    _require(
+        env,
+        not bool((over & ~ended).any()),
+        "where game_over is True, every lane must be terminal or truncated",
+    )
+
+
 # ---- Stepping ----
+
+
+def check_resets(env: Env) -> None:
+    """Checks ``reset(seed, mask)`` of an environment that :func:`~megastep.types.takes_masks`.
+    Leaves its tensors as they were.
+
+    Raises:
+        ContractError: if a masked reset changes other lanes or begins no episode in its own, or one
+            seed gives two first worlds.
+    """
+    n, n_agents, before = n_lanes(env), optional(env, "n_agents"), snapshot(env)
+    reset: Callable = env.reset
+    first = reset(seed=1).clone()
+    check_world(env, first)
+    decision = arrdict(actions=random_actions(env, torch.Generator().manual_seed(1)))
+    last = env.step(decision).clone()
+    mask = torch.arange(n, device=env.device) // n_agents % 2 == 0  # every other environment
+    world = reset(seed=torch.ones(n, dtype=torch.int64, device=env.device), mask=mask)
+    _require(
+        env, bool(world["reset"][mask].all()), "reset must be True in the lanes of a masked reset"
+    )
+    for path, leaf in spaces.leaves(world).items():
+        was, begins = spaces.leaves(last)[path], spaces.leaves(first)[path]
+        _require(
+            env,
+            torch.equal(leaf[~mask], was[~mask]),
+            f"a masked reset must leave other lanes as they are, but {path} has changed",
+        )
+        _require(
+            env,
+            torch.equal(leaf[mask], begins[mask]) or not path.startswith("obs"),
+            f"a seed must give the same first world each time, but {path} differs",
+        )
+    restore(env, before)
 
 
 def random_actions(env: Env, generator: torch.Generator) -> Tree:
@@ -267,6 +324,8 @@ def rollout(env: Env, n_steps: int, seed: int = 1, check: bool = True) -> list[a
     """
     if check:
         check_environment(env)
+        if takes_masks(env):
+            check_resets(env)
     generator, worlds = torch.Generator().manual_seed(seed), []
 
     def add(world) -> None:

@@ -17,6 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.engine.resets import Resets
 from megastep.engine.state_tree import OPAQUE, children, is_expanded, node_at, rebind, walk
 from megastep.read_only import ReadOnlyTensor
 from megastep.types import Env
@@ -45,6 +48,8 @@ class EnvState:
     generators, and the plain values that have changed since this object was made. A plain value is
     a number, a string, or lists, tuples, sets and dicts of these. The global generators of PyTorch,
     NumPy and Python are saved as well.
+
+    The last world of an environment whose lanes were reset by a mask is saved too.
 
     Tensors of a MB and more that have not changed since, such as floor plans, are left out: a new
     environment of the same settings has them.
@@ -103,7 +108,15 @@ class EnvState:
             if path in arrays and _digest(arrays[path]) == first[path]
         }
         arrays = {path: leaf for path, leaf in arrays.items() if path not in unchanged}
-        return state | dict(arrays=arrays, aliases=aliases, unchanged=unchanged)
+        worlds = {
+            path: spaces.leaves(resets.last)
+            for path, resets in self._resets()
+            if resets.is_used and resets.last is not None
+        }
+        return state | dict(arrays=arrays, aliases=aliases, unchanged=unchanged, worlds=worlds)
+
+    def _resets(self) -> Iterator[tuple[str, Resets]]:
+        return ((path, leaf) for path, (_, _, leaf) in walk(self.root, Resets).items())
 
     def host_state(self) -> State:
         """Returns the part of the state that is not in tensors, for `restore_host`."""
@@ -187,6 +200,10 @@ class EnvState:
             raise ValueError(
                 f"the state of {type(self.env).__name__} does not fit: {error}"
             ) from error
+        for path, resets in self._resets():  # a world of another state would mislead a masked reset
+            leaves, device = state.get("worlds", {}).get(path), torch.device(self.env.device)
+            resets.is_used = leaves is not None
+            resets.last = leaves and _tree({k: v.to(device, copy=True) for k, v in leaves.items()})
 
     @torch.no_grad()
     def _load(self, state) -> None:
@@ -297,6 +314,18 @@ class EnvState:
             if hasattr(node, "__dict__"):
                 is_users = node is not self.root and not _is_ours(node)
             stack += [(path + step, child, is_users) for step, child in reversed(children(node))]
+
+
+def _tree(leaves) -> arrdict:
+    """Returns the tree of leaves by dotted path."""
+    tree = arrdict()
+    for path, leaf in leaves.items():
+        *above, name = path.split(".")
+        node = tree
+        for key in above:
+            node = node.setdefault(key, arrdict())
+        node[name] = leaf
+    return tree
 
 
 def _comparable(host_state) -> dict[str, object]:

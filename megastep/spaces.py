@@ -2,7 +2,9 @@
 
 A space, or a (nested) dotdict of spaces, describes one lane: its ``shape`` leaves out the leading
 axis B. A vector or an image may name the ``dtype`` that it is observed and stored in, such as
-``MultiImage(1, 3, 1, 64, dtype=torch.uint8)``; without one it is float16 or float32.
+``MultiImage(1, 3, 1, 64, dtype=torch.uint8)``; without one it is float16 or float32. It may name
+the bounds of its numbers, ``low`` and ``high``, for all or one per channel or dimension; the
+contract's checker holds an environment to them, and adapters for other libraries pass them on.
 
 :func:`leaves` and :func:`map` walk trees of spaces. A star import leaves them out, since ``map``
 would replace Python's.
@@ -22,6 +24,10 @@ __all__ = ["MultiContinuous", "MultiDiscrete", "MultiEmpty", "MultiImage", "Mult
 DTYPES = torch.uint8, torch.float16, torch.float32
 
 
+#: A bound of all numbers of a space, or one for each number of the axis after the agents'.
+Bound = float | tuple[float, ...] | None
+
+
 @dataclass(frozen=True)
 class _Space:
     def __post_init__(self) -> None:
@@ -32,7 +38,7 @@ class _Space:
                 )
 
     def _sizes(self) -> dict[str, int]:
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "dtype"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if not f.kw_only}
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -43,17 +49,44 @@ class _Space:
 @dataclass(frozen=True)
 class _Numbers(_Space):
     dtype: torch.dtype | None = field(default=None, kw_only=True)
+    # what checkers and other libraries are told, so no part of what makes two spaces equal
+    low: Bound = field(default=None, kw_only=True, compare=False)
+    high: Bound = field(default=None, kw_only=True, compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in "low", "high":
+            object.__setattr__(self, name, self._bound(name))
         if self.dtype not in (None, *DTYPES):
             allowed = ", ".join(str(dtype) for dtype in DTYPES)
             raise ValueError(
                 f"{type(self).__name__} cannot have dtype={self.dtype!r}: allowed are {allowed}"
             )
 
+    def _bound(self, name) -> Bound:
+        given = getattr(self, name)
+        if given is None or isinstance(given, (int, float)):
+            return given if given is None else float(given)
+        values = tuple(float(value) for value in given)
+        if len(values) != self.shape[1]:
+            raise ValueError(
+                f"{type(self).__name__} needs one number for {name}, or {self.shape[1]}, not "
+                f"{given!r}"
+            )
+        return values
+
+    def bounds(self, device: torch.device | str | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns (low, high), float32 each, that broadcast with ``shape``; infinite without."""
+        axes = (-1, *[1] * (len(self.shape) - 2))
+        pairs = (self.low, -math.inf), (self.high, math.inf)
+        low, high = (
+            torch.tensor(none if bound is None else bound, device=device).view(axes)
+            for bound, none in pairs
+        )
+        return low, high
+
     def __repr__(self) -> str:
-        # without a dtype of None: checkpoints compare spaces as text
+        # without a dtype of None and bounds: checkpoints compare spaces as text
         dtype = {"dtype": self.dtype} if self.dtype else {}
         values = ", ".join(
             f"{name}={value!r}" for name, value in {**self._sizes(), **dtype}.items()

@@ -5,6 +5,7 @@ No class needs to inherit from the protocols: any object with these attributes i
 environment that are controlled independently, B = N A lanes.
 """
 
+import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -20,6 +21,7 @@ __all__ = [
     "is_stored",
     "n_lanes",
     "optional",
+    "takes_masks",
 ]
 
 #: A space of :mod:`megastep.spaces`, or a (nested) dict of spaces.
@@ -89,6 +91,13 @@ class Env(Protocol):
             the policy: evaluations give it to their environments and freeze it, and `init` gives
             it to those of the next run. Default: none.
         max_episode_steps: steps at which an evaluation cuts an episode off. Default: 100,000.
+        reset(seed=None, mask=None): a reset that takes a seed and a mask. With a mask, (B,) bool,
+            only these lanes begin an episode; the others keep state and observation to the bit, and
+            their rows are those of the last world. With a seed, an integer or (B,) int64, a seed
+            per lane, the episodes from now on are the same each time. Neither synchronises. See
+            :func:`takes_masks`.
+        game_over: (N,) bool, environments whose game ended with the last world, and with it the
+            episodes of all agents. Default: None, a game ends where all its lanes end at once.
         desync(): gives every lane a random age, as if its episode had been going on for some steps.
             Training calls it after ``reset``, so that lanes do not end their episodes in the same
             steps. Default: none.
@@ -128,6 +137,7 @@ DEFAULTS: dict[str, Any] = {
     "roles": None,
     "privileged_space": None,
     "desync": None,
+    "game_over": None,
     # of environments with opponents
     "learners": None,  # (B,) bool, lanes whose transitions are stored; None: all
     "matchups": {},  # (B,) bool by name, groups of lanes that are reported apart
@@ -145,6 +155,11 @@ def optional(owner: object, name: str, defaults: Mapping[str, Any] = DEFAULTS) -
         defaults: the default of each optional attribute.
     """
     return getattr(owner, name, defaults[name])
+
+
+def takes_masks(env: Env) -> bool:
+    """Returns whether an environment has ``reset(seed=None, mask=None)``."""
+    return {"seed", "mask"} <= {*inspect.signature(env.reset).parameters}
 
 
 def n_lanes(env: Env) -> int:

@@ -33,11 +33,13 @@ RUN = "runs/tried"
 ISOLATION = "BUILDAH_ISOLATION", "chroot"
 #: Packages that the image must not have.
 UNWANTED = "clang-format", "coverage", "hypothesis", "pyright", "pytest", "ruff", "sphinx"
+#: Where the Dockerfile has the source while it installs the package.
+SOURCES = "/source", "/tmp/megastep"
 #: Commands in the image. The quickstart evaluates and films by itself, too.
 COMMANDS = (
     f"megastep train experiment=quickstart samples={{samples}} folder={RUN}",
     f"megastep evaluate run={RUN} episodes=64",
-    f"megastep record run={RUN} out=runs/film.gif",
+    f"megastep record run={RUN} file=runs/film.gif",
     "megastep reproduce {row}",
 )
 
@@ -137,11 +139,12 @@ def check(builder: Builder, tag: str, folder: Path, samples: float, row: str) ->
     runs = folder / "runs"
     runs.mkdir()
     os.chown(runs, *map(int, USER.split(":")))
-    find = "from importlib.metadata import distributions as all\n"
-    find += f"print(*{{one.name for one in all()}} & {{*{UNWANTED!r}}})"
+    find = "from importlib.metadata import distributions as all\nfrom pathlib import Path\n"
+    find += f"print(*{{one.name for one in all()}} & {{*{UNWANTED!r}}})\n"
+    find += f"print(*(path for path in map(Path, {SOURCES!r}) if path.exists()))"
     code, text = run(builder, tag, f"python -c {shlex.quote(find)}", runs)
     if code or text.split():
-        print(f"The image has packages that only tests need: {text}")
+        print(f"The image has packages that only tests need, or the source: {text}")
         return code or 1
     for command in COMMANDS:
         code, text = run(builder, tag, command.format(samples=f"{samples:g}", row=row), runs)

@@ -3,6 +3,7 @@ agents.
 
 python scripts/pictures.py                    all, into docs/images and docs/play
 python scripts/pictures.py explorer.gif explorer.html
+python scripts/pictures.py gallery            the pages alone
 """
 
 import argparse
@@ -28,6 +29,8 @@ FILMS = {
     "pointgoal.png": "run=pointgoal_anywhere home=4 steps=30",
     "homes.png": "run=pointgoal_anywhere homes=[1,2,3,4] steps=25 theme=dark dpi=70",
     "deathmatch.png": "run=deathmatch_anywhere against=hunter home=27 steps=60",
+    "memory.gif": "run=memory_9 steps=240 dpi=70 speed=2 seed=2",
+    "keys.png": "run=keys_anywhere steps=60",
     "minimal.png": "env=minimal geometry=box steps=20",
     "pong-court.png": "env=pong steps=30",
 }
@@ -40,6 +43,8 @@ SHEETS = {
 GALLERY = {
     "explorer.html": "run=explorer_anywhere homes=[3,0,1,2]",
     "deathmatch.html": "run=deathmatch_anywhere homes=[27,0,1]",
+    "memory.html": "run=memory_9",
+    "keys.html": "run=keys_anywhere",
     "pointgoal.html": "run=pointgoal_anywhere homes=[4,0,1]",
 }
 
@@ -48,6 +53,7 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("names", nargs="*", help="names of pictures; all by default")
     names = parser.parse_args(argv).names or [*FILMS, *SHEETS, *GALLERY]
+    names = [*GALLERY] if names == ["gallery"] else names
     if unknown := [name for name in names if name not in {*FILMS, *SHEETS, *GALLERY}]:
         raise SystemExit(
             f"There is no picture {unknown[0]}; there are {', '.join([*FILMS, *SHEETS, *GALLERY])}"

@@ -35,11 +35,11 @@ SIMULATOR = (
     ("core", "cubicasa", "toys"),
     ("cuda", "modules"),
     ("compat", "envs", "web"),
-    ("demo",),
+    ("adapters", "demo"),
 )
 ENGINE = (
     ("checks", "outputs", "state_tree", "views"),
-    ("objects",),
+    ("objects", "resets"),
     ("agents", "devices", "scenery"),
     ("launch_params",),
     ("lighting", "movement", "object_updates", "spawning", "texels"),
@@ -133,6 +133,7 @@ OUTSIDE_USERS = {
     "cloudpickle": ("megastep/recording.py",),
     "cuda": ("megastep/kernels/build/compile.py",),
     "gymnasium": (
+        "megastep/adapters/*.py",
         "megastep/envs/gymnasium/*.py",
         "megastep/envs/on_host/*.py",
         "megastep/env_values.py",
@@ -150,8 +151,13 @@ OUTSIDE_USERS = {
     ),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/evaluation/ratings.py",),
+    "pettingzoo": ("megastep/adapters/pettingzoo.py", "megastep/envs/pettingzoo.py"),
     "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
+    "rsl_rl": ("megastep/adapters/rsl_rl.py",),
+    "stable_baselines3": ("megastep/adapters/sb3.py",),
     "tensorboard": ("agents/training/loggers/tensorboard.py",),
+    "tensordict": ("megastep/adapters/rsl_rl.py", "megastep/adapters/torchrl.py"),
+    "torchrl": ("megastep/adapters/torchrl.py",),
     "wandb": ("agents/training/loggers/wandb.py",),
 }
 

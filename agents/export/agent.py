@@ -93,25 +93,29 @@ def command_of(words: str) -> str:
 
 
 def tables_of(folder: Path, step: int, has_homes: bool = True) -> list[dict]:
-    """Returns the evaluations of a run after so many samples, oldest first, of an environment with
-    floor plans those in geometry=suite: titles, commands without their run, and rows.
+    """Returns the evaluations of a run after so many samples, oldest first: titles, commands
+    without their run, and rows. Of an environment with floor plans those in geometry=suite, or, if
+    there are none, those in homes of the run's own source.
     """
-    tables = []
+    tables: dict[bool, list[dict]] = {False: [], True: []}
     files = sorted((folder / "evaluations").glob("*.json"), key=lambda path: path.stat().st_mtime)
     for path in files:
         table = json.loads(path.read_text())
         how = table.get("evaluation", {})
         geometry = how.get("geometry") or {}
         is_suite = geometry.get("name") == components.SUITE
-        if table.get("step") != step or is_suite != has_homes:
+        if table.get("step") != step or (has_homes and geometry and not is_suite):
             continue
         words = ["geometry=suite", *options_of(geometry)] if is_suite else []
         words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed")]
         words += ["greedy=true"] * how["greedy"]
-        words += [f"against={','.join(how['against'])}"] if how.get("against") else []
+        for key in ("baseline", "against"):
+            if how.get(key) and how[key] != ["random"]:  # the default
+                words.append(f"{key}={','.join(how[key])}")
         title = re.sub(f"^{re.escape(folder.name)}(?=, )", "the agent", table["title"])
-        tables.append({"title": title, "command": " ".join(words), "rows": table["rows"]})
-    return tables
+        about = {"title": title, "command": " ".join(words), "rows": table["rows"]}
+        tables[is_suite].append(about)
+    return tables[has_homes] or tables[False]
 
 
 def options_of(geometry: dict) -> list[str]:
@@ -198,8 +202,8 @@ def card(file: Path) -> str:
     facts, name = about["facts"], file.stem
     commands = "; then ".join(f"`{command}`" for command in facts["commands"]) or "unknown"
     plays = any("won" in table["rows"][0] for table in about["tables"])
-    has_homes = components.takes_geometries(about["config"]["train"]["env"]["name"])
-    suite, maze = (" geometry=suite", " geometry=maze") if has_homes else ("", "")
+    is_suite = any("geometry=suite" in table["command"] for table in about["tables"])
+    suite, maze = (" geometry=suite", " geometry=maze") if is_suite else ("", "")
     against = " against=bot" if plays else ""
     gpus = f"{facts['ranks']} × {facts['device']}" if facts["ranks"] > 1 else facts["device"]
     lines = {

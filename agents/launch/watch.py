@@ -229,10 +229,10 @@ class Watch:
                 problem = detector.poll(ours, theirs, self.is_broken) if theirs else None
                 if theirs and problem and not self.has_left:
                     label = f"rank {other} on {theirs.host}"
-                    return self.on_lost(f"{label} {problem}" if self.claim() else None)
+                    return self._end(f"{label} {problem}")
                 if detector.n_stalled * PERIOD > STALLED_SECONDS and self.rank == 0:
                     if problem := self._stall(ours):
-                        return self.on_lost(problem if self.claim() else None)
+                        return self._end(problem)
                 self.n_answers += 1
             self._beat()
             while self.rank > 0 and time.monotonic() < self._leaves_by:
@@ -244,6 +244,14 @@ class Watch:
             if not self.has_left:
                 # saves, as SIGTERM would, but bears one of torchrun's after it
                 os.kill(os.getpid(), signal.SIGUSR1)
+
+    def _end(self, problem: str) -> None:
+        """Ends all ranks. The first to call this reports what has happened."""
+        if not self.claim():
+            return self.on_lost(None)
+        if not self.may_be_silent:  # torchrun's store may end with this rank: the others read first
+            time.sleep(2 * PERIOD)
+        self.on_lost(problem)
 
     def _guard(self) -> None:
         # counts polls, as a suspended job may go on later

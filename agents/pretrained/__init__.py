@@ -24,8 +24,8 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import folders
 from megastep.types import Env
 
-#: Where an agent's spaces are read from, which no floor plan changes.
-_BOX = "megastep.geometries.sources:box"
+#: Where an agent's spaces are read from, which no floor plan changes. Keys needs doorways.
+_HOMES, _N_HOMES = "megastep.geometries.sources:homes", 4
 
 
 def names() -> list[str]:
@@ -60,8 +60,8 @@ def load_with_env(name: str, device: str = "auto", **options: bool) -> tuple[Pol
     device = factory.make_device(device)
     loaded = folders.load_checkpoint(folders.find(name), False, device)
     trained = factory.config_of(loaded)
-    box = settings.kind_of("geometry", _BOX)(name=_BOX)
-    homes = factory.homes(trained.env, box, "test")
+    geometry = settings.kind_of("geometry", _HOMES)(name=_HOMES, n=_N_HOMES)
+    homes = factory.homes(trained.env, geometry, "test")
     where = dict(seed=trained.seed, device=device)
     env = factory.make_sample(trained.env, homes, **where, **options)
     policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)

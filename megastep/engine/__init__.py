@@ -16,6 +16,7 @@ from megastep.engine.object_updates import place_objects, update_objects
 from megastep.engine.objects import Objects, check_objects
 from megastep.engine.outputs import Observation, Physics, Render
 from megastep.engine.rendering import observe, render, update_agent_geometry
+from megastep.engine.resets import Resets
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.engine.spawning import spawn, uniform
 from megastep.kernels.build.compile import EngineError
@@ -31,6 +32,7 @@ __all__ = [
     "Observation",
     "Physics",
     "Render",
+    "Resets",
     "Scenery",
     "bake",
     "check",

@@ -1,7 +1,7 @@
 """Members that the environments share."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 
@@ -9,6 +9,7 @@ from megastep import engine
 from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
 from megastep.modules import RandomSpawns
+from megastep.types import Env
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,10 +29,27 @@ def images(view: engine.Observation) -> arrdict:
 
 
 class DisplayedEnv:
-    """An environment that is drawn by its own ``state(e)`` and ``plot_state(state)``."""
+    """An environment that is drawn by its own ``state(e)`` and ``plot_state(state)``, and begins
+    episodes by its own ``_begin(mask)``.
+    """
 
+    _begin: Callable[[torch.Tensor], arrdict]
+    _resets: engine.Resets
     plot_state: Callable[..., "Figure"]
     state: Callable[..., arrdict]
+
+    def reset(
+        self, seed: int | torch.Tensor | None = None, mask: torch.Tensor | None = None
+    ) -> arrdict:
+        """Starts a new episode in every lane, or in those of a mask. Returns the first world.
+
+        Args:
+            seed: of the episodes from now on, from 0 to 2**63 - 1, or a seed per lane, (B,) int64.
+            mask: (B,) bool, lanes that begin. The others keep state and observation, unless their
+                game begins anew with a lane of the mask, as in Pong. Returns the last world, with
+                new rows in place.
+        """
+        return self._resets(cast(Env, self), self._begin, seed, mask)
 
     def display(self, e: int = 0) -> "Figure":
         """Draws environment ``e`` as it is now. Returns a matplotlib figure."""

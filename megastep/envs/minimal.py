@@ -78,10 +78,10 @@ class Minimal(SceneryEnv):
         self.obs_space = modules.RGB(self.core).space
         self.action_space = self.movement.space
         self._reward = torch.zeros(n_envs, device=self.device)
+        self._resets = engine.Resets()
 
-    def reset(self) -> arrdict:
-        """Starts a new episode in every lane. Returns the first world."""
-        return self._world(self.lifecycle.start_all())
+    def _begin(self, mask) -> arrdict:
+        return self._world(mask)
 
     def desync(self) -> None:
         """Gives every lane a random age, from the seed, so that episodes do not end together."""
@@ -90,7 +90,7 @@ class Minimal(SceneryEnv):
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``, (B, 1). Returns a world."""
         self.movement(decision)
-        return self._world(self.lifecycle.start_ended())
+        return self._resets.keep(self._world(self.lifecycle.start_ended()))
 
     def _world(self, reset) -> arrdict:
         self.spawner(reset)

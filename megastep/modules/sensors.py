@@ -58,7 +58,7 @@ class RGB:
         self.core, self.subsample = core, subsample
         downsample(torch.empty(core.res), subsample)
         self.space = spaces.MultiImage(
-            core.n_agents, 3, len(core.agents.yaws), core.res // subsample
+            core.n_agents, 3, len(core.agents.yaws), core.res // subsample, low=0, high=1
         )
 
     def __call__(self, r: engine.Render | None = None) -> torch.Tensor:
@@ -107,7 +107,7 @@ class Depth:
         self.core, self.subsample, self.max_depth = core, subsample, max_depth
         downsample(torch.empty(core.res), subsample)
         self.space = spaces.MultiImage(
-            core.n_agents, 1, len(core.agents.yaws), core.res // subsample
+            core.n_agents, 1, len(core.agents.yaws), core.res // subsample, low=0, high=1
         )
 
     def __call__(self, r: engine.Render | None = None) -> torch.Tensor:

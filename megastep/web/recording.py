@@ -5,6 +5,7 @@ without it, so such an environment is refused with the name of the operation.
 """
 
 import bisect
+import contextlib
 import ctypes
 import gc
 import struct
@@ -63,9 +64,10 @@ class Memory:
     def scan(self) -> None:
         """Adds all tensors of the process."""
         for one in gc.get_objects():
-            if issubclass(type(one), torch.Tensor) and one.device.type == "cpu":
-                if one.layout is torch.strided:
-                    self.add(one)
+            if issubclass(type(one), torch.Tensor):
+                with contextlib.suppress(RuntimeError, NotImplementedError):  # without memory
+                    if one.device.type == "cpu":
+                        self.add(one)
 
     def contents(self, start: int) -> bytes:
         """Returns what a storage holds."""

@@ -5,6 +5,7 @@ Each is a function of a device that yields measurements. Its docstring is printe
 
 from collections.abc import Callable, Iterator
 
+from adapter_steps import adapters
 from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
@@ -28,6 +29,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "agents": agents,
     "deathmatch": deathmatch,
     "memory": memory,
+    "adapters": adapters,
     "replay": replay,
     "pong": pong,
     "paths": paths,

@@ -222,6 +222,19 @@ def plot_published(records: list[dict], path: Path) -> None:
     save(grid[0, 0].figure, path)
 
 
+def plot_memory(records: list[dict], path: Path) -> None:
+    """Plots what cores find in Memory over the seconds of their training, from memory.jsonl."""
+    ax = subplots(7, 4)
+    cores = [record for record in records if record["budget"] == 120 and not record["variant"]]
+    styles = {1: "-", 3: "--"}
+    colours = dict(zip(CORE_ORDER, ("tab:grey", "tab:blue", "tab:orange", "tab:green")))
+    for record in sorted(cores, key=lambda record: -record["found"][-1]):
+        style = dict(color=colours[record["core"]], linestyle=styles[record["layers"]])
+        ax.plot(record["seconds"], record["found"], label=record["name"], **style)
+    ax.set(xlabel="seconds on one H200", ylabel="objects found per episode, 9 x 9 mazes", ylim=0)
+    finish(ax, path)
+
+
 def plot_scaling(records: list[dict], path: Path) -> None:
     """Plots samples per second over the number of GPUs, from `scaling`, beside linear scaling: on
     the machine that was measured last.

@@ -62,14 +62,14 @@ def text_of(name: str) -> str:
     if "rows" in quote:
         return _table(quote)
     if "agent" in quote:
-        return quote["as"].format(**_results(quote["agent"], quote["source"]))
+        return quote["as"].format(**_results(quote["agent"], quote.get("source")))
     return _formatted(quote["what"], quote["card"], quote["as"])
 
 
 def _results(agent, source):
-    """Returns the means of a trained agent in a source of homes, from its file."""
+    """Returns the means of a trained agent, in a source of homes if any, from its file."""
     tables = agent_file.read_metadata(AGENTS / f"{agent}{agent_file.SUFFIX}")["tables"]
-    row = next(row for table in tables for row in table["rows"] if row["source"] == source)
+    row = next(row for table in tables for row in table["rows"] if row.get("source") == source)
     return row | {name: metric["mean"] for name, metric in row.get("metrics", {}).items()}
 
 

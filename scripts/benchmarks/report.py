@@ -76,3 +76,5 @@ def write(path: Path) -> None:
     figures.plot_scaling(rows, path.with_name("scaling.svg"))
     figures.plot_learners(rows, path.with_name("learners.svg"))
     figures.plot_published(rows, path.with_name("published.svg"))
+    if (curves := path.with_name("memory.jsonl")).exists():
+        figures.plot_memory(records.read(curves), path.with_name("memory.svg"))

@@ -87,23 +87,26 @@ class Forage(SceneryEnv):
         kinds = {"food": food, "nest": modules.Disc(1, radius=0.3)}
         self.objects = modules.Objects(geometries, self.core, kinds, colours=("green", "blue"))
         self.food, self.nest = self.objects["food"], self.objects["nest"]
+        self._resets = engine.Resets()
         self.carried_home = torch.zeros(n_envs, device=self.device)
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
         self.obs_space = dotdict(
-            rgb=spaces.MultiImage(1, 3, 1, 64),
-            d=spaces.MultiImage(1, 1, 1, 64),
+            rgb=spaces.MultiImage(1, 3, 1, 64, low=0, high=1),
+            d=spaces.MultiImage(1, 1, 1, 64, low=0, high=1),
             imu=spaces.MultiVector(1, 3),
-            carrying=spaces.MultiVector(1, 1),
+            carrying=spaces.MultiVector(1, 1, low=0, high=1),
         )
 
-    def reset(self) -> arrdict:
-        """Starts a new episode in every environment. Returns the first world."""
-        return self._world(self.lifecycle.start_all())
+    def _begin(self, mask):
+        begins = mask.view(self.n_envs, -1).any(1)
+        # nothing keeps clear of what lay about in the last episode, so a seed gives the same places
+        self.objects.all.visible.masked_fill_(begins[:, None], False)
+        return self._world(begins.repeat_interleave(self.n_agents, output_size=len(mask)))
 
     def step(self, decision: Any) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         self.movement(decision)
-        return self._world(self.lifecycle.start_ended())
+        return self._resets.keep(self._world(self.lifecycle.start_ended()))
 
     def _world(self, reset):
         begins = reset.view(self.n_envs, -1)[:, 0]  # all agents of an environment begin together

@@ -151,11 +151,17 @@ def bad_rollout(seed, n_lanes, n_bad, value, extra_row, to_gpu=torch.Tensor.cuda
     return floats
 
 
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1.01 * LIMIT, -1e30])
-@pytest.mark.parametrize("n_lanes, n_bad", [(1, 1), (3, 2), (40, 2), (1100, 700)])
+@pytest.mark.parametrize(
+    "n_lanes, n_bad, value",
+    [
+        *((3, 2, value) for value in (torch.nan, torch.inf, -torch.inf, 1.01 * LIMIT, -1e30)),
+        *((*shape, torch.nan) for shape in ((1, 1), (40, 2), (1100, 700))),
+        *((*shape, 1.01 * LIMIT) for shape in ((1, 1), (40, 2), (1100, 700))),
+    ],
+)
 @pytest.mark.parametrize("extra_row", [False, True])
 def test_kernels_find_what_the_plain_form_finds(
-    to_gpu, monkeypatch, value, n_lanes, n_bad, extra_row
+    to_gpu, monkeypatch, n_lanes, n_bad, value, extra_row
 ):
     """Among many rollouts: the first bad one is kept until it is read, with up to eight lanes."""
     good, first, second = (

@@ -352,7 +352,7 @@ def test_inspect(here, capsys):
 
 def test_rerun(here, capsys):
     """A run whose learning rate followed the clock is repeated, though it was interrupted."""
-    words = ["seconds=1.5", "checkpoint_seconds=0.05", "keep_checkpoints=99"]
+    words = ["seconds=0.8", "checkpoint_seconds=0.05", "keep_checkpoints=99"]
     run(*tiny.TINY, *words, "log_every=2", "folder=run")
     *reports, _ = (here / "run/metrics.jsonl").read_bytes().splitlines()
     factors = annealing.read("run")

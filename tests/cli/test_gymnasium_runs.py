@@ -51,12 +51,12 @@ def test_train_evaluate_and_resume_exactly(here):
 
 def test_resumed_processes_begin_new_episodes(here, capsys):
     words = [*WORDS, "env.id=CartPole-v1", "env.vectorization=async", "folder=run"]
-    assert train.main(words) == 0
+    assert train.main([*words, "env.n_envs=2", "samples=32"]) == 0
     assert "Checkpoints cannot hold" not in capsys.readouterr().err
-    assert train.main(["resume=run", "more_samples=32"]) == 0
+    assert train.main(["resume=run", "more_samples=16"]) == 0
     assert "environments were not saved, so new episodes start" in capsys.readouterr().out
     samples = [row["samples"] for row in json_lines.read(here / "run/metrics.jsonl")]
-    assert samples == [32, 64, 96]
+    assert samples == [16, 32, 48]
 
 
 def test_weights_of_another_environment_are_refused_by_its_name(capsys):

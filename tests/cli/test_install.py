@@ -179,9 +179,9 @@ def commands(python, folder, cache):
 @pytest.mark.slow
 def test_installed_command_trains_evaluates_and_records(installed, tmp_path):
     megastep = commands(installed, tmp_path / "empty", tmp_path / "cache")
-    assert "Traceback" not in megastep("train", *tiny.TINY, "samples=64", "folder=run")
-    assert "trained" in megastep("evaluate", "run=run", "episodes=4")
-    megastep("record", "run=latest", "steps=3")
+    finish = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=3"]
+    output = megastep("train", *tiny.TINY, "samples=64", "folder=run", *finish)
+    assert "trained" in output and "Traceback" not in output
     assert (tmp_path / "empty/run/video.mp4").exists()
     errors = megastep("train", "lr=1", returncode=2)
     assert "lr" in errors and "learner.lr" in errors

@@ -410,7 +410,7 @@ def test_tensors_are_read_as_written(tmp_path):
 @torch.no_grad()
 def test_agent_of_the_package(path):
     """It loads, acts, is small, and has a card whose numbers are those of the file."""
-    assert path.stat().st_size <= 2_000_000
+    assert path.stat().st_size <= 4_000_000
     assert agent_file.read(path, None).untrusted == ()
     assert agent_file.read_metadata(path)["tables"], "evaluated in the suite"
     card = path.with_suffix(".md").read_text()
@@ -419,7 +419,7 @@ def test_agent_of_the_package(path):
     )
     for title in (agent.BY_HAND, "## Limits", "## Licence"):
         assert title in card
-    env = pretrained.make_env(path.stem, geometries.sample("box", 1), n_envs=2, device="cpu")
+    env = pretrained.make_env(path.stem, geometries.sample("homes", 2), n_envs=2, device="cpu")
     policy = pretrained.load(path.stem, "cpu")
     world, state = env.reset(), policy.initial(n_lanes(env))
     for _ in range(10):
@@ -429,10 +429,13 @@ def test_agent_of_the_package(path):
 
 
 #: {agent: source, homes, episodes in each; the least mean of some metrics}, counted by hand. By
-#: their cards: success 0.989 and SPL 0.81; coverage 0.990 and return 22.2.
+#: their cards: success 0.989 and SPL 0.81; coverage 0.990 and return 22.2; found 37.2, of which an
+#: agent without memory finds half; success 0.996.
 FIRST_EPISODES = {
     "pointgoal_anywhere": ("bench", 51, 2, {"success": 0.94, "spl": 0.76}),
     "explorer_anywhere": ("homes", 24, 1, {"coverage": 0.97, "return": 16}),
+    "memory_9": ("memory_maze", 16, 1, {"found": 32}),
+    "keys_anywhere": ("homes", 24, 1, {"success": 0.9}),
 }
 
 

@@ -239,17 +239,6 @@ def n_learning(here):
 
 
 @pytest.mark.slow
-def test_joblib(here):
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    code, out, err = finished("train", *SHORT, "-m", "env.pay=1,2", *JOBLIB)
-    assert code == 0 and "Traceback" not in err, err
-    assert [(row["env.pay"], float(row["score"])) for row in rows("mine")] == [("1", 4), ("2", 8)]
-    records = [json.loads(path.read_text()) for path in (here / "mine/.jobs").glob("*/*.json")]
-    assert len({record["process"] for record in records}) == 2
-    assert "job 0: Training on cpu in mine/0_env.pay=1" in out
-
-
-@pytest.mark.slow
 def test_signal_saves_jobs_in_other_processes(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = "samples=1e12", "env.mood=slow", "-m", "seed=1,2,3"
@@ -320,9 +309,13 @@ def test_preempted_submitit_job_continues_its_checkpoint(here):
 @pytest.mark.slow
 def test_job_that_ends_its_process_leaves_the_others(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    code, _, err = finished("train", *SHORT, "-m", "env.mood=dead,fine", *JOBLIB)
+    code, out, err = finished("train", *SHORT, "-m", "env.mood=dead,fine", "env.pay=2", *JOBLIB)
     assert code == 1 and f"Job 0 {sweeps.LOST}" in err and "Traceback" not in err
-    assert [row["state"] for row in rows("mine")] == [sweeps.LOST, "done"]
+    dead, fine = rows("mine")
+    assert (dead["state"], fine["state"], float(fine["score"])) == (sweeps.LOST, "done", 8)
+    records = [json.loads(path.read_text()) for path in (here / "mine/.jobs").glob("*/*.json")]
+    assert len({record["process"] for record in records}) == 2
+    assert "job 1: Training on cpu in mine/1_env.mood=fine" in out
 
 
 def children(process):
@@ -331,14 +324,8 @@ def children(process):
     return [int(pid) for pid in text.split()]
 
 
-@pytest.mark.parametrize(
-    "victim",
-    [
-        pytest.param("worker", marks=pytest.mark.nightly),
-        pytest.param("job", marks=pytest.mark.slow),
-        pytest.param("sweep", marks=pytest.mark.nightly),
-    ],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
 def test_kill_9(here, victim):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = "seconds=8", "checkpoint_seconds=1", "env.mood=slow", "-m", "seed=1,2,3"

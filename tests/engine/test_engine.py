@@ -81,13 +81,15 @@ VIEWS = [
 ]
 
 
-ROUNDS = [(1, 0), (1, 1), (4, 0), (4, 1)]  # number of agents and seed, in the slow tests
+#: Numbers of environments and agents, and a seed. The last are thorough.
+ROUNDS = [
+    *((2, 1, 0), (2, 4, 1)),
+    *(pytest.param(4, n, s, marks=pytest.mark.slow) for n, s in ((1, 1), (4, 0))),
+    *(pytest.param(4, n, s, marks=pytest.mark.nightly) for n, s in ((1, 0), (4, 1))),
+]
 
 
-@pytest.mark.parametrize(
-    "n_envs, n_agents, seed",
-    [(2, 1, 0), (2, 4, 1), *(pytest.param(4, n, s, marks=pytest.mark.slow) for n, s in ROUNDS)],
-)
+@pytest.mark.parametrize("n_envs, n_agents, seed", ROUNDS)
 @pytest.mark.parametrize("view", VIEWS, ids=str)
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
 def test_render_matches_twin(view, n_envs, n_agents, seed, degenerate, device, poison):

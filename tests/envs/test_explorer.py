@@ -111,7 +111,7 @@ def test_episodes_match_twin(settings, device):
     env = explorer(device, **settings)
     life, generator, n_ends = env.lifecycle, torch.Generator().manual_seed(1), 0
     world, before = env.reset(), None
-    for _ in range(80):
+    for _ in range(50):
         if before is not None:
             newly_seen = (64 * world.reward).int()
             # the reward of a first observation is 0, whatever it shows

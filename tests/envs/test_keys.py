@@ -7,7 +7,11 @@ import torch
 from megastep import contract, envs, toys
 from megastep.arrdict import arrdict
 from megastep.envs.keys.episodes import OPEN, Areas, cached_episodes, episodes
+from megastep.envs.keys.step import keys_step
 from megastep.geometries import sample
+from megastep.modules.objects import REACH
+from tests.helpers import keys_twin
+from tests.helpers.outputs import Poison
 
 N_COLOURS = 3
 
@@ -147,3 +151,48 @@ def test_cached_episodes_are_those_that_were_drawn(tmp_path, monkeypatch):
         for cached, part in zip(cached_episodes(homes, 2, N_COLOURS, 3), drawn):
             np.testing.assert_array_equal(cached, part, strict=True)
     assert len([*tmp_path.glob("keys-*")]) == 1
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_step_matches_twin(seed, device, monkeypatch):
+    """Agents are put on keys, doors and goals at random, and beside them."""
+    env = make_env(device, n_envs=40, seed=seed, limit=12, key_reward=0.25, door_reward=0.5)
+    names = "opened", "n_draws", "ages", "ended"
+    tables = {name: table.cpu() for name, table in env.tables.items()}
+    agents, objects = env.core.agents, env.objects.all
+    random = np.random.default_rng(seed)
+    env.reset()
+    n_opened = n_won = 0
+    for _ in range(60):
+        lanes = torch.arange(40)
+        k = torch.as_tensor(random.integers(objects.positions.shape[1], size=40))
+        offset = torch.as_tensor(random.choice([0, 0, 0.1, 0.2, 0.5], (40, 1)), dtype=torch.float32)
+        agents.positions[:, 0] = (objects.positions.cpu()[lanes, k] + offset).to(env.device)
+        state = {name: getattr(env, name).cpu().clone() for name in names}
+        things = {name: getattr(objects, name).cpu().clone() for name in keys_twin.THINGS}
+        expected, positions, things, state = keys_twin.keys_step(
+            *(agents.positions[:, 0].cpu(), agents.radius, things, env.layout.cpu(), tables, state),
+            **(env.rules | {"seed": env.seed, "reach": REACH}),
+        )
+        poison = Poison(torch.empty)
+        with monkeypatch.context() as patch:
+            patch.setattr(torch, "empty", poison.allocate)
+            out = keys_step(
+                *(env.core.scenery, agents),
+                **env.tables,
+                **{name: getattr(env, name) for name in names},
+                **(env.rules | {"seed": env.seed, "reach": REACH}),
+            )
+        poison.check(reward=out.reward, metrics=out.metrics, keys_obs=out.keys_obs)
+        for name, value in expected.items():
+            given = getattr(out, name).cpu()
+            given = given.T if name == "metrics" else given.reshape(value.shape)
+            assert torch.equal(given.float(), value.float()), name
+        for name in names:
+            assert torch.equal(getattr(env, name).cpu(), state[name]), name
+        for name, value in things.items():
+            assert torch.equal(getattr(objects, name).cpu(), value), name
+        assert torch.equal(agents.positions[:, 0].cpu(), positions)
+        n_opened += int(expected["metrics"][:, 1].sum())
+        n_won += int(expected["terminal"].sum())
+    assert n_opened > 5 and n_won > 20

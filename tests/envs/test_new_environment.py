@@ -8,7 +8,7 @@ import loky
 import pytest
 import torch
 
-from megastep import arrdict, capture, contract, plotting
+from megastep import arrdict, capture, contract, plotting, types
 from tests.helpers import pages
 from tests.helpers.in_this_process import InThisProcess
 
@@ -54,6 +54,12 @@ def test_safe_is_open_where_dial_and_press_are_right(names):
     dial = env.number + torch.tensor([0, 0, 1])
     actions = arrdict.arrdict(dial=dial[:, None] % 4, press=torch.tensor([[1], [0], [1]]))
     assert env.step(arrdict.arrdict(actions=actions)).reward.tolist() == [1, 0, 0]
+
+
+def test_resets_of_the_page_take_seeds_and_masks(names):
+    env = names["SeededRover"](n_envs=5, device="cpu", limit=9)
+    assert types.takes_masks(env)
+    contract.rollout(env, 20)
 
 
 def test_python_code_trains(names):

@@ -109,7 +109,8 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     """To an evaluation, to another run, to one that resumes without its environments, to a snapshot
     and in the file of an agent.
     """
-    words = [*PENDULUM, "samples=256", "folder=run", "env.vectorization=async", "snapshots=1"]
+    words = [*PENDULUM, "env.n_envs=2", "env.vectorization=async"]  # a process each
+    words += ["samples=128", "folder=run", "snapshots=1"]
     assert train.main(words) == 0
     saved = checkpoint.load_latest("run/checkpoints")
     learnt = saved.state["wrappers"]
@@ -118,7 +119,7 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     assert is_same(checkpoint.load_latest("run/snapshots").state["wrappers"], learnt)
     assert evaluate.main(["run=run", "episodes=3"]) == 0
     assert train.main(["init=run", *PENDULUM, "samples=128", "folder=next"]) == 0
-    assert train.main(["resume=run", "more_samples=128"]) == 0
+    assert train.main(["resume=run", "more_samples=64"]) == 0
     states, frozen = zip(*loads, strict=True)
     assert frozen == (True, False, False)
     assert all(s["1.NormalizeObservation.obs_rms.count"] == count for s in states)

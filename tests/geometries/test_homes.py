@@ -539,7 +539,7 @@ def test_statistics_of_generated_homes(generated):
     assert make_homes.outside(make_homes.statistics(generated), medians) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_statistics_of_a_thousand_homes_generated_in_seconds():
     start = time.process_time()
     plans = [homes.generate(seed) for seed in range(10_000, 11_000)]

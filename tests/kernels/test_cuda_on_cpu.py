@@ -1,7 +1,6 @@
 """What `tests/helpers/cuda_on_cpu.py` does with threads that exchange numbers, and with faults."""
 
-import tempfile
-from pathlib import Path
+import functools
 
 import numpy as np
 import pytest
@@ -38,15 +37,26 @@ KERNEL exchange(NumbersParams p) {
 """
 
 
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A function of a kernel's text: its library, and what stands in for `launch`."""
+
+    @functools.cache
+    def build(text, *flags):
+        folder = tmp_path_factory.mktemp("exchange")  # a loaded library stays loaded
+        (folder / "params.h").write_text(PARAMS)
+        (folder / "exchange.cu").write_text(text)
+        return KernelLibrary(folder, *flags), CudaOnCpu(folder)
+
+    return build
+
+
 @pytest.fixture
-def exchange(tmp_path):
+def exchange(built):
     """A function of a kernel's body and numbers: what its threads, one per number, give back."""
 
     def run(body, numbers, order="forward", in_every_order=False):
-        folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a loaded library stays loaded
-        (folder / "params.h").write_text(PARAMS)
-        (folder / "exchange.cu").write_text(KERNEL % body)
-        library, launch = KernelLibrary(folder), CudaOnCpu(folder)
+        library, launch = built(KERNEL % body)
         launch.order = order
 
         def after():
@@ -244,10 +254,8 @@ KERNEL BOUNDS(2) exchange(NumbersParams p) {
         ("expect(arrivals, 64 * 8);", "its threads wait for each other"),
     ],
 )
-def test_blocks_of_a_cluster_send_each_other_numbers(tmp_path, missing, message, order, is_late):
-    (tmp_path / "params.h").write_text(PARAMS)
-    (tmp_path / "exchange.cu").write_text(CLUSTER.replace(missing, ""))
-    library, launch = KernelLibrary(tmp_path, ("--std=c++17",)), CudaOnCpu(tmp_path)
+def test_blocks_of_a_cluster_send_each_other_numbers(built, missing, message, order, is_late):
+    library, launch = built(CLUSTER.replace(missing, ""), ("--std=c++17",))
     launch.order, launch.is_late = order, is_late
     before = torch.arange(256, dtype=torch.int32)
     after = torch.full_like(before, -1)

@@ -372,7 +372,7 @@ class Stuck(Minimal):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "line, code, expected",
-    [("pass", launcher.LOST, "hangs: "), ("raise MemoryError", 2, "Out of memory")],
+    [("time.sleep(0.1)", launcher.LOST, "hangs: "), ("raise MemoryError", 2, "Out of memory")],
 )
 def test_rank_that_fails_alone(here, line, code, expected):
     (here / "stuck.py").write_text(STUCK.format(line))

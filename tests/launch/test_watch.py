@@ -125,6 +125,21 @@ def test_rank_that_the_store_does_not_answer_ends(two, monkeypatch):
     two.leave()
 
 
+@pytest.mark.parametrize("may_be_silent", [False, True])
+def test_rank_that_reports_a_loss_waits_until_others_have_read_it(two, monkeypatch, may_be_silent):
+    """If torchrun's store ends with the first, the others are blocked in an operation for longer.
+    The launcher's store does not.
+    """
+    steps = []
+    monkeypatch.setattr(watch.time, "sleep", lambda s: steps.append((s, two.store.get("end"))))
+    two.on_lost, two.may_be_silent = steps.append, may_be_silent
+    two._end("rank 1 hangs")
+    two.rank = 1
+    two._end("rank 0 hangs")
+    pause = [] if may_be_silent else [(2 * watch.PERIOD, b"0")]
+    assert steps == [*pause, "rank 1 hangs", None]
+
+
 def test_store_of_a_launcher_that_is_suspended_may_be_silent(two, monkeypatch):
     monkeypatch.setattr(watch, "SILENT_SECONDS", 0.05)
     has_ended = threading.Event()

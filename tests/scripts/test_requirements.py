@@ -25,11 +25,14 @@ LOCKED = [Requirement(re.split(r" \\\n", block)[0]) for block in BLOCKS]
 
 
 def in_project():
-    """The requirements of pyproject.toml, those of the extras included."""
+    """The requirements of pyproject.toml, with those of the extra `test` and of what it includes."""
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 cannot read TOML")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = project["optional-dependencies"].values()
-    wanted = [*project["dependencies"], *(text for extra in extras for text in extra)]
+    extras, wanted = project["optional-dependencies"], [*project["dependencies"]]
+    names = ["test", "gymnasium"]
+    for name in names:
+        wanted += extras[name]
+        names += [n for req in map(Requirement, extras[name]) for n in req.extras if n in extras]
     return [req for req in map(Requirement, wanted) if req.name != project["name"]]
 
 

@@ -42,7 +42,7 @@ def test_failing_run_raises():
             pass
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_recipes_are_trained_and_evaluated_by_source(monkeypatch):
     pong = "env=pong samples=8192 env.n_envs=32 log_every=1"
     pointgoal = "env=pointgoal samples=4096 env.n_envs=32 env.limit=16 env.res=64 log_every=1"

@@ -140,9 +140,15 @@ def test_what_a_seeker_remembers_is_worth_finds():
     assert found[Mapper] > 3 * found[Wanderer], found
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("homes", [HOMES, DENSE], ids=["homes", "dense"])
-@pytest.mark.parametrize("opponent, least", [("bot", 0.6), ("random", 0.8)])
+@pytest.mark.parametrize(
+    "homes, opponent, least",
+    [
+        pytest.param(HOMES, "bot", 0.6, marks=pytest.mark.slow, id="homes-bot"),
+        pytest.param(DENSE, "random", 0.8, marks=pytest.mark.slow, id="dense-random"),
+        pytest.param(HOMES, "random", 0.8, marks=pytest.mark.nightly, id="homes-random"),
+        pytest.param(DENSE, "bot", 0.6, marks=pytest.mark.nightly, id="dense-bot"),
+    ],
+)
 def test_hunter_wins_duels(homes, opponent, least):
     env = envs.Deathmatch(128, homes, n_agents=2, device="cpu")
     random = RandomActions(env.action_space)

@@ -156,13 +156,13 @@ class Deathmatch(SceneryEnv):
         self.movement = modules.MomentumMovement(self.core)
         pixels, n_privileged = res // subsample, privileged_size(n_agents)
         self.obs_space = dotdict(
-            rgb=spaces.MultiImage(1, 3, 1, pixels),
-            d=spaces.MultiImage(1, 1, 1, pixels),
+            rgb=spaces.MultiImage(1, 3, 1, pixels, low=0, high=1),
+            d=spaces.MultiImage(1, 1, 1, pixels, low=0, high=1),
             imu=spaces.MultiVector(1, 3),
-            health=spaces.MultiVector(1, 3),
+            health=spaces.MultiVector(1, 3, low=0, high=(1, 1, n_agents - 1)),
         )
         if hearing:
-            self.obs_space["sound"] = spaces.MultiVector(1, 3)
+            self.obs_space["sound"] = spaces.MultiVector(1, 3, low=(0, -1, -1), high=1)
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
         self.privileged_space = spaces.MultiVector(1, n_privileged) if privileged else None
         self.rules: dict = dict(
@@ -194,13 +194,19 @@ class Deathmatch(SceneryEnv):
         self.ended = torch.zeros(n_lanes, dtype=torch.bool, **on)
         # steps of the round, -1 if the next begins one
         self.round_ages = torch.zeros(n_envs, dtype=torch.int32, **on) if resample else None
+        self._resets = engine.Resets(lanes_last=("tally",))
 
-    def reset(self) -> arrdict:
-        """Starts a new episode for every agent. Returns a world."""
-        self.ended.fill_(True)
-        if self.round_ages is not None:
-            self.round_ages.fill_(-1)
-        return self._world()
+    def _begin(self, mask) -> arrdict:
+        self.ended.copy_(mask)
+        if self.round_ages is not None:  # a round goes on, at its age, unless all agents begin
+            begins = mask.view(self.n_envs, -1).all(1)
+            self.round_ages.sub_(1).masked_fill_(begins, -1)
+        return self._world(damage=0.0, recovery=0.0, drain=0.0, health_per_hit=0.0)
+
+    @property
+    def game_over(self) -> torch.Tensor | None:
+        """(N,) bool: whether the round ended with the last world; None without rounds."""
+        return None if self.round_ages is None else self.round_ages < 0
 
     def desync(self) -> None:
         """Gives every lane a random age, from the seed, so that episodes do not end together."""
@@ -215,10 +221,12 @@ class Deathmatch(SceneryEnv):
         actions = checks.lanes("actions", decision["actions"], n_lanes, self.device)
         actions = actions.reshape(n_lanes, 1).long().contiguous()
         self.movement(dict(actions=actions_of_live(actions, self.ended)))
-        return self._world()
+        return self._resets.keep(self._world())
 
-    def _world(self) -> arrdict:
-        """Respawns agents whose episode has ended, renders, and lets the agents hit each other."""
+    def _world(self, **rules) -> arrdict:
+        """Respawns agents whose episode has ended, renders, and lets the agents hit each other, by
+        other ``rules`` than usual if given.
+        """
         self.spawner(self.ended)
         view = self._view(**self._search_arguments())
         step = deathmatch_step(
@@ -231,7 +239,7 @@ class Deathmatch(SceneryEnv):
             self.ended,
             self.round_ages,
             privileged=self.privileged_space is not None,
-            **self.rules,
+            **self.rules | rules,
         )
         world = arrdict(
             obs=arrdict(self._images(view), health=step.health_obs),

@@ -109,6 +109,7 @@ class Explorer(SceneryEnv):
             imu=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
+        self._resets = engine.Resets()
         self.privileged_space = None
         words = -(-self.core.scenery.layouts.max_texels // 32)
         pixels = self.obs_space.d.H * self.obs_space.d.W
@@ -123,9 +124,8 @@ class Explorer(SceneryEnv):
                 episode=spaces.MultiVector(1, N_EPISODE), unseen=spaces.MultiVector(1, N_BINS)
             )
 
-    def reset(self) -> arrdict:
-        """Starts a new episode in every lane. Returns the first world."""
-        self.lifecycle.ended.fill_(True)
+    def _begin(self, mask) -> arrdict:
+        self.lifecycle.ended.copy_(mask)
         return self._world()
 
     def desync(self) -> None:
@@ -135,7 +135,7 @@ class Explorer(SceneryEnv):
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world."""
         self.movement(decision)
-        return self._world()
+        return self._resets.keep(self._world())
 
     def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, renders, and computes rewards and flags."""

@@ -142,7 +142,7 @@ class Keys(SceneryEnv):
             rgb=modules.RGB(self.core, subsample).space,
             d=modules.Depth(self.core, subsample).space,
             imu=spaces.MultiVector(1, 3),
-            keys=spaces.MultiVector(1, doors),
+            keys=spaces.MultiVector(1, doors, low=0, high=1),
         )
         self.action_space = self.movement.space
         self.privileged_space = (
@@ -153,10 +153,12 @@ class Keys(SceneryEnv):
             torch.zeros(n_envs, dtype=torch.int32, device=self.device) for _ in range(3)
         )
         self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
+        self._resets = engine.Resets()
 
-    def reset(self) -> arrdict:
-        """Starts a new episode in every environment. Returns the first world."""
-        self.ended.fill_(True)
+    def _begin(self, mask) -> arrdict:
+        self.ended.copy_(mask)
+        # which keys keep from when they were carried; a seed gives the same episodes each time
+        self.objects.all.angles.masked_fill_(mask[:, None], 0.0)
         return self._world()
 
     def desync(self) -> None:
@@ -167,7 +169,7 @@ class Keys(SceneryEnv):
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world."""
         self.movement(decision)
-        return self._world()
+        return self._resets.keep(self._world())
 
     def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, computes rewards and flags, and renders."""
@@ -220,7 +222,8 @@ class Keys(SceneryEnv):
         and the goal in a ring, and the agent's RGB and depth.
         """
         carried = [name for name, has in zip(modules.COLOURS, state.carried) if has]
-        title = f"step {state.age} · {state.opened} doors opened"
+        doors = "door" if state.opened == 1 else "doors"
+        title = f"step {state.age} · {state.opened} {doors} opened"
         title += f" · carries {', '.join(carried)}" if carried else ""
         yaws = state.core.yaws
         figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))

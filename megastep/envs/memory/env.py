@@ -128,7 +128,7 @@ class Memory(SceneryEnv):
             rgb=modules.RGB(self.core, subsample).space,
             d=modules.Depth(self.core, subsample).space,
             imu=spaces.MultiVector(1, 3),
-            cue=spaces.MultiVector(1, 3),
+            cue=spaces.MultiVector(1, 3, low=0, high=1),
         )
         self.action_space = self.movement.space
         self.privileged_space = (
@@ -141,10 +141,10 @@ class Memory(SceneryEnv):
             torch.zeros(n_envs, dtype=torch.int32, device=self.device) for _ in range(4)
         )
         self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
+        self._resets = engine.Resets()
 
-    def reset(self) -> arrdict:
-        """Starts a new episode in every environment. Returns the first world."""
-        self.ended.fill_(True)
+    def _begin(self, mask) -> arrdict:
+        self.ended.copy_(mask)
         return self._world()
 
     def desync(self) -> None:
@@ -155,7 +155,7 @@ class Memory(SceneryEnv):
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world."""
         self.movement(decision)
-        return self._world()
+        return self._resets.keep(self._world())
 
     def _world(self) -> arrdict:
         """Respawns agents whose episode has ended, computes rewards and flags, and renders."""

@@ -3,6 +3,7 @@
 N environments of one agent, so B = N lanes.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -131,7 +132,7 @@ class PointGoal(SceneryEnv):
             rgb=modules.RGB(self.core, subsample).space,
             d=modules.Depth(self.core, subsample).space,
             imu=spaces.MultiVector(1, 3),
-            goal=spaces.MultiVector(1, 3),
+            goal=spaces.MultiVector(1, 3, low=(0, -1, -1), high=(math.inf, 1, 1)),
         )
         self.action_space = self.movement.space
         self.privileged_space = (
@@ -143,10 +144,10 @@ class PointGoal(SceneryEnv):
         )
         self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
         self.progress = torch.zeros((PROGRESS_ROWS, n_envs), device=self.device)
+        self._resets = engine.Resets(lanes_last=("progress",))
 
-    def reset(self) -> arrdict:
-        """Starts a new episode in every environment. Returns a world."""
-        self.ended.fill_(True)
+    def _begin(self, mask) -> arrdict:
+        self.ended.copy_(mask)
         return self._world()
 
     def desync(self) -> None:
@@ -156,7 +157,7 @@ class PointGoal(SceneryEnv):
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions``. Returns a world."""
-        return self._world(self.movement(decision).progress)
+        return self._resets.keep(self._world(self.movement(decision).progress))
 
     def _world(self, free=None) -> arrdict:
         """Respawns agents whose episode has ended, renders, and computes rewards and flags."""

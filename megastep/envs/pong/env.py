@@ -28,6 +28,8 @@ ROWS, COLUMNS = PIXELS
 PADDLE_ROWS, TRAIL_GREY, PADDLE_GREY, BALL_GREY = (
     LIBRARY.constants[name] for name in ("PADDLE_ROWS", "TRAIL_GREY", "PADDLE_GREY", "BALL_GREY")
 )
+LIMITS = 1, 1, 1, 1, 1, 1, 2, 2  # of the features' magnitudes
+N_DRAWS, ENDED = 11, 12  # rows of a game's state
 TEXT = {0: " ", TRAIL_GREY: ".", PADDLE_GREY: "|", BALL_GREY: "o"}  # character of each grey
 
 
@@ -94,34 +96,37 @@ class Pong(DisplayedEnv):
         self.seed, self.points, self.limit = seed, points, limit * points
         self.tracker_speed = tracker_speed
         self.action_space = spaces.MultiDiscrete(1, 3)
-        self.obs_space = spaces.MultiVector(1, FEATURES)
+        self.obs_space = spaces.MultiVector(
+            1, FEATURES, low=tuple(-limit for limit in LIMITS), high=LIMITS
+        )
         n_lanes = n_envs * self.n_agents
         engine.fit(n_envs, 64 + self.n_agents * (64 + pixels * ROWS * COLUMNS), self.device)
         on: dict = dict(device=self.device)
         self.games = torch.zeros((GAME_FIELDS, n_envs), dtype=torch.int32, **on)
         self.error_flag = torch.zeros(1, dtype=torch.int32, **on)
         self.no_actions = torch.zeros((n_lanes, 1), dtype=torch.int64, **on)
+        self._resets = engine.Resets(lanes_last=("games",), draws={"games": N_DRAWS})
         self.pixels = None
         if pixels:
             self.obs_space = spaces.MultiImage(1, 1, ROWS, COLUMNS, dtype=torch.uint8)
             shape = n_lanes, *self.obs_space.shape
             self.pixels = torch.zeros(shape, dtype=torch.uint8, **on)
 
-    def reset(self) -> arrdict:
-        """Starts a new episode in every environment. Returns a world."""
-        return self._world(self.no_actions, restart=True)
+    def _begin(self, mask) -> arrdict:
+        self.games[ENDED].copy_(mask.view(self.n_envs, -1).any(1))
+        return self._world(self.no_actions)
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
-        return self._world(checks.alike("actions", decision["actions"], self.no_actions))
+        actions = checks.alike("actions", decision["actions"], self.no_actions)
+        return self._resets.keep(self._world(actions))
 
-    def _world(self, actions, restart=False) -> arrdict:
+    def _world(self, actions) -> arrdict:
         step = pong_step(
             self.games,
             actions,
             self.error_flag,
             self.seed,
-            restart=restart,
             points=self.points,
             limit=self.limit,
             tracker_speed=self.tracker_speed,

@@ -1,0 +1,256 @@
+"""Environments of megastep as Gymnasium's: a vector environment on the device, and one of N = 1."""
+
+from collections.abc import Mapping
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from megastep import envs
+from megastep.adapters.lanes import Lanes, ended, fresh
+from megastep.adapters.spaces import gymnasium_space, row, stacked, to_numpy, without_agents
+from megastep.plotting import rasterise
+from megastep.types import Env, Tree, optional
+
+__all__ = ["SingleEnv", "VectorEnv", "make_single", "make_vector"]
+
+FPS = 10
+
+
+class VectorEnv(gymnasium.vector.VectorEnv):
+    """An environment of megastep as a `gymnasium.vector.VectorEnv`: each lane is one of its
+    environments.
+
+    Args:
+        env: the environment.
+        autoreset_mode: when a lane begins its next episode. ``NEXT_STEP``: in the step after its
+            last. ``SAME_STEP``: at once; ``infos`` have the last observation as ``final_obs``, and
+            all lanes are rendered twice. ``DISABLED``: by ``reset(options={"reset_mask": mask})``.
+        to_numpy: return arrays; otherwise tensors on the device, without synchronising. Tensors of
+            ``infos`` are there in every step then, with masks.
+        dtype: of observations in floats. Default: float32 for arrays, the environment's float16 for
+            tensors.
+        copy: return copies. Otherwise tensors are valid until the next step or reset.
+        render_mode: None, or ``rgb_array``, a drawing of each environment.
+
+    Raises:
+        ValueError: if the environment has no masked resets, which all modes but ``NEXT_STEP`` need.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        *,
+        to_numpy: bool = True,
+        dtype: torch.dtype | None = None,
+        copy: bool = True,
+        render_mode: str | None = None,
+    ):
+        mode = _mode(autoreset_mode)
+        self.lanes = Lanes(
+            env,
+            mode is AutoresetMode.SAME_STEP,
+            None if mode is AutoresetMode.NEXT_STEP else f"autoreset_mode={mode.name}",
+        )
+        self.env, self.num_envs, self.device = env, self.lanes.n_lanes, self.lanes.device
+        self.mode, self.to_numpy, self.copy = mode, to_numpy, copy
+        self.dtype = dtype or (torch.float32 if to_numpy else torch.float16)
+        self.single_observation_space = gymnasium_space(env.obs_space, self.dtype)
+        self.single_action_space = gymnasium_space(env.action_space, torch.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        modes = ["rgb_array"] if hasattr(env, "plot_state") else []
+        self.render_mode = _render_mode(render_mode, modes)
+        fps = optional(env, "fps")
+        self.metadata = dict(autoreset_mode=mode, render_modes=modes, render_fps=fps)
+        self._ended = np.zeros(self.num_envs, bool)
+
+    def reset(
+        self, *, seed: Tree = None, options: Mapping[str, Tree] | None = None
+    ) -> tuple[Tree, dict[str, Tree]]:
+        """Begins episodes in all lanes, or in those of a mask. Returns (observations, infos).
+
+        Args:
+            seed: an integer s, for seeds s, s + 1, ... of the lanes, or one seed per lane.
+            options: ``reset_mask``: (B,) bool, lanes that begin; the others stay as they are.
+
+        Raises:
+            ValueError: naming an option that there is not, or does not fit.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        options = dict(options or {})
+        mask = options.pop("reset_mask", None)
+        if options:
+            raise ValueError(f"reset takes options['reset_mask'] alone, not {sorted(options)}")
+        if mask is not None:
+            mask = self.lanes.mask(mask)
+        world = self.lanes.reset(seed, mask)
+        if self.to_numpy:
+            self._ended = np.zeros_like(self._ended) if mask is None else to_numpy(ended(world))
+        return self._converted(world["obs"]), {}
+
+    def step(self, actions: Tree) -> tuple[Tree, Tree, Tree, Tree, dict[str, Tree]]:
+        """Steps all lanes. Returns (observations, rewards, terminations, truncations, infos)."""
+        if self.to_numpy and self.mode is AutoresetMode.DISABLED and self._ended.any():
+            raise ValueError(
+                f"lane {int(self._ended.argmax())} has ended its episode: in DISABLED, begin the "
+                'next by reset(options={"reset_mask": mask}) before the next step'
+            )
+        world, final = self.lanes.step(actions)
+        over = ended(final)
+        names = "reward", "terminal", "truncated"
+        parts = dict(zip(names, (final[name] for name in names)), over=over)
+        parts["metrics"] = dict(final.get("metrics", {}))
+        is_same_step = self.mode is AutoresetMode.SAME_STEP
+        if self.to_numpy:
+            parts, obs = to_numpy(parts), self._converted(world["obs"])
+            self._ended = np.zeros_like(self._ended) if is_same_step else parts["over"]
+            infos = self._numpy_infos(parts, final) if parts["over"].any() else {}
+        else:
+            parts["obs"] = without_agents(self.env.obs_space, world["obs"])
+            if is_same_step:
+                parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
+            parts = fresh(parts) if self.copy else parts
+            obs = self._as_dtype(parts["obs"])
+            infos = self._infos(parts, self._as_dtype(parts.get("final_obs", {})))
+        return obs, parts["reward"], parts["terminal"], parts["truncated"], infos
+
+    def _converted(self, obs) -> Tree:
+        obs = without_agents(self.env.obs_space, obs, self.dtype if self.to_numpy else None)
+        if self.to_numpy:
+            return to_numpy(obs)
+        return self._as_dtype(fresh(obs) if self.copy else obs)
+
+    def _as_dtype(self, obs) -> Tree:
+        if isinstance(obs, Mapping):
+            return {key: self._as_dtype(part) for key, part in obs.items()}
+        return obs.to(self.dtype) if obs.is_floating_point() else obs
+
+    def _infos(self, parts, final_obs) -> dict[str, Tree]:
+        """Returns Gymnasium's infos: each key with a mask of the lanes that have it."""
+        over, metrics = parts["over"], parts["metrics"]
+        own = {
+            key: part for name, value in metrics.items() for key, part in _pair(name, value, over)
+        }
+        if self.mode is AutoresetMode.SAME_STEP:
+            return dict(final_obs=final_obs, _final_obs=over, final_info=own, _final_info=over)
+        return own
+
+    def _numpy_infos(self, parts, final) -> dict[str, Tree]:
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        if self.mode is AutoresetMode.SAME_STEP:
+            last = self._converted(final["obs"])
+            for lane in np.flatnonzero(parts["over"]):
+                final_obs[lane] = row(last, lane)
+        return self._infos(parts, final_obs)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Returns a drawing (H, W, 3) uint8 of each environment if ``render_mode`` is
+        ``rgb_array``.
+        """
+        if self.render_mode is None:
+            return None
+        drawn: Tree = self.env
+        return tuple(rasterise(drawn.display(e)) for e in range(drawn.n_envs))
+
+    def close_extras(self, **kwargs: Tree) -> None:
+        """Closes the environment."""
+        self.lanes.close()
+
+
+def _pair(name, value, mask) -> tuple[tuple[str, Tree], tuple[str, Tree]]:
+    return (name, value), (f"_{name}", mask)
+
+
+def _mode(given) -> AutoresetMode:
+    if isinstance(given, AutoresetMode):
+        return given
+    modes = {key: mode for mode in AutoresetMode for key in (mode.name.lower(), mode.value.lower())}
+    if str(given).lower() not in modes:
+        names = ", ".join(mode.name for mode in AutoresetMode)
+        raise ValueError(f"autoreset_mode must be one of {names}, not {given!r}")
+    return modes[str(given).lower()]
+
+
+def _render_mode(given, modes) -> str | None:
+    if given is not None and given not in modes:
+        raise ValueError(f"render_mode must be None or one of {modes}, not {given!r}")
+    return given
+
+
+class SingleEnv(gymnasium.Env):
+    """An environment of megastep with one lane as a `gymnasium.Env`, in NumPy.
+
+    Args:
+        env: the environment, of one lane.
+        render_mode: None or ``rgb_array``.
+
+    Raises:
+        ValueError: if the environment has several lanes.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+
+    def __init__(self, env: Env, render_mode: str | None = None):
+        self.vector = VectorEnv(env, AutoresetMode.NEXT_STEP, render_mode=render_mode)
+        if self.vector.num_envs != 1:
+            raise ValueError(
+                f"a single environment has one lane, but this {type(env).__name__} has "
+                f"{self.vector.num_envs}: use VectorEnv, or ParallelEnv for several agents"
+            )
+        self.observation_space = self.vector.single_observation_space
+        self.action_space = self.vector.single_action_space
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": optional(env, "fps")}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Tree] | None = None
+    ) -> tuple[Tree, dict[str, Tree]]:
+        """Begins an episode. Returns (observation, info)."""
+        super().reset(seed=seed)
+        obs, _ = self.vector.reset(seed=seed, options=options)
+        return row(obs, 0), {}
+
+    def step(self, action: Tree) -> tuple[Tree, float, bool, bool, dict[str, Tree]]:
+        """Returns (observation, reward, terminated, truncated, info)."""
+        actions = stacked([action])
+        obs, reward, terminated, truncated, infos = self.vector.step(actions)
+        info = {key: float(value[0]) for key, value in infos.items() if not key.startswith("_")}
+        return row(obs, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> np.ndarray | None:
+        """Returns a drawing (H, W, 3) uint8 if ``render_mode`` is ``rgb_array``."""
+        frames = self.vector.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Closes the environment."""
+        self.vector.close()
+
+
+def make_vector(
+    name: str,
+    num_envs: int = 1,
+    *,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    to_numpy: bool = True,
+    dtype: torch.dtype | None = None,
+    copy: bool = True,
+    render_mode: str | None = None,
+    **settings: Tree,
+) -> VectorEnv:
+    """Returns a :class:`VectorEnv` by its class name, for ``gymnasium.make_vec``. ``settings`` are
+    the environment's. ``num_envs`` counts environments; several agents are that many lanes.
+    """
+    env = envs.ENVS[name.lower()](num_envs, **settings)
+    options: dict[str, Tree] = dict(to_numpy=to_numpy, dtype=dtype, copy=copy)
+    return VectorEnv(env, autoreset_mode, render_mode=render_mode, **options)
+
+
+def make_single(name: str, render_mode: str | None = None, **settings: Tree) -> SingleEnv:
+    """Returns a :class:`SingleEnv` by its class name, on the CPU, for ``gymnasium.make``."""
+    env = envs.ENVS[name.lower()](1, **{"device": "cpu"} | settings)
+    return SingleEnv(env, render_mode)

@@ -1,0 +1,193 @@
+"""An environment as other libraries step it: resets of single lanes, copies that stay valid, and
+conversions. N environments, B lanes.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import TypeVar, cast
+
+import numpy as np
+import torch
+from torch.utils import _pytree
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.capture import Captured, Graph, capture
+from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
+
+__all__ = ["Lanes", "ended", "fresh"]
+
+WORD = 4  # bytes
+
+
+def ended(world: World) -> torch.Tensor:
+    """Returns (B,) bool: where a world ends an episode."""
+    return world["terminal"] | world["truncated"]
+
+
+def fresh(tree: Tree) -> Tree:
+    """Returns a copy of a tree of tensors, on a GPU by one kernel for all that fit."""
+    leaves, spec = _pytree.tree_flatten(tree)
+    copies = [torch.empty_like(leaf) for leaf in leaves]
+    pairs = [*zip(copies, leaves)]
+    words = [pair for pair in pairs if pair[0].is_cuda and all(map(_is_words, pair))]
+    if words:
+        into, given = ([_words(leaf) for leaf in side] for side in zip(*words))
+        torch._foreach_copy_(into, given)  # pyright: ignore[reportPrivateImportUsage]
+        pairs = [pair for pair in pairs if not all(map(_is_words, pair))]
+    for copy, leaf in pairs:
+        copy.copy_(leaf)
+    return _pytree.tree_unflatten(copies, spec)
+
+
+def _is_words(leaf) -> bool:
+    return leaf.is_contiguous() and leaf.nbytes % WORD == 0 and leaf.data_ptr() % WORD == 0
+
+
+def _words(leaf) -> torch.Tensor:
+    return leaf.view(-1).view(torch.int32)
+
+
+Method = TypeVar("Method", bound=Callable)
+
+
+def _in_plain_tensors(method: Method) -> Method:
+    """Decorates a method that keeps tensors, so that it may be called in an inference mode, whose
+    tensors cannot be changed outside it.
+    """
+
+    @functools.wraps(method)
+    def call(*args, **kwargs) -> object:
+        with torch.inference_mode(False), torch.no_grad():
+            return method(*args, **kwargs)
+
+    return cast(Method, call)
+
+
+class Lanes:
+    """Steps an environment. On a GPU steps are CUDA graphs, and worlds are valid until the next
+    step or reset.
+
+    Args:
+        env: the environment.
+        same_step: begin a new episode in the step that ends one, by a masked reset.
+        purpose: what needs masked resets, for the message; None if nothing does.
+
+    Raises:
+        ValueError: if the environment's resets take no masks, but must.
+    """
+
+    def __init__(self, env: Env, same_step: bool = False, purpose: str | None = None):
+        self.purpose = purpose
+        if purpose and not takes_masks(env):
+            raise ValueError(
+                f"{purpose} needs reset(seed=None, mask=None) of the environment, which "
+                f"{type(env).__name__} does not have: see megastep.types.Env"
+            )
+        self.env, self.n_lanes, self.device = env, n_lanes(env), torch.device(env.device)
+        self.takes_masks, self._is_same_step = takes_masks(env), same_step
+        on_gpu = self.device.type == "cuda" and optional(env, "capturable")
+        self._on_gpu, self._captured = on_gpu, Captured(env)  # plain steps on a CPU
+        self._both, self._reset = None, cast(Callable, env.reset)
+        self._resets: dict[int, Callable] = {}  # by their number of arguments
+
+    @_in_plain_tensors
+    def reset(
+        self, seed: int | Sequence[int | None] | None = None, mask: torch.Tensor | None = None
+    ) -> World:
+        """Returns the first world, or with a mask the last one with new rows.
+
+        Args:
+            seed: of lane 0; the next has the next seed. Or one seed per lane.
+            mask: (B,) bool, lanes that begin.
+
+        Raises:
+            ValueError: naming what does not fit.
+        """
+        is_recorded = any(isinstance(step, Graph) for step in (self._captured._step, self._both))
+        if not self.takes_masks and seed is None and mask is None:
+            return self.env.reset()
+        if not self.takes_masks:
+            raise ValueError(
+                f"{type(self.env).__name__} takes neither seeds nor masks: it has no "
+                "reset(seed=None, mask=None), see megastep.types.Env"
+            )
+        seeds = self._seeds(seed)
+        if not is_recorded:
+            return self._reset(seed=seeds, mask=mask)
+        # into the world that the graph of a step returns, by a graph too
+        mask = (
+            torch.ones(self.n_lanes, dtype=torch.bool, device=self.device) if mask is None else mask
+        )
+        arguments = (mask,) if seeds is None else (mask, seeds)
+        if len(arguments) not in self._resets:
+            self._resets[len(arguments)] = capture(self._masked_reset, arguments, (self.env,))
+        return self._resets[len(arguments)](*arguments)
+
+    def _masked_reset(self, mask, seeds=None) -> World:
+        return self._reset(seed=seeds, mask=mask)
+
+    def _seeds(self, seed) -> torch.Tensor | None:
+        if seed is None:
+            return None
+        if isinstance(seed, (int, np.integer)):
+            return int(seed) + torch.arange(self.n_lanes, device=self.device)
+        seeds = [*seed]
+        if len(seeds) != self.n_lanes or not all(isinstance(s, (int, np.integer)) for s in seeds):
+            raise ValueError(
+                f"seed must be an integer, or {self.n_lanes} of them, one per lane, not {seed!r}"
+            )
+        return torch.as_tensor(seeds, dtype=torch.int64).to(self.device)
+
+    def mask(self, values: Tree) -> torch.Tensor:
+        """Returns a mask (B,) bool on the device, of a tensor or an array.
+
+        Raises:
+            ValueError: if it has another shape or dtype.
+        """
+        mask = torch.as_tensor(values)
+        if mask.shape != (self.n_lanes,) or mask.dtype != torch.bool:
+            raise ValueError(
+                f"a reset's mask must be bool, of shape ({self.n_lanes},), not {mask.dtype} of "
+                f"shape {tuple(mask.shape)}"
+            )
+        return mask.to(self.device)
+
+    def decision(self, actions: Tree) -> arrdict:
+        """Returns the decision of actions as other libraries batch them: per leaf (B, ...) of any
+        number type, without an axis of one agent per lane.
+        """
+
+        def converted(space, values) -> torch.Tensor:
+            dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else torch.float32
+            values = torch.as_tensor(values).to(self.device, dtype, non_blocking=True)
+            return values.reshape(self.n_lanes, *space.shape).contiguous()
+
+        return arrdict(actions=spaces.map(converted, self.env.action_space, actions))
+
+    @_in_plain_tensors
+    def step(self, actions: Tree) -> tuple[World, World]:
+        """Returns (world, final world). With ``same_step``, the first has the first observation
+        where an episode ended, and the final world its last one; otherwise both are the same.
+        """
+        decision = self.decision(actions)
+        if not self._is_same_step:
+            world = self._captured.step(decision)
+            return world, world
+        if not self._on_gpu:
+            return self._same_step(decision, bool)
+        if self._both is None:
+            self._both = capture(self._same_step, (decision,), (self.env,))
+        return self._both(decision)
+
+    def _same_step(self, decision, is_needed=lambda any_ended: True) -> tuple[World, World]:
+        world = self.env.step(decision)
+        over = ended(world)
+        if not is_needed(over.any()):
+            return world, world
+        final = world.clone()
+        return self._reset(mask=over), final
+
+    def close(self) -> None:
+        """Closes the environment."""
+        optional(self.env, "close")()

@@ -1,0 +1,75 @@
+# pyright: reportMissingImports=false
+"""An environment of megastep as rsl_rl's vector environment."""
+
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from megastep import spaces
+from megastep.adapters.lanes import Lanes, ended
+from megastep.types import Env, optional
+
+__all__ = ["RslRlVecEnv"]
+
+
+class RslRlVecEnv(VecEnv):
+    """An environment of megastep with continuous actions as an `rsl_rl.env.VecEnv`, on the device.
+
+    Observations are groups of vectors (B, D) float32: ``policy`` has the observation, and
+    ``critic`` the observation and the privileged one, if the environment has it. A lane begins its
+    next episode in the step that ends one, by a masked reset; ``extras["time_outs"]`` says where a
+    time limit ended it. Actions are clipped to their bounds.
+
+    Args:
+        env: the environment, such as Explorer or PointGoal with ``control="continuous"``.
+
+    Raises:
+        ValueError: if its actions are not one `MultiContinuous` space of one agent per lane, or its
+            resets take no masks.
+    """
+
+    def __init__(self, env: Env):
+        space = env.action_space
+        if not isinstance(space, spaces.MultiContinuous) or space.n_agents != 1:
+            raise ValueError(
+                "rsl_rl acts by vectors of numbers, but the actions of this "
+                f"{type(env).__name__} are {space!r}: use control='continuous', if it has that"
+            )
+        self.lanes, self.env = Lanes(env, True, "rsl_rl"), env
+        self.num_envs, self.num_actions = self.lanes.n_lanes, space.dim
+        self.device, self.cfg = self.lanes.device, {}
+        self.low, self.high = space.tensors(self.device)
+        self.max_episode_length = optional(env, "max_episode_steps")
+        self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        self._world = self.lanes.reset()
+
+    def get_observations(self) -> TensorDict:
+        """Returns the observation groups of now."""
+        return self._groups(self._world)
+
+    def reset(self) -> tuple[TensorDict, dict]:
+        """Begins episodes in all lanes. Returns (observations, extras)."""
+        self._world = self.lanes.reset()
+        self.episode_length_buf = torch.zeros_like(self.episode_length_buf)
+        return self.get_observations(), {}
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """Steps by actions (B, ``num_actions``). Returns (observations, rewards, dones, extras)."""
+        actions = actions.detach().clamp(self.low, self.high)
+        self._world, final = self.lanes.step(actions)
+        over = ended(final)
+        self.episode_length_buf = (self.episode_length_buf + 1).masked_fill(over, 0)
+        extras = dict(time_outs=final["truncated"].clone())
+        return self._groups(self._world), final["reward"].clone(), over, extras
+
+    def _groups(self, world) -> TensorDict:
+        groups = dict(policy=_flat(world["obs"]))
+        if "privileged" in world:
+            groups["critic"] = torch.cat([groups["policy"], _flat(world["privileged"])], 1)
+        return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
+
+
+def _flat(tree) -> torch.Tensor:
+    """Returns a tree of tensors (B, ...) as one of shape (B, D) float32."""
+    leaves = spaces.leaves(tree).values()
+    return torch.cat([leaf.flatten(1).float() for leaf in leaves], 1)

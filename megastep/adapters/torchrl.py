@@ -1,0 +1,105 @@
+# pyright: reportMissingImports=false, reportArgumentType=false
+"""An environment of megastep as TorchRL's."""
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, Unbounded
+from torchrl.data.tensor_specs import TensorSpec
+from torchrl.envs import EnvBase
+
+from megastep import spaces
+from megastep.adapters.lanes import Lanes, ended, fresh
+from megastep.adapters.spaces import without_agents
+from megastep.types import Env, Tree, optional
+
+__all__ = ["TorchRLEnv"]
+
+
+class TorchRLEnv(EnvBase):
+    """An environment of megastep as a `torchrl.envs.EnvBase`, batch-locked: B lanes, on the
+    environment's device.
+
+    Lanes begin episodes when TorchRL resets them, by a masked reset. Observations are the keys of
+    the observation space, or ``observation``; ``privileged`` is one more, if there is one.
+
+    Args:
+        env: the environment, whose resets take masks.
+        dtype: of observations in floats.
+
+    Raises:
+        ValueError: if they do not.
+    """
+
+    def __init__(self, env: Env, dtype: torch.dtype = torch.float32):
+        self.lanes = Lanes(env, purpose="TorchRL")
+        n, self.device_of_env = self.lanes.n_lanes, self.lanes.device
+        super().__init__(device=self.device_of_env, batch_size=[n])
+        self.megastep, self.dtype_of_obs, self._seeds = env, dtype, None
+        self._space = dict(_named(env.obs_space, "observation"))
+        if optional(env, "privileged_space") is not None:
+            self._space |= dict(privileged=optional(env, "privileged_space"))
+        on = dict(device=self.device_of_env)
+        self.observation_spec = Composite(
+            {key: _spec(part, n, dtype, on) for key, part in self._space.items()}, shape=[n], **on
+        )
+        actions = env.action_space
+        self.action_spec = _spec(actions, n, torch.float32, on)
+        self.reward_spec = Unbounded((n, 1), dtype=torch.float32, **on)
+        flags = "done", "terminated", "truncated"
+        self.full_done_spec = Composite(
+            {flag: Categorical(2, shape=(n, 1), dtype=torch.bool, **on) for flag in flags},
+            shape=[n],
+            **on,
+        )
+
+    def _tensordict(self, world) -> TensorDict:
+        named = _named(world["obs"], "observation")
+        named = {key: named[key] if key in named else world[key] for key in self._space}
+        parts = without_agents(self._space, named)
+        flags = dict(done=ended(world), terminated=world["terminal"], truncated=world["truncated"])
+        parts = fresh(parts | flags | dict(reward=world["reward"]))
+        parts = {
+            key: part[:, None] if key in (*flags, "reward") else self._as_dtype(part)
+            for key, part in parts.items()
+        }
+        return TensorDict(parts, batch_size=self.batch_size, device=self.device)
+
+    def _as_dtype(self, part) -> Tree:
+        if isinstance(part, Mapping):
+            return {key: self._as_dtype(leaf) for key, leaf in part.items()}
+        return part.to(self.dtype_of_obs) if part.is_floating_point() else part
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        seeds, self._seeds = self._seeds, None
+        world = self.lanes.reset(seeds, None if mask is None else mask.reshape(-1))
+        return self._tensordict(world).exclude("reward")
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        world, _ = self.lanes.step(tensordict.get("action"))
+        return self._tensordict(world)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seeds = seed
+
+
+def _named(space, name) -> Mapping:
+    return space if isinstance(space, Mapping) else {name: space}
+
+
+def _spec(space, n, dtype, on) -> TensorSpec:
+    """Returns the spec of n lanes' leaves, (n, ...), without an axis of one agent per lane."""
+    if isinstance(space, Mapping):
+        return Composite({k: _spec(part, n, dtype, on) for k, part in space.items()}, shape=[n])
+    shape = n, *(space.shape[1:] if space.shape[0] == 1 else space.shape)
+    if isinstance(space, spaces.MultiDiscrete):
+        if len(shape) == 1:
+            return Categorical(space.n_actions, shape=shape, dtype=torch.int64, **on)
+        choices = [space.n_actions] * space.n_agents
+        return MultiCategorical(choices, shape=shape, dtype=torch.int64, **on)
+    if isinstance(space, spaces.MultiContinuous):
+        low, high = (bound.expand(space.shape).reshape(shape[1:]) for bound in space.tensors())
+        return Bounded(low.expand(shape), high.expand(shape), shape, dtype=torch.float32, **on)
+    return Unbounded(shape, dtype=space.dtype if space.dtype == torch.uint8 else dtype, **on)

@@ -1,0 +1,162 @@
+"""Resets of some lanes: by a mask, and by a seed. N environments, B lanes."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, TypeVar
+
+import torch
+from torch.utils import _pytree
+
+from megastep.engine import checks
+from megastep.engine.state_tree import is_expanded, walk
+from megastep.read_only import ReadOnlyTensor
+from megastep.types import n_lanes
+
+if TYPE_CHECKING:
+    from megastep.arrdict import arrdict
+    from megastep.types import Env
+
+__all__ = ["Resets"]
+
+Integers = TypeVar("Integers", int, torch.Tensor)
+COUNTERS = "counts", "n_draws"  # attributes that count a generator's draws
+PER_DRAW = "counts", "values"  # may have several rows per environment
+MASK32 = 2**32 - 1
+
+
+class Resets:
+    """The ``reset(seed, mask)`` of an environment, for any that begins episodes by a mask.
+
+    Remembers the world that was returned last, so that lanes that do not begin keep their rows. A
+    step costs nothing more. The state of the environment is every tensor that
+    :func:`~megastep.engine.state_tree.state_tree` finds with N or B rows; draws are counted by
+    tensors called ``counts`` or ``n_draws``.
+
+    Args:
+        lanes_last: attributes of the environment whose lanes are on the last axis.
+        draws: rows that count draws, by the attributes that have them.
+
+    Attributes:
+        last: the last world, or None.
+        is_used: whether a mask was ever given.
+    """
+
+    __slots__ = (
+        "lanes_last",
+        "draws",
+        "last",
+        "is_used",
+    )  # no __dict__, so no state: see `state_tree`
+
+    def __init__(self, lanes_last: tuple[str, ...] = (), draws: Mapping[str, int] | None = None):
+        self.lanes_last, self.draws, self.is_used = lanes_last, draws or {}, False
+        self.last: arrdict | None = None
+
+    def __reduce__(self) -> tuple:
+        return Resets, (
+            self.lanes_last,
+            self.draws,
+        )  # a copy of an environment has no last world yet
+
+    def keep(self, world: "arrdict") -> "arrdict":
+        """Remembers and returns a world. Call it on what ``step`` returns."""
+        self.last = world
+        return world
+
+    def __call__(
+        self,
+        env: "Env",
+        begin: Callable[[torch.Tensor], "arrdict"],
+        seed: int | torch.Tensor | None = None,
+        mask: torch.Tensor | None = None,
+    ) -> "arrdict":
+        """Begins episodes, as described at ``reset`` of :class:`~megastep.types.Env`.
+
+        Args:
+            env: the environment.
+            begin: takes a mask (B,), begins an episode in these lanes, and returns a world. What it
+                does to other lanes is undone.
+            seed: from 0 to 2**63 - 1, or (B,) int64, a seed per lane.
+            mask: (B,) bool, lanes that begin. Default: all.
+
+        Raises:
+            TypeError, ValueError: naming the argument that does not fit; with a mask, if there is
+                no last world.
+        """
+        everyone = torch.ones(n_lanes(env), dtype=torch.bool, device=env.device)
+        world = self.last
+        if mask is not None:
+            checks.alike("mask", mask, everyone)
+            if world is None:
+                raise ValueError(
+                    "reset(mask=...) leaves the other lanes as they are in the last world, but "
+                    "there is none: call reset() first"
+                )
+        chosen = everyone if mask is None else mask.clone()
+        if seed is not None:
+            self._seed(env, seed, chosen)
+        if mask is None or world is None:
+            return self.keep(begin(chosen))
+        self.is_used = True
+        rows = [*self._rows(env)]
+        before = [leaf.clone() for leaf, _ in rows]
+        leaves = _pytree.tree_leaves(world)
+        world_before = [leaf.clone() for leaf in leaves]
+        new = begin(chosen)
+        began = new["reset"].clone()
+        for (leaf, axis), old in zip(rows, before):
+            leaf.copy_(torch.where(_along(began, env.n_envs, leaf, axis), leaf, old))
+        # in place, so that a CUDA graph that steps and one that resets share the world
+        for leaf, fresh, old in zip(leaves, _pytree.tree_leaves(new), world_before, strict=True):
+            leaf.copy_(torch.where(_along(began, env.n_envs, leaf, 0), fresh, old))
+        return world
+
+    def _rows(self, env) -> Iterable[tuple[torch.Tensor, int]]:
+        """Yields (tensor, axis of the lanes or environments) of what an episode may change."""
+        sizes = env.n_envs, n_lanes(env)
+        for path, (_, step, leaf) in walk(env, torch.Tensor).items():
+            if isinstance(leaf, ReadOnlyTensor) or is_expanded(leaf) or not leaf.ndim:
+                continue
+            if path.removeprefix(".") in self.lanes_last:
+                yield leaf, -1
+            elif len(leaf) in sizes:
+                yield leaf, 0
+            elif step[1:] in PER_DRAW and len(leaf) and len(leaf) % env.n_envs == 0:
+                yield leaf, 0
+
+    def _seed(self, env, seed, chosen) -> None:
+        if isinstance(seed, torch.Tensor):
+            checks.alike("seed", seed, torch.empty_like(chosen, dtype=torch.int64))
+            start = _first_draw(seed)
+        else:
+            start = torch.full_like(
+                chosen, _first_draw(checks.integer("seed", seed, 0, 2**63 - 1)), dtype=torch.int64
+            )
+        leaves = walk(env, torch.Tensor).values()
+        found = [leaf for _, step, leaf in leaves if step[1:] in COUNTERS]
+        found += [getattr(env, name)[row] for name, row in self.draws.items()]
+        for counter in found:
+            places = _along(chosen, env.n_envs, counter, 0)
+            starts = _along(start, env.n_envs, counter, 0)
+            counter.copy_(torch.where(places, starts.to(counter.dtype), counter))
+
+
+def _first_draw(seed: Integers) -> Integers:
+    """Returns where a seed begins in the numbers of each generator, from 0 to 2**30 - 1: the last
+    step of MurmurHash3, of an integer or a tensor.
+    """
+    x = (seed ^ (seed >> 32)) & MASK32
+    x = ((x ^ (x >> 16)) * 0x85EBCA6B) & MASK32
+    x = ((x ^ (x >> 13)) * 0xC2B2AE35) & MASK32
+    return (x ^ (x >> 16)) & (2**30 - 1)
+
+
+def _along(values, n_envs, leaf, axis) -> torch.Tensor:
+    """Returns values (B,) in a shape that broadcasts along an axis of a leaf with B or N rows, or a
+    multiple of N: there an environment's value is True if that of any lane is, or the first lane's.
+    """
+    n_rows = leaf.shape[axis]
+    if n_rows != len(values):
+        by_env = values.view(n_envs, -1)
+        by_env = by_env.any(1) if values.dtype == torch.bool else by_env[:, 0]
+        values = by_env.repeat_interleave(n_rows // n_envs, output_size=n_rows)
+    return values if axis else values.view(-1, *[1] * (leaf.ndim - 1))

@@ -1,0 +1,384 @@
+"""Environments in other libraries: their own checkers, the episodes that they see, and what does
+not fit. What needs a library that is not installed is skipped.
+"""
+
+import importlib.util
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import forage
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+from megastep import adapters, arrdict, contract, envs, geometries
+from megastep.adapters import registration
+from tests.helpers.made_up import Numbers
+from tests.helpers.synchronisation import no_synchronisation
+
+ROOT = Path(__file__).parents[2]
+HOMES = geometries.sample("homes", 4, seed=7)
+NEXT, SAME, OFF = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+
+
+def pong(n=4, **settings):
+    return envs.Pong(n, **dict(limit=30, device="cpu") | settings)
+
+
+def pointgoal(n=4, **settings):
+    return envs.PointGoal(n, HOMES, limit=15, resample=True, **dict(device="cpu") | settings)
+
+
+def moves(env, n_steps, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    return [contract.random_actions(env, generator) for _ in range(n_steps)]
+
+
+# ---- Gymnasium ----
+
+
+@pytest.mark.parametrize("full_name", sorted({*registration.IDS} - {"megastep/Deathmatch-v0"}))
+def test_gymnasium_makes_one(full_name):
+    env = gymnasium.make(full_name, render_mode="rgb_array", seed=3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of observations without bounds, such as velocities
+        check_env(env.unwrapped, skip_render_check=True)
+    first, _ = env.reset(seed=5)
+    again, _ = env.reset(seed=5)
+    assert gymnasium.utils.env_checker.data_equivalence(first, again)
+    frame = env.render()
+    assert frame.ndim == 3 and frame.dtype == np.uint8 and frame.std() > 1
+    assert env.spec.id == full_name and env.spec.kwargs["seed"] == 3
+    env.close()
+
+
+def test_ids_are_those_of_the_entry_point_and_all_environments():
+    tomllib = pytest.importorskip("tomllib")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    point = project["entry-points"]["gymnasium.envs"]["__root__"]
+    assert point == "megastep.adapters.registration:register"
+    foreign = {"Gymnasium", "PettingZoo"}
+    names = {kind.__name__ for kind in envs.ENVS.values()} - foreign
+    assert {*registration.IDS.values()} == names
+    assert all(f"{name}".lower() in envs.ENVS for name in names)
+    env = gymnasium.make_vec(
+        "megastep.adapters:megastep/Deathmatch-v0", 2, n_agents=3, device="cpu"
+    )
+    assert env.num_envs == 6 and env.spec.id == "megastep/Deathmatch-v0"
+
+
+def test_registering_imports_no_torch():
+    code = "import gymnasium, sys; from megastep.adapters.registration import register; register();"
+    code += "assert 'torch' not in sys.modules and 'megastep/Pong-v0' in gymnasium.registry"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_training_imports_no_adapter():
+    code = "import megastep.agents.cli.train, megastep.agents.api, megastep.envs, sys;"
+    code += "assert not [m for m in sys.modules if m.startswith('megastep.adapters')]"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize("in_numpy", (True, False))
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_modes_show_the_same_episodes(mode, in_numpy):
+    """What a native environment shows, in each mode: the last observation of an episode, its
+    flags and metrics, and the first observation of the next.
+    """
+    env, twin = pointgoal(), pointgoal()
+    vector = adapters.VectorEnv(env, mode, to_numpy=in_numpy, dtype=torch.float32)
+    vector.reset(seed=7)
+    twin.reset(seed=torch.arange(7, 11))
+    env.desync()  # else all episodes would end in the same steps
+    twin.desync()
+    n_ends = 0
+    for action in moves(env, 120):
+        given = action[:, 0].numpy() if in_numpy else action[:, 0]
+        obs, reward, terminated, truncated, infos = vector.step(given)
+        world = twin.step(arrdict.arrdict(actions=action))
+        ended = world.terminal | world.truncated
+        assert torch.equal(torch.as_tensor(reward), world.reward)
+        assert torch.equal(torch.as_tensor(terminated), world.terminal)
+        assert torch.equal(torch.as_tensor(truncated), world.truncated)
+        last, collisions = world.obs.d[:, 0].float(), world.metrics.collisions.clone()
+        if mode is not NEXT:  # the twin begins what ended, too
+            if mode is OFF and ended.any():
+                assert torch.equal(torch.as_tensor(obs["d"]), last)
+                obs, _ = vector.reset(options={"reset_mask": ended.numpy()})
+            world = twin.reset(mask=ended) if ended.any() else world
+        assert torch.equal(torch.as_tensor(obs["d"]), world.obs.d[:, 0].float())
+        own = infos.get("final_info", infos) if mode is SAME else infos
+        for lane in ended.nonzero().flatten().tolist():
+            n_ends += 1
+            assert own["collisions"][lane] == collisions[lane] and own["_collisions"][lane]
+            if mode is SAME:
+                final = infos["final_obs"][lane]["d"] if in_numpy else infos["final_obs"]["d"][lane]
+                assert torch.equal(torch.as_tensor(final), last[lane])
+    assert n_ends > 4
+
+
+def test_numpys_wrappers_run_over_it():
+    names = ["RecordEpisodeStatistics", "NormalizeReward", "FlattenObservation", "DictInfoToList"]
+    names += ["NumpyToTorch"] * bool(importlib.util.find_spec("array_api_compat"))
+    from gymnasium.wrappers import vector as wrappers
+
+    for name in names:
+        wrapper = getattr(wrappers, name)
+        env, n_episodes = wrapper(adapters.VectorEnv(pong())), 0
+        env.reset(seed=1)
+        for _ in range(70):
+            action = env.action_space.sample()
+            is_torch = name == "NumpyToTorch"
+            *_, infos = env.step(torch.as_tensor(action) if is_torch else action)
+            n_episodes += "episode" in infos
+        assert n_episodes or name != "RecordEpisodeStatistics"
+
+
+def test_statistics_of_gymnasium_are_those_of_the_episodes():
+    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(
+        adapters.VectorEnv(pong(points=3), SAME)
+    )
+    env.reset(seed=1)
+    for _ in range(200):
+        *_, infos = env.step(env.action_space.sample())
+        for lane in np.flatnonzero(infos.get("_episode", [])):
+            assert abs(infos["episode"]["r"][lane]) <= 3 and infos["episode"]["l"][lane] <= 90
+
+
+def test_what_does_not_fit_is_named_in_gymnasium():
+    for mode in ("same_step", "disabled"):
+        name = mode.upper()
+        with pytest.raises(ValueError, match=f"autoreset_mode={name} needs reset.seed=None, mask="):
+            adapters.VectorEnv(Numbers(), mode)
+    with pytest.raises(ValueError, match="must be one of NEXT_STEP, SAME_STEP, DISABLED, not 'on'"):
+        adapters.VectorEnv(pong(), "on")
+    with pytest.raises(ValueError, match="takes neither seeds nor masks"):
+        adapters.VectorEnv(Numbers()).reset(seed=1)
+    env = adapters.VectorEnv(pong(), OFF)
+    env.reset()
+    with pytest.raises(ValueError, match=r"takes options\['reset_mask'\] alone, not \['speed'\]"):
+        env.reset(options={"speed": 2})
+    with pytest.raises(ValueError, match=r"mask must be bool, of shape \(4,\), not torch.int64"):
+        env.reset(options={"reset_mask": np.ones(4, int)})
+    with pytest.raises(ValueError, match="seed must be an integer, or 4 of them"):
+        env.reset(seed=[1, 2])
+    with pytest.raises(
+        ValueError, match="lane . has ended its episode: in DISABLED, begin the next"
+    ):
+        for _ in range(40):
+            env.step(env.action_space.sample())
+    with pytest.raises(ValueError, match="render_mode must be None or one of"):
+        adapters.VectorEnv(pong(), render_mode="human")
+    with pytest.raises(ValueError, match="a single environment has one lane"):
+        gymnasium.make("megastep/Pong-v0", self_play=True)
+    assert len(adapters.VectorEnv(pong(2), render_mode="rgb_array").render()) == 2
+
+
+def test_an_extra_that_is_missing_is_named(monkeypatch):
+    with pytest.raises(AttributeError, match="megastep.adapters has no Vec; it has SingleEnv"):
+        _ = adapters.Vec
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    monkeypatch.setitem(sys.modules, "stable_baselines3.common.vec_env", None)
+    monkeypatch.delitem(sys.modules, "megastep.adapters.sb3", raising=False)
+    with pytest.raises(ImportError, match=r"pip install 'megastep-flatland\[sb3\]'"):
+        _ = adapters.SB3VecEnv
+
+
+# ---- PettingZoo ----
+
+
+@pytest.mark.parametrize(
+    "make",
+    (
+        lambda: pong(1, self_play=True),
+        lambda: envs.Deathmatch(1, HOMES, n_agents=3, resample=True, limit=40, device="cpu"),
+        lambda: forage.Forage(1, HOMES, limit=30, device="cpu"),
+    ),
+)
+def test_pettingzoo(make):
+    tests = pytest.importorskip("pettingzoo.test")
+    env = adapters.ParallelEnv(make(), render_mode="rgb_array")
+    tests.parallel_api_test(env, num_cycles=100)
+    tests.parallel_seed_test(lambda: adapters.ParallelEnv(make()), num_cycles=30)
+    for agent in env.possible_agents:
+        assert env.observation_space(agent) is env.observation_space(agent)
+        assert env.action_space(agent) is env.action_space(agent)
+    env.reset(seed=1)
+    assert env.render().ndim == 3
+    with pytest.raises(
+        ValueError, match="a parallel environment has n_envs=1, but this Pong has 2"
+    ):
+        adapters.ParallelEnv(pong(2))
+
+
+def test_an_agent_that_dies_plays_on_until_its_round_is_over():
+    pytest.importorskip("pettingzoo")
+    game = envs.Deathmatch(1, HOMES, n_agents=2, resample=True, limit=50, drain=0.5, device="cpu")
+    env = adapters.ParallelEnv(game)
+    env.reset(seed=1)
+    deaths, n_steps = 0, 0
+    while env.agents:
+        actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+        _, _, terminated, truncated, infos = env.step(actions)
+        deaths += sum(info.get("terminal", False) for info in infos.values())
+        n_steps += 1
+    assert n_steps == 50 and deaths >= 2
+    assert all(truncated[a] or terminated[a] for a in env.possible_agents)
+
+
+# ---- TorchRL, Stable-Baselines3, rsl_rl ----
+
+
+@pytest.mark.parametrize(
+    "make",
+    (
+        pong,
+        lambda: pointgoal(privileged=True),
+        lambda: envs.PointGoal(3, HOMES, limit=20, control="continuous", device="cpu"),
+    ),
+)
+def test_torchrl(make):
+    utils = pytest.importorskip("torchrl.envs.utils")
+    env, twin = adapters.TorchRLEnv(make()), make()
+    utils.check_env_specs(env)
+    env.set_seed(5)
+    rollout = env.rollout(60, break_when_any_done=False)
+    world = twin.reset(seed=5 + torch.arange(contract.n_lanes(twin)))
+    for t in range(60):  # partial resets begin the next episode where one ended, and leave others
+        action = rollout["action"][:, t].reshape(len(world.reward), *twin.action_space.shape)
+        action = action.contiguous()
+        world = twin.step(arrdict.arrdict(actions=action))
+        assert torch.equal(rollout["next", "reward"][:, t, 0], world.reward)
+        assert torch.equal(rollout["next", "truncated"][:, t, 0], world.truncated)
+        world = twin.reset(mask=world.terminal | world.truncated)
+    assert rollout["next", "done"].any()
+
+
+def test_stable_baselines_get_the_last_observation():
+    pytest.importorskip("stable_baselines3")
+    env, twin = adapters.SB3VecEnv(pointgoal()), pointgoal()
+    env.seed(7)
+    env.reset()
+    twin.reset(seed=torch.arange(7, 11))
+    env.env.desync()
+    twin.desync()
+    n_ends = 0
+    for action in moves(twin, 120):
+        obs, reward, done, infos = env.step(action[:, 0].numpy())
+        world = twin.step(arrdict.arrdict(actions=action))
+        ended, last = world.terminal | world.truncated, world.obs.d.clone()
+        truncated = world.truncated.clone()
+        assert torch.equal(torch.as_tensor(done), ended)
+        assert torch.equal(torch.as_tensor(reward), world.reward)
+        world = twin.reset(mask=ended)
+        assert torch.equal(torch.as_tensor(obs["d"]), world.obs.d[:, 0].float())
+        for lane in ended.nonzero().flatten().tolist():
+            n_ends += 1
+            final = torch.as_tensor(infos[lane]["terminal_observation"]["d"])
+            assert torch.equal(final, last[lane, 0].float())
+            assert infos[lane]["TimeLimit.truncated"] == bool(truncated[lane])
+            assert 0 <= infos[lane]["collisions"] <= 15
+    assert n_ends > 4
+    assert env.get_attr("n_envs") == [4] * 4 and env.env_is_wrapped(object) == [False] * 4
+    with pytest.raises(ValueError, match="Stable-Baselines3 needs reset.seed=None, mask=None"):
+        adapters.SB3VecEnv(Numbers())
+    with pytest.warns(UserWarning, match="5,000 lanes are more than 4,096"):
+        adapters.SB3VecEnv(pong(5000))
+
+
+def test_rsl_rl_groups_and_time_outs():
+    pytest.importorskip("rsl_rl.env")
+    settings = dict(limit=20, control="continuous", privileged=True, device="cpu")
+    env = adapters.RslRlVecEnv(envs.PointGoal(4, HOMES, **settings))
+    groups = env.get_observations()
+    assert groups["policy"].shape == (4, 64 * 4 + 6) and groups["critic"].shape == (4, 64 * 4 + 10)
+    with torch.inference_mode():
+        for _ in range(20):
+            groups, reward, dones, extras = env.step(2 * torch.randn(4, 3))
+    assert dones.all() and torch.equal(extras["time_outs"], dones) and reward.shape == (4,)
+    assert not env.episode_length_buf.any()
+    env.reset()
+    with pytest.raises(
+        ValueError, match="acts by vectors of numbers, but the actions of this Pong"
+    ):
+        adapters.RslRlVecEnv(pong())
+
+
+# ---- A GPU ----
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("mode", (NEXT, OFF, SAME))
+def test_tensors_are_those_of_the_cpu_and_do_not_synchronise(mode):
+    cpu = adapters.VectorEnv(pointgoal(), mode, to_numpy=False)
+    gpu = adapters.VectorEnv(pointgoal(device="cuda"), mode, to_numpy=False)
+    obs, on_gpu = cpu.reset(seed=3)[0], gpu.reset(seed=3)[0]
+    cpu.env.desync()
+    gpu.env.desync()
+    assert all(torch.equal(obs[key], on_gpu[key].cpu()) for key in obs)
+    actions = [action[:, 0] for action in moves(cpu.env, 60)]
+    gpu.step(actions[0].cuda())  # which records a CUDA graph
+    cpu.step(actions[0])
+    kept = []
+    for action in actions[1:]:
+        given = action.cuda()
+        with no_synchronisation():
+            obs, reward, terminated, truncated, infos = gpu.step(given)
+            ended = terminated | truncated
+            if mode is OFF:
+                obs, _ = gpu.reset(options={"reset_mask": ended})
+        expected, paid, won, cut, told = cpu.step(action)
+        if mode is OFF:
+            expected, _ = cpu.reset(options={"reset_mask": won | cut})
+        assert torch.equal(paid, reward.cpu()) and torch.equal(cut, truncated.cpu())
+        if mode is SAME:
+            final = infos["final_obs"]["rgb"][ended].cpu()
+            assert torch.equal(final, told["final_obs"]["rgb"][won | cut])
+        kept.append((obs, {key: leaf.clone() for key, leaf in obs.items()}, expected))
+    for given, copies, expected in kept:  # no later step has written into them
+        for key in given:
+            assert torch.equal(given[key], copies[key])
+            assert torch.equal(given[key].cpu(), expected[key])
+
+
+# ---- Training ----
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    "name, package",
+    [
+        ("gymnasium", "gymnasium"),
+        ("sb3", "stable_baselines3"),
+        ("sb3_recurrent", "sb3_contrib"),
+        ("torchrl", "torchrl"),
+        ("rsl_rl", "rsl_rl"),
+        ("skrl", "skrl"),
+    ],
+)
+def test_libraries_train_agents_above_random(name, package):
+    """By more than both 95 % intervals, after the budget that docs/adapters.md states."""
+    pytest.importorskip(package)
+    import other_libraries
+
+    random, trained = other_libraries.compare(name, other_libraries.BUDGETS[name])
+    assert trained[0] - trained[1] > random[0] + random[1], (random, trained)
+
+
+def test_the_code_of_the_page_runs():
+    """In order. What needs a library that is not installed is left out."""
+    names, n_run = {}, 0
+    text = (ROOT / "docs" / "adapters.md").read_text()
+    for block in re.findall(r"```python\n(.*?)```", text, re.S):
+        try:
+            exec(compile(block, "docs/adapters.md", "exec"), names)
+            n_run += 1
+        except ImportError:
+            continue
+    assert n_run >= 2
