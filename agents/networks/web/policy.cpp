@@ -89,7 +89,7 @@ static void convolve_pixel(const PolicyConvolveParams& p, const float* x, float*
                            int row, int column) {
     int top = row * p.stride_h - p.padding_h, left = column * p.stride_w - p.padding_w;
     int n = p.n_out - channel < BLOCK ? p.n_out - channel : BLOCK;
-    float sums[BLOCK] = {};
+    Four sums[BLOCK / 4] = {};
     for (int in = 0; in < p.n_in; in++)
         for (int i = top < 0 ? -top : 0; i < p.kernel_h && top + i < p.height; i++)
             for (int j = left < 0 ? -left : 0; j < p.kernel_w && left + j < p.width; j++) {
@@ -97,15 +97,15 @@ static void convolve_pixel(const PolicyConvolveParams& p, const float* x, float*
                 int at = (in * p.kernel_h + i) * p.kernel_w + j;
                 const float* weight = p.weight + (long long)at * p.n_out + channel;
                 if (n == BLOCK)
-                    for (int c = 0; c < BLOCK; c++)
-                        sums[c] += weight[c] * value;
+                    for (int c = 0; c < BLOCK / 4; c++)
+                        sums[c] += *(const Four*)(weight + 4 * c) * value;
                 else
                     for (int c = 0; c < n; c++)
-                        sums[c] += weight[c] * value;
+                        sums[c / 4][c % 4] += weight[c] * value;
             }
     for (int c = 0; c < n; c++) {
         int at = ((channel + c) * p.out_height + row) * p.out_width + column;
-        out[at] = activated(sums[c] + p.bias[channel + c], 1);
+        out[at] = activated(sums[c / 4][c % 4] + p.bias[channel + c], 1);
     }
 }
 
