@@ -165,7 +165,8 @@ function drawPlan(game, context, width, height, ratio) {
     const angle = own.field("angles", lane + 1)[lane] * Math.PI / 180, size = Math.max(7, data.radius * plan.scale);
     shape(context, sights[i], `${fill}38`);
     shape(context, trail.slice(-500).map(plan.at), null, fill, 2);
-    const line = own.field("centre_line", lane + 1, Int32Array)?.[lane] ?? -1;
+    const looked = trail.length > 1 ? own.field("centre_line", lane + 1, Int32Array) : null;
+    const line = looked?.[lane] ?? -1;  // nobody hits on a first observation
     const target = game.players[Math.floor(line / own.word("scenery.n_model"))];
     if (line >= 0 && target) shape(context, [centre, plan.at(target.trail.at(-1))], null, fill, 2);
     shape(context, [[0.8, 1.05], [0, 1.8], [-0.8, 1.05]].map(([turn, far]) => (
