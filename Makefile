@@ -17,7 +17,7 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-slow test-nightly test-gpu lint docs pictures image wheel setup lock clean
+.PHONY: train test test-slow test-nightly test-gpu lint wasm docs pictures image wheel setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
@@ -45,7 +45,11 @@ lint: $(SETUP)             ## check style, formatting and types of Python, and t
 pictures: $(SETUP)         ## draw the pictures of README and docs again, from packaged agents
 	$(PYTHON) scripts/pictures.py
 
+wasm: $(SETUP)             ## build the kernels of web pages again, megastep/web/megastep.wasm
+	$(PYTHON) scripts/build_wasm.py
+
 docs: $(SETUP)             ## build the site in docs/_build; warnings are errors
+	test -d docs/play || $(PYTHON) scripts/pictures.py gallery
 	$(PYTHON) -m sphinx -W --keep-going -q docs docs/_build
 
 image:                     ## build the container image with buildah, try it; IMAGE_OPTIONS=--stand-in
@@ -84,4 +88,4 @@ lock:                      ## resolve the versions in requirements/ anew; needs 
 	$(BASE) scripts/lock.py
 
 clean:                     ## delete .venv, build folders and caches
-	rm -rf .venv docs/_build build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv docs/_build docs/play build dist *.egg-info .pytest_cache .ruff_cache

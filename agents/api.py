@@ -118,6 +118,26 @@ class Run:
 
         return export(str(self.path), format, None if file is None else os.fspath(file))
 
+    def web(
+        self,
+        file: "str | os.PathLike | None" = None,
+        against: str | None = None,
+        homes: list[int] | None = None,
+        seed: int = 1,
+    ) -> Path:
+        """Writes a page that plays the agent in a browser: `run.web()`. Returns the path.
+
+        Args:
+            file: default: `page.html` in the run's folder.
+            against: another run, which plays the other agents.
+            homes: numbers of homes of the test split. Default: the first four.
+            seed: of the first episodes.
+        """
+        from megastep.agents.cli.web import write
+
+        file = None if file is None else os.fspath(file)
+        return write(str(self.path), against, homes, seed, file)
+
 
 def make(env: object, privileged: bool = False, **settings_of_env: object) -> "Env":
     """Returns an environment: `megastep.make("explorer", n_envs=64, geometry="homes")`.

@@ -28,13 +28,14 @@ author = copyright = "the megastep authors"
 release = version = package.version().split()[-1]
 
 extensions = ["myst_parser", "sphinx.ext.linkcode"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "play"]
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 suppress_warnings = ["misc.highlighting_failure"]
 html_theme = "furo"
 html_title = "megastep"
 html_static_path = []
+html_extra_path = [path.name for path in [ROOT / "docs/play"] if path.exists()]  # pages to play
 html_theme_options = {"source_repository": f"{REPOSITORY}/", "source_branch": "main"}
 html_theme_options |= {"source_directory": "docs/"}
 html_theme_options = html_theme_options if REPOSITORY else {}

@@ -81,6 +81,8 @@ class Env(Protocol):
         bot: class of a scripted policy for this environment, whose arguments are settings of the
             environment, or `env`, the environment itself. It plays as ``opponents.bot`` and
             ``against=bot``. Default: none.
+        controls: {key of a keyboard: action}, by which a person drives an agent in a page that
+            ``megastep web`` writes. Default: None, movement by arrow keys, or digits.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``. Default: None, there is none.
         coefficients: a tuple of `megastep.coefficients.Coefficients`, such as weights of rewards,
@@ -136,6 +138,7 @@ DEFAULTS: dict[str, Any] = {
     "layout": None,
     "weigh_layouts": None,
     "bot": None,
+    "controls": None,
     "roles": None,
     "privileged_space": None,
     "desync": None,

@@ -1,7 +1,9 @@
-"""Draws every picture of README and docs again, from packaged agents.
+"""Draws every picture of README and docs again, and the pages of the site's gallery, from packaged
+agents.
 
-python scripts/pictures.py                    all, into docs/images
-python scripts/pictures.py explorer.gif pong.png
+python scripts/pictures.py                    all, into docs/images and docs/play
+python scripts/pictures.py explorer.gif explorer.html
+python scripts/pictures.py gallery            the pages alone
 """
 
 import argparse
@@ -13,9 +15,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import show_homes
 
-from megastep.agents.cli import record
+from megastep.agents.cli import record, web
 
-IMAGES = Path(__file__).resolve().parents[1] / "docs/images"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+IMAGES, PAGES = DOCS / "images", DOCS / "play"
 MOST = 8_000_000  # bytes of all pictures
 #: What films or draws each: words for record.py, or for show_homes.py.
 FILMS = {
@@ -36,20 +39,31 @@ SHEETS = {
     "cluttered-homes.png": "--count 10 --density 3 --clutter 1",
     "mazes.png": "--mazes",
 }
+#: Words for megastep web.
+GALLERY = {
+    "explorer.html": "run=explorer_anywhere homes=[3,0,1,2]",
+    "deathmatch.html": "run=deathmatch_anywhere homes=[27,0,1]",
+    "memory.html": "run=memory_9",
+    "keys.html": "run=keys_anywhere",
+    "pointgoal.html": "run=pointgoal_anywhere homes=[4,0,1]",
+}
 
 
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("names", nargs="*", help="names of pictures; all by default")
-    names = parser.parse_args(argv).names or [*FILMS, *SHEETS]
-    if unknown := [name for name in names if name not in {*FILMS, *SHEETS}]:
+    names = parser.parse_args(argv).names or [*FILMS, *SHEETS, *GALLERY]
+    names = [*GALLERY] if names == ["gallery"] else names
+    if unknown := [name for name in names if name not in {*FILMS, *SHEETS, *GALLERY}]:
         raise SystemExit(
-            f"There is no picture {unknown[0]}; there are {', '.join([*FILMS, *SHEETS])}"
+            f"There is no picture {unknown[0]}; there are {', '.join([*FILMS, *SHEETS, *GALLERY])}"
         )
     for name in names:
         path = IMAGES / name
         if name in SHEETS:
             show_homes.main([str(path), *SHEETS[name].split()])
+        elif name in GALLERY:
+            web.main([*GALLERY[name].split(), f"file={PAGES / name}"])
         elif code := record.main([*FILMS[name].split(), "device=cpu", f"file={path}"]):
             raise SystemExit(code)
     size = sum(path.stat().st_size for path in IMAGES.iterdir())

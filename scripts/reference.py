@@ -61,8 +61,8 @@ REPORTERS = {
 #: Megastep's own machinery, which nobody needs to import; and `cuda`, another name of `engine`.
 INTERNAL = re.compile(
     r"megastep\.(__main__|adapters\.(?!gymnasium|vector_checks)\w+|cache|compat|cuda|colour|demo|env_probe|env_values|global_generators|imports|kernels"
-    r"|wrapper_state|agents\.(cli|console|export|distributed\.(?!pooling)"
-    r"\w+|factory|launch|package|pretrained|private_ops|runs|networks\.(kernels|\w+_cpu)|storage\.\w*kernels"
+    r"|web|wrapper_state|agents\.(cli|console|export|distributed\.(?!pooling)"
+    r"\w+|factory|launch|package|pretrained|private_ops|runs|networks\.(kernels|web|\w+_cpu)|storage\.\w*kernels"
     r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.\w+\.(?!(env|bot)\b)\w+)\b"
 )
 

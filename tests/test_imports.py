@@ -36,7 +36,7 @@ SIMULATOR = (
     ("capture", "contract", "env_state", "geometries", "scene"),
     ("core", "cubicasa", "toys"),
     ("cuda", "modules"),
-    ("compat", "envs", "wrappers"),
+    ("compat", "envs", "web", "wrappers"),
     ("adapters", "demo"),
 )
 ENGINE = (
@@ -98,6 +98,10 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.recording",
     "megastep.scene",
     "megastep.sync_envs",
+    "megastep.web.page",
+    "megastep.web.program",
+    "megastep.web.recording",
+    "megastep.web.scene",
     "megastep.workers",
     "megastep.wrappers",
 }
@@ -113,11 +117,14 @@ OWN_USERS = {
         "megastep/envs/pointgoal/path_graph.py",
         "megastep/kernels/build/*.py",
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
+        "megastep/web/*.py",
         "agents/algorithms/*.py",
         "agents/algorithms/kernels/*.py",
         "agents/distributed/bucket.py",
+        "agents/export/web.py",
         "agents/networks/*_cpu.py",
         "agents/networks/kernels/*.py",
+        "agents/networks/web/*.py",
         "agents/selfplay/opponents.py",
         "agents/storage/copies.py",
         "agents/storage/replay_kernels.py",

@@ -18,6 +18,7 @@ COMMANDS = {
     "record": "films a trained policy; --help says more",
     "report": "writes a page about a run or several: curves, evaluations, homes; --help says more",
     "compare": "draws a metric of several runs, averaged over seeds; --help says more",
+    "web": "writes a page that plays an agent in a browser; --help says more",
     "export": "writes an agent for ONNX, torch.export, a hub, or in one file; --help says more",
     "reproduce": "lists the results in docs/lab; makes one again; --help says more",
     "inspect": "verifies a run's checkpoints and prints what is in them",

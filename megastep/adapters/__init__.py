@@ -2,7 +2,7 @@
 
 Each adapter is imported at its first use, and needs the extra of its name, such as
 ``pip install 'megastep-flatland[sb3]'``. Importing this package registers the environments with
-Gymnasium, if it is installed, as its entry point does.
+Gymnasium, if it is installed.
 """
 
 import importlib

@@ -1,5 +1,6 @@
 """Environments of megastep as Gymnasium's: a vector environment on the device, and one of N = 1."""
 
+import inspect
 from collections.abc import Mapping
 
 import gymnasium
@@ -9,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from megastep import envs
-from megastep.adapters.lanes import Lanes, ended, fresh
+from megastep.adapters.lanes import Copies, Lanes, ended, fresh
 from megastep.adapters.spaces import gymnasium_space, row, stacked, to_numpy, without_agents
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
@@ -17,6 +18,7 @@ from megastep.types import Env, Tree, optional
 __all__ = ["SingleEnv", "VectorEnv", "make_single", "make_vector"]
 
 FPS = 10
+OUTCOMES = "reward", "terminal", "truncated"
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
@@ -67,6 +69,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         fps = optional(env, "fps")
         self.metadata = dict(autoreset_mode=mode, render_modes=modes, render_fps=fps)
         self._ended = np.zeros(self.num_envs, bool)
+        self._stepped: tuple | None = None
 
     def reset(
         self, *, seed: Tree = None, options: Mapping[str, Tree] | None = None
@@ -99,24 +102,34 @@ class VectorEnv(gymnasium.vector.VectorEnv):
                 f"lane {int(self._ended.argmax())} has ended its episode: in DISABLED, begin the "
                 'next by reset(options={"reset_mask": mask}) before the next step'
             )
-        world, final = self.lanes.step(actions)
-        over = ended(final)
-        names = "reward", "terminal", "truncated"
-        parts = dict(zip(names, (final[name] for name in names)), over=over)
-        parts["metrics"] = dict(final.get("metrics", {}))
-        is_same_step = self.mode is AutoresetMode.SAME_STEP
+        stepped = self.lanes.step(actions)
         if self.to_numpy:
-            parts, obs = to_numpy(parts), self._converted(world["obs"])
-            self._ended = np.zeros_like(self._ended) if is_same_step else parts["over"]
-            infos = self._numpy_infos(parts, final) if parts["over"].any() else {}
-        else:
-            parts["obs"] = without_agents(self.env.obs_space, world["obs"])
-            if is_same_step:
-                parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
-            parts = fresh(parts) if self.copy else parts
-            obs = self._as_dtype(parts["obs"])
-            infos = self._infos(parts, self._as_dtype(parts.get("final_obs", {})))
-        return obs, parts["reward"], parts["terminal"], parts["truncated"], infos
+            return self._as_arrays(*stepped)
+        if stepped is not self._stepped:  # on a GPU the same each time
+            self._stepped, self._parts = stepped, self._tensors(*stepped)
+            self._copies = Copies(self._parts)
+        parts = self._copies() if self.copy else self._parts
+        infos = self._infos(parts, self._as_dtype(parts.get("final_obs", {})))
+        flags = parts["terminal"], parts["truncated"]
+        return self._as_dtype(parts["obs"]), parts["reward"], *flags, infos
+
+    def _tensors(self, world, final, over) -> dict[str, Tree]:
+        """Returns what a step returns, without copies."""
+        parts: dict[str, Tree] = {name: final[name] for name in OUTCOMES}
+        parts |= dict(over=over, metrics=dict(final.get("metrics", {})))
+        parts["obs"] = without_agents(self.env.obs_space, world["obs"])
+        if self.mode is AutoresetMode.SAME_STEP:
+            parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
+        return parts
+
+    def _as_arrays(self, world, final, over) -> tuple[Tree, Tree, Tree, Tree, dict[str, Tree]]:
+        parts = {name: final[name] for name in OUTCOMES}
+        parts = to_numpy(parts | dict(over=over, metrics=dict(final.get("metrics", {}))))
+        is_same_step = self.mode is AutoresetMode.SAME_STEP
+        self._ended = np.zeros_like(self._ended) if is_same_step else parts["over"]
+        infos = self._numpy_infos(parts, final) if parts["over"].any() else {}
+        flags = parts["terminal"], parts["truncated"]
+        return self._converted(world["obs"]), parts["reward"], *flags, infos
 
     def _converted(self, obs) -> Tree:
         obs = without_agents(self.env.obs_space, obs, self.dtype if self.to_numpy else None)
@@ -245,12 +258,19 @@ def make_vector(
     """Returns a :class:`VectorEnv` by its class name, for ``gymnasium.make_vec``. ``settings`` are
     the environment's. ``num_envs`` counts environments; several agents are that many lanes.
     """
-    env = envs.ENVS[name.lower()](num_envs, **settings)
+    env = _made(name, num_envs, settings)
     options: dict[str, Tree] = dict(to_numpy=to_numpy, dtype=dtype, copy=copy)
     return VectorEnv(env, autoreset_mode, render_mode=render_mode, **options)
 
 
 def make_single(name: str, render_mode: str | None = None, **settings: Tree) -> SingleEnv:
     """Returns a :class:`SingleEnv` by its class name, on the CPU, for ``gymnasium.make``."""
-    env = envs.ENVS[name.lower()](1, **{"device": "cpu"} | settings)
-    return SingleEnv(env, render_mode)
+    return SingleEnv(_made(name, 1, {"device": "cpu"} | settings), render_mode)
+
+
+def _made(name, n_envs, settings) -> Env:
+    kind = envs.ENVS[name.lower()]
+    names = [*inspect.signature(kind).parameters][1:]
+    if unknown := sorted(settings.keys() - {*names}):
+        raise ValueError(f"{name} has no setting {unknown[0]}: it has {', '.join(names)}")
+    return kind(n_envs, **settings)

@@ -12,10 +12,10 @@ from torch.utils import _pytree
 
 from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.capture import Captured, Graph, capture
+from megastep.capture import Graph, capture
 from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
-__all__ = ["Lanes", "ended", "fresh"]
+__all__ = ["Copies", "Lanes", "ended", "fresh"]
 
 WORD = 4  # bytes
 
@@ -25,19 +25,34 @@ def ended(world: World) -> torch.Tensor:
     return world["terminal"] | world["truncated"]
 
 
+class Copies:
+    """Copies a tree of tensors whose numbers change between the calls. On a GPU one kernel copies
+    all that fit.
+    """
+
+    def __init__(self, tree: Tree):
+        leaves, self._spec = _pytree.tree_flatten(tree)
+        fits = [leaf.is_cuda and _is_words(leaf) for leaf in leaves]
+        self._leaves = [(leaf, _words(leaf) if fit else None) for leaf, fit in zip(leaves, fits)]
+        self._words = [words for _, words in self._leaves if words is not None]
+
+    def __call__(self) -> Tree:
+        """Returns a copy as of now."""
+        copies = [
+            torch.empty_like(leaf) if words is not None else leaf.clone()
+            for leaf, words in self._leaves
+        ]
+        if self._words:
+            into = [
+                _words(copy) for copy, (_, words) in zip(copies, self._leaves) if words is not None
+            ]
+            torch._foreach_copy_(into, self._words)  # pyright: ignore[reportPrivateImportUsage]
+        return _pytree.tree_unflatten(copies, self._spec)
+
+
 def fresh(tree: Tree) -> Tree:
-    """Returns a copy of a tree of tensors, on a GPU by one kernel for all that fit."""
-    leaves, spec = _pytree.tree_flatten(tree)
-    copies = [torch.empty_like(leaf) for leaf in leaves]
-    pairs = [*zip(copies, leaves)]
-    words = [pair for pair in pairs if pair[0].is_cuda and all(map(_is_words, pair))]
-    if words:
-        into, given = ([_words(leaf) for leaf in side] for side in zip(*words))
-        torch._foreach_copy_(into, given)  # pyright: ignore[reportPrivateImportUsage]
-        pairs = [pair for pair in pairs if not all(map(_is_words, pair))]
-    for copy, leaf in pairs:
-        copy.copy_(leaf)
-    return _pytree.tree_unflatten(copies, spec)
+    """Returns a copy of a tree of tensors."""
+    return Copies(tree)()
 
 
 def _is_words(leaf) -> bool:
@@ -87,8 +102,8 @@ class Lanes:
         self.env, self.n_lanes, self.device = env, n_lanes(env), torch.device(env.device)
         self.takes_masks, self._is_same_step = takes_masks(env), same_step
         on_gpu = self.device.type == "cuda" and optional(env, "capturable")
-        self._on_gpu, self._captured = on_gpu, Captured(env)  # plain steps on a CPU
-        self._both, self._reset = None, cast(Callable, env.reset)
+        self._on_gpu, self._reset = on_gpu, cast(Callable, env.reset)
+        self._step: Callable | None = None
         self._resets: dict[int, Callable] = {}  # by their number of arguments
 
     @_in_plain_tensors
@@ -104,7 +119,6 @@ class Lanes:
         Raises:
             ValueError: naming what does not fit.
         """
-        is_recorded = any(isinstance(step, Graph) for step in (self._captured._step, self._both))
         if not self.takes_masks and seed is None and mask is None:
             return self.env.reset()
         if not self.takes_masks:
@@ -113,7 +127,7 @@ class Lanes:
                 "reset(seed=None, mask=None), see megastep.types.Env"
             )
         seeds = self._seeds(seed)
-        if not is_recorded:
+        if not isinstance(self._step, Graph):
             return self._reset(seed=seeds, mask=mask)
         # into the world that the graph of a step returns, by a graph too
         mask = (
@@ -166,27 +180,27 @@ class Lanes:
         return arrdict(actions=spaces.map(converted, self.env.action_space, actions))
 
     @_in_plain_tensors
-    def step(self, actions: Tree) -> tuple[World, World]:
-        """Returns (world, final world). With ``same_step``, the first has the first observation
-        where an episode ended, and the final world its last one; otherwise both are the same.
+    def step(self, actions: Tree) -> tuple[World, World, torch.Tensor]:
+        """Returns (world, final world, where an episode ended). With ``same_step``, the first has
+        the first observation where an episode ended, and the final world its last one; otherwise
+        both are the same. On a GPU the same objects each time.
         """
         decision = self.decision(actions)
-        if not self._is_same_step:
-            world = self._captured.step(decision)
-            return world, world
-        if not self._on_gpu:
-            return self._same_step(decision, bool)
-        if self._both is None:
-            self._both = capture(self._same_step, (decision,), (self.env,))
-        return self._both(decision)
+        if self._step is None:
+            step = self._same_step if self._is_same_step else self._next_step
+            self._step = capture(step, (decision,), (self.env,)) if self._on_gpu else step
+        return self._step(decision)
 
-    def _same_step(self, decision, is_needed=lambda any_ended: True) -> tuple[World, World]:
+    def _next_step(self, decision) -> tuple[World, World, torch.Tensor]:
         world = self.env.step(decision)
-        over = ended(world)
-        if not is_needed(over.any()):
-            return world, world
+        return world, world, ended(world)
+
+    def _same_step(self, decision) -> tuple[World, World, torch.Tensor]:
+        world, _, over = self._next_step(decision)
+        if not self._on_gpu and not over.any():
+            return world, world, over
         final = world.clone()
-        return self._reset(mask=over), final
+        return self._reset(mask=over), final, over
 
     def close(self) -> None:
         """Closes the environment."""

@@ -8,7 +8,7 @@ import numpy as np
 import pettingzoo
 import torch
 
-from megastep.adapters.lanes import Lanes, ended
+from megastep.adapters.lanes import Lanes
 from megastep.adapters.spaces import gymnasium_space, row, stacked, to_numpy, without_agents
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
@@ -76,9 +76,11 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         """Steps all agents. Returns (observations, rewards, terminations, truncations, infos) by
         agent.
         """
-        world, _ = self.lanes.step(stacked([actions[agent] for agent in self.possible_agents]))
+        world, _, ended = self.lanes.step(
+            stacked([actions[agent] for agent in self.possible_agents])
+        )
         over = optional(self.env, "game_over")
-        is_over = bool(ended(world).all() if over is None else over.all())
+        is_over = bool(ended.all() if over is None else over.all())
         names = "reward", "terminal", "truncated"
         values = to_numpy({name: world[name] for name in names})
         metrics = to_numpy(dict(world.get("metrics", {})))

@@ -2,7 +2,7 @@
 
 __all__ = ["IDS", "register"]
 
-#: Classes of :mod:`megastep.envs`. Here by name, since importing Gymnasium calls :func:`register`.
+#: Classes of :mod:`megastep.envs`. Here by name, since registering them imports none.
 IDS = {
     f"megastep/{name}-v0": name
     for name in ("Deathmatch", "Explorer", "Keys", "Memory", "Minimal", "PointGoal", "Pong")

@@ -6,7 +6,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from megastep import spaces
-from megastep.adapters.lanes import Lanes, ended
+from megastep.adapters.lanes import Lanes
 from megastep.types import Env, optional
 
 __all__ = ["RslRlVecEnv"]
@@ -56,11 +56,10 @@ class RslRlVecEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """Steps by actions (B, ``num_actions``). Returns (observations, rewards, dones, extras)."""
         actions = actions.detach().clamp(self.low, self.high)
-        self._world, final = self.lanes.step(actions)
-        over = ended(final)
+        self._world, final, over = self.lanes.step(actions)
         self.episode_length_buf = (self.episode_length_buf + 1).masked_fill(over, 0)
         extras = dict(time_outs=final["truncated"].clone())
-        return self._groups(self._world), final["reward"].clone(), over, extras
+        return self._groups(self._world), final["reward"].clone(), over.clone(), extras
 
     def _groups(self, world) -> TensorDict:
         groups = dict(policy=_flat(world["obs"]))

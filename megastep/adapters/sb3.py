@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecEnv
 
-from megastep.adapters.lanes import Lanes, ended
+from megastep.adapters.lanes import Lanes
 from megastep.adapters.spaces import gymnasium_space, row, to_numpy, without_agents
 from megastep.types import Env, Tree, optional
 
@@ -69,8 +69,8 @@ class SB3VecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Tree, np.ndarray, np.ndarray, list[dict]]:
         """Returns (observations, rewards, dones, infos)."""
-        world, final = self.lanes.step(self._actions)
-        over, truncated = to_numpy(ended(final)), to_numpy(final["truncated"])
+        world, final, ended = self.lanes.step(self._actions)
+        over, truncated = to_numpy(ended), to_numpy(final["truncated"])
         infos: list[dict] = [{} for _ in range(self.num_envs)]
         if over.any():
             last = self._observations(final)

@@ -78,7 +78,7 @@ class TorchRLEnv(EnvBase):
         return self._tensordict(world).exclude("reward")
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        world, _ = self.lanes.step(tensordict.get("action"))
+        world, *_ = self.lanes.step(tensordict.get("action"))
         return self._tensordict(world)
 
     def _set_seed(self, seed: int | None) -> None:

@@ -291,6 +291,20 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     return Path(np.concatenate(polygons), np.concatenate(codes))
 
 
+def room_outlines(lines: ArrayLike, lights: ArrayLike) -> list[list[list[float]]]:
+    """Returns the outlines of the rooms as closed polygons of points x, y in metres, rounded to
+    centimetres. What lies in an odd number of them is floor.
+
+    Args:
+        lines: (L, 2, 2) endpoints of walls in metres.
+        lights: (K, 2 or more), x and y first.
+    """
+    lines = np.ascontiguousarray(lines, np.float32)
+    path = _rooms(lines.tobytes(), _points(lights).tobytes())
+    polygons = path.to_polygons(closed_only=True)
+    return [np.round(polygon.astype(float), 2).tolist() for polygon in polygons]
+
+
 def _flooded(flood, wall) -> np.ndarray:
     """Returns all cells that are connected with ``flood``, (H, W) bool, but by no ``wall``."""
     while True:

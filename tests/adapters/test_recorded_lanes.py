@@ -55,9 +55,6 @@ def recorded(same_step, monkeypatch):
     graphs_on_cpu.install(monkeypatch)
     lanes = Lanes(Sums(), same_step)
     lanes._on_gpu = True
-    if not same_step:
-        decision = lanes.decision(torch.ones(N, dtype=torch.int64))
-        lanes._captured._step = capture.Graph(lanes.env.step, (decision,), (lanes.env,))
     return lanes
 
 
@@ -71,7 +68,6 @@ def test_any_order_of_calls_shows_what_plain_lanes_do(same_step, monkeypatch):
     generator, kinds = torch.Generator().manual_seed(1), torch.tensor([4.0, 2, 1, 1, 1])
     plain.reset(3)
     graphs.reset(3)
-    n_graphs = 0
     for _ in range(120):
         kind = int(torch.multinomial(kinds, 1, generator=generator))
         mask = torch.rand(N, generator=generator) < 0.4
@@ -85,6 +81,6 @@ def test_any_order_of_calls_shows_what_plain_lanes_do(same_step, monkeypatch):
         ]
         expected, shown = (calls[kind](lanes) for lanes in (plain, graphs))
         pairs = zip(expected, shown) if kind == 0 else [(expected, shown)]
-        assert all(contract.same(one, other) for one, other in pairs)
-        n_graphs = len(graphs._resets)
-    assert n_graphs == 2  # with seeds and without
+        assert all(contract.same({"": one}, {"": other}) for one, other in pairs)
+    recordings = [graphs._step, *graphs._resets.values()]  # a reset with seeds and one without
+    assert len(recordings) == 3 and all(isinstance(one, capture.Graph) for one in recordings)

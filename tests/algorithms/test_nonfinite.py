@@ -127,7 +127,7 @@ def bad_rollout(seed, n_lanes, n_bad, value, extra_row, to_gpu=torch.Tensor.cuda
     """Returns floats on a GPU. Some numbers of some lanes are bad, others large but allowed.
 
     Args:
-        n_bad: bad numbers per tensor, at random places.
+        n_bad: bad numbers per tensor, at random places; the second of imu at its end.
         value: the bad number, which may overflow in float16.
         extra_row: whether observations have T + 1 rows.
     """
@@ -146,6 +146,8 @@ def bad_rollout(seed, n_lanes, n_bad, value, extra_row, to_gpu=torch.Tensor.cuda
         leaf = torch.rand(shape, generator=generator).to(dtype)
         leaf.view(-1)[::7] = 0.99 * LIMIT if dtype == torch.float32 else 65_504.0
         places = torch.randint(leaf.numel(), (n_bad,), generator=generator)
+        if name == "imu":
+            places[1:2] = leaf.numel() - 1  # not in a whole word
         leaf.view(-1)[places] = torch.tensor(value).to(dtype)
         floats[name] = to_gpu(leaf)
     return floats
@@ -155,8 +157,8 @@ def bad_rollout(seed, n_lanes, n_bad, value, extra_row, to_gpu=torch.Tensor.cuda
     "n_lanes, n_bad, value",
     [
         *((3, 2, value) for value in (torch.nan, torch.inf, -torch.inf, 1.01 * LIMIT, -1e30)),
-        *((*shape, torch.nan) for shape in ((1, 1), (40, 2), (1100, 700))),
-        *((*shape, 1.01 * LIMIT) for shape in ((1, 1), (40, 2), (1100, 700))),
+        *((*shape, torch.nan) for shape in ((1, 1), (41, 2), (1100, 700))),
+        *((*shape, 1.01 * LIMIT) for shape in ((1, 1), (41, 2), (1100, 700))),
     ],
 )
 @pytest.mark.parametrize("extra_row", [False, True])

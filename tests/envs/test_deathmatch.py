@@ -10,7 +10,7 @@ import torch
 from megastep import arrdict, contract, core, engine, envs, modules, plotting, scene, toys
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine.outputs import Observation
-from megastep.envs.deathmatch.step import deathmatch_step
+from megastep.envs.deathmatch.step import actions_of_live, deathmatch_step
 from megastep.geometries import sample
 from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned, sound
 
@@ -52,9 +52,9 @@ ALL = dict(
 NOTHING = Observation(*len(Observation._fields) * [None])
 
 
-def fight(device, n_envs, n_agents, steps=30, **rules):
+def fight(device, n_envs, n_agents, steps=30, rounds=False, **rules):
     """Yields steps with random views, half of which show an agent: (inputs, outputs, positions,
-    angles).
+    angles), with `rounds` as long as an episode.
     """
     random = np.random.default_rng(n_agents)
     scenery = scene.scenery([toys.box()], n_agents, n_envs, device=device)
@@ -65,17 +65,22 @@ def fight(device, n_envs, n_agents, steps=30, **rules):
         ages=torch.zeros(n, dtype=torch.int32, device=device),
         ended=torch.ones(n, dtype=torch.bool, device=device),
     )
+    if rounds:
+        state["round_ages"] = torch.full((n_envs,), -1, dtype=torch.int32, device=device)
     for _ in range(steps):
         line = random.integers(-1, 16 * n_agents, lanes).astype(np.int32)
         ray = random.integers(-1, 512, lanes).astype(np.int32)
         positions, angles = random.uniform(-9, 9, (*lanes, 2)), random.uniform(-180, 180, lanes)
+        newly_seen = random.integers(0, 99, lanes).astype(np.int32)
         c.agents.positions.copy_(torch.from_numpy(positions))
         c.agents.angles.copy_(torch.from_numpy(angles))
         view = NOTHING._replace(
             centre_line=torch.from_numpy(line).to(device),
             agent_ray=torch.from_numpy(ray).to(device),
+            newly_seen=torch.from_numpy(newly_seen).to(device),
         )
-        inputs = dict(line=line, ray=ray, **{k: v.cpu().numpy().copy() for k, v in state.items()})
+        inputs = dict(line=line, ray=ray, newly_seen=newly_seen)
+        inputs |= dict(**{k: v.cpu().numpy().copy() for k, v in state.items()})
         out = deathmatch_step(scenery, c.agents, view, **state, **rules, privileged=True)._asdict()
         outputs = {k: v.cpu().numpy().copy() for k, v in (out | state).items() if v is not None}
         outputs |= dict(zip(METRICS, outputs["metrics"], strict=True))
@@ -89,7 +94,11 @@ def test_step_matches_twin_on_every_bit(rules, n_agents, device):
     for inputs, outputs, positions, angles in fight(device, 5, n_agents, **rules):
         for e in range(5):
             lanes = slice(e * n_agents, (e + 1) * n_agents)
-            state = {k: v[..., lanes] for k, v in inputs.items() if k not in ("line", "ray")}
+            state = {
+                k: v[..., lanes]
+                for k, v in inputs.items()
+                if k not in ("line", "ray", "newly_seen")
+            }
             expected = hits_of(
                 inputs["line"][e], inputs["ray"][e], **state, n_model=8, res=512, rules=ALL | rules
             )
@@ -101,6 +110,43 @@ def test_step_matches_twin_on_every_bit(rules, n_agents, device):
             np.testing.assert_allclose(outputs["privileged"][lanes, 0], close, rtol=0, atol=2e-6)
             dead += int(expected["terminal"].sum())
     assert dead > 5
+
+
+def test_rounds_and_search_match_pytorch_on_every_bit(device):
+    """Against the step without them, and the operations that a round's end and the reward take."""
+    steps = fight(device, 5, 3, limit=7, damage=0.31)
+    with_rounds = fight(device, 5, 3, limit=7, damage=0.31, search_reward=0.37, rounds=True)
+    rounds, n_over = torch.full((5,), -1, dtype=torch.int32), 0
+    for (before, plain, *_), (inputs, outputs, *_) in zip(steps, with_rounds, strict=True):
+        if not all((inputs[name] == before[name]).all() for name in before):
+            break  # the round's end has changed who begins an episode
+        step = {name: torch.from_numpy(values) for name, values in plain.items()}
+        rounds += 1
+        over = (rounds >= 7) & ~step["reset"].view(5, 3).any(1)
+        rounds = rounds.masked_fill(over, -1)
+        over = over[:, None].expand(5, 3).flatten()
+        kills, damage, hits, _ = step["tally"]
+        so_far = torch.stack([kills, torch.zeros(15), damage, hits / step["ages"]])
+        search = torch.from_numpy(inputs["newly_seen"]).flatten() * 0.37
+        expected = dict(
+            reward=step["reward"] + search.masked_fill(step["reset"], 0.0),
+            metrics=torch.where(over & ~step["ended"], so_far, step["metrics"]),
+            truncated=step["truncated"] | (over & ~step["terminal"]),
+            ended=step["ended"] | over,
+            round_ages=rounds,
+        )
+        n_over += int(over.sum())
+        for name, values in expected.items():
+            assert (torch.from_numpy(outputs[name]) == values).all(), name
+    assert n_over >= 3
+
+
+def test_actions_of_ended_lanes_are_nothing(device):
+    ended = torch.tensor([False, True, True, False], device=device)
+    actions = torch.tensor([[3], [4], [0], [6]], device=device)
+    assert actions_of_live(actions, ended).tolist() == [[3], [0], [0], [6]]
+    with pytest.raises(ValueError, match="actions"):
+        actions_of_live(actions[:3], ended)
 
 
 def test_optional_outputs_are_left_out():

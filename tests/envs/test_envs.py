@@ -357,9 +357,9 @@ class Launches(TorchDispatchMode):
         ("explorer", 0),
         ("explorer, privileged", 0),
         ("explorer, cameras", 0),
-        ("deathmatch", 1),
-        ("deathmatch, privileged", 1),
-        ("deathmatch, all rules", 4),  # three of them for search_reward
+        ("deathmatch", 0),
+        ("deathmatch, privileged", 0),
+        ("deathmatch, all rules", 0),
         ("pointgoal", 1),
         ("pointgoal, cameras", 1),
         ("pong", 0),

@@ -55,6 +55,7 @@ def fixture(device):
         points=torch.full((D, 4, 2), 3.0, device=device),
         out=torch.zeros((N * A, 4), device=device),
         games=torch.zeros((GAME_FIELDS, N), dtype=torch.int32, device=device),
+        rounds=torch.zeros(N, dtype=torch.int32, device=device),
         actions=torch.zeros((N, 1), dtype=torch.int64, device=device),
         error_flag=torch.zeros(1, dtype=torch.int32, device=device),
         goals=GoalFields(**goal_fields(scenery.device)),
@@ -329,7 +330,8 @@ def operations(f):
         deathmatch_step,
         dict(
             scenery=f.scenery, agents=f.one_camera, view=f.view, health=f.health, tally=f.tally,
-            ages=f.ages, ended=f.ended, limit=9, aim_reward=1.0, privileged=True,
+            ages=f.ages, ended=f.ended, round_ages=f.rounds, limit=9, aim_reward=1.0,
+            privileged=True,
         ),
         dict(
             OPERANDS,
@@ -339,7 +341,8 @@ def operations(f):
                 ("damage", "recovery", "drain", "health_per_hit", "hearing"), numbers(-0.1)
             ),
             **dict.fromkeys(("hit_reward", "wound_cost", "kill_reward", "death_cost"), numbers()),
-            aim_reward=numbers(),
+            **dict.fromkeys(("aim_reward", "search_reward"), numbers()),
+            round_ages=optional_tensors,
             limit=limits,
             privileged=flags,
         ),

@@ -25,7 +25,7 @@ LOCKED = [Requirement(re.split(r" \\\n", block)[0]) for block in BLOCKS]
 
 
 def in_project():
-    """The requirements of pyproject.toml, with those of the extra `test` and of what it includes."""
+    """The requirements of pyproject.toml, with those of the extra `test` and what it includes."""
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 cannot read TOML")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras, wanted = project["optional-dependencies"], [*project["dependencies"]]

@@ -29,7 +29,7 @@ class Oracle:
 
     def __init__(self, env: Any, otherwise: Any = None):
         self.steering = Steering(env, block=BLOCK)
-        self.otherwise = None if otherwise is None else otherwise(env, self.steering)
+        self.otherwise: Any = None if otherwise is None else otherwise(env, self.steering)
         if not hasattr(env, "cue"):
             raise ValueError(f"it finds the object of env.cue, and {type(env).__name__} has no cue")
         self.cue, self.positions = env.cue, env.objects.all.positions

@@ -18,7 +18,13 @@ from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.envs.common import SceneryEnv
 from megastep.envs.deathmatch.bot import Bot
-from megastep.envs.deathmatch.step import MAX_AGENTS, TALLY_ROWS, deathmatch_step, privileged_size
+from megastep.envs.deathmatch.step import (
+    MAX_AGENTS,
+    TALLY_ROWS,
+    actions_of_live,
+    deathmatch_step,
+    privileged_size,
+)
 from megastep.scene import scenery, spread
 from megastep.schedules import Number, Scheduled
 from megastep.settings import MAX_ENVS, checked
@@ -169,6 +175,7 @@ class Deathmatch(SceneryEnv):
             drain=drain / fps,
             health_per_hit=health_per_hit,
             limit=limit,
+            search_reward=search_reward / modules.TEXELS_PER_POINT,
             hearing=hearing,
         )
         self.weights = Coefficients(
@@ -183,7 +190,7 @@ class Deathmatch(SceneryEnv):
         words = -(-homes.layouts.max_texels // 32) if search_reward else 0
         bytes_per_lane = 8 * pixels + 4 * n_privileged * privileged + 4 * words + 128
         engine.fit(n_envs, n_agents * bytes_per_lane, self.device)
-        self.search_reward, self.seen = search_reward, None
+        self.seen = None
         if search_reward:
             shape = n_envs, n_agents, words
             self.seen = torch.zeros(shape, dtype=torch.int32, device=self.device)
@@ -220,8 +227,8 @@ class Deathmatch(SceneryEnv):
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         n_lanes = len(self.ended)
         actions = checks.lanes("actions", decision["actions"], n_lanes, self.device)
-        actions = actions.reshape(n_lanes, 1).masked_fill(self.ended[:, None], 0)
-        self.movement(dict(actions=actions))
+        actions = actions.reshape(n_lanes, 1).long().contiguous()
+        self.movement(dict(actions=actions_of_live(actions, self.ended)))
         return self._resets.keep(self._world())
 
     def _world(self, **rules) -> arrdict:
@@ -238,48 +245,24 @@ class Deathmatch(SceneryEnv):
             self.tally,
             self.ages,
             self.ended,
+            self.round_ages,
             privileged=self.privileged_space is not None,
             **self.rules | rules,
             **self.weights.tensors,
         )
-        reward = step.reward
-        if self.seen is not None:
-            assert view.newly_seen is not None
-            search = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
-            reward = reward + search.masked_fill_(step.reset, 0.0)
-        truncated, metrics = step.truncated, step.metrics
-        if self.round_ages is not None:
-            truncated, metrics = self._end_rounds(step)
         world = arrdict(
             obs=arrdict(self._images(view), health=step.health_obs),
-            reward=reward,
+            reward=step.reward,
             reset=step.reset,
             terminal=step.terminal,
-            truncated=truncated,
-            metrics=arrdict(zip(METRICS, metrics.unbind())),
+            truncated=step.truncated,
+            metrics=arrdict(zip(METRICS, step.metrics.unbind())),
         )
         if step.sound is not None:
             world.obs["sound"] = step.sound
         if step.privileged is not None:
             world["privileged"] = step.privileged
         return world
-
-    def _end_rounds(self, step) -> tuple[torch.Tensor, torch.Tensor]:
-        """Ends every episode of the environments whose round is over, but not while one begins.
-
-        Returns `truncated` and the metrics with those episodes in them.
-        """
-        assert self.round_ages is not None
-        shape = self.n_envs, self.n_agents
-        over = self.round_ages.add_(1) >= self.rules["limit"]
-        over &= ~step.reset.view(shape).any(1)
-        self.round_ages.masked_fill_(over, -1)
-        over = over[:, None].expand(shape).flatten()
-        kills, damage, hits, _ = self.tally
-        so_far = torch.stack([kills, torch.zeros_like(kills), damage, hits / self.ages])
-        metrics = torch.where(over & ~self.ended, so_far, step.metrics)
-        self.ended |= over
-        return step.truncated | (over & ~step.terminal), metrics
 
     def _search_arguments(self) -> dict[str, torch.Tensor]:
         """The arguments of observe that count newly seen texels, if search_reward is not 0."""

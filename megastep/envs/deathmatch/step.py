@@ -17,7 +17,7 @@ from megastep.kernels.build.launch import launch
 
 __all__ = [
     *("MAX_AGENTS", "LIBRARY", "TALLY_ROWS"),
-    *("DeathmatchStep", "deathmatch_step", "privileged_size"),
+    *("DeathmatchStep", "actions_of_live", "deathmatch_step", "privileged_size"),
 ]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
@@ -45,6 +45,25 @@ def privileged_size(n_agents: int) -> int:
     return 1 + LIBRARY.constants["PRIVILEGED_PER_OPPONENT"] * (n_agents - 1)
 
 
+def actions_of_live(actions: torch.Tensor, ended: torch.Tensor) -> torch.Tensor:
+    """Returns the actions (B, 1) int64 that a step takes: 0 where an episode has ended.
+
+    Args:
+        actions: (B, 1) int64.
+        ended: (B,) bool, lanes whose episode ended in the last step.
+    """
+    n, device = len(ended), ended.device
+    out = torch.empty((n, 1), dtype=torch.int64, device=device)
+    launch(
+        *(LIBRARY, "actions_of_live", device, n),
+        actions=checks.address("actions", actions, (n, 1), torch.int64, device),
+        ended=checks.address("ended", ended, (n,), torch.bool, device),
+        out=out,
+        n_lanes=n,
+    )
+    return out
+
+
 def deathmatch_step(
     scenery: Scenery,
     agents: Agents,
@@ -53,6 +72,7 @@ def deathmatch_step(
     tally: torch.Tensor,
     ages: torch.Tensor,
     ended: torch.Tensor,
+    round_ages: torch.Tensor | None = None,
     *,
     damage: float = 0.1,
     recovery: float = 0.0,
@@ -64,6 +84,7 @@ def deathmatch_step(
     kill_reward: float | torch.Tensor = 0.0,
     death_cost: float | torch.Tensor = 0.0,
     aim_reward: float | torch.Tensor = 0.0,
+    search_reward: float = 0.0,
     hearing: float = 0.0,
     privileged: bool = False,
 ) -> DeathmatchStep:
@@ -72,13 +93,17 @@ def deathmatch_step(
 
     Args:
         view: from :func:`~megastep.engine.observe` with one camera per agent and ``centre_line``;
-            with ``agent_ray`` too if ``aim_reward`` is not 0.
+            with ``agent_ray`` too if ``aim_reward`` is not 0, and ``newly_seen`` if
+            ``search_reward`` is not.
         health: (B,) float32, from 0 to 1, updated in place.
         tally: (4, B) float32, updated in place: kills, damage and hits of the episode so far, and
             how well the agent aimed in the last step.
         ages: (B,) int32, steps since the first observation, updated in place.
         ended: (B,) bool, updated in place. In: lanes that start an episode in this step. Out: lanes
             whose episode ends in this step.
+        round_ages: (N,) int32, steps of the round, -1 if the next step begins one, updated in
+            place. When they reach ``limit``, all episodes of the environment are truncated, but not
+            while one begins. None: there are no rounds.
         damage: health that a hit costs its target.
         recovery: health regained in a step without a wound.
         drain: health lost in every step.
@@ -90,6 +115,7 @@ def deathmatch_step(
         death_cost: per death.
         aim_reward: for bringing another agent from the edge of the view to its centre; taken back
             as far as it leaves again.
+        search_reward: per texel that ``view.newly_seen`` counts.
         hearing: metres at which the sound of the nearest other agent fades. 0: no sound.
         privileged: compute the privileged observation.
 
@@ -109,7 +135,7 @@ def deathmatch_step(
     rewards = dict(hit_reward=hit_reward, wound_cost=wound_cost, kill_reward=kill_reward)
     rewards |= dict(death_cost=death_cost, aim_reward=aim_reward)
     not_negative = dict(health_rules, hearing=hearing)
-    for name, value in not_negative.items():
+    for name, value in dict(not_negative, search_reward=search_reward).items():
         checks.number(name, value, -math.inf, math.inf)
     rewards = {name: checks.weight(name, value, device) for name, value in rewards.items()}
     for name, value in not_negative.items():
@@ -119,6 +145,11 @@ def deathmatch_step(
     is_scheduled = isinstance(aim_reward, torch.Tensor)
     if view.agent_ray is not None if is_scheduled else aim_reward:
         agent_ray = checks.address("view.agent_ray", view.agent_ray, lanes, torch.int32, device)
+    newly_seen = rounds = 0
+    if search_reward:
+        newly_seen = checks.address("view.newly_seen", view.newly_seen, lanes, torch.int32, device)
+    if round_ages is not None:
+        rounds = checks.address("round_ages", round_ages, (n,), torch.int32, device)
     if checks.flag("privileged", privileged) or hearing:
         poses = state_params(scenery, agents, "positions", "angles")
     flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
@@ -140,6 +171,8 @@ def deathmatch_step(
             "view.centre_line", view.centre_line, lanes, torch.int32, device
         ),
         agent_ray=agent_ray,
+        newly_seen=newly_seen,
+        round_ages=rounds,
         **poses,
         health=checks.address("health", health, (n_lanes,), torch.float32, device),
         tally=checks.address("tally", tally, (TALLY_ROWS, n_lanes), torch.float32, device),
@@ -148,6 +181,7 @@ def deathmatch_step(
         **out._asdict(),
         **not_negative,
         **rewards,
+        search_reward=search_reward,
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
         res=agents.res,
         n_envs=n,

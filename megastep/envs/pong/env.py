@@ -75,6 +75,7 @@ class Pong(DisplayedEnv):
     """
 
     fps, bot = 30.0, Tracker
+    controls = {"ArrowUp": 1, "ArrowDown": 2}
 
     @checked
     def __init__(

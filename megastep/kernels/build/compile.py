@@ -8,6 +8,7 @@ flags, compiler and processor.
 import ctypes
 import functools
 import hashlib
+import json
 import os
 import platform
 import re
@@ -15,7 +16,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +24,15 @@ import torch
 
 from megastep import cache
 from megastep.kernels.build.forks import end_threads_at_forks
-from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
+from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary
 
 if TYPE_CHECKING:
     from ctypes import CDLL
 
-__all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
+__all__ = [
+    *("EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"),
+    *("wasm", "wasm_key", "wasm_keys", "wasm_tools"),
+]
 
 
 class EngineError(RuntimeError):
@@ -148,6 +152,103 @@ def _load(name, body, path) -> "CDLL":
             f"({error}): set MEGASTEP_CACHE to a private folder with free space on a mount that is "
             f"not noexec."
         ) from None
+
+
+# ---- WebAssembly ----
+
+#: Name of the section of a module that holds {operation: the `wasm_key` of its library}.
+WASM_SECTION = "megastep"
+
+
+def wasm_key(library: KernelLibrary) -> str:
+    """Returns a hash of a library's sources for the CPU and of clang's flags."""
+    files = library.sources(".h", ".cpp")
+    return _key(*files, *files.values(), *WASM_FLAGS)
+
+
+def wasm(
+    operations: Mapping[KernelLibrary, Sequence[str]], flags: tuple[str, ...] = WASM_FLAGS
+) -> bytes:
+    """Returns CPU operations of several libraries as one WebAssembly module, which imports nothing,
+    and exports them, `malloc` and its memory.
+
+    It computes the same bits as the CPU. Structs hold pointers of 4 bytes, see
+    :func:`~megastep.kernels.build.headers.words`.
+
+    Raises:
+        EngineError: if clang or its libraries for WebAssembly are missing, or cannot build them.
+    """
+    command, version = wasm_tools()
+    keys = {name: wasm_key(library) for library, names in operations.items() for name in names}
+    if len(keys) < sum(map(len, operations.values())):
+        names = sorted(name for names in operations.values() for name in names)
+        twice = next(name for name, other in zip(names, names[1:]) if name == other)
+        raise EngineError(f"Two kernel libraries define the operation {twice}: rename one.")
+    key = _key(json.dumps(keys), *flags, command, version)
+    return cache.fetch(f"wasm-{key}.wasm", lambda: _build_wasm(operations, command, flags, keys))[0]
+
+
+def wasm_keys(module: bytes) -> dict[str, str]:
+    """Returns {operation: the `wasm_key` of its library} of a module that `wasm` built."""
+    head = WASM_SECTION.encode()
+    start = module.rindex(bytes([len(head)]) + head) + 1 + len(head)
+    return json.loads(module[start:])
+
+
+def wasm_tools() -> tuple[str, str]:
+    """Returns the path of a clang++ that builds WebAssembly, and its version as text.
+
+    Raises:
+        EngineError: if there is none.
+    """
+    folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
+    names = {"clang++": 0, **{f"clang++-{version}": version for version in range(14, 40)}}
+    found = [folder / name for name in names for folder in folders if (folder / name).is_file()]
+    for path in found:
+        suffix = path.name.removeprefix("clang++")
+        if any(shutil.which(name) for name in (f"wasm-ld{suffix}", "wasm-ld")):
+            return str(path), _run([str(path), "--version"]).stdout
+    raise EngineError(
+        "Kernels for a browser are built by clang, and clang++ or wasm-ld is missing: install them "
+        "with WebAssembly's libraries (Debian: apt install clang lld wasi-libc libc++-dev-wasm32 "
+        "libclang-rt-dev-wasm32)."
+    )
+
+
+def _build_wasm(operations, command, flags, keys) -> bytes:
+    linked = [f"-Wl,--export={name}" for name in ("malloc", *keys)]
+    with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+        objects = []
+        for i, library in enumerate(operations):
+            for name in library.sources(".cpp"):
+                objects.append(str(Path(folder) / f"{i}-{name.replace('/', '-')}.o"))
+                source = str(library.folder / name)
+                _run_clang([command, *flags, f"-I{KERNELS}", "-c", source, "-o", objects[-1]])
+        out = Path(folder) / "kernels.wasm"
+        # without -O: clang would have a wasm-opt that it finds change what it built
+        options = "--target=wasm32-wasi", "-mexec-model=reactor", "-Wl,--strip-all"
+        _run_clang([command, *options, *linked, *objects, "-o", str(out)])
+        return out.read_bytes() + _section(WASM_SECTION.encode(), json.dumps(keys).encode())
+
+
+def _section(name: bytes, content: bytes) -> bytes:
+    """Returns a custom section of a WebAssembly module."""
+    content = bytes([len(name)]) + name + content
+    size, length = [], len(content)
+    while not size or length:  # seven bits a byte, the lowest first
+        size.append(length % 128 | (128 if length > 127 else 0))
+        length >>= 7
+    return bytes([0, *size]) + content
+
+
+def _run_clang(command) -> None:
+    process = _run(command)
+    if process.returncode:
+        raise EngineError(
+            f"{command[0]} could not build kernels for a browser; it needs lld and WebAssembly's "
+            f"libraries (Debian: apt install lld wasi-libc libc++-dev-wasm32 "
+            f"libclang-rt-dev-wasm32). Its output: {' '.join(process.stderr.split())[:500]}"
+        )
 
 
 # ---- The GPU ----

@@ -12,9 +12,11 @@ Three kinds of declarations are recognised:
 import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-__all__ = ["constants", "early_operations", "operations", "packer", "struct_fields"]
+__all__ = [
+    *("Word", "constants", "early_operations", "operations", "packer", "struct_fields", "words"),
+]
 
 FORMATS = {"int": "i", "float": "f", "unsigned int": "I"}  # characters of the module struct
 INT = re.compile(r"constexpr\s+int\s+(\w+)\s*=\s*(-?(?:0|[1-9]\d*));")
@@ -73,6 +75,53 @@ def _field(line, formats, header) -> tuple[str, str]:
             f"of them."
         )
     return match[3], "P" if match[2] else formats[kind]
+
+
+class Word(NamedTuple):
+    """A pointer or number of a struct.
+
+    Attributes:
+        name: of the field, such as `radius`, or `scenery.radius` in a struct that is a field.
+        kind: its format, of the module struct.
+        offset: in bytes, with pointers of this machine.
+    """
+
+    name: str
+    kind: str
+    offset: int
+
+
+def words(sources: Mapping[str, str]) -> dict[str, list[Word]]:
+    """Returns all pointers and numbers of every struct ``...Params``, in order, those of structs
+    that are fields too.
+
+    Where pointers take 4 bytes, as in WebAssembly, a struct is an array of them, 4 bytes each.
+
+    Raises:
+        ValueError: as `struct_fields`.
+    """
+    structs, found = struct_fields(sources), {}
+    for text in sources.values():
+        for name, body in STRUCT.findall(_without_comments(text)):
+            found[name], before = [], ""
+            for line, (field, kind) in zip(body.split(";"), structs[name]):
+                before += kind
+                match = FIELD.fullmatch(line.strip())
+                inner = None if match is None else match[1].replace("const", "").strip()
+                if kind.endswith("s") and inner is not None:
+                    size = int(kind[2:-1])
+                    start, count = struct.calcsize(before) - size, int((match and match[4]) or 0)
+                    for i in range(count or 1):
+                        title = f"{field}.{i}" if count else field
+                        at = start + i * (size // (count or 1))
+                        found[name] += [
+                            Word(f"{title}.{word.name}", word.kind, at + word.offset)
+                            for word in found[inner]
+                        ]
+                else:
+                    offset = struct.calcsize(before) - struct.calcsize(kind)
+                    found[name].append(Word(field, kind, offset))
+    return found
 
 
 def packer(fields: Fields) -> struct.Struct:

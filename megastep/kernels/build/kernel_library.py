@@ -8,7 +8,10 @@ from typing import Any
 
 from megastep.kernels.build import headers
 
-__all__ = ["CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "KernelLibrary"]
+__all__ = [
+    *("CPU_FLAGS", "CUDA_FLAGS", "FAST_CUDA_FLAGS", "KERNELS", "SCALAR_WASM_FLAGS", "WASM_FLAGS"),
+    "KernelLibrary",
+]
 
 #: The folder of the engine's kernels. Its headers in ``common/`` are for all kernel libraries.
 KERNELS = Path(__file__).parents[1]
@@ -25,6 +28,21 @@ CPU_FLAGS = (
     "-shared",
     "-fPIC",
 )
+#: clang's flags for WebAssembly without vectors. As the CPU's, with one thread, and small.
+SCALAR_WASM_FLAGS = (
+    "--target=wasm32-wasi",
+    "-std=c++17",
+    "-Os",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp-simd",
+    "-fno-exceptions",
+    "-fno-rtti",
+    "-w",
+)
+#: The same with vectors of 128 bits. Never relaxed ones, whose results depend on the processor.
+WASM_FLAGS = (*SCALAR_WASM_FLAGS, "-msimd128")
 #: NVRTC's flags, without the architecture. No fused multiply-adds and IEEE division, so that the
 #: GPU computes the same bits as the CPU.
 CUDA_FLAGS = (
@@ -55,6 +73,8 @@ class KernelLibrary:
 
     Attributes:
         constants: {name: number} from ``constants.h``, the folder's and the common one.
+        words: {struct: its pointers and numbers}, as
+            :func:`~megastep.kernels.build.headers.words` returns them.
         packers: {struct: function of {field: value} that packs one}, as
             :func:`~megastep.kernels.build.headers.builder` returns it.
         params: a function for each struct; ``params.RowParams(n=64, ...)`` packs one that is a
@@ -79,6 +99,10 @@ class KernelLibrary:
     @cached_property
     def constants(self) -> dict[str, Any]:
         return headers.constants(self.sources(".h"))
+
+    @cached_property
+    def words(self) -> dict[str, list[headers.Word]]:
+        return headers.words(self.sources(".h"))
 
     @cached_property
     def packers(self) -> dict[str, Callable[[Mapping[str, object]], bytes]]:

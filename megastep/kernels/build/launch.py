@@ -1,7 +1,9 @@
 """Launches an operation of a kernel library on the device where its tensors are."""
 
+import contextlib
 import ctypes
 import functools
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -9,7 +11,7 @@ import torch
 from megastep.kernels.build.compile import EngineError, bindings, check_status, cpu, cuda
 from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
 
-__all__ = ["ENGINE", "Blocks", "launch"]
+__all__ = ["ENGINE", "Blocks", "launch", "observed"]
 
 #: The engine's operations.
 ENGINE = KernelLibrary(KERNELS)
@@ -20,6 +22,9 @@ MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
 USUAL_SHARED = 48 * 1024  # bytes of dynamic shared memory that any kernel may have
 #: {(kernel, GPU): bytes} of those that have more.
 _ALLOWED_SHARED: dict[tuple[object, int], int] = {}
+Observer = Callable[[KernelLibrary, str, bytes], None]
+#: What is told of launches on a CPU.
+_OBSERVERS: list[Observer] = []
 
 
 class Blocks(NamedTuple):
@@ -66,7 +71,10 @@ def launch(
         struct = library.cpu_operations.get(operation)
         if struct is None:
             raise _missing(library, operation, ".cpp", "a GPU (device=cuda)")
-        cpu(library)[operation](library.packers[struct](fields))
+        packed = library.packers[struct](fields)
+        for observer in _OBSERVERS:
+            observer(library, operation, packed)
+        cpu(library)[operation](packed)
         return
     blocks = shape if isinstance(shape, Blocks) else (-(-shape // BLOCK), 1, BLOCK, 0)
     x, y, n_threads, shared = blocks
@@ -95,6 +103,16 @@ def launch(
             make_current(index)
             status = driver.cuLaunchKernelEx(*call)
     check_status(status, f"Launching {operation}")
+
+
+@contextlib.contextmanager
+def observed(observer: Observer) -> Iterator[None]:
+    """Calls ``observer(library, operation, packed struct)`` before each launch on a CPU."""
+    _OBSERVERS.append(observer)
+    try:
+        yield
+    finally:
+        _OBSERVERS.remove(observer)
 
 
 def _missing(library, operation, suffix, other) -> EngineError:

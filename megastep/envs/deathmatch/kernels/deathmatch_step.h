@@ -98,6 +98,8 @@ HD void finish_step(const DeathmatchStepParams& p, int first, int a, const Hits&
     float wounds = (float)hits.wounds[a];
     float reward = *p.hit_reward * hit - *p.wound_cost * wounds + *p.kill_reward * kill -
                    *p.death_cost * (float)dies + *p.aim_reward * gain_of_aim(p, i);
+    if (p.newly_seen)
+        reward += (float)p.newly_seen[i] * p.search_reward;
     p.reward[i] = reset ? 0.f : reward;
     p.reset[i] = (unsigned char)reset;
     p.terminal[i] = (unsigned char)(ends && dies);
@@ -154,6 +156,28 @@ HD void write_privileged(const DeathmatchStepParams& p, int first, int a) {
     }
 }
 
+// Counts a step of the round. At its end, ends the episodes of all agents, but not while one
+// begins.
+HD void end_round(const DeathmatchStepParams& p, int env) {
+    int first = env * p.n_agents, is_over = ++p.round_ages[env] >= p.limit;
+    long long n = (long long)p.n_envs * p.n_agents;
+    for (int i = first; i < first + p.n_agents; i++)
+        is_over = is_over && !p.reset[i];
+    if (!is_over)
+        return;
+    p.round_ages[env] = -1;
+    for (int i = first; i < first + p.n_agents; i++) {
+        if (!p.ended[i]) {
+            p.metrics[i] = p.tally[i];
+            p.metrics[n + i] = 0.f;
+            p.metrics[2 * n + i] = p.tally[n + i];
+            p.metrics[3 * n + i] = p.tally[2 * n + i] / (float)p.ages[i];
+            p.ended[i] = 1;
+        }
+        p.truncated[i] = !p.terminal[i];
+    }
+}
+
 // One step of one environment.
 HD void deathmatch_env(const DeathmatchStepParams& p, int env) {
     int first = env * p.n_agents;
@@ -163,6 +187,8 @@ HD void deathmatch_env(const DeathmatchStepParams& p, int env) {
         update_health(p, first, a, hits);
     for (int a = 0; a < p.n_agents; a++)
         finish_step(p, first, a, hits);
+    if (p.round_ages)
+        end_round(p, env);
     for (int a = 0; a < p.n_agents; a++) {
         if (p.sound)
             write_sound(p, first, a);

@@ -6,11 +6,13 @@
 struct DeathmatchStepParams {
     const int* centre_line;  // (N, A) line at the centre of each view, as Render.indices
     const int* agent_ray;    // (N, A) ray closest to the centre that hits an agent, or -1
+    const int* newly_seen;   // (N, A) texels seen for the first time; null: they earn nothing
     const float* positions;  // (N, A, 2) for sound and privileged
     const float* angles;     // (N, A) for sound and privileged
     float* health;           // (N, A) in and out, as the next three: from 0 to 1
     float* tally;            // (TALLY_ROWS, N, A): kills, damage, hits so far; aim in the last step
     int* ages;               // (N, A) steps since the first observation
+    int* round_ages;         // (N) steps of the round, -1: the next begins one; null: no rounds
     unsigned char* ended;    // (N, A) in: starts an episode in this step; out: ends it in this step
     float* reward;           // (N, A) out, as the next six
     unsigned char* reset;    // (N, A)
@@ -29,6 +31,7 @@ struct DeathmatchStepParams {
     const float* kill_reward;
     const float* death_cost;
     const float* aim_reward;  // for bringing an agent from the edge of the view to its centre
+    float search_reward;      // per newly seen texel
     float hearing;            // metres at which sounds fade
     int limit;                // steps per episode
     int res;                  // rays per view
@@ -36,6 +39,14 @@ struct DeathmatchStepParams {
     int n_agents;             // A
     int n_model;              // M
     int n_threads;            // CPU threads
+};
+
+// The actions of B lanes as the step takes them: 0 where an episode has ended.
+struct ActionsOfLiveParams {
+    const long long* actions;    // (B)
+    const unsigned char* ended;  // (B)
+    long long* out;              // (B)
+    int n_lanes;
 };
 
 // B lanes, R pixels.

@@ -1,0 +1,77 @@
+"""megastep web run=RUN: a page that plays a trained agent in a browser, from one file."""
+
+from pathlib import Path
+
+from megastep.agents import console
+from megastep.agents.cli import plain_words
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.runs import folders
+
+HELP = """Writes a page that plays a trained agent in a browser, from one file without a server.
+
+  megastep web run=RUN                 RUN/page.html; a packaged agent: NAME.html here
+  megastep web run=RUN homes=[3,7]     in these homes of split=test; default: the first four
+  megastep web run=RUN against=OTHER   two agents, the other one of another run
+  megastep web run=RUN seed=5          the seed of the first episodes
+  megastep web run=RUN file=x.html     into this file, overwritten if it exists
+
+The page has keys to play, pause and step, and to drive an agent yourself. docs/web.md says how to
+put it on a site of your own."""
+
+
+def main(words: list[str]) -> int:
+    """Writes the page that the words of a command line ask for. Returns the exit code."""
+    if not words or words[0] in ("-h", "--help"):
+        console.say(HELP)
+        return 0 if words else 2
+    keys = {"run": False, "against": False, "homes": True, "seed": False, "file": False}
+    given = plain_words.parse(words, keys)
+    if "run" not in given:
+        raise UserError("run is missing; run=latest takes the newest run")
+    run = given["run"][0]
+    write(
+        run,
+        *given.get("against", [None]),
+        homes=[_number("homes", text) for text in given["homes"]] if "homes" in given else None,
+        seed=_number("seed", given.get("seed", ["1"])[0]),
+        file=given["file"][0] if "file" in given else None,
+    )
+    return 0
+
+
+def write(
+    run: str,
+    against: str | None = None,
+    homes: list[int] | None = None,
+    seed: int = 1,
+    file: str | None = None,
+) -> Path:
+    """Writes a page, and says where and how large it is. Returns its path.
+
+    Args:
+        file: default: one in the run's folder, or here of a packaged agent.
+        run, against, homes, seed: as for `megastep.agents.export.web.make`.
+
+    Raises:
+        UserError: the page cannot be made, or the file not written.
+    """
+    source = folders.find(run)
+    own = folders.folder_of(source) / "page.html"
+    path = own if file is None else Path(file)
+    if path.suffix != ".html":
+        raise UserError(f"file={path} is no page; its name ends with .html")
+    from megastep.agents.export import web  # with PyTorch
+    from megastep.agents.runs.atomic_files import make_folders, write_atomically
+
+    text = web.make(run, against, homes, seed)
+    with user_errors(f"{path} cannot be written: "):
+        make_folders(path.parent)
+        write_atomically(path, text.encode())
+    console.say(f"Wrote {path}, {len(text) / 1e6:.2f} MB: open it in a browser")
+    return path
+
+
+def _number(key: str, text: str) -> int:
+    if not text.isdecimal() or int(text) >= 2**32:
+        raise UserError(f"{key}: {text!r} is no number from 0 to 4,294,967,295")
+    return int(text)

@@ -1,0 +1,309 @@
+"""A policy as launches of kernels without PyTorch, for programs of `megastep.web`.
+
+B lanes, W width.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, cast
+
+import torch
+from torch import nn
+
+from megastep.agents.errors import UserError
+from megastep.agents.networks.continuous_outputs import BetaOutput, GaussianOutput
+from megastep.agents.networks.cores import CORES, GRU, Feedforward, Stack
+from megastep.agents.networks.duelling_output import DuellingOutput
+from megastep.agents.networks.encoders import ENCODERS, Cnn, Conv, Flat, OneHot
+from megastep.agents.networks.lstm import LSTM
+from megastep.agents.networks.mingru import MinGRU
+from megastep.agents.networks.outputs import MultiDiscreteOutput
+from megastep.agents.networks.policy import Policy
+from megastep.agents.networks.running_norm import RunningNorm
+from megastep.agents.networks.web import LIBRARY
+from megastep.web.program import Launch, Leaf, Program, Ref
+
+FLOAT = 4  # bytes
+KINDS = {torch.float16: 0, torch.float32: 1, torch.uint8: 2, torch.bool: 2, torch.int64: 3}
+ACTIVATIONS = {torch.relu: 1, torch.tanh: 2}
+
+
+class Acting(NamedTuple):
+    """Where a program's policy has what a page shows.
+
+    Attributes:
+        section: the name of its launches.
+        lanes: the lanes that it acts in.
+        logits: (B, A, n) of these lanes.
+        states: (B, W) each, the hidden state.
+    """
+
+    section: str
+    lanes: range
+    logits: Leaf
+    states: list[Leaf]
+
+
+def add_policy(
+    program: Program, policy: Policy, lanes: range, section: str = "policy", seed: int = 1
+) -> Acting:
+    """Adds a policy's forward pass to a program.
+
+    Args:
+        program: gets the section, and memory.
+        policy: what acts.
+        lanes: where it acts: it reads their observations, and writes their actions.
+        section: name of the launches.
+        seed: of the actions. Their draws are not PyTorch's.
+
+    Raises:
+        UserError: it has a core or an encoder of the user's.
+    """
+    with torch.no_grad():
+        return _Lowering(program, policy, lanes, section, seed).acting()
+
+
+class _Lowering:
+    def __init__(self, program, policy, lanes, section, seed) -> None:
+        self.program, self.policy, self.lanes = program, policy.actor(), lanes
+        self.section, self.seed, self.n = section, seed, len(lanes)
+        self.launches: list[Launch] = []
+        self.states: list[Leaf] = []
+
+    def acting(self) -> Acting:
+        """Adds everything."""
+        width = self.policy.width
+        x = self.scratch(width)
+        columns, n_columns = self.intake()
+        activation = ACTIVATIONS[self.policy.intake.activation]
+        self.linear(columns, self.policy.intake.project, x, n_columns, width, activation)
+        core = cast(nn.Module, self.policy.core)
+        for one in core if isinstance(core, Stack) else [core]:
+            self.core(one, x, width)
+        logits = self.output(x, width)
+        self.program.sections[self.section] = self.launches
+        return Acting(self.section, self.lanes, logits, self.states)
+
+    def launch(self, operation: str, **values) -> None:
+        """Adds a launch. Words that are not given are 0, or null pointers."""
+        words = LIBRARY.words[LIBRARY.cpu_operations[operation]]
+        empty = {word.name: None if word.kind == "P" else 0 for word in words}
+        assert values.keys() <= empty.keys(), values.keys() - empty.keys()
+        values = empty | values | dict(n_lanes=self.n) if "n_lanes" in empty else empty | values
+        self.launches.append(Launch(LIBRARY, operation, values))
+
+    def scratch(self, n: int) -> Ref:
+        """Returns memory for n numbers of each lane, zeros at first."""
+        return self.program.add(torch.zeros(self.n * n))
+
+    def weights(self, tensor: torch.Tensor | None) -> Ref | None:
+        return None if tensor is None else self.program.add(tensor.detach().float().cpu())
+
+    def linear(self, x, layer: nn.Linear, out, n_in, n_out, activation=0, adds=0) -> None:
+        """Adds a linear layer."""
+        self.launch(
+            "policy_linear",
+            x=x,
+            weight=self.weights(layer.weight),
+            bias=self.weights(layer.bias),
+            out=out,
+            n_in=n_in,
+            n_out=n_out,
+            x_stride=n_in,
+            out_stride=n_out,
+            adds=adds,
+            activation=activation,
+        )
+
+    # ---- Intake ----
+
+    def intake(self) -> tuple[Ref, int]:
+        """Adds normalisation and encoders. Returns the columns, and how many there are."""
+        intake, first = self.policy.intake, 0
+        n = intake.n_features + intake.n_padding
+        columns = self.scratch(n)
+        for path, norm, encoder in zip(intake.paths, intake.norms, intake.encoders):
+            leaf = self.program.world[f"obs.{path}".rstrip(".")]
+            target = Ref(columns.buffer, FLOAT * first)
+            if type(encoder) in (Flat, OneHot):
+                self.normalise(leaf, norm, encoder, target, n)
+            elif type(encoder) in (Conv, Cnn):
+                self.convolve(leaf, norm, encoder, target, n)
+            else:
+                raise UserError(
+                    f"a page has no encoder {type(encoder).__name__}; it has "
+                    f"agent.encoder={', '.join(ENCODERS)}"
+                )
+            first += cast(Flat, encoder).n_features
+        return columns, n
+
+    def normalise(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
+        """Adds the normalisation of a leaf."""
+        if leaf.dtype not in KINDS:
+            raise UserError(f"a page has no observations of {leaf.dtype}")
+        shape, n_axes = leaf.shape[1:], len(leaf.shape) - 1
+        sizes = [1] * (4 - n_axes) + [*shape]
+        strides = [0] * (4 - n_axes) + [*leaf.strides[1:]]
+        mean = scale = None
+        if isinstance(norm, RunningNorm):
+            mean, scale = (self.weights(part.expand(shape)) for part in (norm.mean, norm.scale))
+        choices = len(encoder.values) if isinstance(encoder, OneHot) else 0
+        self.launch(
+            "policy_normalise",
+            obs=self.of_lanes(leaf),
+            mean=mean,
+            scale=scale,
+            out=out,
+            kind=KINDS[leaf.dtype],
+            **{f"size{i}": size for i, size in enumerate(sizes)},
+            **{f"stride{i}": stride for i, stride in enumerate(strides)},
+            obs_stride=leaf.strides[0],
+            out_stride=out_stride,
+            choices=choices,
+        )
+
+    def convolve(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
+        """Adds the normalisation and the convolutions of a leaf."""
+        n_agents, channels, height, width = leaf.shape[1:]
+        shape: Sequence[int] = (channels, height, width)
+        if isinstance(encoder, Conv):  # rows count as channels
+            shape = channels * height, 1, width
+            layers = [encoder.first, encoder.second]
+        else:
+            layers = [layer for layer in encoder.layers if isinstance(layer, nn.Conv2d)]
+        n = n_agents * math.prod(shape)
+        x = self.scratch(n)
+        self.normalise(leaf, norm, encoder, x, n)
+        for i, layer in enumerate(layers):
+            own = layer.kernel_size, layer.stride, cast("tuple[int, ...]", layer.padding)
+            rows = 1, 1, 0  # of a convolution of rows
+            kernel, stride, padding = (
+                (row, *pair) if len(pair) == 1 else pair for row, pair in zip(rows, own)
+            )
+            sizes = [
+                (size + 2 * pad - k) // step + 1
+                for size, pad, k, step in zip(shape[1:], padding, kernel, stride)
+            ]
+            n_out = n_agents * layer.out_channels * math.prod(sizes)
+            is_last = i == len(layers) - 1
+            target, target_stride = (out, out_stride) if is_last else (self.scratch(n_out), n_out)
+            self.launch(
+                "policy_convolve",
+                x=x,
+                weight=self.weights(layer.weight.movedim(0, -1)),
+                bias=self.weights(layer.bias),
+                out=target,
+                n_images=n_agents,
+                n_in=shape[0],
+                height=shape[1],
+                width=shape[2],
+                n_out=layer.out_channels,
+                out_height=sizes[0],
+                out_width=sizes[1],
+                **dict(zip(("kernel_h", "kernel_w"), kernel)),
+                **dict(zip(("stride_h", "stride_w"), stride)),
+                **dict(zip(("padding_h", "padding_w"), padding)),
+                x_stride=n,
+                out_stride=target_stride,
+            )
+            x, n, shape = target, n_out, (layer.out_channels, *sizes)
+
+    def of_lanes(self, leaf: Leaf) -> Ref:
+        """Returns the place of a leaf's first number of these lanes."""
+        offset = self.lanes.start * leaf.strides[0] * leaf.dtype.itemsize
+        return Ref(leaf.ref.buffer, leaf.ref.offset + offset)
+
+    # ---- Core ----
+
+    def core(self, core, x: Ref, width: int) -> None:
+        """Adds a recurrent core, whose outputs are added to x."""
+        kind = type(core)
+        if kind is Feedforward:
+            hidden = self.scratch(width)
+            self.linear(x, core.hidden, hidden, width, width, ACTIVATIONS[core.activation])
+            self.launch("policy_add", x=hidden, out=x, n=self.n * width)
+            return
+        if kind not in (LSTM, GRU, MinGRU):
+            raise UserError(
+                f"a page has no recurrent core {kind.__name__}; it has "
+                f"agent.core={', '.join(CORES)}"
+            )
+        n_gates = {LSTM: 4, GRU: 3, MinGRU: 2}[kind]
+        gates, output = self.scratch(n_gates * width), self.state(width)
+        cell = self.state(width) if kind is LSTM else None
+        self.linear(x, core.input, gates, width, n_gates * width)
+        recurrent = None
+        if kind is LSTM:
+            self.linear(output, core.recurrent, gates, width, n_gates * width, adds=1)
+        elif kind is GRU:
+            recurrent = self.scratch(n_gates * width)
+            self.linear(output, core.recurrent, recurrent, width, n_gates * width)
+        self.launch(
+            f"policy_{kind.__name__.lower()}",
+            gates=gates,
+            recurrent=recurrent,
+            output=output,
+            cell=cell,
+            x=x,
+            width=width,
+        )
+
+    def state(self, width: int) -> Ref:
+        """Adds a hidden state, which is cleared where an episode starts."""
+        state = self.scratch(width)
+        reset = self.of_lanes(self.program.world["reset"])
+        self.launch("policy_clear", reset=reset, state=state, width=width)
+        self.states.append(Leaf(state, (self.n, width), (width, 1), torch.float32))
+        return state
+
+    # ---- Output ----
+
+    def output(self, x: Ref, width: int) -> Leaf:
+        """Adds the output. Returns the logits."""
+        output = self.policy.output
+        if not isinstance(
+            output, (MultiDiscreteOutput, DuellingOutput, GaussianOutput, BetaOutput)
+        ):
+            raise UserError("a page has one kind of actions, not a dict of them")
+        n_agents, n = output.shape
+        n_logits = n if isinstance(output, (MultiDiscreteOutput, DuellingOutput)) else 2 * n
+        logits = self.scratch(n_agents * n_logits)
+        values: dict = {}
+        if isinstance(output, DuellingOutput):
+            hidden, scores, value = map(self.scratch, (2 * width, n_agents * n, n_agents))
+            self.linear(x, output.hidden, hidden, width, 2 * width, ACTIVATIONS[torch.relu])
+            # value and advantage each read their half of the hidden layer
+            for layer, out, half in ((output.value, value, 0), (output.advantage, scores, 1)):
+                whole = nn.Linear(2 * width, len(layer.weight))
+                whole.weight.zero_()[:, half * width : (half + 1) * width] = layer.weight
+                whole.bias = layer.bias
+                self.linear(hidden, whole, out, 2 * width, len(layer.weight))
+            values = dict(values=value, epsilon=output.epsilon)
+            operation = "policy_duelling"
+        else:
+            n_scores = len(output.linear.weight)
+            scores = self.scratch(n_scores)
+            self.linear(x, output.linear, scores, width, n_scores)
+            operation = "policy_softmax"
+        if isinstance(output, (GaussianOutput, BetaOutput)):
+            values = dict(low=self.weights(output.low), high=self.weights(output.high))
+            operation = "policy_beta"
+        if isinstance(output, GaussianOutput):
+            values |= dict(values=self.weights(output.log_std))
+            operation = "policy_gaussian"
+        key = "numbers" if n_logits > n else "actions"
+        self.launch(
+            operation,
+            scores=scores,
+            **values,
+            logits=logits,
+            **{key: self.of_lanes(self.program.actions)},
+            counts=self.program.add(torch.zeros(self.n, dtype=torch.int32)),
+            key0=self.seed & 0xFFFFFFFF,
+            key1=self.seed >> 32,
+            first=self.lanes.start,
+            n_agents=n_agents,
+            n_choices=n,
+        )
+        shape = self.n, n_agents, n_logits
+        return Leaf(logits, shape, (n_agents * n_logits, n_logits, 1), torch.float32)

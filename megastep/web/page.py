@@ -1,0 +1,146 @@
+"""Writes a program, and what a page draws of it, as one HTML file."""
+
+import base64
+import gzip
+import html
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from megastep.kernels.build.compile import EngineError, wasm, wasm_key, wasm_keys, wasm_tools
+from megastep.plotting.styles import AGENTS, THEMES
+from megastep.web.program import Buffer, Launch, Leaf, Program, Ref
+
+__all__ = ["SHIPPED", "module", "page"]
+
+FOLDER = Path(__file__).parent
+#: The module that comes with megastep; `make wasm` builds it.
+SHIPPED = FOLDER / "megastep.wasm"
+ALIGNMENT = 8  # bytes, of buffers in the page's data
+
+
+def module(program: Program) -> bytes:
+    """Returns a WebAssembly module with the operations of a program: the one that comes with
+    megastep if it has them, or one that clang builds now.
+
+    Raises:
+        EngineError: it has to be built, and that fails.
+    """
+    shipped = SHIPPED.read_bytes() if SHIPPED.exists() else b""
+    keys, operations = wasm_keys(shipped) if shipped else {}, program.operations()
+    if all(keys.get(name) == wasm_key(lib) for lib, names in operations.items() for name in names):
+        return shipped
+    try:
+        wasm_tools()
+    except EngineError as error:
+        own = [name for lib, names in operations.items() for name in names if name not in keys]
+        which = ", ".join(own) or "kernels that have changed since"
+        raise EngineError(f"The module that comes with megastep lacks {which}. {error}") from None
+    return wasm(operations)
+
+
+def page(program: Program, about: Mapping, code: bytes) -> str:
+    """Returns an HTML page that plays a program.
+
+    Args:
+        program: with the sections `reset` and `step`, and those of the policies in ``about``.
+        about: what the page shows, see `megastep.web.scene`.
+        code: the WebAssembly module.
+    """
+    buffers, parts, size = [], [], 0
+    for buffer in program.buffers:
+        packed, body = _packed(buffer)
+        buffers.append([buffer.n_bytes, size, packed])
+        body += bytes(-len(body) % ALIGNMENT)
+        parts.append(body)
+        size += len(body)
+    data = json.dumps(
+        {
+            **{key: _plain(value) for key, value in about.items()},
+            "colours": AGENTS,
+            "buffers": buffers,
+            "copies": program.copies,
+            "world": {path: _leaf(leaf) for path, leaf in program.world.items()},
+            "actions": _leaf(program.actions),
+            "names": {launch.operation: [*launch.values] for launch in program.launches},
+            "sections": {
+                name: [[launch.operation, _values(launch)] for launch in launches]
+                for name, launches in program.sections.items()
+            },
+        },
+        separators=(",", ":"),
+    ).encode()
+    head = struct.pack("<III", len(data), len(code), size)
+    body = gzip.compress(head + data + code + b"".join(parts), mtime=0)
+    text = (FOLDER / "page.html").read_text()
+    fields = {
+        "title": html.escape(about["title"]),
+        "themes": _themes(),
+        "program": (FOLDER / "program.js").read_text(),
+        "script": (FOLDER / "page.js").read_text(),
+        "data": base64.b64encode(body).decode(),
+    }
+    for name, value in fields.items():
+        text = text.replace(f"<!--{name}-->", value, 1)
+    return text
+
+
+def _packed(buffer: Buffer) -> tuple[int, bytes]:
+    """Returns how a buffer's contents are stored, and what is: 0 nothing, 1 the bytes, 2 its
+    floats as fp16, if that loses nothing.
+    """
+    if buffer.contents is None or not any(buffer.contents):
+        return 0, b""
+    if buffer.is_float:
+        numbers = np.frombuffer(buffer.contents, np.float32)
+        with np.errstate(over="ignore"):
+            halves = numbers.astype(np.float16)
+        if (halves.astype(np.float32).view(np.uint32) == numbers.view(np.uint32)).all():
+            return 2, halves.tobytes()
+    return 1, buffer.contents
+
+
+def _leaf(leaf: Leaf) -> list:
+    dtype = str(leaf.dtype).removeprefix("torch.")
+    return [*leaf.ref, leaf.shape, leaf.strides, dtype]
+
+
+def _values(launch: Launch) -> list:
+    """Returns the words of a launch: places as [buffer, offset], numbers as their 32 bits."""
+    words = launch.library.words[launch.library.cpu_operations[launch.operation]]
+    values = []
+    for word in words:
+        value = launch.values[word.name]
+        if value is None or isinstance(value, Ref):
+            values.append(value and [*value])
+        else:
+            value = 1 if word.name.endswith("n_threads") else value
+            values.append(struct.unpack("<I", struct.pack(f"<{word.kind}", value))[0])
+    return values
+
+
+def _plain(value: object) -> object:
+    """Returns what JSON can hold: leaves as lists, ranges as their ends."""
+    if isinstance(value, Leaf):
+        return _leaf(value)
+    if isinstance(value, range):
+        return [value.start, value.stop]
+    if isinstance(value, dict):
+        return {key: _plain(child) for key, child in value.items()}
+    return [*map(_plain, value)] if isinstance(value, list) else value
+
+
+def _themes() -> str:
+    """Returns the colours of both themes as CSS."""
+    rules = []
+    for name, theme in THEMES.items():
+        colours = {**vars(theme), "wall_low": theme.wall[0], "wall_high": theme.wall[1]}
+        body = "".join(
+            f"--{key.replace('_', '-')}:{value};" for key, value in colours.items() if key != "wall"
+        )
+        rule = f":root{{{body}}}"
+        rules.append(rule if name == "light" else f"@media (prefers-color-scheme:{name}){{{rule}}}")
+    return "".join(rules)

@@ -1,0 +1,163 @@
+"""Programs: launches of kernels, and the memory that they read and write."""
+
+import ctypes
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+
+from megastep.kernels.build.compile import cpu
+from megastep.kernels.build.kernel_library import KernelLibrary
+
+__all__ = ["Buffer", "Launch", "Leaf", "Program", "Ref", "Replay"]
+
+
+class Ref(NamedTuple):
+    """A place in a program's memory: the index of a buffer, and bytes from its start."""
+
+    buffer: int
+    offset: int = 0
+
+
+class Launch(NamedTuple):
+    """A launch of an operation.
+
+    Attributes:
+        library: the library that has it.
+        operation: its name.
+        values: {name of a word of its struct: number, place, or None for a null pointer}.
+    """
+
+    library: KernelLibrary
+    operation: str
+    values: dict[str, int | float | Ref | None]
+
+
+class Buffer(NamedTuple):
+    """A part of a program's memory.
+
+    Attributes:
+        n_bytes: its size.
+        contents: what it holds at the start; None: anything.
+        is_float: whether that is float32 alone.
+    """
+
+    n_bytes: int
+    contents: bytes | None = None
+    is_float: bool = False
+
+
+class Leaf(NamedTuple):
+    """A tensor in a program's memory.
+
+    Attributes:
+        ref: the place of its first number.
+        shape: (B, ...).
+        strides: numbers between neighbours along each axis.
+        dtype: of its numbers.
+    """
+
+    ref: Ref
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    dtype: torch.dtype
+
+
+@dataclass
+class Program:
+    """An environment, and what acts in it, as launches.
+
+    Attributes:
+        buffers: the memory.
+        sections: {name: launches}, such as `reset`, `step` and `policy`.
+        copies: (from, to), whole buffers that are copied after `reset`.
+        world: {dotted path: leaf} of the world that a step returns.
+        actions: the actions that a step takes, (B, ...).
+    """
+
+    actions: Leaf
+    buffers: list[Buffer] = field(default_factory=list)
+    sections: dict[str, list[Launch]] = field(default_factory=dict)
+    copies: list[tuple[int, int]] = field(default_factory=list)
+    world: dict[str, Leaf] = field(default_factory=dict)
+
+    def add(self, tensor: torch.Tensor) -> Ref:
+        """Adds a buffer with a tensor's numbers. Returns its place."""
+        contents = tensor.contiguous().numpy().tobytes()
+        self.buffers.append(Buffer(tensor.nbytes, contents, tensor.dtype == torch.float32))
+        return Ref(len(self.buffers) - 1)
+
+    @property
+    def launches(self) -> Iterable[Launch]:
+        """All launches of all sections."""
+        return (launch for section in self.sections.values() for launch in section)
+
+    def operations(self) -> dict[KernelLibrary, list[str]]:
+        """Returns the operations that are launched, by library."""
+        found: dict[KernelLibrary, list[str]] = {}
+        for launch in self.launches:
+            names = found.setdefault(launch.library, [])
+            if launch.operation not in names:
+                names.append(launch.operation)
+        return found
+
+
+class Replay:
+    """Runs a program with the CPU's kernels.
+
+    Args:
+        program: what to run. Memory that holds anything at the start is zeros.
+    """
+
+    def __init__(self, program: Program):
+        self.program = program
+        self.memory = [bytearray(buffer.n_bytes) for buffer in program.buffers]
+        self.start()
+        self._addresses = [
+            ctypes.addressof((ctypes.c_char * max(len(part), 1)).from_buffer(part)) if part else 0
+            for part in self.memory
+        ]
+        self._calls = {
+            name: [self._call(launch) for launch in launches]
+            for name, launches in program.sections.items()
+        }
+
+    def start(self) -> None:
+        """Gives the memory what it holds at the start."""
+        for part, buffer in zip(self.memory, self.program.buffers, strict=True):
+            if buffer.contents is not None:
+                part[:] = buffer.contents
+
+    def run(self, section: str) -> None:
+        """Runs the launches of a section, and after `reset` the copies."""
+        for function, packed in self._calls[section]:
+            function(packed)
+        for source, target in self.program.copies if section == "reset" else ():
+            self.memory[target][:] = self.memory[source]
+
+    def tensor(self, leaf: Leaf) -> torch.Tensor:
+        """Returns a leaf as a tensor that shares its memory."""
+        flat = torch.frombuffer(self.memory[leaf.ref.buffer], dtype=torch.uint8)
+        numbers = flat[leaf.ref.offset % leaf.dtype.itemsize :]
+        size = len(numbers) // leaf.dtype.itemsize * leaf.dtype.itemsize
+        numbers = numbers[:size].view(leaf.dtype)
+        return numbers.as_strided(leaf.shape, leaf.strides, leaf.ref.offset // leaf.dtype.itemsize)
+
+    def world(self) -> Mapping[str, torch.Tensor]:
+        """Returns the leaves of the world by path."""
+        return {path: self.tensor(leaf) for path, leaf in self.program.world.items()}
+
+    def _call(self, launch: Launch) -> tuple[Callable[[bytes], None], bytes]:
+        library, name, values = launch
+        words = library.words[library.cpu_operations[name]]
+        end = max(word.offset + struct.calcsize(word.kind) for word in words)
+        packed = bytearray(-8 * (-end // 8))
+        for word in words:
+            value = values[word.name]
+            if isinstance(value, Ref):
+                value = self._addresses[value.buffer] + value.offset
+            value = 0 if value is None else value
+            struct.pack_into(word.kind, packed, word.offset, value)
+        return cpu(library)[name], bytes(packed)

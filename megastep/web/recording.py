@@ -1,0 +1,360 @@
+"""Records what a step of an environment launches.
+
+What counts is what kernels compute. Where PyTorch computes something in between, a replay would go
+without it, so such an environment is refused with the name of the operation.
+"""
+
+import bisect
+import contextlib
+import ctypes
+import gc
+import struct
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.kernels.build.launch import observed
+from megastep.spaces import random_actions
+from megastep.types import Env, World, n_lanes
+from megastep.web.program import Buffer, Launch, Leaf, Program, Ref, Replay
+
+__all__ = ["record"]
+
+#: Steps with random actions that a replay must repeat, beside the recorded ones.
+N_CHECKED = 16
+#: Operators that only reserve memory.
+ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided")
+
+
+class Memory:
+    """The storages of tensors, by address. Keeps them, so that no address is used twice."""
+
+    def __init__(self) -> None:
+        self.starts: list[int] = []
+        self.storages: dict[int, torch.UntypedStorage] = {}
+
+    def add(self, tensor: torch.Tensor) -> int:
+        """Adds a tensor's storage. Returns its address."""
+        storage = torch.Tensor.untyped_storage(tensor)
+        start = storage.data_ptr()
+        if start not in self.storages:
+            bisect.insort(self.starts, start)
+            self.storages[start] = storage
+        return start
+
+    def find(self, address: int) -> int:
+        """Returns the address of the storage that an address lies in.
+
+        Raises:
+            ValueError: if no tensor has it.
+        """
+        for scan in (None, self.scan):
+            if scan:
+                scan()
+            i = bisect.bisect_right(self.starts, address) - 1
+            if i >= 0 and address < self.starts[i] + self.storages[self.starts[i]].nbytes():
+                return self.starts[i]
+        raise ValueError("a kernel reads memory that no tensor of PyTorch holds")
+
+    def scan(self) -> None:
+        """Adds all tensors of the process."""
+        for one in gc.get_objects():
+            if issubclass(type(one), torch.Tensor):
+                with contextlib.suppress(RuntimeError, NotImplementedError):  # without memory
+                    if one.device.type == "cpu":
+                        self.add(one)
+
+    def contents(self, start: int) -> bytes:
+        """Returns what a storage holds."""
+        return ctypes.string_at(start, self.storages[start].nbytes())
+
+
+class Written(NamedTuple):
+    """An operator of PyTorch that computed something.
+
+    Attributes:
+        operator: its name.
+        start: address of the storage that it wrote.
+        is_late: whether a launch had used the storage before.
+    """
+
+    operator: str
+    start: int
+    is_late: bool
+
+
+class Tape(TorchDispatchMode):
+    """Notes launches of kernels, and operators of PyTorch that compute.
+
+    Args:
+        memory: gets the storages of all results.
+        use: called with the address of each storage that a launch uses, before it.
+
+    Attributes:
+        launches: places are an address and an offset.
+        used: addresses of the storages that launches use.
+        made: those that operators reserved.
+        written: operators that compute.
+    """
+
+    def __init__(self, memory: Memory, use: Callable[[int], object]):
+        super().__init__()
+        self.memory, self.use = memory, use
+        self.launches: list[Launch] = []
+        self.used: set[int] = set()
+        self.made: dict[int, None] = {}
+        self.written: list[Written] = []
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # otherwise PyTorch imports its compiler, which takes seconds
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None) -> object:
+        result = func(*args, **(kwargs or {}))
+        name, returns = func._schema.name.rpartition("::")[2], func._schema.returns
+        aliases = [one.alias_info for one in returns]
+        if aliases and all(alias is not None and not alias.is_write for alias in aliases):
+            return result  # a view
+        for one in result if isinstance(result, (list, tuple)) else [result]:
+            if isinstance(one, torch.Tensor):
+                start = self.memory.add(one)
+                if not any(aliases):
+                    self.made[start] = None
+                if name not in ALLOCATIONS:
+                    self.written.append(Written(name.strip("_"), start, start in self.used))
+        return result
+
+    def observe(self, library: KernelLibrary, operation: str, packed: bytes) -> None:
+        """Notes a launch."""
+        values = {}
+        for word in library.words[library.cpu_operations[operation]]:
+            (value,) = struct.unpack_from(word.kind, packed, word.offset)
+            if word.kind == "P" and value:
+                start = self.memory.find(value)
+                self.used.add(start)
+                self.use(start)
+                value = Ref(start, value - start)
+            values[word.name] = None if word.kind == "P" and not value else value
+        self.launches.append(Launch(library, operation, values))
+
+
+class Recorder:
+    """Records an environment on a CPU."""
+
+    def __init__(self, env: Env):
+        self.env, self.memory = env, Memory()
+        self.index: dict[int, int] = {}  # of the buffer of each storage
+        self.buffers: list[Buffer] = []
+        self.memory.scan()
+
+    def use(self, start: int) -> int:
+        """Returns the index of a storage's buffer. A new one has what the storage holds now."""
+        if start not in self.index:
+            self.index[start] = len(self.buffers)
+            contents = self.memory.contents(start)
+            self.buffers.append(Buffer(len(contents), contents))
+        return self.index[start]
+
+    def run(
+        self, call: Callable[[], World], keep: bool = True
+    ) -> tuple[Tape, dict[str, torch.Tensor]]:
+        """Calls a function of the environment. Returns its tape and the leaves of its world.
+
+        Args:
+            keep: makes buffers for what it uses.
+        """
+        tape = Tape(self.memory, self.use if keep else lambda start: None)
+        with tape, observed(tape.observe):
+            world = call()
+        leaves = world_leaves(world)
+        for leaf in leaves.values() if keep else ():
+            self.use(self.memory.add(leaf))
+        computed = {written.start for written in tape.written}
+        for start in tape.made if keep else ():
+            if start in self.index and start not in computed:
+                i = self.index[start]
+                self.buffers[i] = Buffer(self.buffers[i].n_bytes)
+        return tape, leaves
+
+    def refuse(self, tape: Tape, leaves: dict[str, torch.Tensor], is_reset: bool) -> None:
+        """Refuses what PyTorch computes where a replay would go without it."""
+        used = tape.used | {self.memory.add(leaf) for leaf in leaves.values()}
+        for operator, start, is_late in tape.written:
+            if is_late if is_reset else start in used:
+                raise ValueError(
+                    f"{self.name} cannot be exported: in {'reset' if is_reset else 'a step'}, "
+                    f"PyTorch's operation {operator} computes between its kernels, and a page has "
+                    f"kernels alone; move it into one (docs/kernels.md)"
+                )
+
+    @property
+    def name(self) -> str:
+        return type(self.env).__name__
+
+    def launches(self, tape: Tape) -> list[Launch]:
+        """Returns launches of a tape with places in buffers."""
+
+        def place(value: int | float | Ref | None) -> int | float | Ref | None:
+            return Ref(self.index[value.buffer], value.offset) if isinstance(value, Ref) else value
+
+        return [
+            launch._replace(values={name: place(value) for name, value in launch.values.items()})
+            for launch in tape.launches
+        ]
+
+    def leaf(self, tensor: torch.Tensor) -> Leaf:
+        """Returns a tensor as a leaf of the program."""
+        offset = int(tensor.storage_offset()) * tensor.itemsize
+        ref = Ref(self.use(self.memory.add(tensor)), offset)
+        return Leaf(ref, tuple(tensor.shape), tensor.stride(), tensor.dtype)
+
+
+def record(env: Env) -> Program:
+    """Returns an environment as a program with the sections `reset` and `step`.
+
+    Changes the environment: it is reset and stepped with random actions. A replay is compared with
+    it, every output and all that steps change.
+
+    Args:
+        env: on a CPU, with one tensor of actions.
+
+    Raises:
+        ValueError: what kernels compute is not all that a step does.
+    """
+    recorder, generator = Recorder(env), torch.Generator().manual_seed(1)
+    if isinstance(env.action_space, dict):
+        raise ValueError(f"{recorder.name} cannot be exported: it takes several actions at once")
+
+    def draw() -> torch.Tensor:
+        return random_actions(env.action_space, n_lanes(env), generator=generator)
+
+    actions = draw()
+    recorder.use(recorder.memory.add(actions))
+    decision = arrdict(actions=actions)
+    reset, first = recorder.run(env.reset)
+    recorder.refuse(reset, first, True)
+    expected = [snapshot(recorder, first, {})]
+    step, leaves = recorder.run(lambda: env.step(decision))
+    recorder.refuse(step, leaves, False)
+    if not step.launches:
+        raise ValueError(f"{recorder.name} cannot be exported: its steps launch no kernels")
+    program = Program(recorder.leaf(actions), recorder.buffers)
+    program.sections = dict(reset=recorder.launches(reset), step=recorder.launches(step))
+    program.world = {path: recorder.leaf(leaf) for path, leaf in leaves.items()}
+    program.copies = copies(recorder, first, leaves)
+    kept = {
+        start: i
+        for start, i in recorder.index.items()
+        if start not in step.made and start not in reset.made
+    }
+    taken = [actions.clone()]
+    expected.append(snapshot(recorder, leaves, kept))
+    actions.copy_(draw())
+    again, leaves = recorder.run(lambda: env.step(decision), keep=False)
+    refuse_changes(recorder, (step, again))
+    taken.append(actions.clone())
+    expected.append(snapshot(recorder, leaves, kept))
+    for _ in range(N_CHECKED):
+        actions.copy_(draw())
+        taken.append(actions.clone())
+        expected.append(snapshot(recorder, world_leaves(env.step(decision)), kept))
+    compare(recorder.name, program, taken, expected)
+    return program
+
+
+def world_leaves(world: World) -> dict[str, torch.Tensor]:
+    """Returns the leaves of a world by path, without what only a critic sees."""
+    return {
+        path: leaf
+        for path, leaf in spaces.leaves(world).items()
+        if isinstance(leaf, torch.Tensor) and not path.startswith("privileged")
+    }
+
+
+def copies(recorder: Recorder, first, later) -> list[tuple[int, int]]:
+    """Returns what is copied after a reset, so that its world lies where a step's does."""
+    found = {}
+    for path in later:
+        if path not in first:
+            raise ValueError(f"{recorder.name} cannot be exported: its reset gives no {path}")
+        source, target = (recorder.leaf(tree[path]) for tree in (first, later))
+        sizes = [recorder.buffers[leaf.ref.buffer].n_bytes for leaf in (source, target)]
+        if source.ref.offset != target.ref.offset or sizes[0] != sizes[1]:
+            raise ValueError(
+                f"{recorder.name} cannot be exported: its reset and its steps have another {path}"
+            )
+        if source.ref.buffer != target.ref.buffer:
+            found[source.ref.buffer, target.ref.buffer] = None
+    return [*found]
+
+
+def refuse_changes(recorder: Recorder, tapes: tuple[Tape, Tape]) -> None:
+    """Refuses two steps that launch different things."""
+    names = [[launch.operation for launch in tape.launches] for tape in tapes]
+    if names[0] != names[1]:
+        raise ValueError(
+            f"{recorder.name} cannot be exported: a step launches {', '.join(names[0])}, and the "
+            f"next {', '.join(names[1])}"
+        )
+    orders = [
+        {start: i for i, start in enumerate(start for start in tape.made if start in tape.used)}
+        for tape in tapes
+    ]
+    for launches in zip(*(tape.launches for tape in tapes)):
+        for name in launches[0].values:
+            values = [
+                (order.get(value.buffer, value.buffer), value.offset)
+                if isinstance(value := launch.values[name], Ref)
+                else value
+                for launch, order in zip(launches, orders)
+            ]
+            if values[0] != values[1]:
+                raise ValueError(
+                    f"{recorder.name} cannot be exported: {name} of {launches[0].operation} "
+                    f"changes from step to step; keep what changes in a tensor that kernels write"
+                )
+
+
+def snapshot(recorder: Recorder, leaves, kept: dict[int, int]) -> tuple[dict, dict]:
+    """Returns copies of a world's leaves, and what the storages `kept` hold by buffer."""
+    return (
+        {path: leaf.clone() for path, leaf in leaves.items()},
+        {i: recorder.memory.contents(start) for start, i in kept.items()},
+    )
+
+
+def compare(name: str, program: Program, taken, expected) -> None:
+    """Raises ValueError if a replay differs from the environment in a bit."""
+    replay = Replay(program)
+    for t, (leaves, kept) in enumerate(expected):
+        if t:
+            replay.tensor(program.actions).copy_(taken[t - 1])
+        replay.run("step" if t else "reset")
+        world = replay.world()
+        different = [path for path in leaves if not _same(world[path], leaves[path])]
+        different += [
+            f"memory of {place_of(program, i)}" for i in kept if replay.memory[i] != kept[i]
+        ]
+        if different:
+            raise ValueError(
+                f"{name} cannot be exported: a replay of its kernels differs in {different[0]} "
+                f"{f'in step {t}' if t else 'at the reset'}, so something else computes it"
+            )
+
+
+def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
+    return one.contiguous().numpy().tobytes() == other.contiguous().numpy().tobytes()
+
+
+def place_of(program: Program, buffer: int) -> str:
+    """Returns the first field of a launch that lies in a buffer."""
+    for launch in program.launches:
+        for name, value in launch.values.items():
+            if isinstance(value, Ref) and value.buffer == buffer:
+                return f"{launch.operation}.{name}"
+    return "the world"

@@ -1,0 +1,47 @@
+"""Builds megastep/web/megastep.wasm, the kernels of web pages that come with megastep.
+
+Run it after a change of kernels; a test says when. Needs clang, lld and WebAssembly's libraries
+(Debian: apt install clang lld wasi-libc libc++-dev-wasm32 libclang-rt-dev-wasm32).
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from megastep.agents.networks.web import LIBRARY as POLICY
+from megastep.envs.deathmatch.step import LIBRARY as DEATHMATCH
+from megastep.envs.explorer.step import LIBRARY as EXPLORER
+from megastep.envs.keys.step import LIBRARY as KEYS
+from megastep.envs.memory.step import LIBRARY as MEMORY
+from megastep.envs.pointgoal.library import LIBRARY as POINTGOAL
+from megastep.envs.pong.step import LIBRARY as PONG
+from megastep.kernels.build import compile
+from megastep.kernels.build.kernel_library import WASM_FLAGS
+from megastep.kernels.build.launch import ENGINE
+from megastep.web.page import SHIPPED
+
+LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MEMORY, KEYS, POLICY
+#: Operations of setting up and of scripted bots, which no page launches.
+ABSENT = {
+    *("bake", "place_objects", "uniform", "bot"),
+    *("clearances", "corner_distances", "corner_links", "path_lengths"),
+}
+
+
+def operations():
+    """Returns the operations of the module, by library."""
+    return {
+        library: [name for name in library.cpu_operations if name not in ABSENT]
+        for library in LIBRARIES
+    }
+
+
+def build(flags=WASM_FLAGS):
+    """Returns the module."""
+    return compile.wasm(operations(), flags)
+
+
+if __name__ == "__main__":
+    SHIPPED.write_bytes(build())
+    print(f"{SHIPPED}: {SHIPPED.stat().st_size:,} bytes")

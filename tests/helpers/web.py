@@ -1,0 +1,33 @@
+"""Small environments that a page can play, each with short episodes."""
+
+from megastep import envs, geometries
+
+__all__ = ["ENVS", "made"]
+
+ENVS = {
+    "explorer": (envs.Explorer, dict(n_envs=1, patience=20, resample=True, privileged=True)),
+    "cameras": (
+        envs.Explorer,
+        dict(n_envs=2, patience=9, cameras=[0, 120], control="continuous", resample=True),
+    ),
+    "pointgoal": (envs.PointGoal, dict(n_envs=1, limit=30, resample=True)),
+    "deathmatch": (
+        envs.Deathmatch,
+        dict(
+            **dict(n_envs=1, n_agents=3, limit=25, damage=0.3, resample=True),
+            **dict(search_reward=0.5, aim_reward=3.0, hearing=20.0, res=64),
+        ),
+    ),
+    "pong": (envs.Pong, dict(n_envs=1, self_play=True)),
+    "pixels": (envs.Pong, dict(n_envs=2, pixels=True)),
+    "memory": (envs.Memory, dict(n_envs=1, limit=30, resample=True)),
+    "keys": (envs.Keys, dict(n_envs=1, limit=30, resample=True)),
+}
+
+
+def made(name, **changes):
+    """Returns an environment by its name here, always with the same seed and homes."""
+    kind, settings = ENVS[name]
+    if kind is not envs.Pong:
+        changes = dict(geometries=geometries.sample("homes", 3, seed=7), **changes)
+    return kind(**{**settings, "device": "cpu", "seed": 3, **changes})
