@@ -1,0 +1,64 @@
+"""docs/tutorials/: every page runs from top to bottom in an empty folder, as its reader types it, and
+ends with a picture or a film.
+"""
+
+import re
+
+import pytest
+
+from tests.helpers import pages
+
+FOLDER = pages.ROOT / "docs" / "tutorials"
+PAGES = sorted(page.name for page in FOLDER.glob("*.md") if page.name != "index.md")
+#: Pages that take more than about three seconds on an idle core.
+LONG = set()
+BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\w*)\n(.*?)```", re.S)
+FILE = re.compile(r"(?:#|//) (\S+\.(?:py|h|cpp|cu))\n")
+PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"
+TIERS = {True: pytest.mark.nightly, False: pytest.mark.slow}
+
+
+def follow(page, folder, patch):
+    """Writes the files of a page and runs its other blocks, in order. Returns its variables."""
+    names = {"__name__": "__main__"}
+    with pages.inside(folder, patch):
+        for reason, language, body in BLOCK.findall((FOLDER / page).read_text()):
+            file = FILE.match(body)
+            if reason:
+                continue
+            if file:
+                path = folder / file[1]
+                path.parent.mkdir(exist_ok=True)
+                path.write_text(body)
+            elif language == "python":
+                exec(compile(body, page, "exec"), names)
+            else:
+                commands = pages.commands(body)
+                assert len(commands) == body.count("\n"), f"{page}: {body} is not run; say why"
+                for script, words in commands:
+                    assert pages.MAINS[script](words) == 0, (script, words)
+    return names
+
+
+@pytest.mark.parametrize("page", [pytest.param(p, marks=TIERS[p in LONG]) for p in PAGES])
+@pytest.mark.usefixtures("drawn_in_this_process")
+def test_page_runs_and_draws_its_picture(page, tmp_path, monkeypatch):
+    follow(page, tmp_path, monkeypatch)
+    last = re.findall(r"\S*\.(?:png|svg|mp4|gif|html)\b", blocks(page)[-1])
+    assert last, "the last block makes no picture"
+    (made,) = tmp_path.rglob(last[-1].strip("\"'()").rpartition('"')[2].rpartition("=")[2])
+    assert made.stat().st_size > 1000
+
+
+def blocks(page):
+    """Returns the blocks of a page that are run and are no files."""
+    found = BLOCK.findall((FOLDER / page).read_text())
+    return [body for reason, _, body in found if not reason and not FILE.match(body)]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_page_ends_with_three_things_to_try(page):
+    text = (FOLDER / page).read_text()
+    end = text.split("\n## Three things to try\n")[1]
+    assert re.findall(r"^(\d)\. ", end, re.M) == ["1", "2", "3"]
+    assert f"({page})" in (FOLDER / "index.md").read_text()
