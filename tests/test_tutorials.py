@@ -11,7 +11,7 @@ from tests.helpers import pages
 FOLDER = pages.ROOT / "docs" / "tutorials"
 PAGES = sorted(page.name for page in FOLDER.glob("*.md") if page.name != "index.md")
 #: Pages that take more than about three seconds on an idle core.
-LONG = set()
+LONG = {"deathmatch.md", "explorer.md", "from-python.md", "training.md", "waypoint.md"}
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\w*)\n(.*?)```", re.S)
 FILE = re.compile(r"(?:#|//) (\S+\.(?:py|h|cpp|cu))\n")
 PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"
