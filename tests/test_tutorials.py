@@ -1,5 +1,5 @@
-"""docs/tutorials/: every page runs from top to bottom in an empty folder, as its reader types it, and
-ends with a picture or a film.
+"""Every page of docs/tutorials/ and docs/concepts/ runs from top to bottom in an empty folder, as its
+reader types it. A tutorial ends with a picture or a film.
 """
 
 import re
@@ -8,8 +8,14 @@ import pytest
 
 from tests.helpers import pages
 
-FOLDER = pages.ROOT / "docs" / "tutorials"
+DOCS = pages.ROOT / "docs"
+FOLDER = DOCS / "tutorials"
 PAGES = sorted(page.name for page in FOLDER.glob("*.md") if page.name != "index.md")
+CONCEPTS = sorted(
+    f"../concepts/{page.name}"
+    for page in (DOCS / "concepts").glob("*.md")
+    if "```python" in page.read_text()
+)
 #: Pages that take more than about three seconds on an idle core.
 LONG = {"deathmatch.md", "explorer.md", "from-python.md", "training.md", "waypoint.md"}
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\w*)\n(.*?)```", re.S)
@@ -48,6 +54,12 @@ def test_page_runs_and_draws_its_picture(page, tmp_path, monkeypatch):
     assert last, "the last block makes no picture"
     (made,) = tmp_path.rglob(last[-1].strip("\"'()").rpartition('"')[2].rpartition("=")[2])
     assert made.stat().st_size > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", CONCEPTS)
+def test_page_of_a_concept_runs(page, tmp_path, monkeypatch):
+    follow(page, tmp_path, monkeypatch)
 
 
 def blocks(page):
