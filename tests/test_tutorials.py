@@ -1,4 +1,4 @@
-"""Every page of docs/tutorials/ and docs/concepts/ runs from top to bottom in an empty folder, as its
+"""Every page of docs/tutorials/ and docs/concepts/ runs from top to bottom in an empty folder, as a
 reader types it. A tutorial ends with a picture or a film.
 """
 
