@@ -17,7 +17,7 @@ CONCEPTS = sorted(
     if "```python" in page.read_text()
 )
 #: Pages that take more than about three seconds on an idle core.
-LONG = {"deathmatch.md", "explorer.md", "from-python.md", "training.md", "waypoint.md"}
+LONG = {"deathmatch.md", "explorer.md", "from-python.md"}
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\w*)\n(.*?)```", re.S)
 FILE = re.compile(r"(?:#|//) (\S+\.(?:py|h|cpp|cu))\n")
 PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"
