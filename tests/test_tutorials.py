@@ -2,9 +2,11 @@
 reader types it. A tutorial ends with a picture or a film.
 """
 
+import importlib
 import re
 
 import pytest
+import torch
 
 from tests.helpers import pages
 
@@ -60,6 +62,24 @@ def test_page_runs_and_draws_its_picture(page, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", CONCEPTS)
 def test_page_of_a_concept_runs(page, tmp_path, monkeypatch):
     follow(page, tmp_path, monkeypatch)
+
+
+@pytest.mark.slow
+def test_cuda_of_the_page_on_kernels_has_the_bits_of_its_cpp(tmp_path, monkeypatch, cuda_on_cpu):
+    page = (FOLDER / "own-kernels.md").read_text()
+    for _, _, body in BLOCK.findall(page):
+        if file := FILE.match(body):
+            (tmp_path / file[1]).parent.mkdir(exist_ok=True)
+            (tmp_path / file[1]).write_text(body)
+    positions = 3 * torch.rand(70, 2, generator=torch.Generator().manual_seed(1))
+    with pages.inside(tmp_path, monkeypatch):
+        trails = importlib.import_module("trails")
+        painted = [torch.zeros(70, 50, 60, dtype=torch.uint8) for _ in range(2)]
+        expected = trails.paint(positions, painted[0])
+        cuda_on_cpu.install(monkeypatch)
+        found = trails.paint(positions, painted[1])
+    assert cuda_on_cpu.launched == {"paint"} and expected.sum() > 500
+    assert torch.equal(found, expected) and torch.equal(*painted)
 
 
 def blocks(page):
