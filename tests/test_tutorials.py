@@ -76,7 +76,8 @@ def test_cuda_of_the_page_on_kernels_has_the_bits_of_its_cpp(tmp_path, monkeypat
         trails = importlib.import_module("trails")
         painted = [torch.zeros(70, 50, 60, dtype=torch.uint8) for _ in range(2)]
         expected = trails.paint(positions, painted[0])
-        cuda_on_cpu.install(monkeypatch)
+        cuda_on_cpu.launched.clear()
+        monkeypatch.setattr(trails, "launch", cuda_on_cpu)
         found = trails.paint(positions, painted[1])
     assert cuda_on_cpu.launched == {"paint"} and expected.sum() > 500
     assert torch.equal(found, expected) and torch.equal(*painted)
