@@ -169,6 +169,8 @@ class LearnerOptions(Protocol):
         warmup: updates over which the learning rate rises to the initial one.
         read_lr: reads the learning rate, if the learner changes it itself.
         extra: parameters that it trains besides the policy's.
+        copy_from: takes over, in place, what another learner of its class has learnt, the policy's
+            weights included. None: it cannot be a member of a population.
     """
 
     set_lr: Callable[[float], None] | None = None
@@ -182,6 +184,7 @@ class LearnerOptions(Protocol):
     warmup: int = 0
     read_lr: Callable[[], float] | None = None
     extra: Sequence[torch.Tensor] = ()
+    copy_from: Callable[[Learner], None] | None = None
 
     @staticmethod
     def bytes_per_env(env: Env) -> float:
