@@ -284,6 +284,13 @@ class OpponentPool(Protocol):
     def refresh_snapshots(self, policy: Actor, n_updates: int) -> None:
         """Replaces the oldest snapshot by the policy if it is time to."""
 
+    def is_due(self, n_updates: int) -> bool:
+        """Returns whether `refresh_rivals` replaces one after so many updates."""
+        ...
+
+    def refresh_rivals(self, policies: Sequence[Actor], n_updates: int) -> None:
+        """Replaces the oldest snapshot of another member by one of these if it is time to."""
+
     def pop_win_rates(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]
     ) -> dict[str, float]:

@@ -361,13 +361,13 @@ def make_opponents(
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
     """
     options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
-    if not (cfg.opponents.past or cfg.opponents.bot):
+    if not (cfg.opponents.past or cfg.opponents.bot or cfg.opponents.league):
         return None
     bot = None
     if cfg.opponents.bot:
         bot = in_env(make_bot(cfg.opponents.bot_class, cfg.env, sample), cfg.env, env)
     with errors():
-        if cfg.opponents.past:
+        if cfg.opponents.past or cfg.opponents.league:
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
             engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")

@@ -553,7 +553,9 @@ class Train(Common):
         over = self.learner.anneal
         lag, env = getattr(self.learner, "lag", 0), self.env
         has_curriculum = self.curriculum.name != "none"
-        is_async = lag and (self.opponents.past or self.opponents.bot)
+        opponents = self.opponents
+        is_async = lag and (opponents.past or opponents.bot or opponents.league)
+        is_member = self.population.size > 1
         # classes of users are asked when they are made
         draws = getattr(env, "resample", not env.name.startswith("megastep."))
         cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
@@ -567,6 +569,9 @@ class Train(Common):
                 else f"env={env_name(env)} draws no home for each episode; {cure}"
             ),
             **{f"learner.{name}": text for name, text in too_large(self.learner, self)},
+            "opponents.league": opponents.league
+            and not is_member
+            and "are other members of a population, which needs population.size=2 or more",
             "learner.lag": is_async
             and "opponents change with every update, so nothing can be collected ahead of it; use "
             "learner.lag=0, or no opponents",

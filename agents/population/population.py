@@ -181,8 +181,22 @@ class Population:
             is_due = self.samples // self.every > before // self.every
             if is_due and leader.fraction_left > 0:
                 self.take_over()
+        self.meet()
         if time.monotonic() - self.saved_at >= self.checkpoint_seconds:
             self.save()
+
+    def meet(self) -> None:
+        """Gives the members' opponents each other's policies, where they play in a league."""
+        pools = [trainer.opponents for trainer in self.trainers]
+        updates = self.leader.updates
+        if not any(pool is not None and pool.is_due(updates) for pool in pools):
+            return
+        self.turns.wait()
+        policies = [trainer.policy for trainer in self.trainers]
+        for member, pool in enumerate(pools):
+            if pool is not None:
+                pool.refresh_rivals([*policies[member + 1 :], *policies[:member]], updates)
+        self.turns.wait()
 
     def save(self) -> None:
         """Begins to save a checkpoint of each member, once all have the last one."""

@@ -1,6 +1,8 @@
 """Populations, from the command line."""
 
+import random
 import shutil
+import subprocess
 
 import pytest
 import yaml
@@ -12,6 +14,7 @@ from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations
 from tests.cli.test_exact_resume import differences
 from tests.helpers import tiny
+from tests.helpers.processes import HUNG, forked
 
 pytestmark = pytest.mark.usefixtures("here")
 SMALL = [
@@ -237,3 +240,61 @@ def test_agents_of_a_population_are_evaluated_and_start_runs(here, capsys):
     weights, own = ({**state(f)["policy"]} for f in ("next", "P/member-2"))
     assert weights.keys() == own.keys()
     assert "member-2" in (here / "next/config.yaml").read_text()
+
+
+@pytest.mark.slow
+def test_members_of_a_league_meet_each_other_and_resume_with_the_same_bits(here, capsys):
+    """Their opponents are, in turn, the other members' policies of the time."""
+    small = [word for word in tiny.TINY if not word.startswith(("env", "geometry"))]
+    words = [*small, "env=pong", "env.self_play=true", "env.points=1", "env.n_envs=8"]
+    words += ["opponents.league=0.5", "opponents.past=0.25", "opponents.snapshots=2"]
+    words += ["opponents.every=3", "population.size=3", "population.every=240", "logger=none"]
+    words += [VARY, "samples=480"]
+    run(*words, "folder=L", "checkpoint_seconds=1e-9", "keep_checkpoints=99")
+    shutil.copytree("L", "left-alone")
+    won = [json_lines.read(here / f"L/member-{n}/metrics.jsonl")[-1] for n in range(3)]
+    assert any("episode/return/league" in row for row in won)
+    paths = checkpoint.list_checkpoints(here / "L/member-0/checkpoints")
+    early, after = paths[1], paths[4]
+    states = [checkpoint.load_latest(path).state for path in (early, after)]
+    rivals = [one["opponents"]["snapshots"]["2"] for one in states]
+    assert states[0]["updates"] < 3 < states[1]["updates"] < 6
+    at_refresh = checkpoint.load_latest(here / "L/member-1/checkpoints" / paths[2].name).state
+    assert differences(rivals[1], {k: at_refresh["policy"][k] for k in rivals[1]}) == []
+    assert differences(rivals[0], rivals[1]) != []
+    for n in range(3):
+        for path in checkpoint.list_checkpoints(here / f"L/member-{n}/checkpoints")[5:]:
+            shutil.rmtree(path)
+    run("resume=L")
+    assert_equal(here / "L", here / "left-alone")
+    err = refused(capsys, *words, "population.size=1", "population.vary={}", "folder=M")
+    assert "opponents.league" in err and "population.size=2" in err
+
+
+@pytest.mark.nightly
+def test_population_that_is_killed_at_random_moments_has_the_same_bits(here):
+    """Thirty times by SIGKILL, in whatever it does."""
+    words = [*POPULATION, "samples=40960", "population.every=1024"]
+    run(*words)
+    shutil.move("P", "left-alone")
+    generator, n_killed = random.Random(1), 0
+    while n_killed < 30:
+        is_new = not populations.is_root(here / "P") or not checkpoint.list_checkpoints(
+            here / "P/member-2/checkpoints"
+        )
+        if is_new:
+            shutil.rmtree("P", ignore_errors=True)
+        start = [*words, "checkpoint_seconds=1e-9"] if is_new else ["resume=P"]
+        process = forked("train", *start, cwd=here)
+        try:
+            process.communicate(timeout=generator.uniform(1, 5))
+        except (subprocess.TimeoutExpired, TimeoutError):
+            process.kill()
+            process.communicate(timeout=HUNG)
+            n_killed += 1
+            continue
+        break
+    assert n_killed >= 3
+    if process.returncode != 0:
+        run("resume=P")
+    assert_equal(here / "P", here / "left-alone")
