@@ -34,33 +34,24 @@ class Turns:
     def __init__(self, n: int, device: torch.device):
         self.device, is_on_gpu = device, device.type == "cuda"
         self.streams = [torch.cuda.Stream(device) for _ in range(n)] if is_on_gpu else None
-        self.generators = [global_generators.states() for _ in range(n)]
-        self.of_gpu: dict[int, torch.Tensor] = {}
+        self.generators = [self._generators() for _ in range(n)]
 
     @contextlib.contextmanager
     def of(self, member: int) -> Iterator[None]:
         """What is done inside is this member's."""
-        if self.streams is None:
-            with self._generators_of(member):
-                yield
-            return
-        with torch.cuda.stream(self.streams[member]), self._generators_of(member):
+        of_host, of_gpu = self.generators[member]
+        global_generators.restore(of_host)
+        if of_gpu is not None:
+            torch.cuda.set_rng_state(of_gpu, self.device)
+        stream = self.streams and torch.cuda.stream(self.streams[member])
+        with stream or contextlib.nullcontext():
             yield
+        self.generators[member] = self._generators()
 
-    @contextlib.contextmanager
-    def _generators_of(self, member) -> Iterator[None]:
-        on_gpu = None
-        if self.streams is not None:
-            index = self.device.index or 0
-            on_gpu = torch.cuda.default_generators[index]  # pyright: ignore[reportPrivateImportUsage]
-        with global_generators.kept():
-            global_generators.restore(self.generators[member])
-            if on_gpu is not None and member in self.of_gpu:
-                on_gpu.set_state(self.of_gpu[member])
-            yield
-            self.generators[member] = global_generators.states()
-            if on_gpu is not None:
-                self.of_gpu[member] = on_gpu.get_state()
+    def _generators(self) -> tuple[dict[str, tuple], torch.Tensor | None]:
+        is_on_gpu = self.device.type == "cuda"
+        of_gpu = torch.cuda.get_rng_state(self.device) if is_on_gpu else None
+        return global_generators.states(), of_gpu
 
     def wait(self) -> None:
         """Waits until all members have done what is launched."""

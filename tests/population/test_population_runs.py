@@ -232,6 +232,12 @@ def test_agents_of_a_population_are_evaluated_and_start_runs(here, capsys):
     assert entry.run_command("evaluate", ["run=P", *words]) == 0
     best = populations.best(here / "P")
     assert list((here / f"P/member-{best}/evaluations").iterdir())
+    assert entry.run_command("report", ["run=P"]) == 0
+    page = (here / "P/report.html").read_text()
+    assert "<h2>Population</h2>" in page and "score of the population" in page
+    for member, rows in enumerate(zip(*populations.read(here / "P" / populations.FILE))):
+        cells = [f"{row['generation']} from {row['from']}" for row in rows if row["from"] != member]
+        assert (", ".join(cells) or "never") in page
     assert entry.run_command("evaluate", ["run=P", "member=7", *words]) == 2
     assert "has no member 7" in capsys.readouterr().err
     assert entry.run_command("export", ["run=P", "member=1", "format=safetensors"]) == 0
