@@ -43,8 +43,9 @@ class Turns:
         global_generators.restore(of_host)
         if of_gpu is not None:
             torch.cuda.set_rng_state(of_gpu, self.device)
-        stream = self.streams and torch.cuda.stream(self.streams[member])
-        with stream or contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            if self.streams is not None:
+                stack.enter_context(torch.cuda.stream(self.streams[member]))
             yield
         self.generators[member] = self._generators()
 

@@ -61,9 +61,9 @@ def _places(generations, charts) -> list[str]:
     samples = [int(rows[0]["samples"]) for rows in generations]
     scores = np.array([[_number(row.get("score")) for row in rows] for rows in generations])
     lines: dict[str, dict[str, list]] = {}
-    if (known := ~np.isnan(scores).all(1)).any():
+    if not np.isnan(scores).all():
         lines["score of the population"] = {
-            name: [float(of(row)) if is_known else None for row, is_known in zip(scores, known)]
+            name: [None if np.isnan(row).all() else float(of(row)) for row in scores]
             for name, of in SUMMARIES.items()
         }
     for key in populations.settings_of(generations[0][0]):
