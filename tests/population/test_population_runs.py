@@ -12,7 +12,7 @@ from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.cli import entry, train
 from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations
-from tests.cli.test_exact_resume import differences
+from tests.cli.test_exact_resume import CASES, differences
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, forked
 
@@ -303,4 +303,33 @@ def test_population_that_is_killed_at_random_moments_has_the_same_bits(here):
     assert n_killed >= 3
     if process.returncode != 0:
         run("resume=P")
+    assert_equal(here / "P", here / "left-alone")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "r2d2" else pytest.mark.nightly)
+        for name in ("r2d2", "vtrace", "lag", "wrappers")
+    ],
+)
+def test_copies_of_every_learner_resume_with_the_same_bits(here, monkeypatch, case):
+    """What a copy leaves out would come back from the checkpoint, or not."""
+
+    def drawn(self, trainer):
+        member = self.trainers.index(trainer)
+        return random.Random(f"{trainer.samples} {member}").random()
+
+    monkeypatch.setattr(Population, "score_of", drawn)
+    words = [*CASES[case], "log_every=2", "logger=none", "samples=384", "folder=P"]
+    words += ["population.size=3", "population.every=96"]
+    words += ["population.vary={learner.lr: {min: 1e-4, max: 3e-2, log: true}}"]
+    run(*words, "checkpoint_seconds=1e-9", "keep_checkpoints=99")
+    rows = [row for rows in populations.read(here / "P" / populations.FILE) for row in rows]
+    assert sum(row["from"] != row["member"] for row in rows) >= 3
+    shutil.copytree("P", "left-alone")
+    for n in range(3):
+        for path in checkpoint.list_checkpoints(here / f"P/member-{n}/checkpoints")[6:]:
+            shutil.rmtree(path)
+    run("resume=P")
     assert_equal(here / "P", here / "left-alone")
