@@ -169,6 +169,8 @@ class LearnerOptions(Protocol):
         warmup: updates over which the learning rate rises to the initial one.
         read_lr: reads the learning rate, if the learner changes it itself.
         extra: parameters that it trains besides the policy's.
+        copy_from: takes over, in place, what another learner of its class has learnt, the policy's
+            weights included. None: it cannot be a member of a population.
     """
 
     set_lr: Callable[[float], None] | None = None
@@ -182,6 +184,7 @@ class LearnerOptions(Protocol):
     warmup: int = 0
     read_lr: Callable[[], float] | None = None
     extra: Sequence[torch.Tensor] = ()
+    copy_from: Callable[[Learner], None] | None = None
 
     @staticmethod
     def bytes_per_env(env: Env) -> float:
@@ -280,6 +283,13 @@ class OpponentPool(Protocol):
 
     def refresh_snapshots(self, policy: Actor, n_updates: int) -> None:
         """Replaces the oldest snapshot by the policy if it is time to."""
+
+    def is_due(self, n_updates: int) -> bool:
+        """Returns whether `refresh_rivals` replaces one after so many updates."""
+        ...
+
+    def refresh_rivals(self, policies: Sequence[Actor], n_updates: int) -> None:
+        """Replaces the oldest snapshot of another member by one of these if it is time to."""
 
     def pop_win_rates(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["KINDS", "GlobalGenerators", "changed_kinds", "kept", "seed_all", "states"]
+__all__ = ["KINDS", "GlobalGenerators", "changed_kinds", "kept", "restore", "seed_all", "states"]
 
 KINDS = "numpy", "python", "torch"
 _NUMPY: Any = np.random  # whose types leave out the functions that exchange its bit generator
@@ -96,7 +96,12 @@ def kept() -> Iterator[None]:
     try:
         yield
     finally:
-        random.setstate(before["python"])
-        np.random.set_state(before["numpy"])
-        if "torch" in before:
-            sys.modules["torch"].set_rng_state(before["torch"])
+        restore(before)
+
+
+def restore(before: dict[str, tuple]) -> None:
+    """Brings the global generators back to their `states`."""
+    random.setstate(before["python"])
+    np.random.set_state(before["numpy"])
+    if "torch" in before:
+        sys.modules["torch"].set_rng_state(before["torch"])

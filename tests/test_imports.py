@@ -55,7 +55,7 @@ AGENTS = (
     ("algorithms",),
     ("runs",),
     ("training",),
-    ("selfplay",),
+    ("population", "selfplay"),
     ("factory",),
     ("evaluation", "pretrained"),
     ("export", "reports"),
@@ -316,6 +316,8 @@ def environments_are_independent(graph):
 def learner_knows_trees_and_spaces_only(graph):
     for name, target in edges(graph, is_agents):
         shared = SHARED_WITH_BOTS if is_below(name, BOTS) else SHARED
+        if part_of(name, "megastep.agents") == "population":
+            shared = SHARED | {"megastep.global_generators"}
         if part_of(name, "megastep.agents") in UPPER_ROOMS:
             shared = SHARED_WITH_UPPER_ROOMS
         launches = matches(name, OWN_USERS["megastep.kernels.build.launch"])

@@ -194,6 +194,11 @@ class GradientSteps:
         means = (self._totals[:-2] / n_taken).unbind()
         return {**dict(zip(self._metrics, means, strict=True)), "skipped_steps": n_skipped}
 
+    def copy_from(self, other: "GradientSteps") -> None:
+        """Takes over the step size of others, and has skipped no update."""
+        self._lr.copy_(other._lr)
+        self.check.count(torch.zeros((), dtype=torch.bool, device=self._lr.device))
+
     def state_dict(self) -> StateDict:
         """Returns the optimizer's state, the step size and what `check` has counted."""
         check = self.check.state_dict()

@@ -52,6 +52,7 @@ from megastep.agents.errors import UserError, shortened
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import VERSION
+from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
@@ -319,6 +320,19 @@ class GradientLearner:
             generator=self.generator.state_dict(),
             policy_generator=self.policy.generator.state_dict(),
         )
+
+    def copy_from(self, other: "GradientLearner") -> None:
+        """Takes over what another learner of the same class and sizes has learnt: its policy's
+        weights and statistics, and the state of its optimizer. In place, so that captured updates
+        stay; generators and rollouts stay this one's.
+        """
+        own, others = self.policy.state_dict(), other.policy.state_dict()
+        copy_all((own[name], others[name]) for name in own)
+        self.steps.optimizer.load_state_dict(other.steps.optimizer.state_dict())
+        self.coefficients.set(**other.coefficients.values)
+        self.steps.copy_from(other.steps)
+        with torch.no_grad():
+            copy_all(zip(self.extra, other.extra, strict=True))
 
     def check_state(self, state: StateDict) -> None:
         """Raises ValueError if a `state_dict` is not one that `load_state_dict` continues from."""

@@ -259,6 +259,15 @@ class R2D2(GradientLearner):
             result = result._replace(loss=result.loss + extra, metrics=result.metrics | own)
         return result
 
+    def copy_from(self, other: GradientLearner) -> None:
+        """Takes over what another learner has learnt, its target network too. In place."""
+        super().copy_from(other)
+        assert isinstance(other, R2D2)
+        own, others = self.target.state_dict(), other.target.state_dict()
+        copy_all((own[name], others[name]) for name in own)
+        self.n_taken.copy_(other.n_taken)
+        self.reward_scale.copy_(other.reward_scale)
+
     def state_dict(self) -> StateDict:
         """Returns the base's state, the target network, the number of gradient steps taken and the
         scale of rewards.

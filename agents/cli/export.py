@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from megastep.agents import console
-from megastep.agents.cli import plain_words
+from megastep.agents.cli import plain_words, scripts
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.runs import folders
 from megastep.settings import closest
@@ -15,6 +15,7 @@ HELP = """Writes a trained agent for use elsewhere.
   megastep export run=RUN format=safetensors    an agent file with its card: agent.safetensors
   megastep export run=RUN format=hub            a folder for the Hugging Face Hub: hub/
   ... file=my_agent.onnx                        this file or folder instead of one in RUN
+  ... member=3                                  an agent of a population; without it, the best
 
 run= takes a run, one of its checkpoints, latest, or a packaged agent."""
 #: The formats, and the file or folder of each.
@@ -31,11 +32,18 @@ def main(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         console.say(HELP)
         return 0 if words else 2
-    given = plain_words.parse(words, {"run": False, "format": False, "file": False})
+    given = plain_words.parse(
+        words, {"run": False, "format": False, "file": False, "member": False}
+    )
     for key, cure in {"run": "latest takes the newest run", "format": ", ".join(FORMATS)}.items():
         if key not in given:
             raise UserError(f"{key} is missing; {key}={cure}")
-    export(given["run"][0], given["format"][0], *given.get("file", ()))
+    run = given["run"][0]
+    if "member" in given:
+        which = given["member"][0]
+        member = int(which) if which.isdecimal() else which
+        run = scripts.with_member({"run": run, "member": member}, "run")["run"]
+    export(run, given["format"][0], *given.get("file", ()))
     return 0
 
 

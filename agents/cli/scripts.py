@@ -14,7 +14,7 @@ from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, settings
 from megastep.agents.launch import launcher
 from megastep.agents.launch.again import AUTO, RESUMABLE, automatic
-from megastep.agents.runs import agent_file, folders, formats
+from megastep.agents.runs import agent_file, folders, formats, populations
 
 Tree = dict[str, Any]
 
@@ -71,6 +71,8 @@ The most common words:
                                compare its metrics.jsonl
   init=RUN                     start a new run from its weights, in its environment and homes; also
                                the name of a pretrained agent
+  population.size=8 'population.vary={learner.lr: {min: 3e-4, max: 3e-3, log: true}}'
+                               train agents side by side that take over from each other
   env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
   logger=[tensorboard,wandb] logger.wandb.mode=offline
                                several loggers; csv, none, or a class of your own"""
@@ -115,6 +117,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     for key, kind in QUANTITIES.items():
         if key in tree:
             tree[key] = settings.quantity(tree[key], kind)
+    tree = with_member(tree, "init")
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if tree.get("resume") == AUTO and "rerun" not in given:
         given.remove("resume")  # what there is to resume is looked up when training begins
@@ -125,7 +128,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     how, allowed = given[0], {"resume": RESUMABLE, "rerun": REPEATABLE}.get(given[0], typed)
     if refused := [key for key in typed if not {key, key.split(".")[0]} & {*allowed}]:
         raise ConfigErrors((key, CURES[how]) for key in refused)
-    path = folders.find(tree[how])
+    path = folders.find(tree[how], None if how == "resume" else "best")
     if how != "init" and agent_file.is_agent_file(path):
         raise UserError(
             f"{tree[how]} is a pretrained agent, which has the weights only. init={tree[how]} "
@@ -134,8 +137,13 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     # a run in use is refused before its checkpoints are read, which come and go, by rank 0
     is_locked = how == "resume" and environment.rank() == 0
     with folders.locked(folders.folder_of(path)) if is_locked else contextlib.nullcontext():
+        whole = populations.is_root(path)
+        if whole:
+            path = populations.common_checkpoints(path)[0]
         loaded = folders.load_checkpoint(path, tree.get("trust") is True)
     saved = loaded.config["train"]
+    if whole:  # the first member's settings, but for what it is itself
+        saved["population"]["member"] = None
     if how == "init":
         groups = ("env", "geometry", "agent")
         groups = {group: saved[group] for group in groups if group not in typed}
@@ -207,7 +215,7 @@ def check_training(cfg: settings.Train) -> None:
     elif cfg.resume is None:
         folders.check_free(cfg.folder)
     else:
-        with folders.locked(folders.folder_of(folders.find(cfg.resume))):
+        with folders.locked(folders.folder_of(folders.find(cfg.resume, None))):
             pass
 
 
@@ -218,6 +226,7 @@ interval over homes. Prints a table and writes it to the run's folder: evaluatio
 
 The most common words:
   run=RUN              a run folder, one of its checkpoints, latest, or a pretrained agent
+  member=3             an agent of a population, whose folder is run=; without it, the best
   split=training       the homes it was trained in, instead of unseen ones
   geometry=bench       other homes
   env=pong             another environment with the same spaces: after self-play, the tracker
@@ -252,8 +261,26 @@ def check_run(cfg: settings.Evaluate | settings.Record) -> None:
             folders.find(run)
 
 
-def without_training(tree: Tree, typed: list[str]) -> Tree:
-    """Returns the tree without what files, such as environments', set for training alone."""
+def with_member(tree: Tree, key: str) -> Tree:
+    """Returns the tree with the folder of a population's member at a key, in place of the
+    population's folder there and `member`. Raises ConfigErrors if there is no such member.
+    """
+    run, member = tree.get(key), tree.get("member")
+    if member is None or not isinstance(run, str):
+        return tree
+    root = folders.find(run, None)
+    if not populations.is_root(root):
+        raise ConfigErrors([("member", f"is of a population, and {run} is a single run")])
+    if member != "best" and type(member) is not int:
+        raise ConfigErrors([("member", f"{member!r} is neither a number nor best")])
+    return tree | {key: str(populations.member(root, member)), "member": None}
+
+
+def prepare_playing(tree: Tree, typed: list[str]) -> Tree:
+    """Returns the tree with the member of a population that is asked for, and without what files,
+    such as environments', set for training alone.
+    """
+    tree = with_member(tree, "run")
     kinds = settings.Train, settings.Played
     train, played = ({field.name for field in dataclasses.fields(kind)} for kind in kinds)
     absent = train - played - {key.split(".")[0] for key in typed}
@@ -270,7 +297,7 @@ def names_in_list(word: str) -> str:
 
 TRAIN = Script("train", settings.Train, TRAIN_HELP, check_training, prepare_training)
 EVALUATE = Script(
-    "evaluate", settings.Evaluate, EVALUATE_HELP, check_run, without_training, names_in_list
+    "evaluate", settings.Evaluate, EVALUATE_HELP, check_run, prepare_playing, names_in_list
 )
-RECORD = Script("record", settings.Record, RECORD_HELP, check_run, without_training)
+RECORD = Script("record", settings.Record, RECORD_HELP, check_run, prepare_playing)
 SCRIPTS = {script.name: script for script in (TRAIN, EVALUATE, RECORD)}

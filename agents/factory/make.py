@@ -196,14 +196,30 @@ def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
 
 
 def check_memory(
-    env: Env, sample: types.Env, learner: object, geometries: list, **arguments
+    env: Env,
+    sample: types.Env,
+    learner: object,
+    geometries: list,
+    n_members: int = 1,
+    **arguments,
 ) -> None:
     """Raises UserError with the number that fits, if there are too many environments, or too many
-    observations in a replay buffer, for the memory.
+    observations in a replay buffer, or too many members of a population, for the memory.
 
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
+
+    Args:
+        n_members: trainings that are to fit side by side.
     """
+
+    def fit(bytes_each) -> None:
+        if n_members == 1:
+            engine.fit(env.n_envs, bytes_each, sample.device)
+        else:
+            what = "members (population.size)"
+            engine.fit(n_members, env.n_envs * bytes_each, sample.device, what)
+
     options = with_defaults(learner, LearnerOptions)
     n_bytes = options.bytes_per_env(sample)
     n, each = options.replay_size(sample)
@@ -212,13 +228,15 @@ def check_memory(
         engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
         n_bytes += n * each / env.n_envs
         try:
-            engine.fit(env.n_envs, total + n_bytes, sample.device)
+            fit(total + n_bytes)
         except engine.EngineError:
             if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
                 probe = changed(env, n_envs=PROBE)
                 probe = construct(probe, geometries=geometries[:1], **arguments)
                 n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
-                engine.fit(env.n_envs, n_bytes, sample.device)
+                fit(n_bytes)
+            elif n_members > 1:
+                raise
 
 
 def check_network(agent: Agent, env: types.Env, n_rows: int, is_learning: bool) -> None:
@@ -343,13 +361,13 @@ def make_opponents(
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
     """
     options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
-    if not (cfg.opponents.past or cfg.opponents.bot):
+    if not (cfg.opponents.past or cfg.opponents.bot or cfg.opponents.league):
         return None
     bot = None
     if cfg.opponents.bot:
         bot = in_env(make_bot(cfg.opponents.bot_class, cfg.env, sample), cfg.env, env)
     with errors():
-        if cfg.opponents.past:
+        if cfg.opponents.past or cfg.opponents.league:
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
             engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")

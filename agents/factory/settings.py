@@ -25,6 +25,7 @@ from pydantic import (
 )
 
 from megastep.agents.factory import components
+from megastep.agents.population.variation import Variation
 from megastep.imports import import_object
 from megastep.schedules import Scheduled
 from megastep.settings import (
@@ -388,6 +389,74 @@ def schedules_of(cfg: "Train") -> list[str]:
     ]
 
 
+def variable(cfg: "Train") -> dict[str, Scheduled]:
+    """Returns the bounds of the settings that may vary between the members of a population, by key:
+    those that may be schedules.
+    """
+    parts: list = [("learner.", cfg.learner), ("env.", cfg.env)]
+    return {
+        f"{prefix}{name}": extra
+        for prefix, part in parts
+        for name, field in part.__pydantic_fields__.items()
+        for extra in field.metadata
+        if isinstance(extra, Scheduled)
+    }
+
+
+def population_errors(cfg: "Train") -> dict[str, object]:
+    """Returns {dotted key: sentence} of what is wrong with a population, false for what is not."""
+    chosen, bounds = cfg.population, variable(cfg)
+    errors: dict[str, object] = {}
+    for key, one in chosen.vary.items():
+        problem = one.problem()
+        if key not in bounds:
+            problem = f"cannot vary; {closest(key, bounds)}"
+        elif key in schedules_of(cfg):
+            problem = f"is a schedule, {getattr(cfg.learner, key[8:], '')}, and so cannot vary"
+        elif key == "learner.lr" and getattr(cfg.learner, "desired_kl", None) is not None:
+            problem = "follows learner.desired_kl, and so cannot vary"
+        elif not problem:
+            try:
+                for number in one.ends():
+                    bounds[key].check(number)
+            except ValueError as error:
+                problem = str(error)
+        if problem:
+            errors["population.vary"] = f"{key} {problem}"
+    unit = None if cfg.evaluate_every is None else every(cfg.evaluate_every)[1]
+    is_many = chosen.size > 1
+    return errors | {
+        "population.size": not is_many
+        and chosen.vary
+        and "is 1, and population.vary needs several members: population.size=8",
+        "population.score": is_many
+        and chosen.score == "evaluated"
+        and unit != "samples"
+        and "is evaluated, which needs evaluations every so many samples: evaluate_every=10M",
+        "population.schedule": chosen.schedule is not None
+        and (
+            (is_many and "is of a single agent, and cannot be combined with population.size")
+            or (
+                not os.path.isfile(chosen.schedule)
+                and f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
+            )
+        ),
+        **{
+            name: is_many
+            and getattr(cfg, name) not in (1, 0)
+            and "cannot be combined with population.size yet: a population trains in one process"
+            for name in ("ranks", "restarts")
+        },
+        "rerun": is_many
+        and chosen.member is None
+        and cfg.rerun is not None
+        and "repeats a single run; give a member's folder",
+        "resume": is_many
+        and cfg.resume == "auto"
+        and "cannot be auto for a population yet; give resume=RUN, its folder",
+    }
+
+
 def changes_lr(learner: "Learner") -> bool:
     """Returns whether the learning rate has a schedule, or follows the KL divergence."""
     is_constant = isinstance(getattr(learner, "lr", 0.0), (int, float))
@@ -428,6 +497,20 @@ class Finish:
 
 
 @frozen
+class Population:
+    """Agents that train at once, and take over from each other."""
+
+    size: Annotated[int, Field(ge=1, le=1024)] = 1
+    every: Samples = 20_000_000
+    vary: dict[str, Variation] = dataclasses.field(default_factory=dict)
+    exploit: Literal["truncation", "tournament"] = "truncation"
+    explore: Literal["factor", "resample"] = "factor"
+    score: Literal["running", "evaluated"] = "running"
+    schedule: str | None = None
+    member: int | None = None
+
+
+@frozen
 class Train(Common):
     env: Env
     geometry: Geometry
@@ -435,6 +518,7 @@ class Train(Common):
     learner: Learner
     curriculum: Curriculum = cast("Curriculum", NoCurriculum(name="none"))
     opponents: Opposition = Opposition()
+    population: Population = Population()
     logger: Loggers = dataclasses.field(default_factory=dict)
     finish: Finish
     samples: Samples | None
@@ -463,12 +547,15 @@ class Train(Common):
     resume: str | None
     rerun: str | None = None
     init: str | None
+    member: int | Literal["best"] | None = None
 
     def errors(self) -> dict[str, object]:
         over = self.learner.anneal
         lag, env = getattr(self.learner, "lag", 0), self.env
         has_curriculum = self.curriculum.name != "none"
-        is_async = lag and (self.opponents.past or self.opponents.bot)
+        opponents = self.opponents
+        is_async = lag and (opponents.past or opponents.bot or opponents.league)
+        is_member = self.population.size > 1
         # classes of users are asked when they are made
         draws = getattr(env, "resample", not env.name.startswith("megastep."))
         cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
@@ -482,6 +569,9 @@ class Train(Common):
                 else f"env={env_name(env)} draws no home for each episode; {cure}"
             ),
             **{f"learner.{name}": text for name, text in too_large(self.learner, self)},
+            "opponents.league": opponents.league
+            and not is_member
+            and "are other members of a population, which needs population.size=2 or more",
             "learner.lag": is_async
             and "opponents change with every update, so nothing can be collected ahead of it; use "
             "learner.lag=0, or no opponents",
@@ -508,6 +598,10 @@ class Train(Common):
                 and f"extends a resumed run; give resume=RUN, or {name}= for a new run"
                 for name in ("samples", "seconds")
             },
+            **population_errors(self),
+            "member": self.member is not None
+            and self.init is None
+            and "is of a population whose weights start a run; give init=RUN",
             "stop": bool(self.stop)
             and self.evaluate_every is None
             and "needs evaluations in training to reach it: give evaluate_every=60s, or samples",
@@ -525,6 +619,7 @@ class Played(Common):
     geometry: Geometry | None = None
     split: Split
     greedy: bool
+    member: int | Literal["best"] | None = None
 
 
 def _given(run: T | None) -> T:

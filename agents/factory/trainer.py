@@ -26,6 +26,7 @@ from megastep.agents.runs import (
     checkpoint,
     folders,
     formats,
+    populations,
     provenance,
     repeat,
     saver,
@@ -39,7 +40,7 @@ from megastep.imports import import_object
 from megastep.types import optional
 
 if TYPE_CHECKING:
-    from megastep.agents.types import Row, RunLogger
+    from megastep.agents.types import Learner, Row, RunLogger
 
 
 def make_trainer(
@@ -49,6 +50,8 @@ def make_trainer(
     token: str = "",
     on_log: Callable[[Trainer], None] = lambda trainer: None,
     make_evaluator: Callable | None = None,
+    leader: Trainer | None = None,
+    n_members: int = 1,
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
@@ -60,6 +63,8 @@ def make_trainer(
         on_log: called with the trainer after each report.
         make_evaluator: returns what measures the policy every `cfg.evaluate_every`, for `cfg`, the
             environment of the training and the device, such as `evaluation.in_training.Evaluator`.
+        leader: the first member of a population, for the others.
+        n_members: trainers of a population that memory is to hold from this one on.
     """
     number, n_ranks = process_group.rank(), process_group.n_ranks()
     seed = rank_seed(cfg.seed, number)
@@ -78,7 +83,8 @@ def make_trainer(
     policy.generator = SeededGenerator(stream_seed(seed, "policy"))
     learner = factory.make_learner(cfg.learner, policy, seed)
     cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)
-    factory.check_memory(cfg.env, sample, learner, **where)
+    check_population(cfg, learner)
+    factory.check_memory(cfg.env, sample, learner, n_members=n_members, **where)
     env = factory.construct(cfg.env, **where)
     if start := cfg.resume or cfg.init:
         path = folders.find(start)
@@ -141,6 +147,8 @@ def make_trainer(
             layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
             repeat_hint=functools.partial(repeat.hint, is_resumed=cfg.resume is not None),
             callbacks=[import_object(name)() for name in cfg.callbacks],
+            leader=leader,
+            timetable=populations.schedule(Path(path)) if (path := cfg.population.schedule) else (),
             **measured,
             **writers,
         )
@@ -149,6 +157,16 @@ def make_trainer(
                 trainer.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
             trainer.lost += differing(loaded.made_with, made_with)
     return trainer
+
+
+def check_population(cfg: settings.Train, learner: "Learner") -> None:
+    """Raises UserError if a learner cannot be a member of a population."""
+    options = with_defaults(learner, LearnerOptions)
+    if cfg.population.size > 1 and options.copy_from is None:
+        raise UserError(
+            f"{type(learner).__name__} has no copy_from(other), so the members of a population "
+            "cannot take over from each other: add the method, or use population.size=1"
+        )
 
 
 def make_loggers(cfg: settings.Train, folder: Path, step: int) -> loggers.Loggers:

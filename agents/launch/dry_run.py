@@ -48,11 +48,10 @@ def sizes(cfg: settings.Train, device) -> dict[str, int]:
 def count_opponents(cfg: settings.Train, sample) -> int:
     """Returns the number of lanes that opponents control. Raises UserError if they do not fit."""
     opponents = cfg.opponents
-    if not (opponents.past or opponents.bot):
+    if not (opponents.past or opponents.bot or opponents.league):
         return 0
     with factory.errors():
-        n_per_snapshot, n_bot = count_environments(
-            sample, cfg.env.n_envs, opponents.past, opponents.bot, opponents.snapshots
-        )
-    n_past = n_per_snapshot * opponents.snapshots if opponents.past else 0
+        shares = opponents.past, opponents.bot, opponents.snapshots, opponents.league
+        n_per_snapshot, n_bot, n_per_rival = count_environments(sample, cfg.env.n_envs, *shares)
+    n_past = (n_per_snapshot + n_per_rival) * opponents.snapshots
     return (n_past + n_bot) * (optional(sample, "n_agents") - 1)

@@ -3,13 +3,10 @@
 import contextlib
 import functools
 import itertools
-import json
 import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import yaml
 
 from megastep import engine
 from megastep.agents import console, factory, package
@@ -23,32 +20,28 @@ from megastep.agents.errors import (
     NonFinite,
     UserError,
     memory_problem,
-    user_errors,
 )
-from megastep.agents.evaluation import evaluate_run, in_training, record, tables
+from megastep.agents.evaluation import in_training
 from megastep.agents.factory import env_failures, settings
-from megastep.agents.factory.trainer import make_loggers, make_trainer
-from megastep.agents.launch import again, dry_run, gpu, launcher, rank, rank_checks, signals
-from megastep.agents.runs import folders, provenance, scores
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.factory.trainer import make_trainer
+from megastep.agents.launch import (
+    again,
+    dry_run,
+    finishing,
+    gpu,
+    launcher,
+    population,
+    rank,
+    rank_checks,
+    signals,
+)
+from megastep.agents.runs import folders, provenance
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
 from megastep.agents.training.trainer import Trainer
-from megastep.agents.types import RunResult
-from megastep.imports import import_object
 
 if TYPE_CHECKING:
-    from megastep.agents.types import Config
-
-
-def with_more(cfg: settings.Train) -> settings.Train:
-    """Returns `cfg` with more_samples and more_seconds turned into totals of the resumed run."""
-    totals = {}
-    for name in ("samples", "seconds"):
-        if (more := getattr(cfg, f"more_{name}")) is not None and cfg.resume:
-            had = folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).numbers[name]
-            totals |= {name: had + more, f"more_{name}": None}
-    return settings.changed(cfg, **totals)
+    pass
 
 
 def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
@@ -77,6 +70,8 @@ def run(cfg: settings.Train) -> Path | None:
     """
     if cfg.dry_run:
         return dry_run.show(cfg)
+    if cfg.population.size > 1 and cfg.population.member is None:
+        return population.run(cfg)
     if launcher.is_needed(cfg):
         return launcher.run(cfg)
     with rank.joined() as team:
@@ -111,7 +106,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             token = rank_checks.check_shared(folder)
             if team:
                 team.set_folder(folder)
-            cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
+            cfg = together(lambda: again.with_more(settings.changed(cfg, resume=resume)))
             try:
                 trainer = together(
                     env_failures.told(cfg.env, folder, rank=process_group.rank())(
@@ -124,7 +119,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 undo.pop_all()  # the folder has the traceback
                 raise
             rank_checks.check_world(cfg, trainer)
-            from_rank_0(functools.partial(write_config, folder, trainer.saver.config["train"]))
+            from_rank_0(
+                functools.partial(folders.write_config, folder, trainer.saver.config["train"])
+            )
             hosts = process_group.gather_objects(process_group.hostname())
             clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(trainer.lost)))
             if is_first:
@@ -177,29 +174,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
         result, samples = result_of(trainer), trainer.samples
         del trainer, saved  # frees GPU memory for the evaluation
-        common: dict = dict(
-            run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device
-        )
-        common["trust"] = True  # its modules have just been imported
-        table, film = None, None
-        if cfg.finish.evaluate:
-            with process_group.unhurried():
-                episodes = cfg.finish.episodes
-                table = evaluate_run.run(
-                    settings.Evaluate(episodes=episodes, baseline=("random",), **common)
-                )
-        if cfg.finish.record and is_first:
-            with console.warned():
-                film = record.run(
-                    settings.Record(steps=cfg.finish.steps, home=None, file=None, **common)
-                )
-        if cfg.finish.report and is_first:
-            from megastep.agents.reports import report
-
-            with console.warned():
-                console.say(f"Report: {report.write([folder], folder / 'report.html')}")
-        if is_first:
-            tell_loggers(cfg, folder, samples, table, film)
+        finishing.finish(cfg, folder, samples)
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All other rollouts were used; the run is in {folder}"
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
@@ -208,27 +183,6 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if is_first:
             console.say(f"{result}. The run is in {folder}\n{next_command(cfg, folder)}")
     return folder
-
-
-def tell_loggers(
-    cfg: settings.Train, folder: Path, samples: int, table: Path | None, film: Path | None
-) -> None:
-    """Gives the result of a run to those of its loggers that have a method `finish`.
-
-    Args:
-        table: the .json of its evaluation.
-        film: its video.
-    """
-    if not any(hasattr(import_object(one.name), "finish") for one in cfg.logger.values()):
-        return
-    numbers = {name: x for name, x in scores.outcome(folder).items() if x is not None}
-    cells = []
-    if table is not None:
-        cells = [tables.cells(row) for row in json.loads(table.read_text())["rows"]]
-    with console.warned(), process_group.unhurried():
-        logger = make_loggers(cfg, folder, samples)
-        logger.finish(samples, RunResult({"samples": samples, **numbers}, film, cells))
-        logger.close()
 
 
 def result_of(trainer: Trainer) -> str:
@@ -261,13 +215,6 @@ def saved_by(trainer: Trainer, folder: Path) -> str:
     text = trainer.saver.error or "The latest updates could not be saved"
     text = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else text
     return f"{text}. {folders.to_continue(folder)}"
-
-
-def write_config(folder: Path, config: "Config") -> None:
-    """Writes a run's configuration into its folder."""
-    with user_errors(folders.CANNOT.format(folder)):
-        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")
-        write_atomically(folder / "config.yaml", text)
 
 
 def compare(folder: Path, original: Path) -> None:

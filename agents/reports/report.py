@@ -16,7 +16,7 @@ import numpy as np
 from megastep.agents import console
 from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import tables
-from megastep.agents.reports import homes, runs, statistics
+from megastep.agents.reports import homes, populations, runs, statistics
 from megastep.agents.runs import checkpoint
 from megastep.agents.runs.atomic_files import write_atomically
 
@@ -156,6 +156,7 @@ def _several(every: list[runs.Run], charts: list) -> str:
     if keys := runs.differing(every):
         values = [[key, *(str(g[0].settings().get(key)) for g in groups.values())] for key in keys]
         parts += ["<h2>Settings that differ</h2>", _table(["setting", *groups], values)]
+    parts += populations.section(every, charts, _table)
     parts += ["<h2>Curves</h2>"]
     parts += [_charts(_drawn(*every), [(group, name) for name, group in groups.items()], charts)]
     if scored:

@@ -37,6 +37,7 @@ __all__ = [
     "DamagedCheckpoint",
     "GoneCheckpoint",
     "list_checkpoints",
+    "is_intact",
     "load_latest",
     "save",
     "set_aside_after",
@@ -137,6 +138,16 @@ def load_latest(
     if messages:
         raise CheckpointError(f"Every checkpoint in {folder} is damaged: {'; '.join(messages)}")
     raise CheckpointError(f"There is no checkpoint in {folder}; has the run saved one yet?")
+
+
+def is_intact(path: Path) -> bool:
+    """Returns whether a checkpoint is whole: every file is the one that was written."""
+    try:
+        manifest = checkpoint_format.read_manifest(path)
+        with checkpoint_format.verified(path, manifest, manifest["files"]):
+            return True
+    except CheckpointError:
+        return False
 
 
 def set_aside_after(folder: Path | str, step: int) -> None:

@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import yaml
+
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.runs import (
@@ -20,12 +22,20 @@ from megastep.agents.runs import (
     checkpoint,
     checkpoint_format,
     formats,
+    populations,
     strange_files,
 )
-from megastep.agents.runs.atomic_files import check_room, make_folders, remove_folders
+from megastep.agents.runs.atomic_files import (
+    check_room,
+    make_folders,
+    remove_folders,
+    write_atomically,
+)
 
 if TYPE_CHECKING:
     import torch
+
+    from megastep.agents.types import Config
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: File with the run folder of each start, one per line.
@@ -103,6 +113,13 @@ def check_free(name: str | None, is_again: bool = False) -> None:
         raise UserError(text)
 
 
+def write_config(folder: Path, config: "Config") -> None:
+    """Writes a run's configuration into its folder."""
+    with user_errors(CANNOT.format(folder)):
+        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")
+        write_atomically(folder / "config.yaml", text)
+
+
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Locks a run folder for the duration of the context, so that no other process trains in it.
@@ -159,7 +176,7 @@ def known() -> list[Path]:
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
     folders = {*RUNS.glob("*"), *SWEEPS.glob("*/*"), *order}
-    folders = [path for path in folders if (path / "checkpoints").is_dir()]
+    folders = [p for p in folders if (p / "checkpoints").is_dir() or populations.is_root(p)]
     return sorted(folders, key=lambda path: (order.get(path, -1), str(path)))
 
 
@@ -169,11 +186,13 @@ def pretrained() -> dict[str, Path]:
     return {path.stem: path for path in files}
 
 
-def find(name: str) -> Path:
+def find(name: str, member: int | str | None = "best") -> Path:
     """Returns the path of a run folder, a checkpoint or an agent file.
 
     Args:
         name: a path, `latest`, or the name of a pretrained agent; an existing path has priority.
+        member: of a population, whose folder is returned if the path is a population's: a number,
+            or `best`; None: the population's own folder.
 
     Raises:
         UserError: nothing is found (the message has the most similar names), or the run holds a
@@ -182,6 +201,9 @@ def find(name: str) -> Path:
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
         path = folders[-1]
+    if populations.is_root(path):
+        strange_files.check_folder(path)
+        return path if member is None else populations.member(path, member)
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
         is_in_run = path.parent.name in ("checkpoints", "snapshots")
         strange_files.check_folder(folder_of(path) if is_in_run else path)
@@ -258,7 +280,8 @@ def command_of(script: str, key: str, folder: Path) -> str:
 
 def to_continue(folder: Path) -> str:
     """Returns a sentence with the command that continues a run, or why it cannot be continued."""
-    if not checkpoint.list_checkpoints(folder / "checkpoints"):
+    where = populations.folder_of(folder, 0) if populations.is_root(folder) else folder
+    if not checkpoint.list_checkpoints(where / "checkpoints"):
         return "It has no checkpoint, so it cannot be continued"
     return f"To continue: {resume_command(folder)}"
 
@@ -276,9 +299,15 @@ def folder_of(path: Path) -> Path:
     """
     if agent_file.is_agent_file(path):
         return RUNS / f"pretrained-{path.stem}"
+    if populations.is_root(path):
+        return path
     return path.parent.parent if checkpoints_of(path) == path else path
 
 
 def name_of(path: Path) -> str:
     """Returns the agent's name in tables: that of its run folder or agent file."""
-    return path.stem if agent_file.is_agent_file(path) else folder_of(path).name
+    if agent_file.is_agent_file(path):
+        return path.stem
+    folder = folder_of(path)
+    is_member = populations.is_root(folder.parent)
+    return f"{folder.parent.name}/{folder.name}" if is_member else folder.name

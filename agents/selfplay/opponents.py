@@ -1,9 +1,10 @@
-"""Opponents: past snapshots of the policy, or a scripted bot, in some of the environments.
+"""Opponents: past snapshots of the policy, other members of its population, or a scripted bot, in
+some of the environments.
 
 Axes: N environments of A agents, B = N A lanes; M of the environments have opponents.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +29,8 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Opponents:
-    """Wraps a multi-agent environment so that past snapshots or a scripted bot play some agents.
+    """Wraps a multi-agent environment so that past snapshots, other members of a population or a
+    scripted bot play some agents.
 
     In an environment with opponents, one agent learns and a single opponent controls all others.
     The learning agent's slot rotates across environments. In the remaining environments, which come
@@ -42,6 +44,8 @@ class Opponents:
         scripted: the bot, a policy; needed if `bot` > 0.
         past: fraction of environments played against snapshots.
         bot: fraction of environments played against `scripted`.
+        league: fraction of environments played against other members of a population, of which
+            there are as many snapshots again.
         snapshots: number of snapshots. Each gets the same number of environments.
         every: updates between two refreshes; each replaces the oldest snapshot.
         seed: of the opponents' actions.
@@ -50,15 +54,16 @@ class Opponents:
         learners: (B,) bool, lanes whose transitions are used for learning. Never changes, so CUDA
             graphs stay valid.
         matchups: (B,) bool by name, the lanes of environments played against "now" (the current
-            policy), "past" and "bot". Names without environments are absent.
+            policy), "past", "league" and "bot". Names without environments are absent.
         snapshots: the snapshots, as policies. Refreshed in place.
+        rivals: those of other members, which `refresh_rivals` sets; until then, of the policy.
         scripted: the bot, or None if it does not play.
 
     All other attributes are those of `env`.
 
     Raises:
-        ValueError: the environment has one agent, `past + bot` is 0 or above 1, `bot > 0` without
-            `scripted`, or a snapshot or the bot would get no environment.
+        ValueError: the environment has one agent, `past + league + bot` is 0 or above 1, `bot > 0`
+            without `scripted`, or a snapshot or the bot would get no environment.
     """
 
     @checked
@@ -70,6 +75,7 @@ class Opponents:
         *,
         past: Fraction = 0.0,
         bot: Fraction = 0.0,
+        league: Fraction = 0.0,
         snapshots: Annotated[int, Field(ge=1, le=10_000)] = 4,
         every: Annotated[int, Field(ge=1, le=10**9)] = 100,
         seed: int = 1,
@@ -77,17 +83,23 @@ class Opponents:
         self.env, self.every, device = env, every, env.device
         self.n_agents = optional(env, "n_agents")
         self.scripted = scripted if bot else None
-        n_per_snapshot, n_bot = count_environments(env, env.n_envs, past, bot, snapshots)
+        n_per_snapshot, n_bot, n_per_rival = count_environments(
+            env, env.n_envs, past, bot, snapshots, league
+        )
         if bot and scripted is None:
             raise ValueError(
                 f"opponents.bot={bot} needs a bot that plays: pass scripted=, a policy, or bot=0"
             )
-        n_snapshots = snapshots if past else 0
         # autocast caches the cast of a weight only if the weight requires a gradient
-        self.snapshots = [policy.actor().requires_grad_(True) for _ in range(n_snapshots)]
+        self.snapshots, self.rivals = (
+            [policy.actor().requires_grad_(True) for _ in range(snapshots if share else 0)]
+            for share in (past, league)
+        )
         self.generator = SeededGenerator(stream_seed(seed, "opponents"))
-        n_by_opponent = [n_per_snapshot] * n_snapshots + [n_bot] * (n_bot > 0)
-        self.n_past, self.n_opposed = n_per_snapshot * n_snapshots, sum(n_by_opponent)
+        n_by_opponent = [n_per_snapshot] * len(self.snapshots) + [n_per_rival] * len(self.rivals)
+        n_by_opponent += [n_bot] * (n_bot > 0)
+        self.n_past, self.n_opposed = n_per_snapshot * len(self.snapshots), sum(n_by_opponent)
+        self.n_league = n_per_rival * len(self.rivals)
 
         slots = [rotating_slots(n, self.n_agents, device) for n in n_by_opponent]
         self.slots = torch.cat(slots)  # (M, 1)
@@ -97,9 +109,9 @@ class Opponents:
         self.learners = learners.flatten()
         opponent_lanes = (~self.learners).nonzero()[:, 0]
         n_lanes_by_opponent = [n * (self.n_agents - 1) for n in n_by_opponent]
-        opponents = [*self.snapshots, scripted][: len(n_by_opponent)]
+        opponents = [*self.snapshots, *self.rivals, scripted][: len(n_by_opponent)]
         self.mixed_policy = MixedPolicy(opponents, opponent_lanes.split(n_lanes_by_opponent))
-        self.matchups = self._matchups({"past": self.n_past, "bot": n_bot})
+        self.matchups = self._matchups({"past": self.n_past, "league": self.n_league, "bot": n_bot})
         # (2, M): pairs of a learning agent and an opponent that were won and decided since `pop`
         self.pairs = torch.zeros(2, self.n_opposed, device=device)
         self.returns = torch.zeros(self.n_opposed, self.n_agents, device=device)
@@ -187,8 +199,29 @@ class Opponents:
         """
         if not self.snapshots or n_updates % self.every:
             return
-        index = (n_updates // self.every - 1) % len(self.snapshots)
-        snapshot, weights = self.snapshots[index], policy.state_dict()
+        self._refresh((n_updates // self.every - 1) % len(self.snapshots), policy)
+
+    def is_due(self, n_updates: int) -> bool:
+        """Returns whether `refresh_rivals` replaces one after so many updates."""
+        return bool(self.rivals) and n_updates % self.every == 0
+
+    def refresh_rivals(self, policies: Sequence[Policy], n_updates: int) -> None:
+        """Copies another member's policy into the oldest of the rivals, every `every` updates, the
+        members in turn.
+
+        Args:
+            policies: of the other members.
+            n_updates: of each member so far.
+        """
+        if not self.is_due(n_updates):
+            return
+        number = n_updates // self.every - 1
+        index = len(self.snapshots) + number % len(self.rivals)
+        self._refresh(index, policies[number % len(policies)])
+
+    def _refresh(self, index: int, policy: Policy) -> None:
+        """Copies a policy into the opponent of an index, which forgets its episodes."""
+        snapshot, weights = [*self.snapshots, *self.rivals][index], policy.state_dict()
         snapshot.load_state_dict({name: weights[name] for name in snapshot.state_dict()})
         state = self.hidden_state[str(index)]
         state[:] = snapshot.initial(self.mixed_policy.sizes[index], self.env.device)
@@ -201,8 +234,9 @@ class Opponents:
         A kind of opponent without a decided pair is absent.
 
         Metrics:
-            episode/won/KIND: fraction of pairs won against past snapshots (past) or the bot (bot)
-                since the last report, of those that were decided.
+            episode/won/KIND: fraction of pairs won against past snapshots (past), other members of
+                the population (league) or the bot (bot) since the last report, of those that were
+                decided.
 
         Args:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.
@@ -217,15 +251,17 @@ class Opponents:
 
     def _pairs_by_kind(self) -> dict[str, torch.Tensor]:
         """Returns the parts of `pairs`, (2, m) by kind of opponent. They are views."""
-        past, bot = self.pairs.tensor_split([self.n_past], 1)
-        return {"past": past, "bot": bot}
+        ends = [self.n_past, self.n_past + self.n_league]
+        past, league, bot = self.pairs.tensor_split(ends, 1)
+        return {"past": past, "league": league, "bot": bot}
 
     def state_dict(self) -> StateDict:
         """Returns the snapshots, the generator's state, and by lane what opponents see and remember
         and the scores of the episodes in progress. The environment has a state of its own.
         """
+        opponents = [*self.snapshots, *self.rivals]
         return dict(
-            snapshots={str(i): policy.state_dict() for i, policy in enumerate(self.snapshots)},
+            snapshots={str(i): policy.state_dict() for i, policy in enumerate(opponents)},
             generator=self.generator.state_dict(),
             lanes=dict(self._lanes(), pairs=self.pairs.clone()),  # a report clears the pairs
         )
@@ -236,12 +272,13 @@ class Opponents:
         Raises:
             ValueError: the state has another number of snapshots.
         """
-        if len(state["snapshots"]) != len(self.snapshots):
+        opponents = [*self.snapshots, *self.rivals]
+        if len(state["snapshots"]) != len(opponents):
             raise ValueError(
                 f"the saved opponents have {len(state['snapshots'])} snapshots, these have "
-                f"{len(self.snapshots)}: use the opponents.snapshots and opponents.past of the run"
+                f"{len(opponents)}: use the opponents.snapshots and opponents.past of the run"
             )
-        for i, snapshot in enumerate(self.snapshots):
+        for i, snapshot in enumerate(opponents):
             snapshot.load_state_dict(state["snapshots"][str(i)])
         self.generator.load_state_dict(state["generator"], self.learners.device)
         if "lanes" in state:
@@ -253,9 +290,10 @@ class Opponents:
 
 
 def count_environments(
-    env: Env, n_envs: int, past: float, bot: float, snapshots: int
-) -> tuple[int, int]:
-    """Returns the number of environments per snapshot, and against the bot, of `n_envs` like `env`.
+    env: Env, n_envs: int, past: float, bot: float, snapshots: int, league: float = 0.0
+) -> tuple[int, int, int]:
+    """Returns the number of environments per snapshot, against the bot, and per snapshot of another
+    member, of `n_envs` like `env`.
 
     Raises:
         ValueError: as for `Opponents`.
@@ -264,26 +302,30 @@ def count_environments(
         raise ValueError(
             f"opponents need an environment with at least two agents; {type(env).__name__} has one"
         )
-    if not past + bot:
+    if not past + bot + league:
         raise ValueError(
             "opponents need opponents.past or opponents.bot above 0; without opponents, use the "
             "environment itself"
         )
-    if past + bot > 1:
+    if past + bot + league > 1:
+        others = f", opponents.league={league}" if league else ""
         raise ValueError(
-            f"opponents.past={past} and opponents.bot={bot} are fractions of the environments, so "
-            "their sum must be at most 1"
+            f"opponents.past={past}{others} and opponents.bot={bot} are fractions of the "
+            "environments, so their sum must be at most 1"
         )
-    n_past, n_bot = round(past * n_envs), round(bot * n_envs)
-    if past and n_past < snapshots:
-        raise ValueError(
-            f"opponents.past={past} of {n_envs:,} environments is {n_past:,} environments, too "
-            f"few for opponents.snapshots={snapshots:,}: reduce opponents.snapshots or raise "
-            "env.n_envs"
-        )
+    n_bot = round(bot * n_envs)
+    for name, share in {"past": past, "league": league}.items():
+        n = round(share * n_envs)
+        if share and n < snapshots:
+            raise ValueError(
+                f"opponents.{name}={share} of {n_envs:,} environments is {n:,} environments, too "
+                f"few for opponents.snapshots={snapshots:,}: reduce opponents.snapshots or raise "
+                "env.n_envs"
+            )
     if bot and not n_bot:
         raise ValueError(
             f"opponents.bot={bot} of {n_envs:,} environments is none: raise opponents.bot or "
             "env.n_envs"
         )
-    return n_past // snapshots, n_bot
+    n_past, n_league = round(past * n_envs), round(league * n_envs)
+    return n_past // snapshots, n_bot, n_league // snapshots

@@ -39,7 +39,12 @@ class NonFiniteGuard:
     Attributes:
         value: the first NaN or infinity of the run, or None.
         hint: how to reproduce it, or "".
+        tolerates_divergence: a policy that diverged is noted in `has_diverged`, and raises nothing,
+            for whoever replaces it. Its updates are skipped, so its weights stay as they are.
+        has_diverged: the last `MAX_SKIPPED` updates were skipped.
     """
+
+    tolerates_divergence = has_diverged = False
 
     def __init__(self, env: Env, learner: Learner, make_hint: Callable[[NonFiniteValue], str]):
         self.learner, self.make_hint, self.device = learner, make_hint, env.device
@@ -74,10 +79,13 @@ class NonFiniteGuard:
                 self.value, self.hint = value, from_rank_0(lambda: self.make_hint(value))
             if rank() == 0:
                 warnings.warn(f"{text}; its rollout was skipped{self.hint}", stacklevel=2)
-        if n_skipped < MAX_SKIPPED:
+        self.has_diverged = n_skipped >= MAX_SKIPPED
+        if not self.has_diverged:
             return n_skipped == 0
-        advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
         is_from_env = value is not None and value.is_from_env
+        if self.tolerates_divergence and not is_from_env:
+            return False
+        advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
         if value is not None and is_from_env:
             advice = f"It came from the environment: check how it computes {value.name}"
         raise NonFiniteError(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
 import torch
@@ -56,7 +57,8 @@ class Trainer:
         budget: when the run ends and how its learning rate falls; None: when `stop()` says so.
         log_every: updates between two reports.
         checkpoint_seconds: seconds between two checkpoints. One that is due while the last is still
-            being written comes after it; below a second, training waits for it.
+            being written comes after it; below a second, training waits for it. Infinity: whoever
+            goes through `rounds` saves; only the last one is saved here.
         desync: starts the first episodes at random ages, so that not all lanes end theirs at the
             same time, if the environment has a method `desync()`. Statistics leave these episodes
             out.
@@ -80,6 +82,10 @@ class Trainer:
             have statistics of their own; None for none.
         profiler: profiles some of the updates, if not None.
         callbacks: objects with methods of `callbacks.HOOKS`.
+        leader: a trainer whose plans this one follows, so that both do the same updates: the member
+            of a population that is asked first.
+        timetable: (samples, settings) each, in order: settings by key, such as `learner.lr`, that
+            are set after so many samples, see `set_settings`.
 
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
@@ -124,6 +130,8 @@ class Trainer:
         layout_sources: Sequence[str] | None = None,
         profiler: Profiler | None = None,
         callbacks: Sequence[object] = (),
+        leader: Trainer | None = None,
+        timetable: Sequence[tuple[int, Mapping[str, float]]] = (),
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.logger = NoLogger() if logger is None else logger
@@ -138,11 +146,14 @@ class Trainer:
         self.opponents = optional(env, "opponent_pool")
         self.annealing_record, self.profiler = annealing_record, profiler
         self.callbacks, self.is_stopped = Callbacks(callbacks), False
+        self.leader, self.timetable = leader, [*timetable]
+        self.latest_plan: Plan | None = None
         options = with_defaults(learner, LearnerOptions)
         self.set_lr, self.read_lr = options.set_lr, options.read_lr
         self.warmup, self.extra = options.warmup, options.extra
         self.coefficients = [*optional(env, "coefficients")]
         self.has_env_schedules = any(one.schedules for one in self.coefficients)
+        self.learner_coefficients = options.coefficients
         if options.coefficients is not None:
             self.coefficients.append(options.coefficients)
         self.scheduled: dict[str, float] = {}
@@ -207,6 +218,11 @@ class Trainer:
                 last good checkpoint is kept.
             Exception: any other error, after a checkpoint was saved if there are no other ranks.
         """
+        for _ in self.rounds(stop):
+            pass
+
+    def rounds(self, stop: Callable[[], bool] = lambda: False) -> Generator[None, None, None]:
+        """Trains as `train` does, and yields after each update, when its report is written."""
         try:
             self.snapshot_saver(self)
             self.callbacks("on_start", self)
@@ -226,8 +242,10 @@ class Trainer:
                     self.samples_at_report = self.samples
                     self.log(losses)
                     is_sound = self.nonfinite_guard.check(self.rollout)
-                    if is_sound and self.evaluate_every and self.evaluated_at == self.samples:
+                    is_evaluated = self.evaluate_every and self.evaluated_at == self.samples
+                    if is_sound and is_evaluated and self.checkpoint_seconds < math.inf:
                         self.save_checkpoint()
+                yield
             state = self.state_dict()  # a resumed run repeats what this last report empties
             if self.updates > self.updates_at_log:
                 self.log(losses)
@@ -273,6 +291,9 @@ class Trainer:
         """
         with waiting():
             self.timer.wait(MAX_AHEAD * len(PHASES))
+        if self.leader is not None:
+            assert self.leader.latest_plan is not None
+            return self.leader.latest_plan
         seconds = self.clock.seconds
         seconds_since = seconds - self.seconds_at_checkpoint
         plan = Plan(
@@ -282,7 +303,8 @@ class Trainer:
         )
         # a slow disk does not stop training, unless a checkpoint of each update is wanted
         is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
-        return agree(plan, is_stopped, is_behind)
+        self.latest_plan = agree(plan, is_stopped, is_behind)
+        return self.latest_plan
 
     def start(self, phase: str) -> None:
         """Starts one of the `PHASES` of an update."""
@@ -339,12 +361,34 @@ class Trainer:
         Raises:
             UserError: a schedule of the user's fails.
         """
+        while self.timetable and self.timetable[0][0] <= self.samples:
+            self.set_settings(self.timetable.pop(0)[1])
         if self.has_env_schedules:
             self.wait_for_collector()  # which reads them
         for one in self.coefficients:
             if one.schedules:
                 with user_errors("", (ValueError,)):
                     self.scheduled |= one.follow(fraction)
+
+    def set_settings(self, values: Mapping[str, float]) -> None:
+        """Changes settings from the next update on, without waiting for the device.
+
+        Args:
+            values: numbers by key: `learner.NAME`, or `env.NAME`, of those that may be schedules.
+
+        Raises:
+            ValueError: a setting cannot change while training.
+        """
+        self.wait_for_collector()
+        for key, value in values.items():
+            part, _, name = key.partition(".")
+            owners = [self.learner_coefficients] if part == "learner" else self.coefficients
+            owners = [one for one in owners if one is not None and name in one.values]
+            if not owners:
+                raise ValueError(f"{key} cannot change while training")
+            owners[0].set(**{name: value})
+            if key == "learner.lr":
+                self.lr = self.learner.lr = value
 
     def _set_lr(self, lr_fraction) -> None:
         """Sets the learning rate of an update, if it changes and the learner does not do so."""

@@ -15,7 +15,7 @@ from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree
 from megastep.agents.factory.settings import loggers
-from megastep.agents.launch import train as launch_train
+from megastep.agents.launch import again
 from megastep.agents.runs import checkpoint, folders
 from megastep.imports import import_object
 from megastep.settings import arguments_of, sentence, settings_class
@@ -210,7 +210,7 @@ def test_budgets_that_are_refused(stopped, budget, words, key, text):
 def test_more_comes_on_top(stopped):
     run = stopped("samples=64", "seconds=2")
     cfg = settings(f"resume={run}", "more_samples=1e3", "more_seconds=60")
-    cfg = launch_train.with_more(cfg)
+    cfg = again.with_more(cfg)
     assert (cfg.samples, cfg.seconds) == (1064, 62.5)
     assert cfg.more_samples is cfg.more_seconds is None
 

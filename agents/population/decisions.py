@@ -1,0 +1,108 @@
+"""Who copies whom in a generation, and with which settings: functions of the seed, the generation,
+the member and the scores alone (Jaderberg et al. 2017).
+"""
+
+import math
+import random
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from megastep.agents.generator import stream_seed
+from megastep.agents.population.variation import Variation
+
+#: Fraction of members at the end of the ranking that copy one at its top.
+TRUNCATED = 0.25
+Settings = dict[str, float]
+
+
+class Decision(NamedTuple):
+    """What a member does at a generation.
+
+    Attributes:
+        source: the member that it copies; itself if none.
+        settings: its settings from then on, by key.
+    """
+
+    source: int
+    settings: Settings
+
+
+def member_seed(seed: int, member: int) -> int:
+    """Returns the seed of a member's run: the population's for member 0, for each other one of its
+    own, below 2**31 as NumPy and environments of others want it.
+    """
+    return seed if member == 0 else stream_seed(seed, f"member {member}") % 2**31
+
+
+def first(seed: int, member: int, vary: Mapping[str, Variation]) -> Settings:
+    """Returns the settings with which a member begins."""
+    generator = _generator(seed, 0, member)
+    return {key: one.draw(generator) for key, one in vary.items()}
+
+
+def decide(
+    seed: int,
+    generation: int,
+    scores: Sequence[float | None],
+    settings: Sequence[Settings],
+    vary: Mapping[str, Variation],
+    exploit: str = "truncation",
+    explore: str = "factor",
+) -> list[Decision]:
+    """Returns the decision of each member.
+
+    Args:
+        seed: the population's.
+        generation: 1 for the first.
+        scores: of each member; higher is better. None: unknown, so it neither copies nor is copied.
+            Minus infinity: it has diverged, so it copies another, and is never copied.
+        settings: of each member.
+        vary: what the settings may be.
+        exploit: "truncation": the last quarter of the ranking copies members drawn from the first.
+            "tournament": each member draws another, and copies it if that has the better score.
+        explore: what a member that copies does with the settings of the other: "factor": each is
+            multiplied by 0.8 or 1.2; "resample": each is drawn anew.
+    """
+    known = [n for n, score in enumerate(scores) if score is not None]
+    ranked = sorted(known, key=lambda n: (-_score(scores[n]), n))
+    sound = [n for n in ranked if _score(scores[n]) > -math.inf]
+    n_cut = max(1, int(TRUNCATED * len(ranked)))
+    decisions = []
+    for member, own in enumerate(settings):
+        generator, source = _generator(seed, generation, member), member
+        if member in known and sound:
+            has_diverged = member not in sound
+            if exploit == "tournament" and not has_diverged and len(sound) > 1:
+                rival = generator.choice([n for n in sound if n != member])
+                source = rival if _score(scores[rival]) > _score(scores[member]) else member
+            elif has_diverged or member in ranked[max(n_cut, len(ranked) - n_cut) :]:
+                source = generator.choice(sound[:n_cut])
+                is_better = _score(scores[source]) > _score(scores[member])
+                source = source if is_better else member
+        if source == member:
+            decisions.append(Decision(member, dict(own)))
+            continue
+        numbers = {
+            key: one.draw(generator)
+            if explore == "resample"
+            else one.near(settings[source][key], generator)
+            for key, one in vary.items()
+        }
+        decisions.append(Decision(source, numbers))
+    return decisions
+
+
+def order(decisions: Sequence[Decision], scores: Sequence[float | None]) -> list[int]:
+    """Returns the members that copy, in an order in which each is copied before it copies: the
+    worst first, as each copies a better one.
+    """
+    copying = [n for n, one in enumerate(decisions) if one.source != n]
+    return sorted(copying, key=lambda n: (_score(scores[n]), n))
+
+
+def _score(score: float | None) -> float:
+    return -math.inf if score is None else score
+
+
+def _generator(seed: int, generation: int, member: int) -> random.Random:
+    return random.Random(stream_seed(seed, f"population {generation} {member}"))

@@ -1,0 +1,264 @@
+"""The members of a population: they train in turns, on a GPU on a stream each, and take over from
+each other every so many samples.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from megastep import global_generators
+from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.population import decisions
+from megastep.agents.runs import json_lines, populations
+from megastep.agents.types import LearnerOptions, with_defaults
+from megastep.types import optional
+
+if TYPE_CHECKING:
+    from megastep.agents.population.variation import Variation
+    from megastep.agents.training.trainer import Trainer
+    from megastep.agents.types import Row
+
+
+class Turns:
+    """What the members of one process each have for themselves: a stream of the GPU, and the global
+    generators, from which code of the user's may draw.
+    """
+
+    def __init__(self, n: int, device: torch.device):
+        self.device, is_on_gpu = device, device.type == "cuda"
+        self.streams = [torch.cuda.Stream(device) for _ in range(n)] if is_on_gpu else None
+        self.generators = [self._generators() for _ in range(n)]
+
+    @contextlib.contextmanager
+    def of(self, member: int) -> Iterator[None]:
+        """What is done inside is this member's."""
+        of_host, of_gpu = self.generators[member]
+        global_generators.restore(of_host)
+        if of_gpu is not None:
+            torch.cuda.set_rng_state(of_gpu, self.device)
+        with contextlib.ExitStack() as stack:
+            if self.streams is not None:
+                stack.enter_context(torch.cuda.stream(self.streams[member]))
+            yield
+        self.generators[member] = self._generators()
+
+    def _generators(self) -> tuple[dict[str, tuple], torch.Tensor | None]:
+        is_on_gpu = self.device.type == "cuda"
+        of_gpu = torch.cuda.get_rng_state(self.device) if is_on_gpu else None
+        return global_generators.states(), of_gpu
+
+    def wait(self) -> None:
+        """Waits until all members have done what is launched."""
+        if self.streams is not None:
+            torch.cuda.synchronize(self.device)
+
+
+class Population:
+    """Trains members and lets them take over from each other.
+
+    A member that diverges goes on without learning, and copies another at the next generation.
+
+    Args:
+        trainers: of the members, whose `checkpoint_seconds` are infinite. All but the first have it
+            as their `leader`.
+        turns: in which they were made.
+        folder: where `population.jsonl` is written.
+        seed: that decisions are drawn with.
+        every: samples of each member from one generation to the next. A generation is at the first
+            report after so many, and none when the budget is spent.
+        vary: the settings that differ, by key, and what they may be.
+        exploit, explore: as for `decisions.decide`.
+        score: "running": members are ranked by the return of their last report; "evaluated": of
+            their last evaluation.
+        checkpoint_seconds: seconds between two checkpoints of all members.
+
+    Attributes:
+        settings: of each member, by key.
+        generation: the number of the last one.
+        n_diverged: how often each member has diverged.
+    """
+
+    def __init__(
+        self,
+        trainers: Sequence[Trainer],
+        turns: Turns,
+        folder: Path,
+        seed: int,
+        every: int,
+        vary: Mapping[str, Variation],
+        exploit: str = "truncation",
+        explore: str = "factor",
+        score: str = "running",
+        checkpoint_seconds: float = 30.0,
+    ):
+        self.trainers, self.turns, self.seed, self.every = [*trainers], turns, seed, every
+        self.vary, self.exploit, self.explore, self.score = vary, exploit, explore, score
+        self.checkpoint_seconds, self.saved_at = checkpoint_seconds, time.monotonic()
+        path = folder / populations.FILE
+        json_lines.truncate_after(path, self.samples)
+        generations = populations.read(path) if path.exists() else []
+        self.lines, self.generation = json_lines.JsonLines(path), len(generations) - 1
+        self.n_diverged = [0] * len(trainers)
+        self.samples_at_round = self.leader.samples_at_report
+        for trainer in trainers:
+            trainer.nonfinite_guard.tolerates_divergence = True
+        if generations:
+            self._restore(generations)
+        else:
+            members = range(len(trainers))
+            self.settings = [decisions.first(seed, member, vary) for member in members]
+            self._write([None for _ in members], [*members])
+
+    @property
+    def leader(self) -> Trainer:
+        """The first member, whose clock decides."""
+        return self.trainers[0]
+
+    @property
+    def samples(self) -> int:
+        """Samples of each member so far."""
+        return self.trainers[0].samples
+
+    def _restore(self, generations: list[list[Row]]) -> None:
+        self.settings = [populations.settings_of(row) for row in generations[-1]]
+        for rows in generations:
+            self.n_diverged = [
+                n + int(row.get("diverged", 0))
+                for n, row in zip(self.n_diverged, rows, strict=True)
+            ]
+        for member, trainer in enumerate(self.trainers):
+            with self.turns.of(member):
+                trainer.set_settings(self.settings[member])
+
+    def train(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Trains all members until the budget is spent, one of them ends, or `stop()` returns True,
+        then saves a checkpoint of each.
+
+        Raises:
+            NonFiniteError: all members have diverged; or an environment returns only NaN.
+        """
+
+        def ends() -> bool:
+            return stop() or any(one.is_stopped or one.is_reached for one in self.trainers)
+
+        rounds = [trainer.rounds(ends) for trainer in self.trainers]
+        try:
+            while self._is_round_left(rounds):
+                self._after_round()
+        finally:
+            for one in rounds:
+                one.close()
+            self.lines.close()
+
+    def _is_round_left(self, rounds: Sequence[Generator[None]]) -> bool:
+        """Has each member do an update; returns False when they have ended instead."""
+        has_ended = []
+        for member, one in enumerate(rounds):
+            with self.turns.of(member):
+                has_ended.append(next(one, StopIteration) is StopIteration)
+        return not any(has_ended)
+
+    def _after_round(self) -> None:
+        leader, before = self.leader, self.samples_at_round
+        is_reported = leader.samples_at_report == leader.samples
+        if is_reported:
+            self.samples_at_round = self.samples
+            is_due = self.samples // self.every > before // self.every
+            if is_due and leader.fraction_left > 0:
+                self.take_over()
+        self.meet()
+        if time.monotonic() - self.saved_at >= self.checkpoint_seconds:
+            self.save()
+
+    def meet(self) -> None:
+        """Gives the members' opponents each other's policies, where they play in a league."""
+        pools = [trainer.opponents for trainer in self.trainers]
+        updates = self.leader.updates
+        if not any(pool is not None and pool.is_due(updates) for pool in pools):
+            return
+        self.turns.wait()
+        policies = [trainer.policy for trainer in self.trainers]
+        for member, pool in enumerate(pools):
+            if pool is not None:
+                pool.refresh_rivals([*policies[member + 1 :], *policies[:member]], updates)
+        self.turns.wait()
+
+    def save(self) -> None:
+        """Begins to save a checkpoint of each member, once all have the last one."""
+        for trainer in self.trainers:
+            trainer.saver.wait()
+        for member, trainer in enumerate(self.trainers):
+            with self.turns.of(member):
+                trainer.save_checkpoint()
+        self.saved_at = time.monotonic()
+
+    def take_over(self) -> None:
+        """Lets members copy others, as `decisions.decide` says, and writes who did.
+
+        Raises:
+            NonFiniteError: all members have diverged.
+        """
+        scores = [self.score_of(trainer) for trainer in self.trainers]
+        if all(score == -math.inf for score in scores):
+            raise NonFiniteError(
+                f"All {len(scores)} members diverged: choose a smaller range of learning rates",
+                False,
+            )
+        self.generation += 1
+        made = decisions.decide(
+            *(self.seed, self.generation, scores, self.settings, self.vary),
+            *(self.exploit, self.explore),
+        )
+        self.turns.wait()
+        for member in decisions.order(made, scores):
+            self.copy(self.trainers[made[member].source], self.trainers[member])
+            self.trainers[member].set_settings(made[member].settings)
+        self.turns.wait()
+        self.settings = [one.settings for one in made]
+        self._write(scores, [one.source for one in made])
+
+    def score_of(self, trainer: Trainer) -> float | None:
+        """Returns a member's score: minus infinity if it has diverged, None if it is unknown."""
+        if trainer.nonfinite_guard.has_diverged:
+            return -math.inf
+        return trainer.evaluation.get("return") if self.score == "evaluated" else trainer.score
+
+    @staticmethod
+    def copy(source: Trainer, target: Trainer) -> None:
+        """Gives a member what another has learnt, in place: weights, optimizer, statistics."""
+        for one in source, target:
+            one.wait_for_collector()
+        copy_from = with_defaults(target.learner, LearnerOptions).copy_from
+        assert copy_from is not None
+        copy_from(source.learner)
+        if learnt := optional(source.env, "wrapper_state")():
+            optional(target.env, "load_wrapper_state")(learnt, False)
+        target.nonfinite_guard.has_diverged = False
+
+    def _write(self, scores: Sequence[float | None], sources: Sequence[int]) -> None:
+        for member, (score, source) in enumerate(zip(scores, sources, strict=True)):
+            has_diverged = score == -math.inf
+            self.n_diverged[member] += has_diverged
+            row: dict[str, float | str] = {"generation": max(self.generation, 0), "member": member}
+            row["from"] = source
+            if score is not None and not has_diverged:
+                row["score"] = score
+            if has_diverged:
+                row["diverged"] = 1
+            of_settings = self.settings[member].items()
+            row |= {f"{populations.KEY}{key}": value for key, value in of_settings}
+            self.lines.write(self.samples, row)
+        self.generation = max(self.generation, 0)
+        self.lines.file.sync()
+
+    def close(self) -> None:
+        """Closes the members' environments and files."""
+        for trainer in self.trainers:
+            trainer.close()

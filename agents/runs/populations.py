@@ -1,0 +1,127 @@
+"""What a population leaves on disk: a run folder per member, `member-0`, `member-1`, ..., and
+`population.jsonl`, with a line for each member of each generation.
+"""
+
+import itertools
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from megastep.agents.errors import UserError
+from megastep.agents.runs import checkpoint, json_lines, scores
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Row
+
+FILE, PREFIX, KEY = "population.jsonl", "member-", "settings/"
+
+
+def folder_of(root: Path, member: int) -> Path:
+    """Returns the run folder of a member."""
+    return root / f"{PREFIX}{member}"
+
+
+def is_root(path: Path) -> bool:
+    """Returns whether a folder is that of a population."""
+    return folder_of(path, 0).is_dir()
+
+
+def members(root: Path) -> list[Path]:
+    """Returns the run folders of all members, in their order."""
+    paths = (folder_of(root, n) for n in itertools.count())
+    return [*itertools.takewhile(Path.is_dir, paths)]
+
+
+def score_of(folder: Path) -> float | None:
+    """Returns a member's last evaluated return, else the mean return of its last reports."""
+    rows = json_lines.read(folder / "metrics.jsonl") if (folder / "metrics.jsonl").exists() else []
+    evaluated = [row["eval/return"] for row in rows if row.get("eval/return") is not None]
+    return evaluated[-1] if evaluated else scores.mean_return(rows)
+
+
+def best(root: Path) -> int:
+    """Returns the number of the member with the highest score, the first of equal ones."""
+    found = [score_of(folder) for folder in members(root)]
+    return max(range(len(found)), key=lambda n: (-1e400 if found[n] is None else found[n], -n))
+
+
+def member(root: Path, which: "int | str" = "best") -> Path:
+    """Returns the run folder of a member, by its number or `best`.
+
+    Raises:
+        UserError: there is no such member.
+    """
+    n = len(members(root))
+    number = best(root) if which == "best" else int(which)
+    if not 0 <= number < n:
+        raise UserError(
+            f"{root} has no member {which}; its members are 0 to {n - 1}, and member=best"
+        )
+    return folder_of(root, number)
+
+
+def common_checkpoints(root: Path) -> list[Path]:
+    """Returns the newest checkpoint of each member after one number of samples, that all of them
+    have saved whole.
+
+    Raises:
+        UserError: there is none.
+    """
+    by_step = []
+    for folder in members(root):
+        paths = checkpoint.list_checkpoints(folder / "checkpoints")
+        by_step.append({checkpoint.step_of(path): path for path in paths})
+    steps = set.intersection(*map(set, by_step))
+    for step in sorted(steps, reverse=True):
+        paths = [paths[step] for paths in by_step]
+        if all(map(checkpoint.is_intact, paths)):
+            return paths
+    raise UserError(
+        f"{root} cannot be resumed: its members have no intact checkpoint after the same number "
+        "of samples; init=RUN starts a new run from the best member's weights"
+    )
+
+
+def read(path: Path) -> "list[list[Row]]":
+    """Returns the rows of `population.jsonl`, a list for each generation, each in the order of
+    members.
+    """
+    rows = json_lines.read(path)
+    return [[*group] for _, group in itertools.groupby(rows, lambda row: row["generation"])]
+
+
+def settings_of(row: "Row") -> dict[str, float]:
+    """Returns the settings in a row, by key."""
+    return {key[len(KEY) :]: value for key, value in row.items() if key.startswith(KEY)}
+
+
+def lineage(generations: "list[list[Row]]", member: int) -> list[int]:
+    """Returns the ancestor of a member after each generation, up to itself after the last."""
+    line = [member]
+    for rows in reversed(generations[1:]):
+        line.append(int(rows[line[-1]]["from"]))
+    return line[::-1]
+
+
+def schedule(path: Path) -> list[tuple[int, dict[str, float]]]:
+    """Returns the settings of the best member and its ancestors over time: (samples, settings).
+
+    Raises:
+        UserError: the file holds no generations.
+    """
+    try:
+        generations = read(path)
+        scored = [row.get("score") for row in generations[-1]] if generations else []
+        if not scored:
+            raise ValueError("it has no generation")
+        at_end = [-1e400 if score is None else score for score in scored]
+        rows = generations[-1]
+        # who copies at the last generation is judged by the one that it copies
+        ends = [at_end[int(row["from"])] for row in rows]
+        line = lineage(generations, ends.index(max(ends)))
+        return [
+            (int(rows[n]["samples"]), settings_of(rows[n])) for rows, n in zip(generations, line)
+        ]
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise UserError(
+            f"{path} holds no settings over time ({error}); give the {FILE} of a population"
+        ) from None

@@ -1,0 +1,335 @@
+"""Populations, from the command line."""
+
+import random
+import shutil
+import subprocess
+
+import pytest
+import yaml
+
+from megastep.agents.algorithms.learner import GradientLearner
+from megastep.agents.algorithms.ppo import PPO
+from megastep.agents.cli import entry, train
+from megastep.agents.population.population import Population
+from megastep.agents.runs import checkpoint, json_lines, populations
+from tests.cli.test_exact_resume import CASES, differences
+from tests.helpers import tiny
+from tests.helpers.processes import HUNG, forked
+
+pytestmark = pytest.mark.usefixtures("here")
+SMALL = [
+    "env=tests.cli.test_exact_resume:Steered",
+    *tiny.TINY[2:],
+    *("env.n_envs=16", "log_every=2", "logger=none"),
+]
+VARY = (
+    "population.vary={learner.lr: {min: 1e-4, max: 3e-2, log: true}, "
+    "learner.entropy_coef: {choices: [0.001, 0.01, 0.03]}}"
+)
+POPULATION = [*SMALL, "population.size=3", "population.every=512", VARY, "folder=P"]
+LONG = "samples=5120"
+
+
+def run(*words):
+    assert train.main([*words]) == 0
+
+
+def refused(capsys, *words, code=2):
+    assert train.main([*words]) == code
+    return capsys.readouterr().err
+
+
+def state(folder):
+    return checkpoint.load_latest(f"{folder}/checkpoints").state
+
+
+def files(root, n=3):
+    names = [f"member-{n}/{name}" for n in range(n) for name in ("metrics.jsonl", "annealing.f64")]
+    return {name: (root / name).read_bytes() for name in (*names, populations.FILE)}
+
+
+def assert_equal(one, other, n=3):
+    assert files(one, n) == files(other, n)
+    for member in range(n):
+        states = [state(populations.folder_of(root, member)) for root in (one, other)]
+        assert differences(*states) == []
+
+
+@pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)], ids=["cpu", "cuda"]
+)
+def test_members_have_the_bits_of_runs_alone(here, device):
+    """Until a member first copies, which none does here."""
+    words = [*POPULATION, "samples=1024", "population.every=1e9", f"device={device}"]
+    run(*words)
+    for member in range(3):
+        config = yaml.safe_load((here / f"P/member-{member}/config.yaml").read_text())
+        run(
+            *(*SMALL, "samples=1024", f"folder=alone-{member}", f"device={device}"),
+            f"seed={config['seed']}",
+            f"learner.lr={config['learner']['lr']!r}",
+            f"learner.entropy_coef={config['learner']['entropy_coef']}",
+        )
+        states = [state(f"{name}-{member}") for name in ("P/member", "alone")]
+        assert differences(*states) == []
+        ours, theirs = (here / f"{name}-{member}/metrics.jsonl" for name in ("P/member", "alone"))
+        assert ours.read_bytes() == theirs.read_bytes()
+    settings = [
+        populations.settings_of(row) for row in populations.read(here / "P" / "population.jsonl")[0]
+    ]
+    assert len({one["learner.lr"] for one in settings}) == 3
+
+
+class Killed(BaseException):
+    """In place of a signal that leaves no time."""
+
+
+def test_killed_and_interrupted_population_has_the_same_bits(here, monkeypatch, capsys):
+    """Killed between the copies of a generation, before its checkpoint, and between the checkpoints
+    of two members; what is saved is then of different samples.
+    """
+    run(*POPULATION, LONG)
+    shutil.move("P", "left-alone")
+    generations = populations.read(here / "left-alone" / populations.FILE)
+    copied = [
+        (g, row["member"])
+        for g, rows in enumerate(generations)
+        for row in rows
+        if row["from"] != row["member"]
+    ]
+    assert len(copied) >= 3 and len(generations) == 10
+    copy, save, calls = GradientLearner.copy_from, Population.save, []
+
+    def killed_in_copy(self, other):
+        calls.append("copy")
+        if len(calls) == 2:
+            raise Killed
+        copy(self, other)
+
+    def killed_in_save(self):
+        calls.append("save")
+        if len(calls) < 9:
+            return save(self)
+        for trainer in self.trainers:
+            trainer.saver.wait()
+        self.trainers[0].save_checkpoint()
+        self.trainers[0].saver.wait()
+        raise Killed
+
+    for words, owner, name, fault in (
+        (
+            [*POPULATION, LONG, "checkpoint_seconds=1e-9"],
+            GradientLearner,
+            "copy_from",
+            killed_in_copy,
+        ),
+        (["resume=P", "checkpoint_seconds=1e-9"], Population, "save", killed_in_save),
+    ):
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(owner, name, fault)
+            train.main(words)
+    steps = [checkpoint.list_checkpoints(here / f"P/member-{n}/checkpoints")[-1] for n in (0, 1)]
+    assert checkpoint.step_of(steps[0]) > checkpoint.step_of(steps[1])
+    run("resume=P")
+    assert_equal(here / "P", here / "left-alone")
+    assert "bit for bit" not in capsys.readouterr().out
+
+
+def test_settings_of_a_lineage_are_a_schedule_for_one_agent(here):
+    """The best member's, which here never copied: the same bits as its own."""
+    run(*POPULATION, LONG)
+    path = here / "P" / populations.FILE
+    timetable = populations.schedule(path)
+    generations = populations.read(path)
+    assert [samples for samples, _ in timetable] == [rows[0]["samples"] for rows in generations]
+    scores = {row["from"]: generations[-1][int(row["from"])]["score"] for row in generations[-1]}
+    best = [row["from"] for row in generations[-1]].index(max(scores, key=scores.__getitem__))
+    line = populations.lineage(generations, best)
+    assert timetable == [
+        (rows[0]["samples"], populations.settings_of(rows[n])) for rows, n in zip(generations, line)
+    ]
+    run(*SMALL, "samples=512", f"population.schedule={path}", "folder=one", "log_every=1")
+    config = yaml.safe_load((here / f"P/member-{line[0]}/config.yaml").read_text())
+    row = json_lines.read(here / "one/metrics.jsonl")[0]
+    fraction = 1 - 0 / 512
+    assert row["lr"] == pytest.approx(config["learner"]["lr"] * fraction, rel=1e-6)
+
+
+def test_a_member_that_diverges_is_replaced_and_named(here, capsys):
+    words = [*POPULATION[:-2], "population.vary={learner.lr: {choices: [1e-3, 1e6]}}"]
+    words = [
+        *words,
+        "population.size=4",
+        "seed=3",
+        "folder=D",
+        "samples=10240",
+        "population.every=4096",
+    ]
+    run(*words)
+    rows = [row for rows in populations.read(here / "D" / populations.FILE) for row in rows]
+    diverged = [row for row in rows if row.get("diverged")]
+    assert diverged and all(row["from"] != row["member"] for row in diverged)
+    assert "diverged" in capsys.readouterr().out
+
+
+BAD = {
+    "key": (["population.vary={agent.width: {min: 8, max: 16}}"], "agent.width cannot vary"),
+    "near": (["population.vary={learner.lrr: {min: 1, max: 2}}"], "did you mean learner.lr"),
+    "upside down": (["population.vary={learner.lr: {min: 3e-3, max: 3e-4}}"], "swap them"),
+    "bounds": (["population.vary={learner.gamma: {min: 0.9, max: 1.1}}"], "out of range"),
+    "no range": (["population.vary={learner.lr: {min: 1e-3}}"], "needs min and max"),
+    "log": (
+        ["population.vary={learner.clip: {min: 0, max: 1, log: true}}"],
+        "out of range|above 0",
+    ),
+    "both": (["population.vary={learner.lr: {min: 1, max: 2, choices: [1]}}"], "one of them"),
+    "schedule": (["learner.lr={from:1e-3,to:1e-4}"], "is a schedule"),
+    "size": (["population.size=1"], "needs several members"),
+    "evaluated": (["population.score=evaluated"], "evaluate_every"),
+    "ranks": (["ranks=2"], "one process"),
+    "file": (["population.size=1", "population.vary={}", "population.schedule=x"], "no file 'x'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_sentence(here, capsys, case):
+    words, text = BAD[case]
+    err = refused(capsys, *POPULATION, "samples=64", *words)
+    assert any(part in err for part in text.split("|")), err
+    assert "Traceback" not in err and not (here / "P").exists()
+
+
+class WithoutCopies(PPO):
+    """A learner that cannot copy itself."""
+
+    copy_from = None
+
+
+def test_a_learner_that_cannot_copy_is_refused(here, capsys):
+    learner = f"learner={__name__}:WithoutCopies"
+    err = refused(capsys, *POPULATION, "samples=64", learner)
+    assert "WithoutCopies has no copy_from(other)" in err and not (here / "P").exists()
+
+
+def test_more_members_than_memory_holds_are_refused_before_anything_is_built(here, capsys):
+    words = [
+        *("env=explorer", *tiny.TINY[1:]),
+        "env.n_envs=500000",
+        "population.size=1000",
+        "samples=64",
+        "folder=P",
+    ]
+    err = refused(capsys, *words)
+    assert "members (population.size) need" in err and "fit" in err
+    assert not (here / "P").exists()
+
+
+def test_agents_of_a_population_are_evaluated_and_start_runs(here, capsys):
+    run(*POPULATION, "samples=2560")
+    words = ["split=training", "episodes=4", "baseline=none", "device=cpu", "max_steps=4"]
+    assert entry.run_command("evaluate", ["run=P", "member=2", *words]) == 0
+    assert list((here / "P/member-2/evaluations").iterdir())
+    assert entry.run_command("evaluate", ["run=P", *words]) == 0
+    best = populations.best(here / "P")
+    assert list((here / f"P/member-{best}/evaluations").iterdir())
+    assert entry.run_command("report", ["run=P"]) == 0
+    page = (here / "P/report.html").read_text()
+    assert "<h2>Population</h2>" in page and "score of the population" in page
+    for member, rows in enumerate(zip(*populations.read(here / "P" / populations.FILE))):
+        cells = [f"{row['generation']} from {row['from']}" for row in rows if row["from"] != member]
+        assert (", ".join(cells) or "never") in page
+    assert entry.run_command("evaluate", ["run=P", "member=7", *words]) == 2
+    assert "has no member 7" in capsys.readouterr().err
+    assert entry.run_command("export", ["run=P", "member=1", "format=safetensors"]) == 0
+    assert (here / "P/member-1/agent.safetensors").exists()
+    run("init=P", "member=2", "samples=128", "folder=next", "device=cpu")
+    weights, own = ({**state(f)["policy"]} for f in ("next", "P/member-2"))
+    assert weights.keys() == own.keys()
+    assert "member-2" in (here / "next/config.yaml").read_text()
+
+
+@pytest.mark.slow
+def test_members_of_a_league_meet_each_other_and_resume_with_the_same_bits(here, capsys):
+    """Their opponents are, in turn, the other members' policies of the time."""
+    small = [word for word in tiny.TINY if not word.startswith(("env", "geometry"))]
+    words = [*small, "env=pong", "env.self_play=true", "env.points=1", "env.n_envs=8"]
+    words += ["opponents.league=0.5", "opponents.past=0.25", "opponents.snapshots=2"]
+    words += ["opponents.every=3", "population.size=3", "population.every=240", "logger=none"]
+    words += [VARY, "samples=480"]
+    run(*words, "folder=L", "checkpoint_seconds=1e-9", "keep_checkpoints=99")
+    shutil.copytree("L", "left-alone")
+    won = [json_lines.read(here / f"L/member-{n}/metrics.jsonl")[-1] for n in range(3)]
+    assert any("episode/return/league" in row for row in won)
+    paths = checkpoint.list_checkpoints(here / "L/member-0/checkpoints")
+    early, after = paths[1], paths[4]
+    states = [checkpoint.load_latest(path).state for path in (early, after)]
+    rivals = [one["opponents"]["snapshots"]["2"] for one in states]
+    assert states[0]["updates"] < 3 < states[1]["updates"] < 6
+    at_refresh = checkpoint.load_latest(here / "L/member-1/checkpoints" / paths[2].name).state
+    assert differences(rivals[1], {k: at_refresh["policy"][k] for k in rivals[1]}) == []
+    assert differences(rivals[0], rivals[1]) != []
+    for n in range(3):
+        for path in checkpoint.list_checkpoints(here / f"L/member-{n}/checkpoints")[5:]:
+            shutil.rmtree(path)
+    run("resume=L")
+    assert_equal(here / "L", here / "left-alone")
+    err = refused(capsys, *words, "population.size=1", "population.vary={}", "folder=M")
+    assert "opponents.league" in err and "population.size=2" in err
+
+
+@pytest.mark.nightly
+def test_population_that_is_killed_at_random_moments_has_the_same_bits(here):
+    """Thirty times by SIGKILL, in whatever it does."""
+    words = [*POPULATION, "samples=20480"]
+    run(*words)
+    shutil.move("P", "left-alone")
+    generator, n_killed = random.Random(1), 0
+    while n_killed < 30:
+        is_new = not populations.is_root(here / "P") or not checkpoint.list_checkpoints(
+            here / "P/member-2/checkpoints"
+        )
+        if is_new:
+            shutil.rmtree("P", ignore_errors=True)
+        start = [*words, "checkpoint_seconds=1e-9"] if is_new else ["resume=P"]
+        process = forked("train", *start, cwd=here)
+        try:
+            process.communicate(timeout=generator.uniform(2, 8))
+        except (subprocess.TimeoutExpired, TimeoutError):
+            process.kill()
+            process.communicate(timeout=HUNG)
+            n_killed += 1
+            continue
+        break
+    assert n_killed >= 3
+    if process.returncode != 0:
+        run("resume=P")
+    assert_equal(here / "P", here / "left-alone")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "r2d2" else pytest.mark.nightly)
+        for name in ("r2d2", "vtrace", "lag", "wrappers")
+    ],
+)
+def test_copies_of_every_learner_resume_with_the_same_bits(here, monkeypatch, case):
+    """What a copy leaves out would come back from the checkpoint, or not."""
+
+    def drawn(self, trainer):
+        member = self.trainers.index(trainer)
+        return random.Random(f"{trainer.samples} {member}").random()
+
+    monkeypatch.setattr(Population, "score_of", drawn)
+    words = [*CASES[case], "log_every=2", "logger=none", "samples=384", "folder=P"]
+    words += ["population.size=3", "population.every=96"]
+    words += ["population.vary={learner.lr: {min: 1e-4, max: 3e-2, log: true}}"]
+    run(*words, "checkpoint_seconds=1e-9", "keep_checkpoints=99")
+    rows = [row for rows in populations.read(here / "P" / populations.FILE) for row in rows]
+    assert sum(row["from"] != row["member"] for row in rows) >= 3
+    shutil.copytree("P", "left-alone")
+    for n in range(3):
+        for path in checkpoint.list_checkpoints(here / f"P/member-{n}/checkpoints")[6:]:
+            shutil.rmtree(path)
+    run("resume=P")
+    assert_equal(here / "P", here / "left-alone")
