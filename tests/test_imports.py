@@ -94,6 +94,8 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",
     "megastep.engine",
+    "megastep.geometries.checks",
+    "megastep.geometries.files",
     "megastep.global_generators",
     "megastep.recording",
     "megastep.scene",
