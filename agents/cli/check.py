@@ -1,13 +1,14 @@
 """megastep check path=FILE: what the floor plans of a file do not satisfy."""
 
 from collections import Counter
+from pathlib import Path
 
 from megastep.agents import console
 from megastep.agents.cli import plain_words
 from megastep.agents.errors import UserError, user_errors
 
-HELP = """Checks the floor plans of an .npz file: that each is closed, every room can be reached, lights
-are indoors, and no walls are the same, cross or have no length.
+HELP = """Checks the floor plans of an .npz file: that each is closed, every room can be reached,
+lights are indoors, and no two walls are the same or cross.
 
   megastep check path=plans.npz          also the file of an import: megastep import --help"""
 SHOWN = 20  # plans whose errors are printed
@@ -19,10 +20,14 @@ def main(words: list[str]) -> int:
         console.say(HELP)
         return 0 if words else 2
     given = plain_words.parse(words, {"path": False})
-    from megastep.geometries import checks, files
+    if "path" not in given:
+        raise UserError("path is missing; path=plans.npz names the file")
+    from megastep.geometries import checks, files, imported
 
+    path = Path(given["path"][0])
+    is_database = (path.parent / f"{path.stem.split('-')[0]}.sha256").exists()
     with user_errors():
-        plans = files.load(given["path"][0])
+        plans = imported.load(path) if is_database else files.load(path)
     errors = {index: checks.errors(g) for index, g in enumerate(plans)}
     errors = {index: sentences for index, sentences in errors.items() if sentences}
     for index, sentences in list(errors.items())[:SHOWN]:

@@ -9,7 +9,7 @@ import numpy as np
 from megastep import geometry
 from megastep.dotdict import dotdict
 
-__all__ = ["clearance", "components", "errors", "joins"]
+__all__ = ["clearance", "components", "errors", "fine_rooms", "joins"]
 
 FINE = 0.05  # metres per cell of the raster
 MAX_FINE_CELLS = 2_250_000  # of the raster; a plan of 75 m x 75 m
@@ -150,7 +150,7 @@ def errors(g: dotdict, fine: float = FINE) -> list[str]:
     if (valid.masks[labels[1:-1, 1:-1] == labels[0, 0]] > 0).any():
         messages.append("the envelope is open: a room leads outside")
 
-    distance, rooms, cell = _fine(valid, fine)
+    distance, rooms, cell = fine_rooms(valid, fine)
     is_room = rooms > 0
     cells = geometry.indices(valid.lights, distance.shape, cell)
     is_within = ((cells >= 0) & (cells < distance.shape)).all(1)
@@ -169,7 +169,7 @@ def errors(g: dotdict, fine: float = FINE) -> list[str]:
     return messages
 
 
-def _fine(g, fine) -> tuple[np.ndarray, np.ndarray, float]:
+def fine_rooms(g: dotdict, fine: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Returns the clearance and the rooms of a geometry on a raster, and the side of its cells in
     metres: `fine`, more if the geometry is so large that the raster would have too many.
     """
