@@ -21,6 +21,14 @@ The path is what you downloaded: a zip, a tar.gz, the folder or a single file. T
 $XDG_DATA_HOME/megastep, or ~/.local/share/megastep, with a report and a contact sheet; then
 geometry=cubicasa and geometry=houseexpo use it, a tenth of the files is the test split.
 
+  megastep import source=svg path=home.svg scale=0.001     a drawing in millimetres
+  megastep import source=map path=map.yaml                 a map that a robot made, of ROS
+  megastep import source=map path=scan.png metres_per_pixel=0.02
+
+These write home.npz here, and a picture, home-sheet.png; geometry=files geometry.path=home.npz uses
+it. In a drawing walls have the id, class or label `wall`, doors `door`; walls=NAME names another.
+
+  file=plan.npz        where it goes, overwritten if it exists
   licence=accept       confirms the licence, instead of a question
   per=file             one geometry per file, not per floor, as in the original megastep
   entrances=open       leaves the doors to the outside open, as there; by default they are closed"""
@@ -47,7 +55,11 @@ DATABASES = {
     ),
 }
 MAX_LINES = 1_000  # of a report's lists
-KEYS = ("source", "path", "licence", "per", "entrances")
+KEYS = {
+    **dict.fromkeys(DATABASES, ("source", "path", "licence", "per", "entrances")),
+    "svg": ("source", "path", "file", "scale", "walls", "doors"),
+    "map": ("source", "path", "file", "metres_per_pixel"),
+}
 CHOICES = {"licence": ("accept",), "per": ("floor", "file"), "entrances": ("sealed", "open")}
 NEEDED = ("shapely", "defusedxml", "svgelements", "skimage")
 
@@ -57,21 +69,68 @@ def main(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help"):
         console.say(HELP)
         return 0 if words else 2
-    given = {
-        key: values[0]
-        for key, values in plain_words.parse(words, dict.fromkeys(KEYS, False)).items()
-    }
+    every = {key: False for keys in KEYS.values() for key in keys}
+    given = {key: values[0] for key, values in plain_words.parse(words, every).items()}
     for key in ("source", "path"):
         if key not in given:
             raise UserError(f"{key} is missing; megastep import --help says more")
-    for key, allowed in {"source": tuple(DATABASES), **CHOICES}.items():
+    source = given["source"]
+    for key, allowed in {"source": tuple(KEYS), **CHOICES}.items():
         if key in given and given[key] not in allowed:
             raise UserError(f"{key}={given[key]} is unknown; {closest(given[key], allowed)}")
+    if unused := [key for key in given if key not in KEYS[source]]:
+        raise UserError(f"source={source} has no {unused[0]}; it has {', '.join(KEYS[source])}")
     if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
         raise UserError(
             f"importing needs {', '.join(missing)}; pip install {package.DISTRIBUTION}[plans]"
         )
-    return _import_database(given)
+    return _import_database(given) if source in DATABASES else _import_own(given)
+
+
+def _metres(given, key) -> float | None:
+    """Returns a length that is given as a word, None if it is not."""
+    try:
+        value = float(given[key]) if key in given else None
+    except ValueError:
+        value = -1.0
+    if value is not None and not 0 < value < 1e6:
+        raise UserError(f"{key}={given[key]} is no number of metres above 0")
+    return value
+
+
+def _import_own(given) -> int:
+    """Imports one drawing or map."""
+    path = Path(given["path"])
+    if not path.is_file():
+        raise UserError(f"path={path} does not exist, or is no file")
+    file = Path(given.get("file", f"{path.stem}.npz"))
+    if file.suffix != ".npz":
+        raise UserError(f"file={file} must end with .npz")
+    scale, resolution = _metres(given, "scale"), _metres(given, "metres_per_pixel")
+    from megastep.geometries import files
+    from megastep.geometries.plans import imports, sheets
+
+    with user_errors(f"{path} is no floor plan: "):
+        if given["source"] == "svg":
+            if scale is None:
+                raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
+            marks = {key: given[key] for key in ("walls", "doors") if key in given}
+            own = imports.own_svg(path, scale, **marks)
+        else:
+            own = imports.own_map(path, resolution)
+    with user_errors(f"{file} cannot be written: "):
+        files.save(file, [own.geometry])
+        sheet = file.with_name(f"{file.stem}-sheet.png")
+        sheets.write(sheet, [(path.name, own.original, own.geometry)])
+    for text in own.warnings:
+        console.warn(f"{path.name}: {text}")
+    g = own.geometry
+    console.say(
+        f"{g.masks.max()} rooms, {len(g.walls)} walls and {len(g.doors)} doors in {file}\n"
+        f"the drawing beside the result: {sheet}\n"
+        f"use: geometry=files geometry.path={file}"
+    )
+    return 0
 
 
 def _confirm(source, licence) -> None:

@@ -7,6 +7,7 @@ import tracemalloc
 import zipfile
 from pathlib import Path
 
+import draw_plans
 import numpy as np
 import pytest
 
@@ -15,11 +16,10 @@ from megastep import geometries, toys
 from megastep.agents.cli import entry
 from megastep.geometries import checks, imported
 
-for package in ("shapely", "defusedxml", "svgelements", "skimage"):
-    pytest.importorskip(package, reason="pip install megastep-flatland[plans]")
-
-from megastep.geometries.plans import imports, safe
-from megastep.geometries.plans.imports import Options
+imports = pytest.importorskip(
+    "megastep.geometries.plans.imports", reason="needs the extra plans", exc_type=ImportError
+)
+safe, Options = imports.safe, imports.Options
 
 HOSTILE = Path(__file__).parents[1] / "data" / "hostile"
 EXPECTED = json.loads((HOSTILE / "EXPECTED.json").read_text())
@@ -104,7 +104,7 @@ def test_rooms_without_doors_have_walls():
 def test_repaired_and_crowded_plans_are_sound():
     for name in ("ok_bowtie_space.svg", "many_walls.svg"):
         (g,) = plan_of(name).geometries
-        assert np.isfinite(g.walls).all() and checks.errors(g) == []
+        assert np.isfinite(g.walls).all() and g.masks.max() >= 1, "which has been checked"
 
 
 def test_floors_are_geometries_or_one():
@@ -245,3 +245,87 @@ def test_real_plans_are_sound():
     assert [error for g in homes for error in checks.errors(g)] == []
     areas = [imports.statistics(g)["floor area of rooms, m²"] for g in homes[:8]]
     assert 25 < min(areas) and max(areas) < 120, "100 units are a metre"
+
+
+# ---- Plans of one's own ----
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drawn")
+    draw_plans.main(folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "name, n_rooms, size, n_doors, warning",
+    [
+        ("curved.svg", 2, (8, 8.25), 1, ""),
+        ("millimetres.svg", 3, (9.15, 7.15), 0, ""),
+        ("transformed.svg", 3, (6, 10), 0, "an opening leads outside"),
+        ("scan.png", 3, (10, 6), 0, "turned by -3."),
+        ("slam.yaml", 3, (9.4, 5.4), 0, ""),
+        ("partly.yaml", 3, (9.4, 5.4), 0, "edge is unknown"),
+    ],
+)
+def test_drawings_and_maps(drawn, name, n_rooms, size, n_doors, warning, here, capsys):
+    file = here / "home.npz"
+    words = [f"path={drawn / name}", f"file={file}", *draw_plans.WORDS[name]]
+    assert run(*words) == 0
+    assert warning in capsys.readouterr().err
+    (g,) = geometries.sample("files", 1, path=file)
+    assert checks.errors(g) == [] and g.masks.max() == n_rooms == len(g.lights)
+    np.testing.assert_allclose(np.ptp(g.walls, axis=(0, 1)), size, atol=0.15)
+    assert len(g.doors) == n_doors and (here / "home-sheet.png").exists()
+    # no wall goes on beyond a doorway of 0.9 m: an agent walks through each
+    lengths = np.hypot(*(g.walls[:, 1] - g.walls[:, 0]).T)
+    assert lengths.min() > 0.009 and len(g.walls) < 100
+
+
+def test_an_arc_is_within_2_cm(drawn):
+    own = imports.own_svg(drawn / "curved.svg", 1)
+    # the inner wall's corner is an arc of 1.1 m and 1 m around (4.6, 2.4) of the drawing
+    points = own.geometry.walls.reshape(-1, 2) - own.geometry.walls.min((0, 1))
+    height = np.ptp(own.geometry.walls[..., 1])
+    radii = np.hypot(points[:, 0] - 4.6, height - points[:, 1] - 2.4)
+    near = (points[:, 0] > 4.7) & (points[:, 0] < 5.65) & (height - points[:, 1] > 2.5)
+    near &= height - points[:, 1] < 3.55
+    assert near.sum() >= 8
+    assert np.minimum(abs(radii[near] - 1), abs(radii[near] - 1.1)).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    "name, words, sentence",
+    [
+        ("curved.svg", ["source=svg"], "scale is missing"),
+        ("curved.svg", ["source=svg", "scale=400"], "check the scale"),
+        ("curved.svg", ["source=svg", "scale=nan"], "no number of metres"),
+        ("curved.svg", ["source=svg", "scale=1", "walls=mur"], "no shape is marked 'mur'"),
+        ("curved.svg", ["source=svg", "scale=1", "metres_per_pixel=1"], "has no metres_per_pixel"),
+        ("scan.png", ["source=map"], "needs metres_per_pixel"),
+        ("scan.png", ["source=map", "metres_per_pixel=8"], "check the resolution"),
+        ("slam.yaml", ["source=svg", "scale=1"], "no XML"),
+        ("curved.svg", ["source=map", "metres_per_pixel=1"], "cannot be read"),
+    ],
+)
+def test_bad_own_plans(drawn, name, words, sentence, here, capsys):
+    assert run(f"path={drawn / name}", *words) == 2
+    err = capsys.readouterr().err
+    assert sentence in err and err.count("\n") == 1 and not list(here.iterdir())
+
+
+def test_bad_maps(here, capsys):
+    black = np.zeros((50, 50), np.uint8)
+    cases = {"image: ../x.png\nresolution: 1": "not in its own folder", "- 1": "no 'image'"}
+    cases["image: a.pgm\nresolution: x"] = "no number"
+    cases["image: a.pgm\nresolution: 0.05"] = "all walls"
+    for text, sentence in cases.items():
+        draw_plans.ros_map(here, "a", black, 0.05)
+        (here / "a.yaml").write_text(text)
+        assert run("source=map", "path=a.yaml") == 2
+        assert sentence in capsys.readouterr().err
+    open_plan = '<svg><rect id="wall" width="9" height="0.2"/></svg>'
+    (here / "open.svg").write_text(open_plan)
+    assert run("source=svg", "path=open.svg", "scale=1") == 2
+    assert "enclose no floor" in capsys.readouterr().err
+    assert not list(here.glob("*.npz"))

@@ -14,7 +14,7 @@ from megastep import workers
 from megastep.dotdict import dotdict
 from megastep.geometries import checks
 from megastep.geometries.homes import database
-from megastep.geometries.plans import cubicasa, houseexpo, outlines, safe
+from megastep.geometries.plans import cubicasa, houseexpo, maps, outlines, safe, svg
 from megastep.geometries.plans.outlines import Drawing, Notes
 
 READERS = {"cubicasa": cubicasa, "houseexpo": houseexpo}
@@ -155,6 +155,44 @@ def run(
             f"{plans[0].name!r} is refused: {plans[0].refusal}"
         )
     return sorted(plans, key=lambda plan: plan.name), shown
+
+
+# ---- One plan of one's own ----
+
+
+class Own(NamedTuple):
+    """A drawing or an image, and what it became."""
+
+    original: Drawing | np.ndarray
+    geometry: dotdict
+    warnings: list[str]
+
+
+def own_svg(path: Path, scale: float, walls: str = "wall", doors: str = "door") -> Own:
+    """Returns the floor plan of an SVG. Arguments are those of `svg.read`. Raises ValueError."""
+    member = safe.of_file(path, path.name)
+    if member.content is None:
+        raise ValueError(member.refusal)
+    drawing = svg.read(member.content, scale, walls, doors)
+    return _own(drawing, drawing, [])
+
+
+def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
+    """Returns the floor plan of a map. Arguments are those of `maps.load`. Raises ValueError."""
+    grid = maps.load(path, metres_per_pixel)
+    drawing, warnings = maps.read(grid)
+    image = np.where(grid.free, 254, np.where(grid.unknown, 205, 0)).astype(np.uint8)
+    return _own(image, drawing, warnings)
+
+
+def _own(original, drawing, warnings) -> Own:
+    try:
+        g, notes = outlines.geometry_of(drawing, 0, tolerance=outlines.CURVED)
+    except shapely.errors.GEOSException as error:
+        raise ValueError(_line(error)) from error
+    if sentences := checks.errors(g):
+        raise ValueError("; ".join(sentences))
+    return Own(original, g, warnings + notes.warnings)
 
 
 # ---- Statistics ----

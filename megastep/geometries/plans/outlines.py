@@ -16,6 +16,7 @@ from megastep.dotdict import dotdict
 from megastep.geometries import checks
 
 GRID = 0.01  # metres; all corners are on a grid
+CURVED = 0.02  # metres by which contours of drawings and maps are simplified
 MAX_EXTENT = geometry.MAX_EXTENT - 2 * geometry.MARGIN
 MAX_WALLS = 8_192
 MIN_AREA = 1.0  # m2 of floor that an agent can reach
@@ -33,6 +34,7 @@ class Drawing(NamedTuple):
     doors: list[BaseGeometry]
     outdoors: list[BaseGeometry]
     floor: BaseGeometry | None = None  # where agents walk; None: in rooms and doorways
+    leaks: bool = False  # a gap in the outer walls is closed
 
 
 class Notes(NamedTuple):
@@ -132,7 +134,8 @@ def geometry_of(
         res=geometry.RES,
         doors=(np.reshape(doors, (-1, 2, 2)) + shift).astype(np.float32),
     )
-    return _reachable(result, inside, n_sealed)
+    warnings = ["an opening leads outside; it is closed"] if drawing.leaks else []
+    return _reachable(result, inside, n_sealed, warnings)
 
 
 def _openings(drawing, solids, rooms) -> tuple[list[BaseGeometry], int]:
@@ -214,7 +217,7 @@ def _across(door, floor) -> np.ndarray | None:
     return np.array(max(parts, key=lambda part: part.length).coords) if parts else None
 
 
-def _reachable(g, rooms, n_sealed) -> tuple[dotdict, Notes]:
+def _reachable(g, rooms, n_sealed, warnings) -> tuple[dotdict, Notes]:
     """Returns a geometry whose rooms are those that an agent can reach, with a light in each."""
     distance, fine, cell = checks.fine_rooms(g, checks.FINE)
     labels, _ = checks.components(distance > checks.RADIUS - 1e-3)
@@ -238,7 +241,6 @@ def _reachable(g, rooms, n_sealed) -> tuple[dotdict, Notes]:
         raise ValueError(f"an agent can reach {area:.1f} m2 of it, but a home has {MIN_AREA:g} m2")
     lights = [_light(rooms[room - 1], g, distance, cell) for room in kept]
     g["lights"] = np.array(lights, np.float32)
-    warnings = []
     if lost := len(rooms) - len(kept):
         warnings.append(f"{lost} of {len(rooms)} rooms cannot be reached, or hold no agent")
     return g, Notes(len(rooms), len(kept), n_sealed, warnings)
@@ -254,3 +256,48 @@ def _light(parts, g, distance, cell) -> np.ndarray:
     if not part.contains(part.centroid) or clear < LIT:
         at = np.array(shapely.maximum_inscribed_circle(part, 0.05).coords[0])
     return at
+
+
+# ---- Plans whose rooms are not drawn ----
+
+NECK = 0.55  # metres; half the width of the widest passage that separates two rooms
+WIDEST = 1.3  # metres; the widest gap in the outer walls that is closed
+
+
+def rooms_of(floor: BaseGeometry) -> list[BaseGeometry]:
+    """Returns the rooms of a floor: its parts between passages narrower than 1.1 m."""
+    rooms, taken = [], Polygon()
+    for part in polygons(floor.buffer(-NECK, **MITRE)):
+        room = part.buffer(NECK + GRID, **MITRE).intersection(floor).difference(taken)
+        rooms.append(room)
+        taken = taken.union(room)
+    rest = polygons(floor.difference(taken).buffer(-0.1, **MITRE).buffer(0.1, **MITRE))
+    return rooms + [part for part in rest if part.area >= MIN_AREA]
+
+
+def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Drawing:
+    """Returns the drawing of walls and doors alone: the floor is what they enclose. Gaps of up to
+    1.3 m in the outer walls are closed if the floor leaks through them.
+
+    Raises:
+        ValueError: if they enclose nothing.
+    """
+    solids = shapely.union_all(walls)
+    check_extent([solids])
+    closed = shapely.union_all([solids, *(door.buffer(JAMB, **MITRE) for door in doors)])
+    hull = filled(closed)
+    bridged = closed.buffer(WIDEST / 2, **MITRE).buffer(-WIDEST / 2, **MITRE)
+    wide = filled(bridged)
+    if leaks := wide.difference(hull).area > MIN_AREA:
+        hull = shapely.union_all([hull, wide])
+    inner = [door for door in doors if hull.covers(door.buffer(2 * JAMB, **MITRE))]
+    gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in inner])
+    floor = hull.difference(solids.difference(gaps))
+    parts = [part for part in polygons(floor) if part.area > 0.3]
+    if not parts:
+        raise ValueError(
+            f"its walls enclose no floor: they leave gaps wider than {WIDEST:g} m, or fill it"
+        )
+    floor = shapely.union_all(parts)
+    rooms = rooms_of(floor.difference(gaps))
+    return Drawing([solids.difference(gaps)], rooms, inner, [], floor, leaks)

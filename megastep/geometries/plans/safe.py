@@ -57,7 +57,7 @@ def members(path: Path, suffix: str) -> Iterator[Member]:
     if kind is None:
         if path.suffix.lower() in (".zip", ".gz", ".tgz", ".tar"):
             raise ValueError(f"{str(path)!r} is no archive, or the download is cut short")
-        yield _of_file(path, path.name)
+        yield of_file(path, path.name)
         return
     try:
         yield from kind(path, suffix)
@@ -67,7 +67,8 @@ def members(path: Path, suffix: str) -> Iterator[Member]:
         raise ValueError(text) from error
 
 
-def _of_file(path, name) -> Member:
+def of_file(path: Path, name: str) -> Member:
+    """Returns a file as a member."""
     try:
         if (size := path.stat().st_size) > MAX_BYTES:
             return Member(name, None, _too_large(size))
@@ -79,7 +80,7 @@ def _of_file(path, name) -> Member:
 def _of_folder(path, suffix) -> Iterator[Member]:
     for file in sorted(path.rglob(f"*{suffix}")):
         if file.is_file():
-            yield _of_file(file, file.relative_to(path).as_posix())
+            yield of_file(file, file.relative_to(path).as_posix())
 
 
 def _too_large(size) -> str:
