@@ -5,6 +5,7 @@ drawings and three maps. docs/floor-plans.md shows them beside what `megastep im
 """
 
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,22 @@ def main(folder):
         (folder / f"{name}.svg").write_text(draw())
     for draw in (rotated_scan, speckled_slam, unknown_cells):
         draw(folder)
+
+
+def sheet(path):
+    """Draws the six plans beside what they become, into an image."""
+    from megastep.geometries.plans import imports, sheets
+
+    with tempfile.TemporaryDirectory() as folder:
+        main(folder)
+        pairs = []
+        for name, words in WORDS.items():
+            given = dict(word.split("=") for word in words)
+            own = imports.own_map if given.pop("source") == "map" else imports.own_svg
+            numbers = {key: float(given[key]) for key in given if key != "walls"}
+            plan = own(Path(folder) / name, **(given | numbers))
+            pairs.append((name, plan.original, plan.geometry))
+    sheets.write(Path(path), pairs, columns=3)
 
 
 if __name__ == "__main__":

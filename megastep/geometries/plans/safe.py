@@ -121,7 +121,7 @@ def _of_zip(path, suffix) -> Iterator[Member]:
 class _Capped:
     """A stream of which no more than `left` bytes are read; whoever reads on sets it again."""
 
-    def __init__(self, file: IO[bytes]):
+    def __init__(self, file: IO[bytes] | gzip.GzipFile):
         self.file, self.left, self.total = file, MAX_BYTES, MAX_TOTAL
 
     def read(self, n: int) -> bytes:

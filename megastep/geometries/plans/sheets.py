@@ -37,10 +37,18 @@ def draw(drawing: Drawing, ax: "Axes") -> None:
     ax.autoscale_view()
 
 
-def write(path: Path, pairs: Sequence[tuple[str, "Drawing | np.ndarray", dotdict]]) -> None:
-    """Writes a sheet of (title, drawing or image, geometry) as an image. Raises OSError."""
-    rows = -(-len(pairs) // COLUMNS)
-    columns = min(COLUMNS, len(pairs))
+def write(
+    path: Path,
+    pairs: Sequence[tuple[str, "Drawing | np.ndarray", dotdict]],
+    columns: int = COLUMNS,
+) -> None:
+    """Writes a sheet of (title, drawing or image, geometry), `columns` in a row, as an image.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    columns = min(columns, len(pairs))
+    rows = -(-len(pairs) // columns)
     figure = Figure(figsize=(6.4 * columns, 3.4 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, 2 * columns, squeeze=False)
