@@ -46,7 +46,9 @@ def __getattr__(name) -> object:
         ) from None
 
 
+__all__ = []
 if importlib.util.find_spec("gymnasium"):
+    __all__ += ["SingleEnv", "VectorEnv", "check_vector_env"]
     from megastep.adapters.registration import register
 
     register()

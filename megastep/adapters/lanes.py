@@ -33,20 +33,17 @@ class Copies:
     def __init__(self, tree: Tree):
         leaves, self._spec = _pytree.tree_flatten(tree)
         fits = [leaf.is_cuda and _is_words(leaf) for leaf in leaves]
-        self._leaves = [(leaf, _words(leaf) if fit else None) for leaf, fit in zip(leaves, fits)]
-        self._words = [words for _, words in self._leaves if words is not None]
+        self._leaves = [*zip(leaves, fits)]
+        self._words = [_words(leaf) for leaf, fit in self._leaves if fit]
+        self._sizes = [*map(len, self._words)]
 
     def __call__(self) -> Tree:
         """Returns a copy as of now."""
+        parts = iter(torch.cat(self._words).split(self._sizes) if self._words else ())
         copies = [
-            torch.empty_like(leaf) if words is not None else leaf.clone()
-            for leaf, words in self._leaves
+            next(parts).view(leaf.dtype).view(leaf.shape) if fit else leaf.clone()
+            for leaf, fit in self._leaves
         ]
-        if self._words:
-            into = [
-                _words(copy) for copy, (_, words) in zip(copies, self._leaves) if words is not None
-            ]
-            torch._foreach_copy_(into, self._words)  # pyright: ignore[reportPrivateImportUsage]
         return _pytree.tree_unflatten(copies, self._spec)
 
 
@@ -56,7 +53,8 @@ def fresh(tree: Tree) -> Tree:
 
 
 def _is_words(leaf) -> bool:
-    return leaf.is_contiguous() and leaf.nbytes % WORD == 0 and leaf.data_ptr() % WORD == 0
+    is_aligned = leaf.nbytes % WORD == 0 and leaf.data_ptr() % WORD == 0
+    return leaf.is_contiguous() and leaf.itemsize <= WORD and is_aligned
 
 
 def _words(leaf) -> torch.Tensor:

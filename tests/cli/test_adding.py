@@ -132,7 +132,7 @@ def test_custom_environment(outside, capsys):
     name = "board.counter:Counter"
     assert train.main([f"env={name}", *RUN, "env.limit=9", "env.sizes=[3]"]) == 0
     config = saved().config["train"]["env"]
-    assert config == {"name": name, "n_envs": 4, "limit": 9, "sizes": [3]}
+    assert config == {"name": name, "n_envs": 4, "limit": 9, "sizes": [3], "wrappers": []}
     assert "-counter-" in leftovers()[0].name
     assert train.main(["resume=latest", "samples=128"]) == 0
     assert saved().step == 128
@@ -452,7 +452,8 @@ def test_init_takes_environment_geometry_and_agent_unless_typed(outside):
     common = [w for w in RUN if not w.startswith(("agent.", "env."))]
     assert train.main([*common, "init=first", "env.n_envs=8", "folder=second"]) == 0
     config = checkpoint.load_latest("second/checkpoints").config["train"]
-    assert config["env"] == {"name": "counter:Roomy", "n_envs": 8, "limit": 7}
+    expected = {"name": "counter:Roomy", "n_envs": 8, "limit": 7, "wrappers": []}
+    assert config["env"] == expected
     assert config["agent"]["core"] == "gru" and config["agent"]["width"] == 8
     box = {"name": "megastep.geometries.sources:box", "n": 1, "seed": 1, "width": 6.0}
     assert config["geometry"] == box

@@ -215,7 +215,9 @@ def test_loads_in_python_and_acts_as_the_run(folder, exported):
     assert policy.critic is None and not any(p.requires_grad for p in policy.parameters())
     assert 0 < agent.rounding_error(policy, original, env, 30) < 0.005
     assert pretrained.load(f"package/{NAME}.safetensors", "cpu").width == 8
-    with pytest.raises(UserError, match="deathmatch has no setting cameras; it has n_envs, "):
+    with pytest.raises(
+        UserError, match="deathmatch has no setting cameras; it has wrappers, n_envs, "
+    ):
         pretrained.make_env(NAME, geometries.sample("maze", 2), cameras=3)
 
 
