@@ -107,7 +107,7 @@ def read(grid: Map) -> tuple[Drawing, list[str]]:
     free = morphology.remove_small_holes(free, max_size=n_cells)
     free = morphology.remove_small_objects(free, max_size=n_cells)
     warnings = []
-    labels = measure.label(free, connectivity=1)
+    labels = np.asarray(measure.label(free, connectivity=1))
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     is_drawing = bool(border.any()) and not grid.unknown.any()
     floor = _area(~free if is_drawing else free, resolution)
