@@ -29,8 +29,8 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
     """
     try:
         plan = json.loads(content, parse_constant=_refuse)
-    except (RecursionError, UnicodeDecodeError) as error:
-        raise ValueError("it is no JSON") from error
+    except (json.JSONDecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise ValueError(f"it is no JSON, or cut short ({error})") from error
     if not isinstance(plan, dict) or "verts" not in plan:
         raise ValueError("it has no 'verts'; is it from HouseExpo?")
     corners = _numbers(plan["verts"], 2, "verts")

@@ -1,8 +1,10 @@
 """Imports the floor plans of an archive or folder, in parallel processes."""
 
+import contextlib
 import functools
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +22,11 @@ from megastep.geometries.plans.outlines import Drawing, Notes
 READERS = {"cubicasa": cubicasa, "houseexpo": houseexpo}
 BATCH = 16  # files that a process gets at a time
 PENDING = 4  # batches per process that are read ahead
+#: What libraries raise for broken files, but for ValueError.
+UNREADABLE = (
+    *(shapely.errors.GEOSException, RecursionError, MemoryError, ArithmeticError, LookupError),
+    *(TypeError, AttributeError, AssertionError),
+)
 SHOWN = 12  # plans of the contact sheet
 
 
@@ -58,16 +65,19 @@ def read(options: Options, member: safe.Member) -> Plan:
         return Plan(name, [], [], member.refusal)
     made, refusals = [], []
     try:
-        for drawing in drawings(options, member.content):
-            try:
+        with _refused():
+            floors = drawings(options, member.content)
+    except ValueError as error:
+        return Plan(name, [], [], _line(error))
+    for drawing in floors:
+        try:
+            with _refused():
                 g, notes = geometry_of(options, drawing)
                 if (sentences := checks.errors(g)) and options.sealed:
                     raise ValueError("; ".join(sentences))
                 made.append((g, notes))
-            except (ValueError, shapely.errors.GEOSException) as error:
-                refusals.append(_line(error))
-    except (ValueError, shapely.errors.GEOSException, RecursionError, MemoryError) as error:
-        refusals.append(_line(error))
+        except ValueError as error:
+            refusals.append(_line(error))
     if not made:
         return Plan(name, [], [], "; ".join(dict.fromkeys(refusals)))
     if refusals:
@@ -75,8 +85,27 @@ def read(options: Options, member: safe.Member) -> Plan:
     return Plan(name, [g for g, _ in made], [notes for _, notes in made])
 
 
+@contextlib.contextmanager
+def _refused() -> Iterator[None]:
+    """Turns whatever a stranger's file makes libraries raise into a ValueError."""
+    try:
+        yield
+    except UNREADABLE as error:
+        raise ValueError(f"it cannot be read ({type(error).__name__}: {_line(error)})") from error
+
+
 def _line(error) -> str:
     return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+@contextlib.contextmanager
+def _killed() -> Iterator[None]:
+    """Turns the end of a process of a pool into a ValueError."""
+    try:
+        yield
+    except BrokenExecutor as error:
+        text = "a process was killed, perhaps as memory is short; nothing is imported"
+        raise ValueError(text) from error
 
 
 def _read_all(options, members) -> list[Plan]:
@@ -127,6 +156,7 @@ def run(
             keep(batch, _read_all(options, batch))
     elif (second := next(batches, None)) is not None:
         with (
+            _killed(),
             workers.terminal_signals_blocked(),
             loky.ProcessPoolExecutor(
                 n_processes,
@@ -173,23 +203,22 @@ def own_svg(path: Path, scale: float, walls: str = "wall", doors: str = "door") 
     member = safe.of_file(path, path.name)
     if member.content is None:
         raise ValueError(member.refusal)
-    drawing = svg.read(member.content, scale, walls, doors)
-    return _own(drawing, drawing, [])
+    with _refused():
+        drawing = svg.read(member.content, scale, walls, doors)
+        return _own(drawing, drawing, [])
 
 
 def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
     """Returns the floor plan of a map. Arguments are those of `maps.load`. Raises ValueError."""
-    grid = maps.load(path, metres_per_pixel)
-    drawing, warnings = maps.read(grid)
-    image = np.where(grid.free, 254, np.where(grid.unknown, 205, 0)).astype(np.uint8)
-    return _own(image, drawing, warnings)
+    with _refused():
+        grid = maps.load(path, metres_per_pixel)
+        drawing, warnings = maps.read(grid)
+        image = np.where(grid.free, 254, np.where(grid.unknown, 205, 0)).astype(np.uint8)
+        return _own(image, drawing, warnings)
 
 
 def _own(original, drawing, warnings) -> Own:
-    try:
-        g, notes = outlines.geometry_of(drawing, 0, tolerance=outlines.CURVED)
-    except shapely.errors.GEOSException as error:
-        raise ValueError(_line(error)) from error
+    g, notes = outlines.geometry_of(drawing, 0, tolerance=outlines.CURVED)
     if sentences := checks.errors(g):
         raise ValueError("; ".join(sentences))
     return Own(original, g, warnings + notes.warnings)

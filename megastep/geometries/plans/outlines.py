@@ -19,6 +19,7 @@ GRID = 0.01  # metres; all corners are on a grid
 CURVED = 0.02  # metres by which contours of drawings and maps are simplified
 MAX_EXTENT = geometry.MAX_EXTENT - 2 * geometry.MARGIN
 MAX_WALLS = 8_192
+MAX_CORNERS = 200_000  # of a drawing
 MIN_AREA = 1.0  # m2 of floor that an agent can reach
 LIT = 0.1  # metres; minimum distance of a light from a wall
 JAMB = 0.05  # metres; a doorway is so much wider than its door, on either side
@@ -93,6 +94,10 @@ def geometry_of(
     Raises:
         ValueError: saying what is wrong with the plan.
     """
+    shapes = [*drawing.walls, *drawing.rooms, *drawing.doors, *drawing.outdoors]
+    n_corners = int(shapely.get_num_coordinates(shapes).sum())
+    if n_corners > MAX_CORNERS:
+        raise ValueError(f"it has {n_corners:,} corners, but the limit is {MAX_CORNERS:,}")
     check_extent([*drawing.walls, *drawing.rooms])
     solids = shapely.union_all(drawing.walls)
     rooms = drawing.rooms if sealed else [*drawing.rooms, *drawing.outdoors]

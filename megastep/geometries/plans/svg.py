@@ -123,7 +123,9 @@ def _path(text) -> list[tuple[np.ndarray, bool]]:
         elif isinstance(segment, Line):
             points.append(tuple(segment.end))
         else:
-            points += [tuple(row) for row in np.asarray(segment.npoint(CURVE))[1:].tolist()]
+            with np.errstate(all="ignore"):  # what is not finite is refused below
+                curve = np.asarray(segment.npoint(CURVE))
+            points += [tuple(row) for row in curve[1:].tolist()]
     for line, _ in lines:
         if not np.isfinite(line).all() or np.abs(line).max() > safe.MAX_COORDINATE:
             raise ValueError("a coordinate of a path is not finite, or too large")
