@@ -329,3 +329,18 @@ def test_bad_maps(here, capsys):
     assert run("source=svg", "path=open.svg", "scale=1") == 2
     assert "enclose no floor" in capsys.readouterr().err
     assert not list(here.glob("*.npz"))
+
+
+@pytest.mark.slow
+def test_processes_give_what_one_gives(tmp_path):
+    good, bad = ((HOSTILE / f"houseexpo_{name}.json").read_bytes() for name in ("ok", "nan"))
+    members = {f"{i:03}.json": bad if i % 7 == 0 else good for i in range(60)}
+    path = archive_of(tmp_path / "json.tar.gz", members)
+    counts: list[int] = []
+    one, two = (imports.run(Options("houseexpo"), path, counts.append, n)[0] for n in (1, 2))
+    assert [plan.name for plan in one] == [plan.name for plan in two] == sorted(members)
+    for a, b in zip(one, two, strict=True):
+        assert a.refusal == b.refusal and len(a.geometries) == len(b.geometries)
+        for g, h in zip(a.geometries, b.geometries):
+            np.testing.assert_array_equal(g.walls, h.walls)
+    assert counts[-1] == 60
