@@ -25,7 +25,7 @@ def main(words: list[str]) -> int:
     from megastep.geometries import checks, files, imported
 
     path = Path(given["path"][0])
-    is_database = (path.parent / f"{path.stem.split('-')[0]}.sha256").exists()
+    is_database = path.resolve().parent == imported.folder().resolve()
     with user_errors():
         plans = imported.load(path) if is_database else files.load(path)
     errors = {index: checks.errors(g) for index, g in enumerate(plans)}
