@@ -14,6 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import show_homes
+from examples import draw_plans
 
 from megastep.agents.cli import record, web
 
@@ -39,6 +40,8 @@ SHEETS = {
     "cluttered-homes.png": "--count 10 --density 3 --clutter 1",
     "mazes.png": "--mazes",
 }
+#: Floor plans of others beside what is made of them, which needs the extra `plans`.
+OWN_PLANS = "own-plans.png"
 #: Words for megastep web.
 GALLERY = {
     "explorer.html": "run=explorer_anywhere homes=[3,0,1,2]",
@@ -52,16 +55,17 @@ GALLERY = {
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("names", nargs="*", help="names of pictures; all by default")
-    names = parser.parse_args(argv).names or [*FILMS, *SHEETS, *GALLERY]
+    names = parser.parse_args(argv).names or [*FILMS, *SHEETS, OWN_PLANS, *GALLERY]
     names = [*GALLERY] if names == ["gallery"] else names
-    if unknown := [name for name in names if name not in {*FILMS, *SHEETS, *GALLERY}]:
-        raise SystemExit(
-            f"There is no picture {unknown[0]}; there are {', '.join([*FILMS, *SHEETS, *GALLERY])}"
-        )
+    if unknown := [name for name in names if name not in {*FILMS, *SHEETS, OWN_PLANS, *GALLERY}]:
+        every = ", ".join([*FILMS, *SHEETS, OWN_PLANS, *GALLERY])
+        raise SystemExit(f"There is no picture {unknown[0]}; there are {every}")
     for name in names:
         path = IMAGES / name
         if name in SHEETS:
             show_homes.main([str(path), *SHEETS[name].split()])
+        elif name == OWN_PLANS:
+            draw_plans.sheet(path)
         elif name in GALLERY:
             web.main([*GALLERY[name].split(), f"file={PAGES / name}"])
         elif code := record.main([*FILMS[name].split(), "device=cpu", f"file={path}"]):

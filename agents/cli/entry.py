@@ -21,6 +21,8 @@ COMMANDS = {
     "web": "writes a page that plays an agent in a browser; --help says more",
     "export": "writes an agent for ONNX, torch.export, a hub, or in one file; --help says more",
     "reproduce": "lists the results in docs/lab; makes one again; --help says more",
+    "import": "imports floor plans: CubiCasa5k, HouseExpo, your own; --help says more",
+    "check": "checks the floor plans of a file: closed, reachable, ...; --help says more",
     "inspect": "verifies a run's checkpoints and prints what is in them",
     "rerun": "repeats a run and compares its metrics, byte for byte",
 }

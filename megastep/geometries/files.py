@@ -34,7 +34,10 @@ MAX_DIRECTORY = 8 << 20
 # Bytes of all arrays. Masks become int16, so a load takes less than 500 MB with Python itself.
 MAX_UNPACKED = 96 << 20
 MAX_ARRAY = 32 << 20  # bytes of one array: the maximum of cells in the widest dtype
-MAX_HEADER = 1_024  # bytes of an array's header, which is parsed as Python; numpy writes 118
+# Metres of all walls of a geometry, and of a file: 20 texels a metre, 16 bytes each.
+MAX_LENGTH, MAX_LENGTHS = 20_000, 4_000_000
+HEADER = 128  # bytes of the header that numpy writes
+MAX_HEADER = 1_024  # bytes of an array's header, which is parsed as Python
 
 # What zipfile and numpy raise for broken files. The last four come from parsing an array's header.
 UNREADABLE = (
@@ -56,12 +59,18 @@ def _open(path) -> "ZipFile":
     """Opens a zip file. Raises ValueError if its table of contents exceeds MAX_DIRECTORY."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(max(0, size - (22 + 65_535)))  # the end record and the longest comment after it
-        tail = file.read()
+        # the end record, the longest comment after it, and zip64's two records before it
+        file.seek(max(0, size - (22 + 65_535 + 20 + 56)))
+        start, tail = file.tell(), file.read()
     at = tail.rfind(b"PK\5\6")
     if at < 0 or len(tail) < at + 22:
         raise ValueError("is not an .npz file, or is cut short")
     (directory,) = struct.unpack_from("<I", tail, at + 12)
+    if at >= 20 and tail[at - 20 : at - 16] == b"PK\6\7":  # zip64, as of more than 65,535 arrays
+        (record,) = struct.unpack_from("<Q", tail, at - 12)
+        if record != start + at - 76 or tail[at - 76 : at - 72] != b"PK\6\6":
+            raise ValueError("has a table of contents of zip64 that is out of place")
+        (directory,) = struct.unpack_from("<Q", tail, at - 36)
     if directory > MAX_DIRECTORY:
         raise ValueError(
             f"lists more arrays than {MAX_GEOMETRIES:,} geometries have, which are the limit"
@@ -91,6 +100,9 @@ def _contents(archive) -> dict:
         raise ValueError(f"holds {len(contents):,} geometries, but the limit is {MAX_GEOMETRIES:,}")
     entries = [entry for by_key in contents.values() for entry in by_key.values()]
     for entry in entries:
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            # zipfile unpacks the others whole, whatever size they claim
+            raise ValueError(f"holds {entry.filename!r}, which is compressed other than by deflate")
         if entry.file_size > MAX_ARRAY:
             raise ValueError(
                 f"holds {entry.filename!r} of {entry.file_size:,} bytes, but the limit is "
@@ -148,6 +160,14 @@ def _read_geometry(archive, entries) -> dict:
     return geometry.validate_geometry(g)
 
 
+def _length(g) -> float:
+    """Returns the metres of a geometry's walls. Raises ValueError if they exceed MAX_LENGTH."""
+    length = float(np.hypot(*(g.walls[:, 1] - g.walls[:, 0]).T).sum())
+    if length > MAX_LENGTH:
+        raise ValueError(f"has {length:,.0f} m of walls, but the limit is {MAX_LENGTH:,}")
+    return length
+
+
 def _clause(error) -> str:
     """The first line of an error's message, to be put into a sentence."""
     return str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
@@ -166,10 +186,16 @@ def load(path: str | Path) -> list[dotdict]:
     place = ""
     try:
         with _open(path) as archive:
-            geometries = []
+            geometries, length = [], 0.0
             for index, entries in sorted(_contents(archive).items()):
                 place = f", geometry {index}"
                 geometries.append(_read_geometry(archive, entries))
+                length += _length(geometries[-1])
+                if length > MAX_LENGTHS:
+                    raise ValueError(
+                        f"up to here the file has {length:,.0f} m of walls, but the limit is "
+                        f"{MAX_LENGTHS:,}"
+                    )
             return geometries
     except UNREADABLE as error:
         raise ValueError(f"Geometry file {str(path)!r}{place}: {_clause(error)}.") from error
@@ -182,7 +208,7 @@ def save(path: str | Path, geometries: Sequence[dict]) -> None:
     Raises:
         ValueError: if `load` would refuse a geometry. The message names it.
     """
-    path, arrays = Path(path), {}
+    path, arrays, lengths = Path(path), {}, []
     if not 0 < len(geometries) <= MAX_GEOMETRIES:
         raise ValueError(
             f"{len(geometries):,} geometries cannot be saved: give from 1 to {MAX_GEOMETRIES:,}."
@@ -190,11 +216,19 @@ def save(path: str | Path, geometries: Sequence[dict]) -> None:
     for index, g in enumerate(geometries):
         try:
             g = geometry.validate_geometry(g)
+            lengths.append(_length(g))
         except ValueError as error:
             raise ValueError(f"Geometry {index} cannot be saved: {error}.") from error
         for key, value in g.items():
             if key in KEYS or np.asarray(value).dtype.kind in "fiub":
                 arrays[f"{index}/{key}"] = np.asarray(value)
+    n_bytes = sum(values.nbytes + HEADER for values in arrays.values())
+    if n_bytes > MAX_UNPACKED or sum(lengths) > MAX_LENGTHS:
+        raise ValueError(
+            f"{len(geometries):,} geometries of {n_bytes:,} bytes and {sum(lengths):,.0f} m of "
+            f"walls are too many for a file: the limits are {MAX_UNPACKED:,} bytes and "
+            f"{MAX_LENGTHS:,} m."
+        )
     handle, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -14,14 +14,15 @@ from pydantic import Field
 
 from megastep.dotdict import dotdict
 from megastep.geometries import files as npz
-from megastep.geometries import mazes, memory_mazes, toys
+from megastep.geometries import imported, mazes, memory_mazes, toys
 from megastep.geometries.homes import database, plan
 from megastep.geometry import mirror_image
 from megastep.imports import import_object
 from megastep.settings import checked, closest
 
 __all__ = [
-    *("bench", "box", "column", "files", "homes", "maze", "memory_maze", "mixed", "suite"),
+    *("bench", "box", "column", "cubicasa", "files", "homes", "houseexpo", "maze", "memory_maze"),
+    *("mixed", "suite"),
 ]
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -142,6 +143,28 @@ def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdi
         seed: which geometries of the split are drawn, and in which order.
     """
     return files(n, split, seed, path=str(BENCH))
+
+
+def cubicasa(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
+    """Returns floors of CubiCasa5k's real homes, which `megastep import source=cubicasa` imported.
+
+    Args:
+        n: number of geometries; a split with fewer repeats them.
+        split: training, test or all. Floors of one home are in the same split.
+        seed: which geometries of the split are drawn, and in which order.
+    """
+    return imported.pick("cubicasa", n, split, seed)
+
+
+def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
+    """Returns floor plans of HouseExpo, which `megastep import source=houseexpo` imported.
+
+    Args:
+        n: number of geometries; a split with fewer repeats them.
+        split: training, test or all.
+        seed: which geometries of the split are drawn, and in which order.
+    """
+    return imported.pick("houseexpo", n, split, seed)
 
 
 @checked
@@ -314,8 +337,11 @@ def suite(
         split: training, test or all, of each part.
         seed: which geometries are drawn.
         parts: the parts, as of `mixed`.
-        plans: an `.npz` file of imported floor plans, which are a further part, `plans`.
+        plans: a further part: `cubicasa` or `houseexpo`, if it is imported, or an `.npz` file of
+            floor plans, whose part is called `plans`.
     """
-    if plans is not None:
+    if plans in imported.NAMES:
+        parts = parts | {plans: 512}
+    elif plans is not None:
         parts = parts | {"plans": {"source": "files", "n": 512, "path": plans}}
     return mixed(n, split, seed, parts)

@@ -1,9 +1,12 @@
 """Sources of geometries: toys, splits, files, and files that are broken or malicious."""
 
+import bz2
 import io
 import re
+import struct
 import subprocess
 import sys
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -312,6 +315,64 @@ def test_a_bad_file_is_refused_in_one_sentence(tmp_path, message):
     assert text.startswith(f"Geometry file {str(path)!r}") and "\n" not in text
     assert [p.name for p in tmp_path.iterdir()] == ["bad.npz"]
     assert not (tmp_path.parents[1] / "escaped.npy").exists()
+
+
+def bomb(size):
+    """A compressed member of bzip2 that unpacks to `size` zeros, of a small file."""
+    compressor, blocks = bz2.BZ2Compressor(), []
+    for _ in range(size >> 24):
+        blocks.append(compressor.compress(bytes(1 << 24)))
+    return b"".join([*blocks, compressor.flush()])
+
+
+def test_a_member_that_unpacks_to_more_than_it_claims_is_refused(tmp_path):
+    path, honest = tmp_path / "bomb.npz", npy(toys.box().walls)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("0/walls.npy", honest)
+        (entry,) = archive.infolist()
+    content, data = path.read_bytes(), bomb(1 << 28)
+    start = content.index(b"0/walls.npy") + len("0/walls.npy")
+    head, tail = content[:start], content[start + entry.compress_size :]
+    sizes = struct.pack("<I", entry.compress_size), struct.pack("<I", len(data))
+    path.write_bytes((head + data + tail.replace(*sizes)).replace(*sizes))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="compressed other than by deflate"):
+        files.load(path)
+    assert tracemalloc.get_traced_memory()[1] < 5e7
+    tracemalloc.stop()
+
+
+def test_zip64_directories_are_read_and_limited(tmp_path, monkeypatch):
+    path = write_box(tmp_path / "one.npz")
+    content = path.read_bytes()
+    at = content.rindex(b"PK\5\6")
+    count, size, offset = struct.unpack("<HII", content[at + 10 : at + 20])
+
+    def written(size):
+        record = b"PK\6\6" + struct.pack("<QHHIIQQQQ", 44, 45, 45, 0, 0, count, count, size, offset)
+        locator = b"PK\6\7" + struct.pack("<IQI", 0, at, 1)
+        end = content[at : at + 8] + struct.pack("<HHIIH", 65535, 65535, 2**32 - 1, 2**32 - 1, 0)
+        path.write_bytes(content[:at] + record + locator + end)
+        return path
+
+    assert len(files.load(written(size))) == 1
+    with pytest.raises(ValueError, match="lists more arrays"):
+        files.load(written(2**33))
+    moved = path.read_bytes().replace(b"PK\6\7" + struct.pack("<IQ", 0, at), b"PK\6\7" + bytes(12))
+    path.write_bytes(moved)
+    with pytest.raises(ValueError, match="out of place"):
+        files.load(path)
+
+
+def test_more_texels_than_a_home_can_have_are_refused(tmp_path):
+    walls = np.tile(np.array([[[1, 1], [199, 199]]], np.float32), (30_000, 1, 1))
+    path = write_box(tmp_path / "long.npz", walls=npy(walls))
+    assert path.stat().st_size < 70_000
+    with pytest.raises(ValueError, match="has 8,400,[0-9]+ m of walls, but the limit is 20,000"):
+        files.load(path)
+    wide = [dotdict(toys.box(190.0), res=10.0, masks=np.ones((2, 2), np.int16))] * 6_000
+    with pytest.raises(ValueError, match="too many for a file"):
+        files.save(path, wide)
 
 
 def test_an_encrypted_array_is_refused_in_one_sentence(tmp_path):

@@ -16,7 +16,7 @@ from megastep.dotdict import dotdict
 from megastep.engine import AGENT_RADIUS
 from megastep.envs.pointgoal import geodesics
 from megastep.envs.pointgoal.path_graph import PathGraph
-from megastep.geometries import homes
+from megastep.geometries import checks, homes
 from megastep.geometries.homes import (
     database,
     furniture,
@@ -214,8 +214,8 @@ def test_density_widens_homes_up_to_those_of_the_benchmarks(generated, dense):
 
 def test_no_room_has_cells_inside_furniture(dense):
     for g in dense:
-        distance = check_homes.clearance(g)
-        labels, _ = check_homes.components(distance > check_homes.FINE / 2)
+        distance = checks.clearance(g)
+        labels, _ = checks.components(distance > checks.FINE / 2)
         fine = np.maximum(g.masks, 0).repeat(4, 0).repeat(4, 1)
         assert len(np.unique(labels[(fine > 0) & (labels > 0)])) == 1, g.id
         assert (labels[fine > 0] > 0).mean() > 0.99, "a cell that no wall touches is free"
@@ -256,7 +256,7 @@ def test_an_l_shape_never_walls_in_a_corner():
         free = np.ones((50, 60), bool)
         for x0, y0, x1, y1 in boxes:
             free[y0 // 5 : y1 // 5, x0 // 5 : x1 // 5] = False
-        assert check_homes.components(free)[1] == 1
+        assert checks.components(free)[1] == 1
 
 
 def test_dense_homes_of_the_source_are_generated_ones(monkeypatch, tmp_path):
@@ -438,7 +438,7 @@ def test_checks_find_narrow_passages():
 @pytest.mark.parametrize(
     "error, change",
     [
-        ("a wall is not finite", lambda g: g.walls.__setitem__((0, 1), g.walls[0, 0])),
+        ("a wall has no length", lambda g: g.walls.__setitem__((0, 1), g.walls[0, 0])),
         ("two walls are the same", lambda g: g.walls.__setitem__(1, g.walls[0, ::-1])),
         ("coordinates start at", lambda g: g.walls.__iadd__(0.2)),
         (
@@ -473,7 +473,7 @@ def test_checks_find(error, change):
 
 def test_components_equal_a_flood_fill():
     free = np.random.default_rng(0).random((40, 50)) < 0.6
-    labels, count = check_homes.components(free)
+    labels, count = checks.components(free)
     flooded = np.where(free, np.arange(1, free.size + 1).reshape(free.shape), 0)
     for _ in range(free.size):
         far = np.pad(flooded, 1)

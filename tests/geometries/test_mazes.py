@@ -16,10 +16,10 @@ from megastep import contract, envs, geometry, modules
 from megastep.agents.cli import record
 from megastep.engine import devices
 from megastep.engine.agents import AGENT_RADIUS
-from megastep.geometries import homes, mazes, sample
+from megastep.geometries import checks, homes, mazes, sample
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from megastep.modules.spawning import CLEARANCE, spawn_points
-from scripts import check_homes, show_homes
+from scripts import show_homes
 
 matplotlib.use("Agg")
 
@@ -109,7 +109,7 @@ def test_masks_hold_one_connected_room(kind):
     size, corridor, thickness, _, samples = kind
     for g in samples:
         assert g.masks.dtype == np.int16 and set(np.unique(g.masks)) == {-1, 0, 1}
-        labels, count = check_homes.components(g.masks == 1)
+        labels, count = checks.components(g.masks == 1)
         assert count == 1
         centres = [place(g, cell, corridor, thickness) for cell in cells(size)]
         at = geometry.indices(centres, g.masks.shape, g.res)

@@ -48,35 +48,50 @@ def _arrays(path) -> tuple[dict[str, np.ndarray], np.ndarray]:
         ) from error
     if hashlib.sha256(content).hexdigest() != expected:
         raise ValueError(f"The homes in {str(path)!r} are damaged (wrong sha256); {REMEDY}.")
-    return _unpack(content, COUNT)
+    return unpack(content, COUNT)
 
 
-def pack(plans: Sequence[dotdict]) -> bytes:
-    """Returns the bytes of a database of homes from `homes.generate`."""
+def pack(
+    plans: Sequence[dotdict], compression: int = zipfile.ZIP_LZMA, **further: np.ndarray
+) -> bytes:
+    """Returns the bytes of a database of homes from `homes.generate`, or of other geometries whose
+    coordinates are whole centimetres. `further` are arrays with an entry per home.
+    """
+    is_large = max(int(g.masks.max()) for g in plans) > 127
     arrays = {
         "walls": np.concatenate([np.rint(g.walls * 100) for g in plans]).astype("<i2"),
         "lights": np.concatenate([np.rint(g.lights * 100) for g in plans]).astype("<i2"),
         "doors": np.concatenate([np.rint(g.doors * 100) for g in plans]).astype("<i2"),
-        "masks": np.concatenate([g.masks.ravel() for g in plans]).astype("i1"),
-        "widths": np.array(
-            [(len(g.walls), g.n_outer, len(g.lights), *g.masks.shape, len(g.doors)) for g in plans],
-            "<i4",
+        "masks": np.concatenate([g.masks.ravel() for g in plans]).astype(
+            "i2" if is_large else "i1"
         ),
+        "widths": np.array([_widths(g) for g in plans], "<i4"),
+        **further,
     }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: equal homes give equal bytes
-            entry.compress_type = zipfile.ZIP_LZMA
+            entry.compress_type = compression
             with archive.open(entry, "w") as file:
                 np.lib.format.write_array(file, values, allow_pickle=False)
     return buffer.getvalue()
 
 
-def _unpack(content, n_homes) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Returns the arrays of a database and the index at which each home's begin.
+def _widths(g) -> tuple[int, ...]:
+    n_outer = g.get("n_outer", 0)
+    return len(g.walls), n_outer, len(g.lights), *g.masks.shape, len(g.doors)
 
-    Raises ValueError for one that is larger than so many homes can be, before it is unpacked.
+
+def unpack(
+    content: bytes, n_homes: int, remedy: str = REMEDY, further: Sequence[str] = ()
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Returns the arrays of a database, with `further` ones, and the index at which each home's
+    begin.
+
+    Raises:
+        ValueError: for one that is larger than `n_homes` homes can be, before it is unpacked, or
+            cannot be read. The message ends with the remedy.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -84,9 +99,10 @@ def _unpack(content, n_homes) -> tuple[dict[str, np.ndarray], np.ndarray]:
             n_bytes = sum(entry.file_size for entry in entries.values())
             if n_bytes > n_homes * MAX_EACH + MAX_HEADERS:
                 raise ValueError(f"it unpacks to more than {n_homes:,} homes can have")
-            arrays = {name: files.read_array(archive, entries[f"{name}.npy"]) for name in NAMES}
+            names = *NAMES, *further
+            arrays = {name: files.read_array(archive, entries[f"{name}.npy"]) for name in names}
     except (*files.UNREADABLE, KeyError) as error:
-        raise ValueError(f"The database of homes cannot be read ({error}); {REMEDY}.") from error
+        raise ValueError(f"The database of homes cannot be read ({error}); {remedy}.") from error
     widths = arrays["widths"]
     sizes = np.stack([widths[:, 0], widths[:, 2], widths[:, 3] * widths[:, 4], widths[:, 5]], 1)
     return arrays, np.concatenate([np.zeros((1, 4), int), sizes.cumsum(0)])
@@ -95,10 +111,13 @@ def _unpack(content, n_homes) -> tuple[dict[str, np.ndarray], np.ndarray]:
 @functools.lru_cache(maxsize=COUNT)
 def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
     """Returns the home of seed `index`, with `doors` and `n_outer`. `outer` is as in `generate`."""
-    return _home(*_arrays(path), index, index, outer)
+    return geometry_at(*_arrays(path), index, index, outer)
 
 
-def _home(arrays, starts, index, seed, outer) -> dotdict:
+def geometry_at(
+    arrays: dict[str, np.ndarray], starts: np.ndarray, index: int, seed: int, outer: bool = True
+) -> dotdict:
+    """Returns home `index` of what `unpack` returned, with the id `seed`."""
     _, n_outer, _, height, width, _ = arrays["widths"][index]
     parts = ("walls", "lights", "masks", "doors")
     walls, lights, cells, doors = (
@@ -126,8 +145,8 @@ def generated(
     name = f"{PREFIX}{key.hexdigest()[:20]}"
     content, _ = cache.fetch(name, lambda: _generate(seeds, density, clutter))
     cache.prune(PREFIX, MAX_FILES)
-    database = _unpack(content, len(seeds))
-    return {seed: _home(*database, index, seed, outer) for index, seed in enumerate(seeds)}
+    database = unpack(content, len(seeds))
+    return {seed: geometry_at(*database, index, seed, outer) for index, seed in enumerate(seeds)}
 
 
 def _generate(seeds, density, clutter) -> bytes:

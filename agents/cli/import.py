@@ -1,0 +1,222 @@
+"""megastep import source=SOURCE path=FILE: floor plans of others, as geometries."""
+
+import importlib.util
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+from megastep.agents import console, package
+from megastep.agents.cli import plain_words
+from megastep.agents.errors import UserError, user_errors
+from megastep.settings import closest
+
+HELP = """Imports floor plans.
+
+  megastep import source=cubicasa path=cubicasa5k.zip      CubiCasa5k: 5,000 real homes
+  megastep import source=houseexpo path=json.tar.gz        HouseExpo: 35,000 homes that people drew
+
+The path is what you downloaded: a zip, a tar.gz, the folder or a single file. The database goes to
+$XDG_DATA_HOME/megastep, or ~/.local/share/megastep, with a report and a contact sheet; then
+geometry=cubicasa and geometry=houseexpo use it, a tenth of the files is the test split.
+
+  megastep import source=svg path=home.svg scale=0.001     a drawing in millimetres
+  megastep import source=map path=map.yaml                 a map that a robot made, of ROS
+  megastep import source=map path=scan.png metres_per_pixel=0.02
+
+These write home.npz here, and a picture, home-sheet.png; geometry=files geometry.path=home.npz uses
+it. In a drawing walls have the id, class or label `wall`, doors `door`; walls=NAME names another.
+
+  file=plan.npz        where it goes, overwritten if it exists
+  licence=accept       confirms the licence, instead of a question
+  per=file             one geometry per file, not per floor, as in the original megastep
+  entrances=open       leaves the doors to the outside open, as there; by default they are closed"""
+
+
+class Database(NamedTuple):
+    """Where a database is to be had."""
+
+    title: str
+    place: str
+    licence: str
+
+
+DATABASES = {
+    "cubicasa": Database(
+        "CubiCasa5k (Kalervo et al. 2019)",
+        "https://zenodo.org/record/2613548",
+        "CC BY-NC 4.0: no commercial use, name the authors",
+    ),
+    "houseexpo": Database(
+        "HouseExpo (Li et al. 2019)",
+        "https://github.com/TeaganLi/HouseExpo",
+        "MIT; its plans are from SUNCG, which was withdrawn after a dispute about rights",
+    ),
+}
+MAX_LINES = 1_000  # of a report's lists
+KEYS = {
+    **dict.fromkeys(DATABASES, ("source", "path", "licence", "per", "entrances")),
+    "svg": ("source", "path", "file", "scale", "walls", "doors"),
+    "map": ("source", "path", "file", "metres_per_pixel"),
+}
+CHOICES = {"licence": ("accept",), "per": ("floor", "file"), "entrances": ("sealed", "open")}
+NEEDED = ("shapely", "defusedxml", "svgelements", "skimage")
+
+
+def main(words: list[str]) -> int:
+    """Imports what the words of a command line name. Returns the exit code."""
+    if not words or words[0] in ("-h", "--help"):
+        console.say(HELP)
+        return 0 if words else 2
+    every = {key: False for keys in KEYS.values() for key in keys}
+    given = {key: values[0] for key, values in plain_words.parse(words, every).items()}
+    for key in ("source", "path"):
+        if key not in given:
+            raise UserError(f"{key} is missing; megastep import --help says more")
+    source = given["source"]
+    for key, allowed in {"source": tuple(KEYS), **CHOICES}.items():
+        if key in given and given[key] not in allowed:
+            raise UserError(f"{key}={given[key]} is unknown; {closest(given[key], allowed)}")
+    if unused := [key for key in given if key not in KEYS[source]]:
+        raise UserError(f"source={source} has no {unused[0]}; it has {', '.join(KEYS[source])}")
+    if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
+        raise UserError(
+            f"importing needs {', '.join(missing)}; pip install {package.DISTRIBUTION}[plans]"
+        )
+    return _import_database(given) if source in DATABASES else _import_own(given)
+
+
+def _metres(given, key) -> float | None:
+    """Returns a length that is given as a word, None if it is not."""
+    try:
+        value = float(given[key]) if key in given else None
+    except ValueError:
+        value = -1.0
+    if value is not None and not 0 < value < 1e6:
+        raise UserError(f"{key}={given[key]} is no number of metres above 0")
+    return value
+
+
+def _import_own(given) -> int:
+    """Imports one drawing or map."""
+    path = Path(given["path"])
+    if not path.is_file():
+        raise UserError(f"path={path} does not exist, or is no file")
+    file = Path(given.get("file", f"{path.stem}.npz"))
+    if file.suffix != ".npz":
+        raise UserError(f"file={file} must end with .npz")
+    scale, resolution = _metres(given, "scale"), _metres(given, "metres_per_pixel")
+    from megastep.geometries import files
+    from megastep.geometries.plans import imports, sheets
+
+    with user_errors(f"{path} is no floor plan: "):
+        if given["source"] == "svg":
+            if scale is None:
+                raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
+            marks = {key: given[key] for key in ("walls", "doors") if key in given}
+            own = imports.own_svg(path, scale, **marks)
+        else:
+            own = imports.own_map(path, resolution)
+    with user_errors(f"{file} cannot be written: "):
+        files.save(file, [own.geometry])
+        sheet = file.with_name(f"{file.stem}-sheet.png")
+        sheets.write(sheet, [(path.name, own.original, own.geometry)])
+    for text in own.warnings:
+        console.warn(f"{path.name}: {text}")
+    g = own.geometry
+    console.say(
+        f"{g.masks.max()} rooms, {len(g.walls)} walls and {len(g.doors)} doors in {file}\n"
+        f"the drawing beside the result: {sheet}\n"
+        f"use: geometry=files geometry.path={file}"
+    )
+    return 0
+
+
+def _confirm(source, licence) -> None:
+    """Shows where a database is to be had, and has its licence confirmed."""
+    database = DATABASES[source]
+    console.say(f"{database.title}\n  from {database.place}\n  licence: {database.licence}")
+    if licence == "accept":
+        return
+    if not sys.stdin or not sys.stdin.isatty():
+        raise UserError("the licence is not confirmed; licence=accept does so")
+    try:
+        answer = input("Was it downloaded from there, and do you accept the licence? [y/N] ")
+    except EOFError:
+        answer = ""
+    if answer.strip().lower() not in ("y", "yes"):
+        raise UserError("the licence is not confirmed, so nothing is imported")
+
+
+def _import_database(given) -> int:
+    source, path, start = given["source"], Path(given["path"]), time.monotonic()
+    if not path.exists():
+        raise UserError(f"path={path} does not exist")
+    _confirm(source, given.get("licence"))
+    from megastep.geometries import imported
+    from megastep.geometries.plans import imports, sheets
+
+    is_sealed = given.get("entrances") != "open"
+    options = imports.Options(source, given.get("per", "floor"), is_sealed)
+    with user_errors(f"{imported.folder()} cannot be written: ", (OSError,)):
+        imported.folder().mkdir(parents=True, exist_ok=True)
+        imported.probe()
+    with console.Progress() as progress, user_errors():
+        plans, shown = imports.run(
+            options, path, lambda n: progress.show(None, [f"{n:,} files read"])
+        )
+    geometries = [g for plan in plans for g in plan.geometries]
+    numbers = [i for i, plan in enumerate(plans) for _ in plan.geometries]
+    with user_errors(f"{imported.folder()} cannot be written: "):
+        file, digest = imported.write(source, geometries, numbers)
+        pairs = []
+        for member in shown:
+            drawing = imports.drawings(options, member.content or b"")[0]
+            pairs.append((member.name[-40:], drawing, imports.geometry_of(options, drawing)[0]))
+        sheet = imported.folder() / f"{source}.png"
+        sheets.write(sheet, pairs)
+        report = imported.folder() / f"{source}.md"
+        report.write_text(_report(source, path, plans, geometries, file, digest))
+    n_refused = sum(not plan.geometries for plan in plans)
+    console.say(
+        f"{len(geometries):,} floor plans of {len(plans):,} files in {file}\n"
+        f"{n_refused:,} files are refused; why is in {report}\n"
+        f"contact sheet: {sheet}\n"
+        f"use: geometry={source}; {console.duration(time.monotonic() - start)}"
+    )
+    return 0
+
+
+def _report(source, path, plans, geometries, file, digest) -> str:
+    """Returns the report of an import in Markdown."""
+    from megastep.geometries.plans import imports
+
+    notes = [note for plan in plans for note in plan.notes]
+    some = geometries[:: max(1, len(geometries) // 500)]
+    columns = [imports.quantiles(some), imports.quantiles(imports.generated_homes())]
+    rows = [[key, *(column[key] for column in columns)] for key in columns[0]]
+    table = console.table(
+        ("quantiles 5 / 25 / 50 / 75 / 95 %", source, "generated homes"), rows, is_markdown=True
+    )
+    refused = [(plan.name, plan.refusal) for plan in plans if plan.refusal]
+    kinds = Counter(refusal for _, refusal in refused)
+    n_rooms, n_reachable = (sum(note[i] for note in notes) for i in (0, 1))
+    warnings = [
+        f"- {plan.name}: {text}" for plan in plans for note in plan.notes for text in note.warnings
+    ]
+    lines = [
+        f"# Import of {DATABASES[source].title}",
+        f"- from {path}, licence {DATABASES[source].licence}",
+        f"- {file.name}, sha256 {digest}",
+        f"- {len(geometries):,} floor plans of {len(plans):,} files; {len(refused):,} are refused",
+        f"- {n_reachable:,} of {n_rooms:,} rooms can be reached; agents spawn in these alone",
+        f"- {sum(note.n_sealed for note in notes):,} doors to the outside are closed",
+        f"\n{table}\n",
+        "## Refused",
+        *(f"- {n:,} times: {text}" for text, n in kinds.most_common()),
+        *[f"- {name}: {text}" for name, text in refused][:MAX_LINES],
+        "## Warnings",
+        *warnings[:MAX_LINES],
+    ]
+    return console.visible("\n".join(lines)) + "\n"

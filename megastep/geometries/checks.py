@@ -1,0 +1,180 @@
+"""What every geometry must satisfy, whatever made it: generated homes, mazes, imported plans and
+the files of `geometry=files`. `errors` says what one does not satisfy.
+
+In this file a raster is (H, W) cells of a side of `cell` metres, with row 0 at the top.
+"""
+
+import numpy as np
+
+from megastep import geometry
+from megastep.dotdict import dotdict
+
+__all__ = ["clearance", "components", "errors", "fine_rooms", "joins"]
+
+FINE = 0.05  # metres per cell of the raster
+MAX_FINE_CELLS = 2_250_000  # of the raster; a plan of 75 m x 75 m
+RADIUS = 0.15 / 2**0.5  # metres; of an agent
+SPAWN = 0.15  # metres; each room has a point this far from all walls
+NEAR = 1e-3  # metres; points nearer than this are the same
+PARALLEL = 1e-6  # sine of an angle below which two walls are parallel
+CHUNK = 256  # walls compared with all others at a time
+
+
+def components(free: np.ndarray) -> tuple[np.ndarray, int]:
+    """Labels the 4-connected components of cells, (H, W) bool. Returns the labels, (H, W) integers
+    with 0 where not free, and the number of components.
+    """
+    edges = np.diff(np.pad(free, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    (row, start), end = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
+    # the number of the first run of free cells in each row
+    first = np.searchsorted(row, np.arange(len(free) + 1))
+    parents = list(range(len(row)))
+
+    def root(run) -> int:
+        while parents[run] != run:
+            parents[run] = run = parents[parents[run]]
+        return run
+
+    for i in range(1, len(free)):
+        a, b = first[i - 1], first[i]
+        while a < first[i] and b < first[i + 1]:
+            if start[a] < end[b] and start[b] < end[a]:
+                parents[root(b)] = root(a)
+            a, b = (a + 1, b) if end[a] < end[b] else (a, b + 1)
+    _, labels = np.unique([root(run) for run in range(len(row))], return_inverse=True)
+    result = np.zeros(free.shape, int)
+    result[free] = np.repeat(labels + 1, end - start)
+    return result, int(labels.max(initial=-1)) + 1
+
+
+def clearance(g: dotdict, limit: float = 0.3, cell: float = FINE) -> np.ndarray:
+    """Returns the metres, at most `limit`, from each cell's centre on a raster to the nearest wall.
+
+    `cell` divides the side of the cells of the masks, and the raster has the masks' extent.
+    """
+    ratio = round(g.res / cell)
+    height, width = g.masks.shape[0] * ratio, g.masks.shape[1] * ratio
+    distance = np.full((height, width), limit)
+    x, y = (np.arange(width) + 0.5) * cell, (height - np.arange(height) - 0.5) * cell
+    for (ax, ay), (bx, by) in g.walls.astype(float):
+        columns = slice(*np.searchsorted(x, (min(ax, bx) - limit, max(ax, bx) + limit)))
+        rows = slice(*np.searchsorted(-y, (-max(ay, by) - limit, -min(ay, by) + limit)))
+        px, py = x[None, columns] - ax, y[rows, None] - ay
+        dx, dy = bx - ax, by - ay
+        along = np.clip((px * dx + py * dy) / max(dx * dx + dy * dy, 1e-12), 0, 1)
+        distance[rows, columns] = np.minimum(
+            distance[rows, columns], np.hypot(px - along * dx, py - along * dy)
+        )
+    return distance
+
+
+def joins(labels: np.ndarray, rooms: np.ndarray) -> bool:
+    """Returns True if one component of `labels` enters all `rooms`, (H, W) integers each, both 0
+    where there is none.
+    """
+    pairs = np.unique(np.stack([rooms, labels])[:, (rooms > 0) & (labels > 0)], axis=1)
+    n_entered = np.bincount(pairs[1])
+    return n_entered.max(initial=0) == len(np.unique(rooms[rooms > 0]))
+
+
+def sorted_ends(walls: np.ndarray) -> np.ndarray:
+    """Returns walls (M, 2, 2) as rows (M, 4) that are equal for the same wall in either
+    direction.
+    """
+    ends = walls.astype(np.float64).reshape(-1, 4)
+    is_reversed = (ends[:, 0] > ends[:, 2]) | (ends[:, 0] == ends[:, 2]) & (ends[:, 1] > ends[:, 3])
+    ends[is_reversed] = ends[is_reversed][:, [2, 3, 0, 1]]
+    return ends
+
+
+def crosses(walls: np.ndarray) -> bool:
+    """Returns True if two walls (M, 2, 2) cross at a point that is inside both, or lie on one
+    another for more than a point.
+    """
+    ends = sorted_ends(walls)
+    ends = ends[ends[:, 0].argsort(kind="stable")]
+    starts, vectors = ends[:, :2], ends[:, 2:] - ends[:, :2]
+    lengths = np.hypot(*vectors.T)
+    units = vectors / lengths[:, None]
+    for low in range(0, len(ends), CHUNK):
+        part = slice(low, low + CHUNK)
+        # a wall further on begins further right
+        stop = np.searchsorted(ends[:, 0], ends[part, 2].max() + NEAR)
+        others = slice(low, stop)
+        sine = units[part, None, 0] * units[others, 1] - units[part, None, 1] * units[others, 0]
+        x, y = np.moveaxis(starts[others] - starts[part, None], -1, 0)
+        is_parallel = np.abs(sine) < PARALLEL
+        sine = np.where(is_parallel, 1, sine)
+        along = (x * units[others, 1] - y * units[others, 0]) / sine
+        across = (x * units[part, None, 1] - y * units[part, None, 0]) / sine
+        is_crossing = (along > NEAR) & (along < lengths[part, None] - NEAR)
+        is_crossing &= (across > NEAR) & (across < lengths[others] - NEAR) & ~is_parallel
+        # parallel ones: both ends of the other, along this wall and beside it
+        beside = np.abs(x * units[part, None, 1] - y * units[part, None, 0])
+        first = x * units[part, None, 0] + y * units[part, None, 1]
+        cosine = units[part, None, 0] * units[others, 0] + units[part, None, 1] * units[others, 1]
+        second = first + cosine * lengths[others]
+        shared = np.minimum(np.maximum(first, second), lengths[part, None])
+        shared -= np.maximum(np.minimum(first, second), 0)
+        is_overlap = is_parallel & (beside < NEAR) & (shared > NEAR)
+        np.fill_diagonal(is_overlap, False)
+        if (is_crossing | is_overlap).any():
+            return True
+    return False
+
+
+def errors(g: dotdict, fine: float = FINE) -> list[str]:
+    """Returns a sentence for each thing that a geometry does not satisfy, none if it is sound.
+
+    A sound geometry passes `geometry.validate_geometry`; has no wall of length 0, no two that are
+    the same or cross; is closed, so that nobody can leave its rooms for the outside; lets an agent
+    reach every room from every other; and has each light indoors.
+
+    Args:
+        g: a geometry.
+        fine: metres per cell of the raster on which an agent moves.
+    """
+    try:
+        valid = geometry.validate_geometry(dotdict(g))
+    except ValueError as error:
+        return [str(error)]
+    messages = []
+    if len(valid.walls) < len(g["walls"]):
+        messages.append("a wall has no length")
+    ends = sorted_ends(valid.walls)
+    if len(np.unique(ends, axis=0)) < len(ends):
+        messages.append("two walls are the same")
+    elif crosses(valid.walls):
+        messages.append("two walls cross or overlap; split them where they meet")
+    labels, _ = components(np.pad(valid.masks >= 0, 1, constant_values=True))
+    if (valid.masks[labels[1:-1, 1:-1] == labels[0, 0]] > 0).any():
+        messages.append("the envelope is open: a room leads outside")
+
+    distance, rooms, cell = fine_rooms(valid, fine)
+    is_room = rooms > 0
+    cells = geometry.indices(valid.lights, distance.shape, cell)
+    is_within = ((cells >= 0) & (cells < distance.shape)).all(1)
+    lit = tuple(cells[is_within].T)
+    labels, _ = components(distance > cell * 0.75)
+    if not is_within.all() or (labels[lit] == labels[0, 0]).any():
+        messages.append("a light is outdoors")
+    is_reachable = distance > RADIUS - 1e-3
+    labels, _ = components(is_reachable)
+    if not joins(labels, rooms):
+        messages.append("an agent cannot reach every room")
+    if len(np.unique(labels[is_room & (distance >= SPAWN)])) > 1:
+        messages.append("an agent cannot reach every point to spawn at")
+    if len(np.unique(rooms[is_room])) > len(np.unique(rooms[is_room & (distance >= SPAWN)])):
+        messages.append("a room has no point to spawn at")
+    return messages
+
+
+def fine_rooms(g: dotdict, fine: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Returns the clearance and the rooms of a geometry on a raster, and the side of its cells in
+    metres: `fine`, more if the geometry is so large that the raster would have too many.
+    """
+    ratio = max(1, round(g.res / fine))
+    while ratio > 1 and g.masks.size * ratio**2 > MAX_FINE_CELLS:
+        ratio -= 1
+    rooms = np.maximum(g.masks, 0).repeat(ratio, 0).repeat(ratio, 1)
+    return clearance(g, cell=g.res / ratio), rooms, g.res / ratio

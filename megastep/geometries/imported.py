@@ -1,0 +1,123 @@
+"""The databases of floor plans that `megastep import` has written: CubiCasa5k and HouseExpo.
+
+They lie in the user's data folder, `$XDG_DATA_HOME/megastep`, else `~/.local/share/megastep`, each
+as an `.npz` in the form of `homes.database`, with a further array `files`, the number of the file
+that each geometry is from. The `.sha256` beside it names the `.npz` and is written last, so that an
+import that is interrupted leaves the database as it was.
+"""
+
+import functools
+import hashlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from megastep.dotdict import dotdict
+from megastep.geometries.homes import database
+
+__all__ = ["NAMES", "folder", "load", "pick", "probe", "write"]
+
+#: The sources that can be imported.
+NAMES = ("cubicasa", "houseexpo")
+MAX_GEOMETRIES = 100_000
+
+
+def folder() -> Path:
+    """Returns the folder of imported databases."""
+    base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(base) / "megastep"
+
+
+def probe() -> None:
+    """Raises OSError if the folder cannot be written, before an import begins."""
+    handle, path = tempfile.mkstemp(dir=folder(), suffix=".partial")
+    os.close(handle)
+    os.unlink(path)
+
+
+def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Path, str]:
+    """Writes a database, atomically. Returns its path and sha256.
+
+    Args:
+        name: of the source.
+        plans: its geometries.
+        files: the number of the file that each is from.
+
+    Raises:
+        OSError: if the folder cannot be written.
+    """
+    content = database.pack(plans, zipfile.ZIP_DEFLATED, files=np.array(files, "<i4"))
+    digest = hashlib.sha256(content).hexdigest()
+    folder().mkdir(parents=True, exist_ok=True)
+    path = folder() / f"{name}-{digest[:12]}.npz"
+    _replace(path, content)
+    _replace(folder() / f"{name}.sha256", f"{digest}  {path.name}\n".encode())
+    for old in folder().glob(f"{name}-*.npz"):
+        if old != path:
+            old.unlink(missing_ok=True)
+    return path, digest
+
+
+def _replace(path, content) -> None:
+    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(partial, 0o644)
+        os.replace(partial, path)
+    except BaseException:
+        Path(partial).unlink(missing_ok=True)
+        raise
+
+
+@functools.lru_cache(maxsize=2)
+def _arrays(name, listing, modified) -> tuple[dict, np.ndarray]:
+    """Returns the arrays of a database and the index at which each geometry's begin."""
+    cure = f"run megastep import source={name} path=... again"
+    try:
+        digest, file = listing.read_text().split()
+        content = (listing.parent / Path(file).name).read_bytes()
+    except (OSError, ValueError) as error:
+        raise ValueError(f"the imported {name} cannot be read ({error}); {cure}") from error
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise ValueError(f"the imported {name} is damaged (wrong sha256); {cure}")
+    return database.unpack(content, MAX_GEOMETRIES, cure, ("files",))
+
+
+def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
+    """Returns n geometries of an imported database; all of a file are in the same split.
+
+    Raises:
+        ValueError: if it was not imported, or is damaged.
+    """
+    listing = folder() / f"{name}.sha256"
+    if not listing.exists():
+        raise ValueError(
+            f"{name} is not imported: there is no {listing}. Download it and run megastep import "
+            f"source={name} path=FILE; megastep import --help says where it is to be had"
+        )
+    arrays, starts = _arrays(name, listing, listing.stat().st_mtime_ns)
+    files = np.unique(arrays["files"])
+    order = np.random.RandomState(0).permutation(len(files))  # numpy never changes what it draws
+    n_training = len(files) - max(1, round(len(files) / 10)) if len(files) > 1 else 1
+    parts = {
+        "training": order[:n_training],
+        "test": order[n_training:] if len(files) > 1 else order,
+        "all": order,
+    }
+    members = np.flatnonzero(np.isin(arrays["files"], files[parts[split]]))
+    members = members[np.random.RandomState(seed % 2**32).permutation(len(members))][:n]
+    drawn = [database.geometry_at(arrays, starts, int(i), int(i)) for i in members]
+    return [drawn[i % len(drawn)] for i in range(n)]
+
+
+def load(path: Path) -> list[dotdict]:
+    """Returns all geometries of a database that `write` wrote. Raises ValueError."""
+    arrays, starts = database.unpack(path.read_bytes(), MAX_GEOMETRIES, "import it again")
+    return [database.geometry_at(arrays, starts, i, i) for i in range(len(starts) - 1)]

@@ -1,0 +1,116 @@
+"""Reads CubiCasa5k's `model.svg` (Kalervo et al. 2019): 100 units are a metre, y grows downwards.
+
+Walls are the groups of class Wall, doors and windows are groups within them, rooms are the groups
+of class Space; the direct child `polygon` of each is its outline. A floor is a group of class
+Floorplan; floors lie side by side, all but the first hidden.
+"""
+
+from collections.abc import Iterator
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import shapely
+from svgelements import Matrix
+
+from megastep.geometries.plans import outlines, safe
+from megastep.geometries.plans.outlines import Drawing
+
+SUFFIX = ".svg"
+UNITS = 100  # a metre
+SKIPPED = ("defs", "script", "foreignObject", "use", "text", "symbol", "clipPath", "mask")
+
+
+def tokens(element: Element) -> list[str]:
+    """Returns the words of an element's class."""
+    return (element.get("class") or "").split()
+
+
+def transform(element: Element, above: Matrix) -> Matrix:
+    """Returns the transform of an element within one. Raises ValueError if it is not finite."""
+    text = element.get("transform")
+    if not text:
+        return above
+    matrix = Matrix(text) * above
+    values = [matrix.a, matrix.b, matrix.c, matrix.d, matrix.e, matrix.f]
+    if not np.isfinite(values).all():
+        raise ValueError(f"transform {text[:40]!r} is not finite")
+    return matrix
+
+
+def apply(matrix: Matrix, points: np.ndarray) -> np.ndarray:
+    """Returns points (P, 2) after a transform."""
+    linear = np.array([[matrix.a, matrix.b], [matrix.c, matrix.d]])
+    return points @ linear + (matrix.e, matrix.f)
+
+
+def read(content: bytes, per: str = "floor") -> list[Drawing]:
+    """Returns the drawings of a file, one per floor, or one of all floors with `per="file"`.
+
+    Raises:
+        ValueError: saying what is wrong with the file.
+    """
+    root = safe.xml(content)
+    if safe.name_of(root) != "svg":
+        raise ValueError(f"it is no SVG: its first element is {safe.name_of(root)[:40]!r}")
+    floors = []
+    for floor, matrix in _floors(root, Matrix()):
+        floors.append(drawing := Drawing([], [], [], []))
+        _collect(floor, matrix, drawing)
+    if not floors:
+        raise ValueError("it has no group of class Floorplan; is it from CubiCasa5k?")
+    if per == "file":
+        first, *others = floors
+        for floor in others:
+            for shapes, more in zip(first[:4], floor[:4]):
+                shapes.extend(more)
+        floors = [first]
+    floors = [floor for floor in floors if any(floor[:4])]
+    if not floors:
+        raise ValueError("its floor plan is empty")
+    for floor in floors:
+        if not floor.walls:
+            raise ValueError("it has no Wall")
+        if not floor.rooms:
+            raise ValueError("it has no Space indoors")
+    return floors
+
+
+def _floors(element, above) -> Iterator[tuple[Element, Matrix]]:
+    if safe.name_of(element) in SKIPPED or "FloorsCompose" in tokens(element):
+        return
+    matrix = transform(element, above)
+    if "Floorplan" in tokens(element):
+        yield element, matrix
+        return
+    for child in element:
+        yield from _floors(child, matrix)
+
+
+def _collect(element, matrix, drawing) -> None:
+    """Adds the walls, doors and rooms within an element."""
+    for child in element:
+        if safe.name_of(child) != "g":
+            continue
+        inner, words = transform(child, matrix), tokens(child)
+        if "Wall" in words:
+            drawing.walls.extend(_polygons(child, inner))
+            for opening in child:
+                if "Door" in tokens(opening):
+                    drawing.doors.extend(_polygons(opening, transform(opening, inner)))
+        elif "Space" in words:
+            rooms = drawing.outdoors if "Outdoor" in words else drawing.rooms
+            parts = _polygons(child, inner)
+            if parts:
+                rooms.append(shapely.union_all(parts))
+        else:
+            _collect(child, inner, drawing)
+
+
+def _polygons(element, matrix) -> list:
+    """Returns the polygons that are an element's direct children, in metres with y up."""
+    result = []
+    for child in element:
+        if safe.name_of(child) == "polygon" and (child.get("points") or "").strip():
+            points = apply(transform(child, matrix), safe.points(child.get("points") or ""))
+            result += outlines.ring(points / UNITS * (1, -1))
+    return result

@@ -1,0 +1,262 @@
+"""Imports the floor plans of an archive or folder, in parallel processes."""
+
+import contextlib
+import functools
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import loky
+import numpy as np
+import shapely
+
+from megastep import workers
+from megastep.dotdict import dotdict
+from megastep.geometries import checks
+from megastep.geometries.homes import database
+from megastep.geometries.plans import cubicasa, houseexpo, maps, outlines, safe, svg
+from megastep.geometries.plans.outlines import Drawing, Notes
+
+READERS = {"cubicasa": cubicasa, "houseexpo": houseexpo}
+BATCH = 16  # files that a process gets at a time
+PENDING = 4  # batches per process that are read ahead
+#: What libraries raise for broken files, but for ValueError.
+UNREADABLE = (
+    *(shapely.errors.GEOSException, RecursionError, MemoryError, ArithmeticError, LookupError),
+    *(TypeError, AttributeError, AssertionError),
+)
+SHOWN = 12  # plans of the contact sheet
+
+
+class Plan(NamedTuple):
+    """What a file became: geometries and notes, or why it is refused."""
+
+    name: str
+    geometries: list[dotdict]
+    notes: list[Notes]
+    refusal: str = ""
+
+
+class Options(NamedTuple):
+    """How plans are read."""
+
+    source: str
+    per: str = "floor"
+    sealed: bool = True
+
+
+def drawings(options: Options, content: bytes) -> list[Drawing]:
+    """Returns the drawings of a file. Raises ValueError."""
+    return READERS[options.source].read(content, options.per)
+
+
+def geometry_of(options: Options, drawing: Drawing) -> tuple[dotdict, Notes]:
+    """Returns the geometry of a drawing, and notes. Raises ValueError."""
+    tolerance = getattr(READERS[options.source], "TOLERANCE", outlines.GRID / 2)
+    return outlines.geometry_of(drawing, 0, options.sealed, tolerance)
+
+
+def read(options: Options, member: safe.Member) -> Plan:
+    """Returns the plan of a file. A floor that is no home is a warning if another floor is one."""
+    name = member.name
+    if member.content is None:
+        return Plan(name, [], [], member.refusal)
+    made, refusals = [], []
+    try:
+        with _refused():
+            floors = drawings(options, member.content)
+    except ValueError as error:
+        return Plan(name, [], [], _line(error))
+    for drawing in floors:
+        try:
+            with _refused():
+                g, notes = geometry_of(options, drawing)
+                if (sentences := checks.errors(g)) and options.sealed:
+                    raise ValueError("; ".join(sentences))
+                made.append((g, notes))
+        except ValueError as error:
+            refusals.append(_line(error))
+    if not made:
+        return Plan(name, [], [], "; ".join(dict.fromkeys(refusals)))
+    if refusals:
+        made[0][1].warnings.append(f"{len(refusals)} floors are left out: {'; '.join(refusals)}")
+    return Plan(name, [g for g, _ in made], [notes for _, notes in made])
+
+
+@contextlib.contextmanager
+def _refused() -> Iterator[None]:
+    """Turns whatever a stranger's file makes libraries raise into a ValueError."""
+    try:
+        yield
+    except UNREADABLE as error:
+        raise ValueError(f"it cannot be read ({type(error).__name__}: {_line(error)})") from error
+
+
+def _line(error) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+@contextlib.contextmanager
+def _killed() -> Iterator[None]:
+    """Turns the end of a process of a pool into a ValueError."""
+    try:
+        yield
+    except BrokenExecutor as error:
+        text = "a process was killed, perhaps as memory is short; nothing is imported"
+        raise ValueError(text) from error
+
+
+def _read_all(options, members) -> list[Plan]:
+    return [read(options, member) for member in members]
+
+
+def _batches(members) -> Iterator[list[safe.Member]]:
+    batch = []
+    for member in members:
+        batch.append(member)
+        if len(batch) == BATCH:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+def run(
+    options: Options, path: Path, show: Callable[[int], None], processes: int | None = None
+) -> tuple[list[Plan], list[safe.Member]]:
+    """Returns the plans of all files of an archive, folder or file, sorted by name, and the first
+    files that are plans.
+
+    Args:
+        options: how they are read.
+        path: the archive, folder or file.
+        show: called with the number of files that are read.
+        processes: that read in parallel; None: one per core.
+
+    Raises:
+        ValueError: if there is no file, it is damaged, or none of the files is a plan.
+    """
+    n_processes = loky.cpu_count() if processes is None else processes
+    batches = _batches(safe.members(path, READERS[options.source].SUFFIX))
+    plans: list[Plan] = []
+    shown: list[safe.Member] = []
+
+    def keep(batch, result) -> None:
+        plans.extend(result)
+        good = [one for one, plan in zip(batch, result) if plan.geometries]
+        shown.extend(good[: SHOWN - len(shown)])
+        show(len(plans))
+
+    first = next(batches, [])
+    keep(first, _read_all(options, first))
+    if n_processes < 2:
+        for batch in batches:
+            keep(batch, _read_all(options, batch))
+    elif (second := next(batches, None)) is not None:
+        with (
+            _killed(),
+            workers.terminal_signals_blocked(),
+            loky.ProcessPoolExecutor(
+                n_processes,
+                initializer=workers.end_with_parent,
+                initargs=(os.getpid(),),
+                env=workers.WORKER_ENV,
+            ) as pool,
+        ):
+            submit = functools.partial(pool.submit, _read_all, options)
+            pending = [(second, submit(second))]
+            for batch in batches:
+                pending.append((batch, submit(batch)))
+                if len(pending) >= PENDING * n_processes:
+                    done, result = pending.pop(0)
+                    keep(done, result.result())
+            for done, result in pending:
+                keep(done, result.result())
+    if not plans:
+        raise ValueError(
+            f"{str(path)!r} has no floor plan: no file whose name ends in "
+            f"{READERS[options.source].SUFFIX}"
+        )
+    if not any(plan.geometries for plan in plans):
+        raise ValueError(
+            f"{str(path)!r} has no floor plan that can be used; of {len(plans):,} files, "
+            f"{plans[0].name!r} is refused: {plans[0].refusal}"
+        )
+    return sorted(plans, key=lambda plan: plan.name), shown
+
+
+# ---- One plan of one's own ----
+
+
+class Own(NamedTuple):
+    """A drawing or an image, and what it became."""
+
+    original: Drawing | np.ndarray
+    geometry: dotdict
+    warnings: list[str]
+
+
+def own_svg(path: Path, scale: float, walls: str = "wall", doors: str = "door") -> Own:
+    """Returns the floor plan of an SVG. Arguments are those of `svg.read`. Raises ValueError."""
+    member = safe.of_file(path, path.name)
+    if member.content is None:
+        raise ValueError(member.refusal)
+    with _refused():
+        drawing = svg.read(member.content, scale, walls, doors)
+        return _own(drawing, drawing, [])
+
+
+def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
+    """Returns the floor plan of a map. Arguments are those of `maps.load`. Raises ValueError."""
+    with _refused():
+        grid = maps.load(path, metres_per_pixel)
+        drawing, warnings = maps.read(grid)
+        image = np.where(grid.free, 254, np.where(grid.unknown, 205, 0)).astype(np.uint8)
+        return _own(image, drawing, warnings)
+
+
+def _own(original, drawing, warnings) -> Own:
+    g, notes = outlines.geometry_of(drawing, 0, tolerance=outlines.CURVED)
+    if sentences := checks.errors(g):
+        raise ValueError("; ".join(sentences))
+    return Own(original, g, warnings + notes.warnings)
+
+
+# ---- Statistics ----
+
+
+def statistics(g: dotdict) -> dict[str, float]:
+    """Returns the statistics of a geometry that reports compare."""
+    vectors = (g.walls[:, 1] - g.walls[:, 0]).astype(float)
+    lengths = np.hypot(*vectors.T)
+    is_straight = np.abs(vectors).min(1) <= np.sin(np.radians(1)) * lengths
+    distance, rooms, cell = checks.fine_rooms(g, checks.FINE)
+    return {
+        "floor area of rooms, m²": float((rooms > 0).sum() * cell**2),
+        "rooms": int(g.masks.max()),
+        "walls": len(g.walls),
+        "length of walls, m": float(lengths.sum()),
+        "doors": len(g.get("doors", ())),
+        "longer side, m": float(np.ptp(g.walls, axis=(0, 1)).max()),
+        "straight walls, % of length": 100 * float(lengths[is_straight].sum() / lengths.sum()),
+        "floor nearer than 0.3 m to a wall, %": 100 * float((distance[rooms > 0] < 0.3).mean()),
+    }
+
+
+def generated_homes() -> list[dotdict]:
+    """Returns the homes that reports compare with, the first 200 of the package's."""
+    return [database.home(seed) for seed in range(200)]
+
+
+def quantiles(geometries: list[dotdict]) -> dict[str, str]:
+    """Returns the 5, 25, 50, 75 and 95 % quantiles of each statistic, as text."""
+    rows = [statistics(g) for g in geometries]
+    return {
+        key: " / ".join(
+            f"{value:.3g}"
+            for value in np.quantile([row[key] for row in rows], (0.05, 0.25, 0.5, 0.75, 0.95))
+        )
+        for key in rows[0]
+    }

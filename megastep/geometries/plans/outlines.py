@@ -1,0 +1,308 @@
+"""Makes a geometry from polygons in metres: the floor that agents walk on, and the walls around it.
+
+Whatever the drawing, the geometry is closed, as each side of the floor is a wall.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from shapely import Polygon
+from shapely.geometry.base import BaseGeometry
+
+from megastep import geometry
+from megastep.dotdict import dotdict
+from megastep.geometries import checks
+
+GRID = 0.01  # metres; all corners are on a grid
+CURVED = 0.02  # metres by which contours of drawings and maps are simplified
+MAX_EXTENT = geometry.MAX_EXTENT - 2 * geometry.MARGIN
+MAX_WALLS = 8_192
+MAX_CORNERS = 200_000  # of a drawing
+MIN_AREA = 1.0  # m2 of floor that an agent can reach
+LIT = 0.1  # metres; minimum distance of a light from a wall
+JAMB = 0.05  # metres; a doorway is so much wider than its door, on either side
+SLIT = 0.03  # metres; narrower gaps between rooms and walls are closed
+MITRE: dict = dict(join_style="mitre", cap_style="flat")
+
+
+class Drawing(NamedTuple):
+    """A floor plan as polygons, in metres with y up."""
+
+    walls: list[BaseGeometry]  # solid ones, with doors and windows
+    rooms: list[BaseGeometry]
+    doors: list[BaseGeometry]
+    outdoors: list[BaseGeometry]
+    floor: BaseGeometry | None = None  # where agents walk; None: in rooms and doorways
+    leaks: bool = False  # a gap in the outer walls is closed
+
+
+class Notes(NamedTuple):
+    """What an import reports of a geometry."""
+
+    n_rooms: int  # in the drawing
+    n_reachable: int  # of them, for an agent
+    n_sealed: int  # doors to the outside that are closed
+    warnings: list[str]
+
+
+def polygons(shape: BaseGeometry) -> list[Polygon]:
+    """Returns the polygons of a shape after repair."""
+    valid = shape if shape.is_valid else shapely.make_valid(shape)
+    parts = shapely.get_parts(valid).tolist()
+    nested = [one for part in parts for one in shapely.get_parts(part).tolist()]
+    return [part for part in nested if isinstance(part, Polygon) and part.area > 1e-6]
+
+
+def ring(points: np.ndarray) -> list[Polygon]:
+    """Returns the polygons that a ring of points (P, 2) encloses: none for fewer than 3."""
+    return polygons(Polygon(points)) if len(points) >= 3 else []
+
+
+def filled(shape: BaseGeometry) -> BaseGeometry:
+    """Returns a shape without its holes."""
+    return shapely.union_all([Polygon(part.exterior) for part in polygons(shape)])
+
+
+def check_extent(shapes: Sequence[BaseGeometry]) -> None:
+    """Raises ValueError for a drawing that is larger than a geometry may be, or empty."""
+    bounds = np.array([shape.bounds for shape in shapes if not shape.is_empty]).reshape(-1, 4)
+    extent = (bounds[:, 2:].max(0) - bounds[:, :2].min(0)).max() if len(bounds) else 0
+    if extent > MAX_EXTENT:
+        raise ValueError(
+            f"it is {extent:,.0f} m long, but the limit is {MAX_EXTENT:g} m; check the scale"
+        )
+    if extent < 1:
+        raise ValueError(f"it is {extent:.2f} m long, but a home has at least 1 m; check the scale")
+
+
+def geometry_of(
+    drawing: Drawing, number: int, sealed: bool = True, tolerance: float = GRID / 2
+) -> tuple[dotdict, Notes]:
+    """Returns the geometry of a drawing, and notes.
+
+    Doors to the outside are closed if `sealed`, and rooms outdoors are no rooms. Rooms that no
+    agent can reach keep their walls; agents do not spawn in them.
+
+    Args:
+        drawing: the floor plan.
+        number: the geometry's id.
+        sealed: False: outer doors are open, rooms outdoors are rooms, as in the original megastep.
+        tolerance: metres by which contours are simplified.
+
+    Raises:
+        ValueError: saying what is wrong with the plan.
+    """
+    shapes = [*drawing.walls, *drawing.rooms, *drawing.doors, *drawing.outdoors]
+    n_corners = int(shapely.get_num_coordinates(shapes).sum())
+    if n_corners > MAX_CORNERS:
+        raise ValueError(f"it has {n_corners:,} corners, but the limit is {MAX_CORNERS:,}")
+    check_extent([*drawing.walls, *drawing.rooms])
+    solids = shapely.union_all(drawing.walls)
+    rooms = drawing.rooms if sealed else [*drawing.rooms, *drawing.outdoors]
+    if not rooms:
+        raise ValueError("it has no room" + " indoors" * bool(drawing.outdoors))
+    openings, n_sealed = _openings(drawing, solids, rooms) if sealed else (drawing.doors, 0)
+    gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in openings])
+    solids = solids.difference(gaps)
+    floor = drawing.floor
+    if floor is None:
+        floor = shapely.union_all([*(room.buffer(SLIT, **MITRE) for room in rooms), gaps])
+        floor = floor.difference(solids)  # without what is thinner than 2 cm
+        floor = floor.buffer(-GRID, **MITRE).buffer(GRID, **MITRE)
+    floor = shapely.simplify(shapely.set_precision(floor, GRID), tolerance)
+    floor = shapely.union_all(
+        [part for part in polygons(floor) if part.area > 0.02], grid_size=GRID
+    )
+    if floor.is_empty:
+        raise ValueError("it has no floor: its walls fill it")
+    edges = [floor.boundary] if sealed else []
+    if drawing.walls and sealed:
+        hull = filled(shapely.union_all([solids, floor]))
+        edges.append(shapely.simplify(shapely.set_precision(hull, GRID), tolerance).boundary)
+    elif not sealed:
+        edges.append(shapely.simplify(shapely.set_precision(solids, GRID), tolerance).boundary)
+    walls = merged(shapely.union_all(edges, grid_size=GRID))
+    if not 3 <= len(walls) <= MAX_WALLS:
+        raise ValueError(f"it has {len(walls):,} walls, but 3 to {MAX_WALLS:,} are allowed")
+    shift = geometry.MARGIN - walls.min((0, 1))
+    walls = walls + shift
+    inside = [polygons(room.intersection(floor) if sealed else room) for room in rooms]
+    inside = [[_moved(part, shift) for part in parts] for parts in inside if parts]
+    doors = [line for door in openings if (line := _across(door, floor)) is not None]
+    result = dotdict(
+        id=number,
+        walls=walls.astype(np.float32),
+        lights=np.zeros((0, 2), np.float32),
+        masks=_masks(walls, inside),
+        res=geometry.RES,
+        doors=(np.reshape(doors, (-1, 2, 2)) + shift).astype(np.float32),
+    )
+    warnings = ["an opening leads outside; it is closed"] if drawing.leaks else []
+    return _reachable(result, inside, n_sealed, warnings)
+
+
+def _openings(drawing, solids, rooms) -> tuple[list[BaseGeometry], int]:
+    """Returns the doors between rooms, and the number of those that lead outside."""
+    hull = filled(shapely.union_all([solids, *(room.buffer(SLIT, **MITRE) for room in rooms)]))
+    hull = hull.difference(shapely.union_all(drawing.outdoors).difference(solids))
+    shapely.prepare(hull)
+    inner = [
+        door
+        for door in drawing.doors
+        if hull.covers(door.buffer(2 * JAMB, **MITRE).buffer(-GRID, **MITRE))
+    ]
+    return inner, len(drawing.doors) - len(inner)
+
+
+def _moved(polygon, shift) -> Polygon:
+    return shapely.transform(polygon, lambda points: points + shift)
+
+
+def _rings(polygon) -> list[np.ndarray]:
+    return [np.array(line.coords[:-1]) for line in (polygon.exterior, *polygon.interiors)]
+
+
+def _masks(walls, rooms) -> np.ndarray:
+    """Returns the masks of rooms, each a list of polygons. A room in pieces has them all."""
+    pieces = [(number, part) for number, parts in enumerate(rooms, 1) for part in parts]
+    if len(pieces) > geometry.MAX_ROOMS:
+        raise ValueError(f"it has {len(pieces):,} rooms, but the limit is {geometry.MAX_ROOMS:,}")
+    cells = geometry.masks(walls, [_rings(part) for _, part in pieces])
+    numbers = np.array([-1, 0, *(number for number, _ in pieces)], np.int16)
+    return numbers[cells + 1]
+
+
+def merged(lines: BaseGeometry) -> np.ndarray:
+    """Returns the segments (M, 2, 2) of lines that are split where they meet. Segments that go on
+    straight, where no other meets them, are one.
+    """
+    cm = [np.rint(np.array(part.coords) / GRID).astype(int) for part in _lines(lines)]
+    edges: dict[tuple, set] = {}
+    for part in cm:
+        for a, b in zip(map(tuple, part[:-1].tolist()), map(tuple, part[1:].tolist())):
+            if a != b:
+                edges.setdefault(a, set()).add(b)
+                edges.setdefault(b, set()).add(a)
+    for point in sorted(edges):
+        if len(edges[point]) == 2:
+            (ax, ay), (bx, by) = a, b = sorted(edges[point])
+            x, y = point
+            turn = (ax - x) * (by - y) - (ay - y) * (bx - x)
+            ahead = (ax - x) * (bx - x) + (ay - y) * (by - y)
+            if turn == 0 and ahead < 0 and b not in edges[a]:
+                edges[a].remove(point)
+                edges[b].remove(point)
+                edges[a].add(b)
+                edges[b].add(a)
+                edges[point] = set()
+    pairs = sorted((a, b) for a, others in edges.items() for b in others if a < b)
+    return np.reshape(pairs, (-1, 2, 2)) * GRID
+
+
+def _lines(shape) -> list:
+    parts = shapely.get_parts(shape).tolist()
+    return [part for part in parts if part.geom_type in ("LineString", "LinearRing")]
+
+
+def _across(door, floor) -> np.ndarray | None:
+    """Returns the segment (2, 2) that closes a doorway: the middle of the door along its wall, as
+    wide as the gap; None if the gap is no floor.
+    """
+    corners = np.array(door.minimum_rotated_rectangle.exterior.coords[:4])
+    sides = np.roll(corners, -1, 0) - corners
+    along = sides[0] if np.hypot(*sides[0]) >= np.hypot(*sides[1]) else sides[1]
+    length = np.hypot(*along)
+    if length < 0.2:
+        return None
+    half = along / length * (length / 2 + JAMB)
+    line = shapely.LineString(np.stack([corners.mean(0) - half, corners.mean(0) + half]))
+    parts = [part for part in _lines(line.intersection(floor)) if part.length > 0.2]
+    return np.array(max(parts, key=lambda part: part.length).coords) if parts else None
+
+
+def _reachable(g, rooms, n_sealed, warnings) -> tuple[dotdict, Notes]:
+    """Returns a geometry whose rooms are those that an agent can reach, with a light in each."""
+    distance, fine, cell = checks.fine_rooms(g, checks.FINE)
+    labels, _ = checks.components(distance > checks.RADIUS - 1e-3)
+    can_spawn = (fine > 0) & (distance >= checks.SPAWN)
+    if not can_spawn.any():
+        raise ValueError("it has no room that an agent fits into; check the scale")
+    main = np.bincount(labels[can_spawn]).argmax()
+    ratio = round(g.res / cell)
+    is_other = (can_spawn & (labels != main)).reshape(
+        g.masks.shape[0], ratio, g.masks.shape[1], ratio
+    )
+    cells = np.where(is_other.any((1, 3)) & (g.masks > 0), 0, g.masks)
+    fine = np.where(np.maximum(cells, 0).repeat(ratio, 0).repeat(ratio, 1) > 0, fine, 0)
+    kept = np.unique(fine[can_spawn & (labels == main) & (fine > 0)])
+    numbers = np.zeros(len(rooms) + 2, np.int16)
+    numbers[0] = -1
+    numbers[kept + 1] = np.arange(1, len(kept) + 1)
+    g["masks"] = numbers[cells + 1]
+    area = (fine > 0).sum() * cell**2
+    if area < MIN_AREA:
+        raise ValueError(f"an agent can reach {area:.1f} m2 of it, but a home has {MIN_AREA:g} m2")
+    lights = [_light(rooms[room - 1], g, distance, cell) for room in kept]
+    g["lights"] = np.array(lights, np.float32)
+    if lost := len(rooms) - len(kept):
+        warnings.append(f"{lost} of {len(rooms)} rooms cannot be reached, or hold no agent")
+    return g, Notes(len(rooms), len(kept), n_sealed, warnings)
+
+
+def _light(parts, g, distance, cell) -> np.ndarray:
+    """Returns the place of a room's light: its centroid if that is indoors and clear of walls, else
+    the middle of its largest disc.
+    """
+    part = max(parts, key=lambda part: part.area)
+    at = np.array(part.centroid.coords[0])
+    clear = distance[tuple(geometry.indices(at, distance.shape, cell))]
+    if not part.contains(part.centroid) or clear < LIT:
+        at = np.array(shapely.maximum_inscribed_circle(part, 0.05).coords[0])
+    return at
+
+
+# ---- Plans whose rooms are not drawn ----
+
+NECK = 0.55  # metres; half the width of the widest passage that separates two rooms
+WIDEST = 1.3  # metres; the widest gap in the outer walls that is closed
+
+
+def rooms_of(floor: BaseGeometry) -> list[BaseGeometry]:
+    """Returns the rooms of a floor: its parts between passages narrower than 1.1 m."""
+    rooms, taken = [], Polygon()
+    for part in polygons(floor.buffer(-NECK, **MITRE)):
+        room = part.buffer(NECK + GRID, **MITRE).intersection(floor).difference(taken)
+        rooms.append(room)
+        taken = taken.union(room)
+    rest = polygons(floor.difference(taken).buffer(-0.1, **MITRE).buffer(0.1, **MITRE))
+    return rooms + [part for part in rest if part.area >= MIN_AREA]
+
+
+def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Drawing:
+    """Returns the drawing of walls and doors alone: the floor is what they enclose. Gaps of up to
+    1.3 m in the outer walls are closed if the floor leaks through them.
+
+    Raises:
+        ValueError: if they enclose nothing.
+    """
+    solids = shapely.union_all(walls)
+    check_extent([solids])
+    closed = shapely.union_all([solids, *(door.buffer(JAMB, **MITRE) for door in doors)])
+    hull = filled(closed)
+    bridged = closed.buffer(WIDEST / 2, **MITRE).buffer(-WIDEST / 2, **MITRE)
+    wide = filled(bridged)
+    if leaks := wide.difference(hull).area > MIN_AREA:
+        hull = shapely.union_all([hull, wide])
+    inner = [door for door in doors if hull.covers(door.buffer(2 * JAMB, **MITRE))]
+    gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in inner])
+    floor = hull.difference(solids.difference(gaps))
+    parts = [part for part in polygons(floor) if part.area > 0.3]
+    if not parts:
+        raise ValueError(
+            f"its walls enclose no floor: they leave gaps wider than {WIDEST:g} m, or fill it"
+        )
+    floor = shapely.union_all(parts)
+    rooms = rooms_of(floor.difference(gaps))
+    return Drawing([solids.difference(gaps)], rooms, inner, [], floor, leaks)

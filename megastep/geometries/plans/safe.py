@@ -1,0 +1,228 @@
+"""Reads files of strangers: members of archives with caps, and XML without entities or depth.
+
+Nothing is extracted to disk, nothing is fetched, and every refusal is a ValueError.
+"""
+
+import gzip
+import math
+import re
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import IO, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import DefusedXMLParser
+
+MAX_BYTES = 20 << 20  # of a file
+MAX_MEMBERS = 200_000  # of an archive
+MAX_TOTAL = 8 << 30  # bytes of an archive, unpacked
+MAX_RATIO = 200  # of bytes unpacked to packed, of a member of over a megabyte
+MAX_DEPTH = 200  # elements within elements
+MAX_ELEMENTS = 200_000
+MAX_POINTS = 100_000  # of one list
+MAX_COORDINATE = 1e7
+
+BROKEN = (OSError, EOFError, zipfile.BadZipFile, tarfile.TarError, zlib.error, NotImplementedError)
+NUMBER = re.compile(r"[\s,]*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=[\s,+-]|$)")
+
+
+class Member(NamedTuple):
+    """A file of an archive or folder: its bytes, or why it is refused."""
+
+    name: str
+    content: bytes | None
+    refusal: str = ""
+
+
+def members(path: Path, suffix: str) -> Iterator[Member]:
+    """Yields the files whose names end in `suffix`, of a zip, a tar, a folder, or the file itself.
+
+    Raises:
+        ValueError: there is no such file, or it is damaged or cut short.
+    """
+    if path.is_dir():
+        yield from _of_folder(path, suffix)
+        return
+    if not path.is_file():
+        raise ValueError(f"there is no file or folder {str(path)!r}")
+    with path.open("rb") as file:
+        start = file.read(262 + 6)
+    kind = {b"PK\3\4": _of_zip, b"PK\5\6": _of_zip, b"\x1f\x8b": _of_tar}.get(start[:4])
+    kind = kind or (_of_tar if start[:2] == b"\x1f\x8b" or start[257:262] == b"ustar" else None)
+    if kind is None:
+        if path.suffix.lower() in (".zip", ".gz", ".tgz", ".tar"):
+            raise ValueError(f"{str(path)!r} is no archive, or the download is cut short")
+        yield of_file(path, path.name)
+        return
+    try:
+        yield from kind(path, suffix)
+    except BROKEN as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        text = f"{str(path)!r} is damaged or cut short ({reason}); download it again"
+        raise ValueError(text) from error
+
+
+def of_file(path: Path, name: str) -> Member:
+    """Returns a file as a member."""
+    try:
+        if (size := path.stat().st_size) > MAX_BYTES:
+            return Member(name, None, _too_large(size))
+        return Member(name, path.read_bytes())
+    except OSError as error:
+        return Member(name, None, f"it cannot be read: {error.strerror}")
+
+
+def _of_folder(path, suffix) -> Iterator[Member]:
+    for file in sorted(path.rglob(f"*{suffix}")):
+        if file.is_file():
+            yield of_file(file, file.relative_to(path).as_posix())
+
+
+def _too_large(size) -> str:
+    return f"it has {size:,} bytes, but the limit is {MAX_BYTES:,}"
+
+
+def _is_outside(name) -> bool:
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    return ".." in parts or name.startswith(("/", "\\")) or ":" in name[:3]
+
+
+def _of_zip(path, suffix) -> Iterator[Member]:
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        if len(entries) > MAX_MEMBERS:
+            raise ValueError(f"{str(path)!r} has {len(entries):,} files, more than {MAX_MEMBERS:,}")
+        for entry in sorted(entries, key=lambda entry: entry.filename):
+            name, size = entry.filename, entry.file_size
+            if not name.endswith(suffix) or entry.is_dir():
+                continue
+            if _is_outside(name):
+                yield Member(name, None, "its name leads out of the archive")
+            elif entry.flag_bits & 1:
+                yield Member(name, None, "it is encrypted")
+            elif entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                yield Member(name, None, "it is compressed other than by deflate")
+            elif size > MAX_BYTES:
+                yield Member(name, None, _too_large(size))
+            elif size > 1 << 20 and size > MAX_RATIO * entry.compress_size:
+                yield Member(name, None, f"it unpacks to {size // entry.compress_size:,} times")
+            else:
+                try:
+                    yield Member(name, archive.read(entry))
+                except BROKEN as error:
+                    yield Member(name, None, f"it is damaged: {error}")
+
+
+class _Capped:
+    """A stream of which no more than `left` bytes are read; whoever reads on sets it again."""
+
+    def __init__(self, file: IO[bytes] | gzip.GzipFile):
+        self.file, self.left, self.total = file, MAX_BYTES, MAX_TOTAL
+
+    def read(self, n: int) -> bytes:
+        content = self.file.read(n)
+        self.left -= len(content)
+        self.total -= len(content)
+        if self.left < 0 or self.total < 0:
+            raise tarfile.TarError("it unpacks to more than the limit")
+        return content
+
+
+def _of_tar(path, suffix) -> Iterator[Member]:
+    with path.open("rb") as raw:
+        is_packed = raw.read(2) == b"\x1f\x8b"
+        raw.seek(0)
+        stream = _Capped(gzip.GzipFile(fileobj=raw) if is_packed else raw)
+        with tarfile.open(fileobj=stream, mode="r|") as archive:  # type: ignore[arg-type]
+            for number, entry in enumerate(archive):
+                if number >= MAX_MEMBERS:
+                    raise ValueError(f"{str(path)!r} has more than {MAX_MEMBERS:,} files")
+                stream.left = MAX_BYTES + entry.size  # what follows is skipped or read
+                archive.members = []  # type: ignore[misc]  # which would keep all names
+                if not entry.isfile() or not entry.name.endswith(suffix):
+                    continue
+                if _is_outside(entry.name):
+                    yield Member(entry.name, None, "its name leads out of the archive")
+                elif entry.size > MAX_BYTES:
+                    yield Member(entry.name, None, _too_large(entry.size))
+                else:
+                    file = archive.extractfile(entry)
+                    content = file.read() if file else b""
+                    if len(content) < entry.size:
+                        raise EOFError("a file ends too early")
+                    yield Member(entry.name, content)
+
+
+# ---- XML ----
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """Builds a tree of limited depth and size."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.depth = self.count = 0
+
+    def start(self, tag, attrs) -> ElementTree.Element:
+        self.depth += 1
+        self.count += 1
+        if self.depth > MAX_DEPTH or self.count > MAX_ELEMENTS:
+            raise ValueError(
+                f"it has more than {MAX_DEPTH} elements within one another, or {MAX_ELEMENTS:,}"
+            )
+        return super().start(tag, attrs)
+
+    def end(self, tag) -> ElementTree.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+
+def xml(content: bytes) -> ElementTree.Element:
+    """Returns the root of an XML file. Raises ValueError for a DOCTYPE, an entity, or limits."""
+    if not content.strip():
+        raise ValueError("it is empty")
+    parser = DefusedXMLParser(target=_Builder(), forbid_dtd=True)
+    try:
+        parser.feed(content)
+        return parser.close()
+    except DefusedXmlException as error:
+        raise ValueError(
+            "it has a DOCTYPE or entities, which are refused; save it again as plain SVG, as "
+            "Inkscape does, if a program such as potrace wrote it"
+        ) from error
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is no XML, or cut short ({error})") from error
+
+
+def name_of(element: ElementTree.Element) -> str:
+    """Returns an element's name without its namespace; "" of a comment."""
+    return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
+
+
+def numbers(text: str) -> list[float]:
+    """Returns the numbers of a list that commas or blanks separate. Raises ValueError."""
+    values, at, text = [], 0, text.strip()
+    while at < len(text):
+        match = NUMBER.match(text, at)
+        if match is None:
+            raise ValueError(f"{text[at : at + 20]!r} is no number")
+        values.append(float(match[1]))
+        at = match.end()
+        if len(values) > 2 * MAX_POINTS:
+            raise ValueError(f"a list has more than {MAX_POINTS:,} points")
+    if not all(map(math.isfinite, values)) or max(map(abs, values), default=0) > MAX_COORDINATE:
+        raise ValueError(f"a coordinate is not finite, or above {MAX_COORDINATE:g}")
+    return values
+
+
+def points(text: str) -> np.ndarray:
+    """Returns the points (P, 2) of an SVG list."""
+    values = numbers(text)
+    if len(values) % 2:
+        raise ValueError("a list of points has an odd number of coordinates")
+    return np.reshape(values, (-1, 2))
