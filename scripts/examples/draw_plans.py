@@ -4,7 +4,7 @@ drawings and three maps. docs/floor-plans.md shows them beside what `megastep im
     python scripts/examples/draw_plans.py FOLDER
 """
 
-import sys
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -145,4 +145,6 @@ def sheet(path):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.split(".")[0])
+    parser.add_argument("folder", help="is made if it does not exist")
+    main(parser.parse_args().folder)
