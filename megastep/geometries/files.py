@@ -14,10 +14,10 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -229,10 +229,15 @@ def save(path: str | Path, geometries: Sequence[dict]) -> None:
             f"walls are too many for a file: the limits are {MAX_UNPACKED:,} bytes and "
             f"{MAX_LENGTHS:,} m."
         )
+    write_whole(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Writes a file, by `write(file)`, under another name, and renames it once it is whole."""
     handle, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, **arrays)
+            write(file)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(partial, 0o644)

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from megastep.dotdict import dotdict
+from megastep.geometries.files import write_whole
 from megastep.geometries.homes import database
 
 __all__ = ["NAMES", "folder", "load", "pick", "probe", "write"]
@@ -54,26 +55,13 @@ def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Pa
     digest = hashlib.sha256(content).hexdigest()
     folder().mkdir(parents=True, exist_ok=True)
     path = folder() / f"{name}-{digest[:12]}.npz"
-    _replace(path, content)
-    _replace(folder() / f"{name}.sha256", f"{digest}  {path.name}\n".encode())
+    write_whole(path, lambda file: file.write(content))
+    line = f"{digest}  {path.name}\n".encode()
+    write_whole(folder() / f"{name}.sha256", lambda file: file.write(line))
     for old in folder().glob(f"{name}-*.npz"):
         if old != path:
             old.unlink(missing_ok=True)
     return path, digest
-
-
-def _replace(path, content) -> None:
-    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(partial, 0o644)
-        os.replace(partial, path)
-    except BaseException:
-        Path(partial).unlink(missing_ok=True)
-        raise
 
 
 @functools.lru_cache(maxsize=2)
