@@ -13,7 +13,8 @@ from timing import measurement
 def libraries(device: torch.device) -> Iterator[dict]:
     """What other libraries learn in Pong (points won) or PointGoal (success), by
     `scripts/examples/other_libraries.py`: the mean over 512 episodes, with its 95 % interval, of
-    random actions and after training; and the seconds of a CPU core that both took. Leaves out what is not installed.
+    random actions and after training; and the seconds of a CPU core. Leaves out what is not
+    installed.
     """
     sys.path.append(str(paths.ROOT / "scripts" / "examples"))
     other_libraries = importlib.import_module("other_libraries")
