@@ -10,6 +10,7 @@ from pathlib import Path
 import draw_plans
 import numpy as np
 import pytest
+import yaml
 
 from megastep import cubicasa as original
 from megastep import geometries, toys
@@ -20,6 +21,7 @@ imports = pytest.importorskip(
     "megastep.geometries.plans.imports", reason="needs the extra plans", exc_type=ImportError
 )
 safe, Options = imports.safe, imports.Options
+maps, outlines, shapely = imports.maps, imports.outlines, imports.shapely
 
 HOSTILE = Path(__file__).parents[1] / "data" / "hostile"
 EXPECTED = json.loads((HOSTILE / "EXPECTED.json").read_text())
@@ -329,6 +331,30 @@ def test_bad_maps(here, capsys):
     assert run("source=svg", "path=open.svg", "scale=1") == 2
     assert "enclose no floor" in capsys.readouterr().err
     assert not list(here.glob("*.npz"))
+
+
+def test_thresholds_of_ros_are_exclusive(here):
+    """A cell is free below free_thresh and a wall above occupied_thresh. 51 / 255 is 0.2."""
+    draw_plans.ros_map(here, "a", np.array([[50, 51, 204, 205]], np.uint8), 0.05)
+    text = (here / "a.yaml").read_text()
+    numbers = {"negate": 1, "free_thresh": 0.2, "occupied_thresh": 0.8}
+    (here / "a.yaml").write_text(json.dumps({**yaml.safe_load(text), **numbers}))
+    grid = maps.load(here / "a.yaml")
+    assert grid.free.tolist() == [[True, False, False, False]]
+    assert grid.unknown.tolist() == [[False, True, True, False]]
+
+
+def test_lights_hang_in_their_rooms():
+    """In the middle of a rectangle. The centroid of the other room, a U, is in the first."""
+    inner, home = shapely.box(2, 2, 5, 6), shapely.box(0, 0, 7, 6)
+    wall = inner.buffer(0.1, join_style="mitre") & home
+    outer, door = home - wall, shapely.box(3, 1.9, 4, 2)
+    drawing = outlines.Drawing([wall - inner], [inner, outer], [door], [])
+    g, notes = outlines.geometry_of(drawing, 0)
+    assert notes.n_reachable == 2 and checks.errors(g) == []
+    lights = g.lights.astype(float) - g.walls.min((0, 1))
+    np.testing.assert_allclose(lights[0], (3.5, 4), atol=0.04)  # slits of 3 cm are closed
+    assert outer.contains(shapely.Point(lights[1])) and not outer.contains(outer.centroid)
 
 
 @pytest.mark.slow
