@@ -150,6 +150,11 @@ class Population:
 
         rounds = [trainer.rounds(ends) for trainer in self.trainers]
         try:
+            if self._is_round_left(rounds):
+                for member, trainer in enumerate(self.trainers):  # now all have compiled
+                    with self.turns.of(member):
+                        trainer.start_clock()
+                self._after_round()
             while self._is_round_left(rounds):
                 self._after_round()
         finally:
