@@ -25,14 +25,14 @@ IMAGES, PAGES = DOCS / "images", DOCS / "play"
 MOST = 16_000_000  # bytes of both
 #: What films or draws each: words for record.py, or for show_homes.py.
 FILMS = {
-    "explorer.gif": "run=explorer_anywhere home=3 steps=240 dpi=80 speed=2",
+    "explorer.gif": "run=explorer_anywhere home=3 steps=200 dpi=70 speed=2",
     "explorer.png": "run=explorer_anywhere home=3 steps=90",
     "cameras.png": "env=explorer geometry=maze geometry.braid=0.5 env.cameras=[0,120,240] steps=60 "
     "seed=5",
     "pointgoal.png": "run=pointgoal_anywhere home=4 steps=30",
     "homes.png": "run=pointgoal_anywhere homes=[1,2,3,4] steps=25 theme=dark dpi=70",
     "deathmatch.png": "run=deathmatch_anywhere against=hunter home=27 steps=60",
-    "memory.gif": "run=memory_9 steps=240 dpi=70 speed=2 seed=2",
+    "memory.gif": "run=memory_9 steps=160 dpi=60 speed=2 seed=2",
     "keys.png": "run=keys_anywhere steps=60",
     "minimal.png": "env=minimal geometry=box steps=20",
     "pong-court.png": "env=pong steps=30",
@@ -61,15 +61,14 @@ FILMS |= {
 }
 #: The films of the gallery, each beside the picture of that name; words for record.py.
 MOVING = {
-    "pointgoal.mp4": "run=pointgoal_anywhere home=4 steps=240 dpi=80 speed=2",
-    "homes.mp4": "run=pointgoal_anywhere homes=[1,2,3,4] steps=160 theme=dark dpi=60 speed=2",
-    "deathmatch.mp4": "run=deathmatch_anywhere against=hunter home=27 steps=240 dpi=80 speed=2",
-    "keys.mp4": "run=keys_anywhere steps=240 dpi=80 speed=2",
+    "pointgoal.mp4": "run=pointgoal_anywhere home=4 steps=160 dpi=70 speed=2",
+    "deathmatch.mp4": "run=deathmatch_anywhere against=hunter home=27 steps=160 dpi=70 speed=2",
+    "keys.mp4": "run=keys_anywhere steps=160 dpi=70 speed=2",
     "minimal.mp4": "env=minimal geometry=box steps=100 dpi=80",
     "pong-court.mp4": "run=PONG steps=200 dpi=80",
 }
 MOVING |= {
-    f"{name}.mp4": f"run=explorer_anywhere {words} steps=160 dpi=60 speed=2"
+    f"{name}.mp4": f"run=explorer_anywhere {words} steps=120 dpi=50 speed=2"
     for name, words in SOURCES.items()
 }
 #: Trains the agent that plays Pong in it.
