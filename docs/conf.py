@@ -74,7 +74,19 @@ def prepare(app, name, source):
         text += f"\n{{nb-download}}`{name.rpartition('/')[2]}.ipynb` holds this page as it ran.\n"
     if name == "decisions/README":  # a page for each, which its own links lead to
         text += "\n```{toctree}\n:hidden:\n:glob:\n\n*\n```\n"
+    if name == "gallery":
+        text = re.sub(r"!\[([^\]]*)\]\(images/([\w-]+)\.png\)", film, text)
     source[0] = re.sub(r"\[([^\]]*)\]\((?!\w+:|#)([^)\s]+)\)", linked, text)
+
+
+def film(match):
+    """Returns the film in place of a picture, if there is one."""
+    if not (ROOT / f"docs/play/{match[2]}.mp4").exists():
+        return match[0]
+    return (
+        f'<video src="{match[2]}.mp4" aria-label="{match[1]}" style="max-width: 100%" '
+        "autoplay loop muted playsinline controls></video>"
+    )
 
 
 def write_llms(app, error):

@@ -14,7 +14,7 @@ from tests.helpers import pages
 DOCS = pages.ROOT / "docs"
 FOLDER = DOCS / "tutorials"
 PAGES = sorted(page.name for page in FOLDER.glob("*.md") if page.name != "index.md")
-CONCEPTS = sorted(
+CONCEPTS = ["../performance.md"] + sorted(
     f"../concepts/{page.name}"
     for page in (DOCS / "concepts").glob("*.md")
     if "```python" in page.read_text()

@@ -23,6 +23,7 @@ ROWS = paths.ROOT / "agents" / "cli" / "reproductions.yaml"
 AGENTS = paths.ROOT / "agents" / "pretrained"
 #: The pages that quote: all but the lab notes, which are the evidence.
 PAGES = [paths.ROOT / "README.md", *sorted((paths.ROOT / "docs").glob("*.md"))]
+PAGES += sorted((paths.ROOT / "docs/concepts").glob("*.md"))
 MARKED = re.compile(r"(<!-- quote: ([\w-]+) -->)(.*?)(<!-- end -->)", re.S)
 
 
