@@ -11,8 +11,10 @@ from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
 from exported_agents import exported
 from films import films
+from libraries import libraries
 from nsight_counters import counters
 from peers import peers
+from population_benchmarks import league, members, memory_search, search, small_members
 from published import published
 from replay_buffer import replay
 from scaling import ranks, scaling
@@ -31,6 +33,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "deathmatch": deathmatch,
     "memory": memory,
     "adapters": adapters,
+    "libraries": libraries,
     "replay": replay,
     "pong": pong,
     "paths": paths,
@@ -51,4 +54,9 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "peers": peers,
     "scaling": scaling,
     "ranks": ranks,
+    "members": members,
+    "small_members": small_members,
+    "search": search,
+    "memory_search": memory_search,
+    "league": league,
 }
