@@ -98,6 +98,13 @@ def test_refused(name, words):
     assert not plan.geometries and words in plan.refusal and "\n" not in plan.refusal
 
 
+def test_files_of_too_many_elements_are_refused(monkeypatch):
+    monkeypatch.setattr(safe, "MAX_ELEMENTS", 50)
+    assert safe.xml(b"<svg>" + b"<g/>" * 49 + b"</svg>") is not None
+    with pytest.raises(ValueError, match="or 50$"):
+        safe.xml(b"<svg>" + b"<g/>" * 50 + b"</svg>")
+
+
 def test_rooms_without_doors_have_walls():
     (g,) = plan_of("ok_closed_room_needs_interior_ring.svg").geometries
     assert len(g.walls) == 12, "two rooms and the outline"
