@@ -57,8 +57,7 @@ def add_policy(
         seed: of the actions. Their draws are not PyTorch's.
 
     Raises:
-        UserError: it has a core or an encoder of the user's, or actions of several kinds; or the
-            environment has action masks.
+        UserError: it has a core or an encoder of the user's, or actions of several kinds.
     """
     with torch.no_grad():
         return _Lowering(program, policy, lanes, section, seed).acting()
@@ -262,8 +261,6 @@ class _Lowering:
     def output(self, x: Ref, width: int) -> Leaf:
         """Adds the output. Returns the logits."""
         output = self.policy.output
-        if any(path.partition(".")[0] == "mask" for path in self.program.world):
-            raise UserError("a page has no action masks, and this environment has one")
         if not isinstance(
             output, (MultiDiscreteOutput, DuellingOutput, GaussianOutput, BetaOutput)
         ):

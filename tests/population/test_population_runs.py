@@ -2,7 +2,7 @@
 
 import random
 import shutil
-import subprocess
+import time
 
 import pytest
 import yaml
@@ -277,33 +277,48 @@ def test_members_of_a_league_meet_each_other_and_resume_with_the_same_bits(here,
     assert "opponents.league" in err and "population.size=2" in err
 
 
-@pytest.mark.nightly
-def test_population_that_is_killed_at_random_moments_has_the_same_bits(here):
-    """Thirty times by SIGKILL, in whatever it does."""
-    words = [*POPULATION, "samples=20480"]
+@pytest.mark.parametrize(
+    "n_kills",
+    [pytest.param(3, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.nightly)],
+)
+def test_population_that_is_killed_at_random_moments_has_the_same_bits(here, n_kills):
+    """By SIGKILL: every third time whenever it starts, otherwise after it has saved, in whatever it
+    does then.
+    """
+    words = [*POPULATION, f"samples={2048 * n_kills}", "device=cpu"]
     run(*words)
     shutil.move("P", "left-alone")
-    generator, n_killed = random.Random(1), 0
-    while n_killed < 30:
-        is_new = not populations.is_root(here / "P") or not checkpoint.list_checkpoints(
-            here / "P/member-2/checkpoints"
-        )
+    generator, n_killed, seen = random.Random(1), 0, set()
+    while n_killed < n_kills:
+        paths = [here / f"P/member-{n}/checkpoints" for n in range(3)]
+        is_new = not all(map(checkpoint.list_checkpoints, paths))
         if is_new:
             shutil.rmtree("P", ignore_errors=True)
+        before = set() if is_new else {*checkpoint.list_checkpoints(paths[2])}
         start = [*words, "checkpoint_seconds=1e-9"] if is_new else ["resume=P"]
         process = forked("train", *start, cwd=here)
-        try:
-            process.communicate(timeout=generator.uniform(2, 8))
-        except (subprocess.TimeoutExpired, TimeoutError):
-            process.kill()
-            process.communicate(timeout=HUNG)
-            n_killed += 1
-            continue
-        break
-    assert n_killed >= 3
+        while n_killed % 3 and not {*checkpoint.list_checkpoints(paths[2])} - before:
+            if process.poll() is not None:
+                break
+            time.sleep(0.001)
+        time.sleep(generator.uniform(0, 0.3 if n_killed % 3 else 3))
+        if process.poll() is not None:
+            break
+        process.kill()
+        process.communicate(timeout=HUNG)
+        n_killed += 1
+        seen |= {*map(newest, paths)}
+    print(f"{n_killed} kills, after {len(seen)} numbers of samples")
+    assert n_killed >= n_kills / 2 and len(seen) > n_kills / 2
     if process.returncode != 0:
         run("resume=P")
     assert_equal(here / "P", here / "left-alone")
+
+
+def newest(folder):
+    """Returns the name of the newest checkpoint in a folder, None without one."""
+    paths = checkpoint.list_checkpoints(folder)
+    return paths[-1].name if paths else None
 
 
 @pytest.mark.parametrize(
