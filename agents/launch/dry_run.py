@@ -9,8 +9,8 @@ from megastep.types import n_lanes, optional
 
 
 def show(cfg: settings.Train) -> None:
-    """Prints environments, lanes and batch sizes, per rank, or member of a population, and in total.
-    Writes no file.
+    """Prints environments, lanes and batch sizes, per rank or per member of a population, and in
+    total. Writes no file.
 
     A machine without a GPU, such as a login node, tells the sizes of `device=cuda`, too.
     """
