@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from megastep import global_generators
+from megastep.env_values import masked_actions
 from megastep.sync_envs import TRUE_RETURN, RewardRecorder, numbers_of
 from megastep.wrapper_state import wrapper_state
 
@@ -29,7 +30,7 @@ class Probe(NamedTuple):
             `TRUE_RETURN`, if wrappers change rewards.
         generators: kinds of global generators that the environment draws from.
         learnt: paths of what wrappers keep beyond an episode, see `wrapper_state`.
-        n_masked: actions of the mask in ``info["action_mask"]``; 0 if there is none.
+        n_masked: actions of the mask in ``info["action_mask"]``, see `masked_actions`.
     """
 
     names: tuple[str, ...] = ()
@@ -75,7 +76,7 @@ def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
         global_generators.seed_all(seed)
         before = global_generators.states()
         with contextlib.suppress(Exception):
-            n_masked = _masked_actions(env, env.reset(seed=seed))
+            n_masked = masked_actions(env.action_space, env.reset(seed=seed)[1])
             first, end = wrapper_state(env), time.monotonic() + MAX_SECONDS
             recorder = RewardRecorder.inside(env)
             for reward, is_over, info in itertools.islice(play(env, seed), MAX_STEPS):
@@ -94,11 +95,3 @@ def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
     names = [name for name in names if name != TRUE_RETURN]
     names = [TRUE_RETURN, *names] if is_changed else names
     return Probe(tuple(names), generators, tuple(learnt), n_masked)
-
-
-def _masked_actions(env, result) -> int:
-    """Returns the number of actions of the mask that came with a reset, 0 without."""
-    info = result[1] if isinstance(result, tuple) else None
-    mask = info.get("action_mask") if isinstance(info, Mapping) else None
-    n = int(getattr(getattr(env, "action_space", None), "n", 0))
-    return n if mask is not None and np.shape(mask) == (n,) else 0

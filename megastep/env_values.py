@@ -10,7 +10,13 @@ import numpy as np
 
 from megastep.types import Space, Tree
 
-__all__ = ["beyond_bounds", "problem_of_error", "problem_of_observation", "problem_of_result"]
+__all__ = [
+    "beyond_bounds",
+    "masked_actions",
+    "problem_of_error",
+    "problem_of_observation",
+    "problem_of_result",
+]
 
 FORMS = {
     "reset": "(observation, info)",
@@ -68,6 +74,22 @@ def problem_of_error(method: str, error: Exception) -> str | None:
     if not re.search("values? to unpack|cannot unpack", str(error)):
         return None
     return f"{method}() must return {FORMS[method]}, and returned something else ({error})"
+
+
+def masked_actions(space: Space, info: object) -> int:
+    """Returns the number of actions that ``info["action_mask"]`` tells of: 0 if there is none, -1
+    if it is not a number per action of a Discrete space.
+    """
+    mask = info.get("action_mask") if isinstance(info, Mapping) else None
+    if mask is None:
+        return 0
+    from gymnasium import spaces
+
+    n = int(space.n) if isinstance(space, spaces.Discrete) else 0
+    try:
+        return n if n and np.shape(mask) == (n,) else -1
+    except ValueError:  # of parts with different shapes
+        return -1
 
 
 def beyond_bounds(space: Space, batch: Tree, path: str = "it") -> Iterator[tuple[str, bool]]:

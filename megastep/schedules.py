@@ -30,7 +30,10 @@ _TRIED = 0.0, 0.5, 1.0
 
 @dataclasses.dataclass(frozen=True)
 class Scheduled(annotated_types.BaseMetadata):
-    """Metadata of an annotation: the setting is a number within bounds, or a schedule of such."""
+    """Metadata of an annotation: the setting is a number within bounds, or a schedule of such.
+
+    A schedule may end at an exclusive bound, as one that falls to 0 does.
+    """
 
     ge: float | None = None
     gt: float | None = None
@@ -46,31 +49,32 @@ class Scheduled(annotated_types.BaseMetadata):
         if isinstance(value, numbers.Real) and not isinstance(value, bool):
             return self._bounded(value)
         if isinstance(value, Mapping) and value.keys() == _ENDS:
-            return {name: self._bounded(value[name]) for name in ("from", "to")}
+            return {name: self._bounded(value[name], True) for name in ("from", "to")}
         if callable(value) or (isinstance(value, str) and ":" in value):
             function = schedule_of(cast(Number, value))
             if not callable(function):
                 raise ValueError(f"{value} is no function of the fraction of the budget")
             for fraction in _TRIED:
-                self._bounded(called(function, fraction))
+                self._bounded(called(function, fraction), True)
             return value
         raise ValueError(
             f"expected a number, got {value!r}; a schedule is {{from: 1, to: 0.1}} or "
             "module:function"
         )
 
-    def _bounded(self, value) -> float:
+    def _bounded(self, value, of_schedule=False) -> float:
         if not isinstance(value, numbers.Real) or isinstance(value, bool):
             raise ValueError(f"expected a number, got {value!r}")
         number = float(value)
         is_inside = (
             math.isfinite(number)
             and (self.ge is None or number >= self.ge)
-            and (self.gt is None or number > self.gt)
+            and (self.gt is None or number > self.gt or (of_schedule and number == self.gt))
             and (self.le is None or number <= self.le)
         )
         if not is_inside:
-            lower = f"from {self.ge:,}" if self.gt is None else f"above {self.gt:,}"
+            is_closed = of_schedule or self.gt is None
+            lower = f"from {self.gt or self.ge or 0:,}" if is_closed else f"above {self.gt:,}"
             raise ValueError(f"{value} is out of range: allowed is {lower} to {self.le:,}")
         return number
 

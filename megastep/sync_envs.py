@@ -30,6 +30,7 @@ __all__ = [
     "EnvError",
     "RewardRecorder",
     "SyncEnvs",
+    "allowed_actions",
     "close_all",
     "make_env",
     "numbers_of",
@@ -97,6 +98,20 @@ class BadValue(EnvError):
         return cls(f"{place}: {problem}. To leave it as it is, use env.check=false")
 
 
+def allowed_actions(info: Mapping, n: int, place: str) -> np.ndarray:
+    """Returns the mask of an ``info``, (n,) bool. One that allows nothing, as at an episode's end,
+    counts as one that allows all; so does none.
+
+    Raises:
+        BadValue: it is of another shape.
+    """
+    mask = np.asarray(info.get("action_mask", np.ones(n)), bool)
+    if mask.shape != (n,):
+        problem = f"info['action_mask'] has shape {mask.shape}, and before it had ({n},)"
+        raise BadValue.of(problem, place)
+    return mask if mask.any() else np.ones(n, bool)
+
+
 class RewardRecorder:
     """Keeps the last reward of an environment, which wrappers around it may change."""
 
@@ -143,7 +158,7 @@ class SyncEnvs(WrappedEnvs):
         generators: kinds of global generators that the environments draw from.
         learnt: paths of what their wrappers have learnt.
         check: checks the form of what the environments return in their first `CHECKED_STEPS`.
-        n_masked: actions of the mask in ``info["action_mask"]``; 0 if there is none.
+        n_masked: actions of the mask in ``info["action_mask"]``, see `masked_actions`.
 
     Attributes:
         restarts: (N,) int64, how often each was made anew.
@@ -202,7 +217,7 @@ class SyncEnvs(WrappedEnvs):
     ) -> None:
         """Sets what a `Probe` has told, see above."""
         self.n_masked = n_masked
-        self.masks = np.ones((len(self.envs), n_masked), bool)
+        self.masks = np.ones((len(self.envs), max(0, n_masked)), bool)
         self.names, self.learnt, self.kinds = tuple(names), tuple(learnt), tuple(kinds)
         for generators in self.generators:
             generators.drop({*KINDS} - {*kinds})  # which checkpoints need not hold
@@ -298,15 +313,12 @@ class SyncEnvs(WrappedEnvs):
         failures, self._failures = self._failures, []
         news = {"numbers": numbers, "failures": failures}
         news = {key: value for key, value in news.items() if value}
-        return {**news, "masks": self.masks.copy()} if self.n_masked else news
+        return {**news, "masks": self.masks.copy()} if self.n_masked > 0 else news
 
     def _read_mask(self, i, info) -> None:
-        """Keeps an environment's mask. One that allows nothing, as at an episode's end, counts as
-        one that allows all.
-        """
-        if self.n_masked:
-            mask = np.asarray(info.get("action_mask", 1), bool)
-            self.masks[i] = mask if mask.any() else True
+        """Keeps an environment's mask."""
+        if self.n_masked > 0:
+            self.masks[i] = allowed_actions(info, self.n_masked, f"environment {self.first + i}")
 
     def _last(self, i) -> object:
         """Returns a copy of the last observation of an environment."""

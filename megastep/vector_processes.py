@@ -187,7 +187,7 @@ class VectorProcesses:
                 for name, values in part.get("numbers", {}).items():
                     news["numbers"][name][rows] = values
         news = {key: value for key, value in news.items() if value}
-        if self.n_masked:
+        if self.n_masked > 0:
             news["masks"] = np.concatenate([part["masks"] for part in of_processes])
         return news
 

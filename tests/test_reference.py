@@ -96,14 +96,3 @@ def test_docstrings_become_markdown():
         "Steps.\n\nSees `megastep.optional` and `x`.\n\n\n**Args**\n\n"
         "- **n** (`int`): number of steps, at least 1.\n\n**Returns**\n\ny, (B,)."
     )
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*MystReferenceResolver")
-def test_site_builds_without_warnings(tmp_path, monkeypatch):
-    """All but the writing of HTML, which is half of the time: links and anchors are resolved."""
-    from sphinx.cmd.build import build_main
-
-    monkeypatch.setenv("MEGASTEP_REPOSITORY", "https://example.org/megastep")
-    options = "-W", "--keep-going", "-q", "-E", "-b", "dummy", "-d", str(tmp_path / "doctrees")
-    assert build_main([*options, str(DOCS), str(tmp_path / "site")]) == 0

@@ -80,7 +80,7 @@ def export(run: str, kind: str, file: str | None = None) -> Path:
         return path
     with user_errors(f"{path} cannot be written: "):
         path.parent.mkdir(parents=True, exist_ok=True)
-    step = Step(policy, env.obs_space)
+    step = Step(policy, env.obs_space, env.reset().get("mask"))
     write, runner = {
         "onnx": (runtimes.write_onnx, runtimes.run_onnx),
         "torch": (runtimes.write_torch, runtimes.run_torch),

@@ -57,7 +57,7 @@ def add_policy(
         seed: of the actions. Their draws are not PyTorch's.
 
     Raises:
-        UserError: it has a core or an encoder of the user's.
+        UserError: it has a core or an encoder of the user's, or actions of several kinds.
     """
     with torch.no_grad():
         return _Lowering(program, policy, lanes, section, seed).acting()

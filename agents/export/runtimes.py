@@ -15,6 +15,7 @@ from megastep.agents import package
 from megastep.agents.errors import UserError, shortened
 from megastep.agents.export.step import Step
 from megastep.agents.networks.kernels.library import plain_operations
+from megastep.agents.networks.outputs import FORBIDDEN
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
@@ -38,7 +39,8 @@ class Comparison(NamedTuple):
     """How far a file and its policy are apart.
 
     Attributes:
-        difference: largest absolute difference of logits, continuous actions and hidden states.
+        difference: largest absolute difference of logits, continuous actions and hidden states; of
+            logits that a mask forbids only if the other does not. NaN if a number is.
         n_apart: greedy actions that differ though their logits differ by more than that.
         largest: absolute value of the logits and states.
     """
@@ -131,8 +133,7 @@ def compare(step: Step, run: Runner, policy: "Policy", env: Env, n_steps: int = 
     world, state = env.reset(), policy.initial(n_lanes(env))
     own = state.map(torch.clone) if state else state
     generator = torch.Generator().manual_seed(1)
-    difference = largest = 0.0
-    choices = []
+    difference, largest, choices = torch.zeros(()), 0.0, []
     for _ in range(n_steps):
         is_random = torch.rand(len(world["reset"]), generator=generator) < RESETS
         world = arrdict(cast(arrdict, world), reset=world["reset"] | is_random)
@@ -140,22 +141,25 @@ def compare(step: Step, run: Runner, policy: "Policy", env: Env, n_steps: int = 
         actions, logits, own = step.trees(run(step.tensors(world, own)))
         expected = [*leaves(decision["logits"]), *leaves(state)]
         for mine, theirs in zip([*logits, *leaves(own)], expected, strict=True):
-            difference = max(difference, (mine - theirs).abs().max().item())
+            is_allowed = (mine > FORBIDDEN / 2) | (theirs > FORBIDDEN / 2) | mine.isnan()
+            mine, theirs = (leaf.where(is_allowed, 0.0) for leaf in (mine, theirs))
+            difference = difference.maximum((mine - theirs).abs().max())
             largest = max(largest, theirs.abs().max().item())
         for mine, theirs, scores in zip(actions, leaves(decision["actions"]), logits, strict=True):
             if theirs.is_floating_point():
-                difference = max(difference, (mine - theirs).abs().max().item())
+                difference = difference.maximum((mine - theirs).abs().max())
             else:
                 best = scores.topk(2, -1).values if scores.shape[-1] > 1 else scores.new_ones(1, 2)
                 choices.append((mine != theirs, best[..., 0] - best[..., 1]))
         world = env.step(decision)
     n_apart = sum(int((is_other & (gap > 2 * difference)).sum()) for is_other, gap in choices)
-    return Comparison(difference, n_apart, largest)
+    return Comparison(difference.item(), n_apart, largest)
 
 
 def check(path: Path, comparison: Comparison) -> None:
     """Raises UserError if a file acts otherwise than its policy."""
-    if comparison.n_apart or comparison.difference > MAX_DIFFERENCE * max(1, comparison.largest):
+    is_alike = comparison.difference <= MAX_DIFFERENCE * max(1, comparison.largest)  # also if NaN
+    if comparison.n_apart or not is_alike:
         raise UserError(
             f"{path} acts otherwise than its policy: logits differ by {comparison.difference:.2g}, "
             f"and {comparison.n_apart} actions"

@@ -1,8 +1,9 @@
 """One step of a policy as a function of tensors alone, for other runtimes.
 
-B lanes. Inputs in this order: `obs` or `obs.NAME` for each leaf of the observation, `reset`, and
-`state.0`, `state.1`, ... for the leaves of the hidden state. Outputs: `action`, `logits` (or
-`action.NAME`, `logits.NAME`) and `next_state.0`, ...
+B lanes. Inputs in this order: `obs` or `obs.NAME` for each leaf of the observation; `mask` or
+`mask.NAME`, if the environment has action masks; `reset`; and `state.0`, `state.1`, ... for the
+leaves of the hidden state. Outputs: `action`, `logits` (or `action.NAME`, `logits.NAME`) and
+`next_state.0`, ...
 """
 
 from collections.abc import Sequence
@@ -43,14 +44,16 @@ class Step(nn.Module):
     Args:
         policy: the policy, which acts.
         obs_space: its observation space.
+        mask: an action mask of the environment. None: it has none.
 
     Attributes:
         inputs, outputs: the ports, in order.
     """
 
-    def __init__(self, policy: "Policy", obs_space: Space):
+    def __init__(self, policy: "Policy", obs_space: Space, mask: Tree = None):
         super().__init__()
         self.policy, self.obs_space = policy.actor().eval(), obs_space
+        self.masks = {} if mask is None else spaces.leaves(mask)
         self.example = self.tensors(self._world(2), self.policy.initial(2))
         self.inputs = [*map(_port, self._input_names(), self.example)]
         self.outputs = [*map(_port, self._output_names(), self(*self.example))]
@@ -58,10 +61,10 @@ class Step(nn.Module):
     @torch.no_grad()
     def forward(self, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Returns the outputs for the inputs, (B, ...) each."""
-        obs, reset, state = self._trees(tensors)
+        obs, mask, reset, state = self._trees(tensors)
         obs = mapping(torch.unsqueeze)(obs, 0)
         features, state = self.policy._features(obs, reset[None], state)
-        logits = self.policy.output(features[0])
+        logits = self.policy.output.masked(self.policy.output(features[0]), mask)
         actions = self.policy.output.greedy(logits)
         return *leaves(actions), *leaves(logits), *leaves(state)
 
@@ -70,7 +73,8 @@ class Step(nn.Module):
         obs = spaces.leaves(world["obs"])
         values = [obs[path] for path in self.policy.intake.paths]
         values = [leaf.to(FLOAT) if leaf.is_floating_point() else leaf for leaf in values]
-        return *values, world["reset"], *leaves(state)
+        masks = spaces.leaves(world["mask"]) if self.masks else {}
+        return *values, *(masks[path] for path in self.masks), world["reset"], *leaves(state)
 
     def trees(self, outputs: Sequence[torch.Tensor]) -> tuple[list, list, arrdict]:
         """Returns leaves of actions, leaves of logits and the hidden state of outputs."""
@@ -86,21 +90,25 @@ class Step(nn.Module):
             return torch.zeros(n_lanes, *space.shape, dtype=dtype)
 
         reset = torch.ones(n_lanes, dtype=torch.bool)
-        return arrdict(obs=spaces.map(zeros, self.obs_space), reset=reset)
+        masks = {path: leaf.new_ones(n_lanes, *leaf.shape[1:]) for path, leaf in self.masks.items()}
+        obs = spaces.map(zeros, self.obs_space)
+        return arrdict(obs=obs, reset=reset, **({"mask": _nested(masks)} if masks else {}))
 
-    def _trees(self, tensors) -> tuple[Tree, torch.Tensor, arrdict]:
+    def _trees(self, tensors) -> tuple[Tree, Tree, torch.Tensor, arrdict]:
         paths = self.policy.intake.paths
-        n = len(paths)
-        state = _filled(self.policy.initial(1), [*tensors[n + 1 :]])
-        return _nested(dict(zip(paths, tensors[:n]))), tensors[n], state
+        n, end = len(paths), len(paths) + len(self.masks)
+        mask = _nested(dict(zip(self.masks, tensors[n:end]))) if self.masks else None
+        state = _filled(self.policy.initial(1), [*tensors[end + 1 :]])
+        return _nested(dict(zip(paths, tensors[:n]))), mask, tensors[end], state
 
     def _input_names(self) -> list[str]:
-        obs = [f"obs.{path}".rstrip(".") for path in self.policy.intake.paths]
+        parts = [("obs", self.policy.intake.paths), ("mask", self.masks)]
+        names = [f"{kind}.{path}".rstrip(".") for kind, paths in parts for path in paths]
         n_state = len(leaves(self.policy.initial(1)))
-        return [*obs, "reset", *(f"state.{i}" for i in range(n_state))]
+        return [*names, "reset", *(f"state.{i}" for i in range(n_state))]
 
     def _output_names(self) -> list[str]:
-        obs, reset, state = self._trees(self.example)
+        obs, _, _, state = self._trees(self.example)
         logits = self.policy.output(self.policy.intake(mapping(torch.unsqueeze)(obs, 0))[0])
         paths = [*spaces.leaves(logits)]
         names = [f"{kind}.{path}".rstrip(".") for kind in ("action", "logits") for path in paths]

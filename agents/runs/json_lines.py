@@ -70,7 +70,7 @@ def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
     damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]
     if damaged:
         which = f"line {damaged[0]} is" if len(damaged) == 1 else f"lines {', '.join(damaged)} are"
-        warnings.warn(f"{path}: {which} damaged and skipped", stacklevel=4)
+        warnings.warn(f"{path}: {which} damaged and skipped", stacklevel=3)
     return [(row, line) for row, line in rows if row is not None]
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from megastep.adapters.torchrl import TorchRLEnv as TorchRLEnv
     from megastep.adapters.vector_checks import check_vector_env as check_vector_env
 
-#: The module of each name, which is its extra too.
+#: The module of each name, which is its extra too, with hyphens: older pips find no other.
 _MODULES = {
     "SingleEnv": "gymnasium",
     "VectorEnv": "gymnasium",
@@ -39,7 +39,7 @@ def __getattr__(name) -> object:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("megastep"):
             raise
-        extra = "gymnasium" if module == "vector_checks" else module
+        extra = "gymnasium" if module == "vector_checks" else module.replace("_", "-")
         raise ImportError(
             f"megastep.adapters.{name} needs {error.name}, which is not installed: pip install "
             f"'megastep-flatland[{extra}]'"

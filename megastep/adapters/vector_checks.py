@@ -66,7 +66,13 @@ def check_vector_env(
 
     Raises:
         VectorEnvError: if `strict` and there is a fault.
+        TypeError: if it is no vector environment.
     """
+    if not hasattr(env, "num_envs"):
+        raise TypeError(
+            f"check_vector_env takes a gymnasium.vector.VectorEnv, not a {type(env).__name__}; for "
+            "a single environment there is gymnasium.utils.env_checker.check_env"
+        )
     faults: dict[str, str] = {}
     try:
         _Checker(env, faults, seed, n_steps, reuses_buffers).run(

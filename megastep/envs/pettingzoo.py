@@ -6,7 +6,7 @@ They step on the CPU, one after the other, even if the learner is on a GPU. B = 
 import copy
 import importlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -14,11 +14,11 @@ import torch
 from pydantic import Field
 
 from megastep.env_probe import play_parallel, probe
-from megastep.env_values import problem_of_result
+from megastep.env_values import masked_actions, problem_of_result
 from megastep.envs.on_host.env import VectorizedEnv
 from megastep.imports import import_object
 from megastep.settings import checked
-from megastep.sync_envs import CHECKED_STEPS, BadValue, close_all
+from megastep.sync_envs import CHECKED_STEPS, BadValue, allowed_actions, close_all
 from megastep.types import Tree
 from megastep.wrapper_state import WrappedEnvs, wrapper_state
 
@@ -38,7 +38,8 @@ class PettingZoo(VectorizedEnv):
         that is not there is its last one.
 
     Actions:
-        As those of Gymnasium, for each agent.
+        As those of Gymnasium, for each agent, with its mask in its ``info["action_mask"]`` or as
+        the part ``action_mask`` of its observation.
 
     Reward:
         The environment's own. 0 for an agent that is not there.
@@ -137,7 +138,7 @@ class ParallelEnvs(WrappedEnvs):
         self.envs = [make_one() for _ in range(n_envs)]
         self.render_mode, env = kwargs.get("render_mode"), self.envs[0]
         self.agents, self.metadata = list(env.possible_agents), env.metadata
-        env.reset()
+        first = env.reset()
         self.single_observation_space = self._common(env.observation_space)
         self.single_action_space = self._common(env.action_space)
         n_lanes = n_envs * len(self.agents)
@@ -145,6 +146,10 @@ class ParallelEnvs(WrappedEnvs):
         self.batch = create_empty_array(self.single_observation_space, n_lanes)
         lanes = batch_space(self.single_observation_space, n_lanes)
         self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]  # observations
+        masks = _masks(*first) if isinstance(first, tuple) and len(first) == 2 else {}
+        numbers = (masked_actions(self.single_action_space, info) for info in masks.values())
+        self.n_masked = min(numbers, default=0)
+        self.masks = np.ones((n_lanes, max(0, self.n_masked)), bool)
         shape = n_envs, len(self.agents)
         self.reward, self.present = np.zeros(shape), np.zeros(shape, bool)
         self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
@@ -164,7 +169,7 @@ class ParallelEnvs(WrappedEnvs):
     def reset(self, *, seed: list[int] | None = None) -> tuple[Tree, dict]:
         for e in range(len(self.envs)):
             self._begin(e, seed and seed[e])
-        return self._observations(), {"present": self.present.ravel()}
+        return self._observations(), self._news()
 
     def step(self, actions: Tree) -> tuple:
         from gymnasium.vector.utils import iterate
@@ -177,10 +182,7 @@ class ParallelEnvs(WrappedEnvs):
             else:
                 self._begin(e)
         flags = self.terminated.ravel(), self.truncated.ravel()
-        return (
-            *(self._observations(), self.reward.ravel(), *flags),
-            {"present": self.present.ravel()},
-        )
+        return self._observations(), self.reward.ravel(), *flags, self._news()
 
     def render(self) -> list[np.ndarray]:
         return [env.render() for env in self.envs]
@@ -189,8 +191,8 @@ class ParallelEnvs(WrappedEnvs):
         close_all(self.envs)
 
     def _begin(self, e, seed=None) -> None:
-        observed = self._checked(e, "reset", self.envs[e].reset(seed=seed))[0]
-        self._observe(e, observed)
+        observed, infos = self._checked(e, "reset", self.envs[e].reset(seed=seed))
+        self._observe(e, observed, infos)
         for flags in (self.reward, self.terminated, self.truncated):
             flags[e] = 0
         agents = self.envs[e].agents
@@ -198,8 +200,9 @@ class ParallelEnvs(WrappedEnvs):
 
     def _step(self, e, actions) -> None:
         env = self.envs[e]
-        observed, rewards, terminated, truncated, _ = self._checked(e, "step", env.step(actions))
-        self._observe(e, observed)
+        result = self._checked(e, "step", env.step(actions))
+        observed, rewards, terminated, truncated, infos = result
+        self._observe(e, observed, infos)
         for a, agent in enumerate(self.agents):
             was_present = self.present[e, a]
             ends, cut = (
@@ -223,15 +226,33 @@ class ParallelEnvs(WrappedEnvs):
             raise BadValue.of(problem, f"environment {e}")
         return result
 
-    def _observe(self, e, observed) -> None:
-        for a, agent in enumerate(self.agents):
+    def _observe(self, e, observed, infos) -> None:
+        masks = _masks(observed, infos) if self.n_masked > 0 else {}
+        for a, agent in enumerate(self.agents, e * len(self.agents)):
             if agent in observed:
-                self.latest[e * len(self.agents) + a] = observed[agent]
+                self.latest[a] = observed[agent]
+            if self.n_masked > 0:
+                place = f"environment {e}, {agent}"
+                self.masks[a] = allowed_actions(masks.get(agent, {}), self.n_masked, place)
+
+    def _news(self) -> dict[str, np.ndarray]:
+        news = {"present": self.present.ravel()}
+        return {**news, "masks": self.masks.copy()} if self.n_masked > 0 else news
 
     def _observations(self) -> np.ndarray | dict | tuple:
         from gymnasium.vector.utils import concatenate
 
         return concatenate(self.single_observation_space, self.latest, self.batch)
+
+
+def _masks(observed, infos) -> dict[str, Mapping]:
+    """Returns what has the action mask of each agent that has one: its info or its observation."""
+    found = {}
+    for part in (observed, infos):
+        for agent, one in part.items() if isinstance(part, Mapping) else ():
+            if isinstance(one, Mapping) and "action_mask" in one:
+                found[agent] = one
+    return found
 
 
 def _parallel(env) -> Any:

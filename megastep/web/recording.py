@@ -9,6 +9,7 @@ import contextlib
 import ctypes
 import gc
 import struct
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from megastep.arrdict import arrdict
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import observed
 from megastep.spaces import random_actions
-from megastep.types import Env, World, n_lanes
+from megastep.types import Env, World, n_lanes, optional
 from megastep.web.program import Buffer, Launch, Leaf, Program, Ref, Replay
 
 __all__ = ["record"]
@@ -63,11 +64,13 @@ class Memory:
 
     def scan(self) -> None:
         """Adds all tensors of the process."""
-        for one in gc.get_objects():
-            if issubclass(type(one), torch.Tensor):
-                with contextlib.suppress(RuntimeError, NotImplementedError):  # without memory
-                    if one.device.type == "cpu":
-                        self.add(one)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of tensors that an exporter has left, without memory
+            for one in gc.get_objects():
+                if issubclass(type(one), torch.Tensor):
+                    with contextlib.suppress(RuntimeError, NotImplementedError):  # without memory
+                        if one.device.type == "cpu":
+                            self.add(one)
 
     def contents(self, start: int) -> bytes:
         """Returns what a storage holds."""
@@ -229,6 +232,8 @@ def record(env: Env) -> Program:
     recorder, generator = Recorder(env), torch.Generator().manual_seed(1)
     if isinstance(env.action_space, dict):
         raise ValueError(f"{recorder.name} cannot be exported: it takes several actions at once")
+    if not optional(env, "capturable"):
+        raise ValueError(f"{recorder.name} cannot be exported: it steps in Python, not by kernels")
 
     def draw() -> torch.Tensor:
         return random_actions(env.action_space, n_lanes(env), generator=generator)
@@ -237,6 +242,8 @@ def record(env: Env) -> Program:
     recorder.use(recorder.memory.add(actions))
     decision = arrdict(actions=actions)
     reset, first = recorder.run(env.reset)
+    if any(path.partition(".")[0] == "mask" for path in first):
+        raise ValueError(f"{recorder.name} cannot be exported: a page has no action masks")
     recorder.refuse(reset, first, True)
     expected = [snapshot(recorder, first, {})]
     step, leaves = recorder.run(lambda: env.step(decision))

@@ -1,10 +1,11 @@
 """Benchmark of environments in other libraries: `adapters`."""
 
+import statistics
 from collections.abc import Iterator
 
 import torch
 from random_walks import N_HOMES
-from timing import rate, seconds_per_call
+from timing import measurement, rate, seconds_per_call
 
 from megastep import adapters as adapting
 from megastep import contract, envs
@@ -19,7 +20,8 @@ N_DECISIONS = 32  # taken in turn
 def adapters(device: torch.device) -> Iterator[dict]:
     """Frames per second of Explorer, with metrics, by `env.step` as a CUDA graph, and by the steps
     of `megastep.adapters.VectorEnv` with the same actions: tensors in the three modes of autoreset,
-    copied or not, and arrays. "With resets", a masked reset follows each step.
+    copied or not, and arrays, also as a share of the former. "With resets", a masked reset follows
+    each step.
     """
     for n_envs in N_ENVS[device.type]:
         homes = sample("bench", N_HOMES)
@@ -37,10 +39,15 @@ def adapters(device: torch.device) -> Iterator[dict]:
             native.step(arrdict(actions=actions[i % N_DECISIONS]))
 
         what = f"explorer, {n_envs:,} environments"
-        yield rate(f"{what}, native", n_envs, seconds_per_call(numbered(step), device))
+        whole = seconds_per_call(numbered(step), device)
+        yield rate(f"{what}, native", n_envs, whole)
         for name, settings in (
             ("NEXT_STEP, tensors", dict(autoreset_mode="next_step", to_numpy=False)),
             ("NEXT_STEP, tensors, copy=False", dict(to_numpy=False, copy=False)),
+            (
+                "DISABLED, tensors, copy=False",
+                dict(autoreset_mode="disabled", to_numpy=False, copy=False),
+            ),
             ("DISABLED, tensors", dict(autoreset_mode="disabled", to_numpy=False)),
             ("DISABLED, tensors, with resets", dict(autoreset_mode="disabled", to_numpy=False)),
             ("SAME_STEP, tensors", dict(autoreset_mode="same_step", to_numpy=False)),
@@ -57,7 +64,10 @@ def adapters(device: torch.device) -> Iterator[dict]:
                 if resets:
                     vector.reset(options={"reset_mask": terminated | truncated})
 
-            yield rate(f"{what}, {name}", n_envs, seconds_per_call(numbered(take_step), device))
+            seconds = seconds_per_call(numbered(take_step), device)
+            yield rate(f"{what}, {name}", n_envs, seconds)
+            shares = [100 * statistics.median(whole) / one for one in seconds]
+            yield measurement(f"{what}, {name}: of native", "%", shares)
 
 
 def numbered(function):

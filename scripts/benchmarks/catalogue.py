@@ -11,6 +11,7 @@ from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
 from exported_agents import exported
 from films import films
+from libraries import libraries
 from nsight_counters import counters
 from peers import peers
 from population_benchmarks import league, members, memory_search, search, small_members
@@ -32,6 +33,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "deathmatch": deathmatch,
     "memory": memory,
     "adapters": adapters,
+    "libraries": libraries,
     "replay": replay,
     "pong": pong,
     "paths": paths,

@@ -23,6 +23,7 @@ ROWS = paths.ROOT / "agents" / "cli" / "reproductions.yaml"
 AGENTS = paths.ROOT / "agents" / "pretrained"
 #: The pages that quote: all but the lab notes, which are the evidence.
 PAGES = [paths.ROOT / "README.md", *sorted((paths.ROOT / "docs").glob("*.md"))]
+PAGES += sorted((paths.ROOT / "docs/concepts").glob("*.md"))
 MARKED = re.compile(r"(<!-- quote: ([\w-]+) -->)(.*?)(<!-- end -->)", re.S)
 
 
@@ -89,21 +90,23 @@ def _formatted(what, card, form):
     """Returns the text about the newest records whose name is `what`, a regular expression.
 
     `form` has `{value}`, the median of their values; `{low}`, `{high}` and `{n}` of them; `{lower}`
-    and `{upper}`, the interval of a single one; `{on}`, `{commit}` and `{date}`. By unit, if it is
-    a dict.
+    and `{upper}`, the interval of a single one, and `{half}` of it; `{on}`, `{commit}` and
+    `{date}`. By unit, if it is a dict.
     """
     found = [r for r in _newest() if re.fullmatch(what, r["what"]) and r["on"].startswith(card)]
     if not found:
         raise ValueError(f"no record of {what!r} on {card}")
     form = form if isinstance(form, str) else form[found[0]["unit"]]
     values, commits = [r["value"] for r in found], dict.fromkeys(r["commit"][:7] for r in found)
+    lower, upper = found[0]["lower"], found[0]["upper"]
     return form.format(
         value=statistics.median(values),
         low=min(values),
         high=max(values),
         n=len(values),
-        lower=found[0]["lower"],
-        upper=found[0]["upper"],
+        lower=lower,
+        upper=upper,
+        half=None if lower is None else (upper - lower) / 2,
         on=found[0]["on"],
         commit=", ".join(commits),
         date=max(r["date"] for r in found),

@@ -128,6 +128,16 @@ def main(folder):
         draw(folder)
 
 
+def curved_house():
+    """Returns the geometry of the house with a round room."""
+    from megastep.geometries.plans import imports
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "curved.svg")
+        path.write_text(curved())
+        return imports.own_svg(path, scale=1.0).geometry
+
+
 def sheet(path):
     """Draws the six plans beside what they become, into an image."""
     from megastep.geometries.plans import imports, sheets

@@ -1,6 +1,6 @@
 """Trains with other libraries on megastep's environments, and compares with random actions.
 
-    pip install 'megastep-flatland[sb3,torchrl,rsl_rl,skrl]'
+    pip install 'megastep-flatland[sb3,torchrl,rsl-rl,skrl]'
     python scripts/examples/other_libraries.py sb3 sb3_recurrent torchrl rsl_rl skrl gymnasium
     python scripts/examples/other_libraries.py rsl_rl --device cuda --scale 10
 

@@ -254,6 +254,11 @@ def test_tensors_that_are_not_copied_are_named_unless_announced():
     assert check_vector_env(env, reuses_buffers=True) == []
 
 
+def test_a_single_environment_is_told_where_to_go():
+    with pytest.raises(TypeError, match="VectorEnv, not a TimeLimit; for a single"):
+        check_vector_env(gymnasium.make("CartPole-v1"))
+
+
 def test_the_file_runs_when_copied_alone(tmp_path):
     shutil.copy(pathlib.Path(vector_checks.__file__), tmp_path)
     code = "import gymnasium, vector_checks as v; e = gymnasium.make_vec('CartPole-v1', 2); "

@@ -247,6 +247,10 @@ def test_wrong_spaces_and_environments_are_named():
     with pytest.raises(ValueError, match="obs is MultiDiscrete.*, and not MultiImage or MultiVec"):
         FrameStack(Integers())
     with pytest.raises(
+        ValueError, match="env: int is not an Env: it has no n_envs, device, obs_sp"
+    ):
+        TimeLimit(3, n=3)
+    with pytest.raises(
         ValueError, match="TimeLimit begins episodes .* needs reset.seed=None, mask"
     ):
         TimeLimit(Old(), n=3)
@@ -292,3 +296,12 @@ def test_code_and_commands_of_the_page_work(here, monkeypatch):
             more = ("learner.n_minibatches=2",)
             more += () if "env=gymnasium" in words else ("geometry=box", "env.res=16")
             assert train.main([*words, *small, *more]) == 0, words
+        from my_wrappers import PaidTurns  # pyright: ignore[reportMissingImports]
+
+        plain, paid = (envs.explorer.Explorer(4, [toys.box()], device="cpu") for _ in range(2))
+        paid = PaidTurns(paid, cost=0.25)
+        plain.reset(), paid.reset()
+        for action, cost in ((5, 0.25), (3, 0.0), (6, 0.25)):
+            taken = arrdict(actions=torch.full((4, 1), action))
+            difference = plain.step(taken).reward - paid.step(taken).reward
+            torch.testing.assert_close(difference, torch.full((4,), cost))

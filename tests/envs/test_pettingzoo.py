@@ -16,6 +16,7 @@ from megastep.agents.evaluation import playing, statistics
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from megastep.envs import PettingZoo
+from megastep.sync_envs import BadValue
 
 spaces = pytest.importorskip("gymnasium.spaces")
 
@@ -249,6 +250,66 @@ def test_agents_that_differ_or_act_in_turns_are_refused():
 class Free(Relay):
     def step(self, actions):
         return super().step({agent: self.possible_agents.index(agent) for agent in actions})
+
+
+class Forbids(Relay):
+    """Raises for forbidden actions. The mask is in `info` or, with `seen`, in the observation; the
+    second agent has none after a step.
+    """
+
+    def __init__(self, seen=False, n=4):
+        super().__init__()
+        self.seen, self.n, self.random = seen, n, np.random.default_rng(1)
+
+    def observation_space(self, agent):
+        place, mask = super().observation_space(agent), spaces.Box(0, 1, (self.n,), np.int8)
+        return spaces.Dict(place=place, action_mask=mask) if self.seen else place
+
+    def drawn(self, places):
+        self.masks = {agent: self.random.integers(0, 2, self.n, np.int8) for agent in places}
+        for mask in self.masks.values():
+            mask[self.random.integers(self.n)] = 1
+        if self.count and not self.seen:
+            self.masks.pop("two", None)
+        masks = {agent: dict(action_mask=mask) for agent, mask in self.masks.items()}
+        if self.seen:
+            return {agent: masks[agent] | dict(place=place) for agent, place in places.items()}, {}
+        return places, masks
+
+    def reset(self, seed=None, options=None):
+        return self.drawn(super().reset()[0])
+
+    def step(self, actions):
+        for agent, action in actions.items():
+            if agent in self.masks and not self.masks[agent][action]:
+                raise ValueError(f"{action} is forbidden by {self.masks[agent]}")
+        indices = {agent: self.possible_agents.index(agent) for agent in actions}
+        places, *others, _ = super().step(indices)
+        places, infos = self.drawn(places)
+        return places, *others, infos
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_masks_reach_training_and_evaluation(seen, here):
+    name = f"{__name__}:Forbids"
+    env = PettingZoo(2, id=name, kwargs={"seen": seen}, device="cpu")
+    assert contract.rollout(env, 9)[0].mask.shape == (6, 1, 4)
+    words = [
+        *("env=pettingzoo", f"env.id={name}", f"env.kwargs.seen={seen}", "env.n_envs=4"),
+        *("learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8", "samples=960"),
+    ]
+    assert train.main([*words, "folder=run", "device=cpu"]) == 0
+    assert evaluate.main(["run=run", "episodes=4", "baseline=random"]) == 0
+
+
+def test_a_mask_that_does_not_fit_is_a_sentence():
+    with pytest.warns(UserWarning, match=r"Forbids: info\['action_mask'\] is not used"):
+        env = PettingZoo(1, id=f"{__name__}:Forbids", kwargs={"n": 5}, device="cpu")
+    assert "mask" not in env.reset()
+    env = PettingZoo(1, id=f"{__name__}:Forbids", device="cpu")
+    env.vector.envs[0].n = 5
+    with pytest.raises(BadValue, match=r"environment 0, one: .* \(5,\), and before it had \(4"):
+        env.reset()
 
 
 def test_trains_and_evaluates(tmp_path, monkeypatch):

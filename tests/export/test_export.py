@@ -24,22 +24,25 @@ IMAGE, VECTOR = spaces.MultiImage(1, 3, 1, 64), spaces.MultiVector(1, 3)
 MANY = {"rgb": IMAGE, "self": {"imu": VECTOR, "id": spaces.MultiDiscrete(2, 4)}}
 MOVES = {"move": spaces.MultiDiscrete(2, 7), "say": spaces.MultiDiscrete(1, 3)}
 BOUNDED = spaces.MultiContinuous(1, 2, -2.0, (1.0, 3.0))
-#: Every core, output and encoder: spaces, and settings of the policy.
+#: Every core, output and encoder: spaces, and settings of the policy. In the last two, with masks.
 KINDS = {
     "lstm": (MANY, MOVES, {}),
     "gru": (IMAGE, BOUNDED, dict(core="gru", encoder="conv")),
     "mingru": (MANY, BOUNDED, dict(core="mingru", layers=2, continuous="beta", encoder="cnn")),
     "none": (VECTOR, spaces.MultiDiscrete(1, 5), dict(core="none", output="duelling")),
+    "masked": (VECTOR, MOVES, dict(core="gru")),
 }
+MASKED = {"none": spaces.MultiDiscrete(1, 5), "masked": {"move": MOVES["move"]}}
 
 
 class Noise:
-    """Lanes that observe noise, and whose episodes end now and then."""
+    """Lanes that observe noise, may take some actions, and whose episodes end now and then."""
 
     n_envs, device = 3, "cpu"
 
-    def __init__(self, obs_space):
-        self.obs_space, self.generator = obs_space, torch.Generator().manual_seed(1)
+    def __init__(self, obs_space, masked=None):
+        self.obs_space, self.masked = obs_space, masked
+        self.generator = torch.Generator().manual_seed(1)
 
     def reset(self):
         return self.step(None)
@@ -51,20 +54,35 @@ class Noise:
                 return torch.randint(space.n_actions, shape, generator=self.generator)
             return 3 * torch.randn(self.n_envs, *space.shape, generator=self.generator) + 1
 
+        def allow(space):
+            shape = self.n_envs, *space.shape, space.n_actions
+            mask = torch.rand(shape, generator=self.generator) < 0.5
+            return mask | ~mask.any(-1, keepdim=True)
+
         reset = torch.rand(self.n_envs, generator=self.generator) < 0.05
-        return arrdict(obs=spaces.map(draw, self.obs_space), reset=reset)
+        world = arrdict(obs=spaces.map(draw, self.obs_space), reset=reset)
+        if self.masked is not None:
+            world["mask"] = spaces.map(allow, self.masked)
+            if decision is not None:
+                masks = spaces.leaves(self.mask)
+                for path, actions in spaces.leaves(decision["actions"]).items():
+                    if path in masks:
+                        assert masks[path].gather(-1, actions[..., None]).all()
+            self.mask = world["mask"]
+        return world
 
 
 def made(kind):
     """Returns a policy with weights that matter and statistics, and the step it exports."""
     obs_space, action_space, options = KINDS[kind]
-    policy, env = Policy(obs_space, action_space, width=32, **options), Noise(obs_space)
+    policy = Policy(obs_space, action_space, width=32, **options)
+    env = Noise(obs_space, MASKED.get(kind))
     for _ in range(3):
         policy.update_stats(env.step(None)["obs"])
     with torch.no_grad():
         for weight in policy.output.parameters():
             weight.mul_(20)
-    return policy, env, Step(policy, obs_space)
+    return policy, env, Step(policy, obs_space, env.reset().get("mask"))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -90,6 +108,8 @@ def test_ports_are_named_after_the_spaces():
     assert step.inputs[2] == ("obs.self.id", (2,), "int64")
     assert step.outputs[2] == ("logits.move", (2, 7), "float32")
     assert [port.name for port in made("none")[2].outputs] == ["action", "logits"]
+    assert [port.name for port in made("none")[2].inputs] == ["obs", "mask", "reset"]
+    assert made("masked")[2].inputs[1] == ("mask.move", (2, 7), "bool")
 
 
 def test_comparisons_see_a_hidden_state_that_is_never_reset():
@@ -104,10 +124,28 @@ def test_comparisons_see_a_hidden_state_that_is_never_reset():
         runtimes.check(Path("x.onnx"), found)
 
 
+def test_comparisons_see_a_mask_that_is_not_used_and_a_number_that_is_none():
+    policy, env, step = made("masked")
+
+    def unmasked(inputs):
+        obs, mask, *others = inputs
+        return step(obs, torch.ones_like(mask), *others)
+
+    def broken(inputs):
+        return [leaf / 0 if leaf.is_floating_point() else leaf for leaf in step(*inputs)]
+
+    for run in unmasked, broken:
+        found = runtimes.compare(step, run, policy, env, n_steps=20)
+        with pytest.raises(UserError, match="acts otherwise than its policy"):
+            runtimes.check(Path("x.onnx"), found)
+
+
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(kind, marks=pytest.mark.slow if kind == "lstm" else pytest.mark.nightly)
+        pytest.param(
+            kind, marks=pytest.mark.slow if kind in ("lstm", "masked") else pytest.mark.nightly
+        )
         for kind in KINDS
     ],
 )

@@ -100,8 +100,9 @@ def test_damaged_line_is_named_and_skipped(tmp_path, damage):
     parts = lines(5).split(b"\n")
     parts[2] = damage
     path.write_bytes(b"\n".join(parts))
-    with pytest.warns(UserWarning, match="metrics.jsonl: line 3 .*skipped"):
+    with pytest.warns(UserWarning, match="metrics.jsonl: line 3 .*skipped") as caught:
         assert [row["samples"] for row in json_lines.read(path)] == [0, 1, 3, 4]
+    assert caught[0].filename == __file__, "the line that reads is the one that is shown"
     with pytest.warns(UserWarning, match="line 3"):
         run_loggers = Loggers(tmp_path, step=3)
     run_loggers.write(9, {}, {})

@@ -86,6 +86,22 @@ def test_several_actions_and_no_kernels_are_refused():
         record(env)
 
 
+class Masked(envs.Pong):
+    """Allows some actions."""
+
+    def reset(self):
+        return arrdict(super().reset(), mask=torch.ones(2, 1, 3, dtype=torch.bool))
+
+
+def test_masks_and_environments_in_python_are_refused():
+    with pytest.raises(ValueError, match="Masked cannot be exported: a page has no action masks"):
+        record(Masked(2, device="cpu"))
+    pytest.importorskip("gymnasium")
+    env = envs.Gymnasium(2, id="CartPole-v1", device="cpu")
+    with pytest.raises(ValueError, match="Gymnasium cannot be exported: it steps in Python"):
+        record(env)
+
+
 def test_homes_have_outlines():
     from megastep.plotting.plans import room_outlines
 

@@ -43,7 +43,7 @@ class VectorizedEnv:
             Gymnasium's vector environments do, with a row per lane. If it has ``names``, the last
             part of a result is as that of :class:`~megastep.sync_envs.SyncEnvs`; if it has
             ``present``, that is a dict with ``present``, (B,) bool, the lanes whose next action is
-            used.
+            used. If ``n_masked`` is above 0, it has ``masks``, (B, n_masked) bool.
         n_envs: number of environments, N.
         n_agents: lanes per environment, A.
         seeds: passed to the first ``vector.reset``, one per environment or one for all.
@@ -95,10 +95,16 @@ class VectorizedEnv:
             name: (key, np.zeros(n_lanes, np.float32))
             for name, key in zip(identifiers(names, reserved), names)
         }
+        if (n_masked := getattr(vector, "n_masked", 0)) < 0:
+            warnings.warn(
+                f"{id}: info['action_mask'] is not used: it must be a number per action of a "
+                "Discrete space",
+                stacklevel=3,
+            )
         self._buffers = HostBuffers(
             *(n_lanes, self.obs_space, self.action_space, self.device, [*self._metrics]),
             flags=(*FLAGS, *["learns"] * hasattr(vector, "present")),
-            n_masked=getattr(vector, "n_masked", 0),
+            n_masked=max(0, n_masked),
         )
         self._ended = np.ones(n_lanes, bool)
         self._n_restarts = np.zeros(1, np.int64)  # an array, so that checkpoints hold it
@@ -274,7 +280,7 @@ class VectorizedEnv:
             world["learns"] = present.copy()
         if self._metrics:
             world["metrics"] = arrdict({name: of[1] for name, of in self._metrics.items()})
-        if getattr(self.vector, "n_masked", 0):
+        if getattr(self.vector, "n_masked", 0) > 0:
             world["mask"] = news["masks"][:, None]
         return self._buffers.send(world)
 
