@@ -9,7 +9,8 @@ from megastep.types import n_lanes, optional
 
 
 def show(cfg: settings.Train) -> None:
-    """Prints environments, lanes and batch sizes, per rank and in total. Writes no file.
+    """Prints environments, lanes and batch sizes, per rank or per member of a population, and in
+    total. Writes no file.
 
     A machine without a GPU, such as a login node, tells the sizes of `device=cuda`, too.
     """
@@ -17,13 +18,16 @@ def show(cfg: settings.Train) -> None:
     is_elsewhere = cfg.device.startswith("cuda") and not gpu.is_available()
     device = factory.make_device("cpu" if is_elsewhere else cfg.device)
     kind = "cuda" if is_elsewhere else device.type
-    names = ["", "per rank", "in total"] if n_ranks > 1 else ["", "in total"]
+    n_members = cfg.population.size
+    n, part = (n_members, "per member") if n_members > 1 else (n_ranks, "per rank")
+    names = ["", part, "in total"] if n > 1 else ["", "in total"]
     rows = [
-        [name, *(f"{number * factor:,}" for factor in {1: None, n_ranks: None})]
+        [name, *(f"{number * factor:,}" for factor in {1: None, n: None})]
         for name, number in sizes(cfg, device).items()
     ]
+    members = f" {n_members} members" if n_members > 1 else ""
     ranks = f"{n_ranks} x " if n_ranks > 1 else ""
-    console.say(f"Would train on {ranks}{kind}:\n{console.table(names, rows)}")
+    console.say(f"Would train{members} on {ranks}{kind}:\n{console.table(names, rows)}")
 
 
 def sizes(cfg: settings.Train, device) -> dict[str, int]:

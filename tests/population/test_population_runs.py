@@ -135,24 +135,51 @@ def test_killed_and_interrupted_population_has_the_same_bits(here, monkeypatch, 
     assert "bit for bit" not in capsys.readouterr().out
 
 
-def test_settings_of_a_lineage_are_a_schedule_for_one_agent(here):
-    """The best member's, which here never copied: the same bits as its own."""
-    run(*POPULATION, LONG)
-    path = here / "P" / populations.FILE
-    timetable = populations.schedule(path)
+def replayed(here, root, folder):
+    """Trains one agent with the settings over time of the best member of a population, from the
+    seed of its first ancestor. Returns the members of the line, and the samples of each generation.
+    """
+    path = here / root / populations.FILE
     generations = populations.read(path)
-    assert [samples for samples, _ in timetable] == [rows[0]["samples"] for rows in generations]
-    scores = {row["from"]: generations[-1][int(row["from"])]["score"] for row in generations[-1]}
-    best = [row["from"] for row in generations[-1]].index(max(scores, key=scores.__getitem__))
-    line = populations.lineage(generations, best)
-    assert timetable == [
-        (rows[0]["samples"], populations.settings_of(rows[n])) for rows, n in zip(generations, line)
-    ]
-    run(*SMALL, "samples=512", f"population.schedule={path}", "folder=one", "log_every=1")
-    config = yaml.safe_load((here / f"P/member-{line[0]}/config.yaml").read_text())
-    row = json_lines.read(here / "one/metrics.jsonl")[0]
-    fraction = 1 - 0 / 512
-    assert row["lr"] == pytest.approx(config["learner"]["lr"] * fraction, rel=1e-6)
+    samples = [rows[0]["samples"] for rows in generations]
+    timetable = populations.schedule(path)
+    assert [n for n, _ in timetable] == samples
+    of_members = [populations.lineage(generations, member) for member in range(3)]
+    line = next(
+        line
+        for line in of_members
+        if [of for _, of in timetable]
+        == [populations.settings_of(rows[m]) for rows, m in zip(generations, line)]
+    )
+    config = yaml.safe_load((here / f"{root}/member-{line[0]}/config.yaml").read_text())
+    run(*SMALL, LONG, f"population.schedule={path}", f"folder={folder}", f"seed={config['seed']}")
+    return line, samples
+
+
+def test_replay_of_a_lineage_without_copies_has_the_bits_of_its_member(here):
+    run(*POPULATION, LONG, "population.every=1e9")
+    line, _ = replayed(here, "P", "one")
+    member = here / f"P/member-{line[0]}"
+    assert (member / "metrics.jsonl").read_bytes() == (here / "one/metrics.jsonl").read_bytes()
+    states = [state(folder) for folder in ("one", member)]
+    assert differences(*states) == []
+
+
+def test_replay_of_a_lineage_has_its_bits_until_the_first_copy_and_its_settings_to_the_end(here):
+    """What an ancestor's rollouts and random numbers were after that, no single agent has."""
+    run(*POPULATION, LONG)
+    line, samples = replayed(here, "P", "one")
+    rows = json_lines.read(here / "one/metrics.jsonl")
+    own = [json_lines.read(here / f"P/member-{n}/metrics.jsonl") for n in range(3)]
+    copied = [n for n, m, after in zip(samples[1:], line, line[1:]) if m != after]
+    assert copied and 0 < copied[0] < 5120
+    alike = [row for row in rows if row["samples"] <= copied[0]]
+    assert alike == [row for row in own[line[0]] if row["samples"] <= copied[0]]
+    assert rows != own[line[-1]]
+    for i, row in enumerate(rows):
+        # settings of a generation hold from the update after it
+        member = [m for n, m in zip(samples, line) if n < row["samples"]][-1]
+        assert row["lr"] == own[member][i]["lr"], row["samples"]
 
 
 def test_a_member_that_diverges_is_replaced_and_named(here, capsys):
@@ -285,7 +312,7 @@ def test_population_that_is_killed_at_random_moments_has_the_same_bits(here, n_k
     """By SIGKILL: every third time whenever it starts, otherwise after it has saved, in whatever it
     does then.
     """
-    words = [*POPULATION, f"samples={2048 * n_kills}", "device=cpu"]
+    words = [*POPULATION, f"samples={1024 * n_kills}", "device=cpu"]
     run(*words)
     shutil.move("P", "left-alone")
     generator, n_killed, seen = random.Random(1), 0, set()
