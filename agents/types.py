@@ -285,11 +285,15 @@ class OpponentPool(Protocol):
         """Replaces the oldest snapshot by the policy if it is time to."""
 
     def is_due(self, n_updates: int) -> bool:
-        """Returns whether `refresh_rivals` replaces one after so many updates."""
+        """Returns whether `refresh_rival` replaces one after so many updates."""
         ...
 
-    def refresh_rivals(self, policies: Sequence[Actor], n_updates: int) -> None:
-        """Replaces the oldest snapshot of another member by one of these if it is time to."""
+    def next_rival(self, member: int, size: int, n_updates: int) -> int:
+        """Returns the member of a population whose policy is next."""
+        ...
+
+    def refresh_rival(self, policy: Actor, n_updates: int) -> None:
+        """Replaces the oldest snapshot of another member by this policy."""
 
     def pop_win_rates(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]

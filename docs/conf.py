@@ -27,8 +27,15 @@ project = "megastep"
 author = copyright = "the megastep authors"
 release = version = package.version().split()[-1]
 
-extensions = ["myst_parser", "sphinx.ext.linkcode"]
+extensions = ["myst_nb", "sphinx.ext.linkcode"]
 exclude_patterns = ["_build", "play"]
+# Notebooks run in an empty folder, with the package of this repository.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_execution_timeout = 600  # seconds a cell
+nb_merge_streams = True
+os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 suppress_warnings = ["misc.highlighting_failure"]
@@ -63,6 +70,8 @@ def prepare(app, name, source):
         return f"[{match[1]}]({url})" if REPOSITORY else match[1]
 
     text = reference.expand(source[0])
+    if name.startswith("notebooks/"):
+        text += f"\n{{nb-download}}`{name.rpartition('/')[2]}.ipynb` holds this page as it ran.\n"
     if name == "decisions/README":  # a page for each, which its own links lead to
         text += "\n```{toctree}\n:hidden:\n:glob:\n\n*\n```\n"
     source[0] = re.sub(r"\[([^\]]*)\]\((?!\w+:|#)([^)\s]+)\)", linked, text)

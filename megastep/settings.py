@@ -17,7 +17,7 @@ import math
 import numbers
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import annotated_types
 import pydantic.dataclasses
@@ -183,11 +183,26 @@ def settings_class(name: str, fields: Mapping[str, tuple], is_finite: bool = Tru
 
 def _field(hint, default) -> tuple:
     """Returns (type,) or (type, default) of an argument."""
+    if getattr(hint, "_is_protocol", False):
+        hint = Annotated[Any, pydantic.AfterValidator(functools.partial(_has_members, hint))]
     if default is inspect.Parameter.empty:
         return (Any if hint is None else hint,)
     if hint is None:
         hint = Any if default is None else type(default)
     return hint, default
+
+
+def _has_members(protocol, value) -> object:
+    """Returns a value that has all members of a protocol; ValueError otherwise. From Python 3.12
+    `isinstance` does not see those that a wrapper has by `__getattr__`.
+    """
+    members = {**protocol.__annotations__, **vars(protocol)}
+    absent = [name for name in members if not name.startswith("_") and not hasattr(value, name)]
+    if absent:
+        raise ValueError(
+            f"{type(value).__name__} is not an {protocol.__name__}: it has no {', '.join(absent)}"
+        )
+    return value
 
 
 def _class(name, fields) -> type:

@@ -12,7 +12,7 @@ from megastep import envs
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
-NAMES = "lab", "decisions", "reference", "tutorials", "concepts"
+NAMES = "lab", "decisions", "reference", "tutorials", "notebooks", "concepts"
 FOLDERS = DOCS, *(DOCS / name for name in NAMES)
 PAGES = [page for folder in (ROOT, *FOLDERS) for page in folder.glob("*.md")]
 # Commands that need a run, or files that a reader writes, are not composed here.

@@ -4,6 +4,7 @@ reader types it. A tutorial ends with a picture or a film.
 
 import importlib
 import re
+import shlex
 
 import pytest
 import torch
@@ -19,9 +20,9 @@ CONCEPTS = sorted(
     if "```python" in page.read_text()
 )
 #: Pages that take more than about three seconds on an idle core.
-LONG = {"deathmatch.md", "explorer.md", "from-python.md"}
+LONG = {"deathmatch.md", "explorer.md", "from-python.md", "own-floor-plans.md", "scaling-out.md"}
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\w*)\n(.*?)```", re.S)
-FILE = re.compile(r"(?:#|//) (\S+\.(?:py|h|cpp|cu))\n")
+FILE = re.compile(r"(?:#|//|<!--) (\S+\.(?:py|h|cpp|cu|svg))(?: -->)?\n")
 PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"
 TIERS = {True: pytest.mark.nightly, False: pytest.mark.slow}
 
@@ -41,10 +42,12 @@ def follow(page, folder, patch):
             elif language == "python":
                 exec(compile(body, page, "exec"), names)
             else:
-                commands = pages.commands(body)
-                assert len(commands) == body.count("\n"), f"{page}: {body} is not run; say why"
-                for script, words in commands:
-                    assert pages.MAINS[script](words) == 0, (script, words)
+                for line in body.splitlines():
+                    program, *words = shlex.split(line)
+                    assert program in ("python", "megastep"), f"{page}: {line} is not run; say why"
+                    name = words[0].removesuffix(".py")
+                    main = importlib.import_module(f"megastep.agents.cli.{name}").main
+                    assert main(words[1:]) == 0, line
     return names
 
 

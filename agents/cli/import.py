@@ -172,8 +172,7 @@ def _import_database(given) -> int:
         file, digest = imported.write(source, geometries, numbers)
         pairs = []
         for member in shown:
-            drawing = imports.drawings(options, member.content or b"")[0]
-            pairs.append((member.name[-40:], drawing, imports.geometry_of(options, drawing)[0]))
+            pairs.append((member.name[-40:], *imports.first_home(options, member)))
         sheet = imported.folder() / f"{source}.png"
         sheets.write(sheet, pairs)
         report = imported.folder() / f"{source}.md"

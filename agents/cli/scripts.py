@@ -144,6 +144,8 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     saved = loaded.config["train"]
     if whole:  # the first member's settings, but for what it is itself
         saved["population"]["member"] = None
+    elif how != "init" and saved.get("population", {}).get("member") is not None:
+        saved["ranks"] = 1  # those of its population
     if how == "init":
         groups = ("env", "geometry", "agent")
         groups = {group: saved[group] for group in groups if group not in typed}

@@ -441,12 +441,10 @@ def population_errors(cfg: "Train") -> dict[str, object]:
                 and f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
             )
         ),
-        **{
-            name: is_many
-            and getattr(cfg, name) not in (1, 0)
-            and "cannot be combined with population.size yet: a population trains in one process"
-            for name in ("ranks", "restarts")
-        },
+        "ranks": is_many
+        and isinstance(cfg.ranks, int)
+        and cfg.ranks > chosen.size
+        and f"{cfg.ranks} is more than population.size={chosen.size}; each rank needs a member",
         "rerun": is_many
         and chosen.member is None
         and cfg.rerun is not None

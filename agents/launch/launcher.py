@@ -25,7 +25,7 @@ from megastep.agents.errors import ConfigErrors, shortened
 from megastep.agents.factory import check, settings
 from megastep.agents.launch import gpu, signals
 from megastep.agents.launch.endings import Ending
-from megastep.agents.runs import checkpoint, folders, typed_json
+from megastep.agents.runs import checkpoint, folders, populations, typed_json
 
 #: Environment variable with the job folder, set for ranks that this module started.
 JOB = "MEGASTEP_JOB"
@@ -194,7 +194,8 @@ class Job:
 
 def hint(folder: Path | None) -> str:
     """Returns how to continue a run whose ranks were lost in the middle of an update."""
-    if folder is None or not checkpoint.list_checkpoints(folder / "checkpoints"):
+    runs = () if folder is None else populations.members(folder) or [folder]
+    if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
         return "Nothing was saved yet"
     return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
 

@@ -4,19 +4,23 @@ import contextlib
 import functools
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from megastep import engine
 from megastep.agents import console, factory, package
 from megastep.agents.algorithms.nonfinite import NonFiniteError
-from megastep.agents.errors import NonFinite, UserError, memory_problem
+from megastep.agents.distributed import environment, process_group
+from megastep.agents.distributed.agreement import from_rank_0, together
+from megastep.agents.distributed.process_group import joint
+from megastep.agents.errors import ConfigErrors, EnvFailed, NonFinite, UserError, memory_problem
 from megastep.agents.evaluation import in_training
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
-from megastep.agents.launch import again, finishing, gpu, rank, signals
+from megastep.agents.launch import again, finishing, gpu, rank, rank_checks, signals
 from megastep.agents.population import decisions
-from megastep.agents.population.population import Population, Turns
+from megastep.agents.population.population import Learnt, Population, Turns, hosted
 from megastep.agents.runs import folders, populations, provenance
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
@@ -24,44 +28,77 @@ from megastep.agents.training.progress import progress_of
 if TYPE_CHECKING:
     import torch
 
+T = TypeVar("T")
 
 #: Checkpoints that a member keeps at least: while one is being written, and the one before may be
 #: unfinished elsewhere, all members have the one before that.
 KEPT = 3
 
 
-def run(cfg: settings.Train) -> Path:
-    """Trains a population. Returns its folder.
+def run(cfg: settings.Train, team: rank.Team | None = None) -> Path:
+    """Trains a population, of which each rank of a team hosts a part. Returns its folder.
 
     Raises:
         Interrupted: a signal came; all members were saved.
         UserError: training cannot start or continue.
     """
-    device = factory.make_device(cfg.device)
+    with process_group.apart():
+        return _run(cfg, team)
+
+
+def _run(cfg, team) -> Path:
+    with joint():
+        is_first, n_ranks = process_group.rank() == 0, process_group.n_ranks()
+        device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
+        rank_checks.check_start(cfg)
+        cfg = rank_checks.started_again(cfg, team)
+    if n_ranks > cfg.population.size:
+        problem = f"{n_ranks} is more than the members of the population"
+        raise ConfigErrors([("ranks", f"{problem}; use population.size={n_ranks} or more")])
     with contextlib.ExitStack() as locks:
         with contextlib.ExitStack() as undo:
-            with signals.deferred():
-                root, checkpoints = _open(cfg, locks)
-                if not checkpoints:
+            with signals.deferred(), joint():
+                root, checkpoints = from_rank_0(lambda: _open(cfg, locks))
+                if is_first and not checkpoints:
                     undo.callback(shutil.rmtree, root, ignore_errors=True)
-            with env_failures.told(cfg.env, root):
-                population = make(cfg, root, device, checkpoints)
-            folders.record_start(root)
-            if cfg.device == "auto":
-                gpu.warn_of_job_without()
-            console.say(f"Training {cfg.population.size} members on {device} in {root}")
+            with joint():
+                rank_checks.check_shared(root)
+            if team:
+                team.set_folder(root)
+            told = env_failures.told(cfg.env, root, rank=environment.rank())
+            try:
+                population = _together(told(lambda: make(cfg, root, device, checkpoints)))
+            except EnvFailed:
+                undo.pop_all()  # the folder has the traceback
+                raise
+            if is_first:
+                folders.record_start(root)
+                if cfg.device == "auto":
+                    gpu.warn_of_job_without()
+                ranks = f"{n_ranks} x {device.type}" if n_ranks > 1 else device
+                console.say(f"Training {cfg.population.size} members on {ranks} in {root}")
             undo.pop_all()
         _train(cfg, root, population)
-        samples = population.samples
-        console.say(table(population, root))
+        samples, text = population.samples, table(population, root)
         del population
-        best = populations.member(root)
-        finishing.finish(cfg, best, samples)
-        console.say(
-            f"Trained {samples:,} samples of each member. The best is in {best}\n"
-            f"To evaluate it: {folders.command_of('evaluate', 'run', root)}"
-        )
+        if is_first:
+            console.say(text)
+            best = populations.member(root)
+            with process_group.unhurried():
+                finishing.finish(cfg, best, samples)
+            console.say(
+                f"Trained {samples:,} samples of each member. The best is in {best}\n"
+                f"To evaluate it: {folders.command_of('evaluate', 'run', root)}"
+            )
+        with joint():
+            process_group.exchange([0])  # the others wait for what follows on rank 0
     return root
+
+
+def _together(function: Callable[[], T]) -> T:
+    """Calls `agreement.together`; the function makes what a rank has for itself."""
+    with joint():
+        return together(process_group.apart()(function))
 
 
 def _open(cfg, locks) -> tuple[Path, list[Path]]:
@@ -93,44 +130,52 @@ def member_settings(cfg: settings.Train, member: int) -> settings.Train:
 def make(
     cfg: settings.Train, root: Path, device: "torch.device", checkpoints: list[Path]
 ) -> Population:
-    """Returns the population of a folder, new or as its checkpoints have it."""
-    chosen, trainers = cfg.population, []
-    turns = Turns(chosen.size, device)
-    for member in range(chosen.size):
+    """Returns the population of a folder, new or as its checkpoints have it: the members of this
+    rank.
+    """
+    chosen, trainers, members = cfg.population, [], hosted(cfg.population.size)
+    turns = Turns(len(members), device)
+    for i, member in enumerate(members):
         own = member_settings(cfg, member)
         if checkpoints:
             own = again.with_more(settings.changed(own, resume=str(checkpoints[member])))
         folder = populations.folder_of(root, member)
         folder.mkdir(exist_ok=True)
-        with turns.of(member):
+        with turns.of(i):
             trainer = make_trainer(
                 *(own, folder, device),
                 make_evaluator=in_training.Evaluator,
                 leader=trainers[0] if trainers else None,
-                n_members=1 if trainers else chosen.size,
+                n_members=1 if trainers else len(members),
             )
         trainer.checkpoint_seconds = math.inf
         folders.write_config(folder, trainer.saver.config["train"])
         provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, [])
         trainers.append(trainer)
     turns.wait()
+    visitor = None
+    if len(members) < chosen.size:
+        env = trainers[0].env
+        policy = factory.make_policy(cfg.agent, env, cfg.seed, cfg.agent.critic)
+        visitor = Learnt(policy, factory.make_learner(cfg.learner, policy, cfg.seed))
     return Population(
         *(trainers, turns, root, cfg.seed, chosen.every, chosen.vary),
         *(chosen.exploit, chosen.explore, chosen.score, cfg.checkpoint_seconds),
+        *(chosen.size, visitor),
     )
 
 
 def _train(cfg, root, population) -> None:
     """Trains the members and turns what may happen into a sentence."""
     progress = console.Progress()
-    leader = population.leader
-    leader.on_log = lambda trainer: progress.show(*progress_of(trainer))
+    if population.rank == 0:
+        population.leader.on_log = lambda trainer: progress.show(*progress_of(trainer))
     hint = functools.partial(folders.to_continue, root)
     try:
         with (
-            env_failures.told(cfg.env, root, hint),
+            env_failures.told(cfg.env, root, hint, population.rank),
             signals.handled(rank.announce) as numbers,
-            progress,
+            progress if population.rank == 0 else contextlib.nullcontext(),
             contextlib.closing(population),
         ):
             population.train(lambda: bool(numbers))
@@ -143,23 +188,31 @@ def _train(cfg, root, population) -> None:
         reason = problem or str(error).partition("\n")[0].rstrip(".")
         raise UserError(f"{reason}. {hint()}") from error
     finally:
-        for trainer in population.trainers:
-            curves.plot_curves(trainer.saver.folder.parent)
-    if numbers:
+        with process_group.unhurried():
+            for trainer in population.trainers:
+                curves.plot_curves(trainer.saver.folder.parent)
+    unsaved = next((one.saver.error for one in population.trainers if one.saver.error), None)
+    with joint():
+        ends = process_group.gather_objects((numbers[:1], unsaved))
+    if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
         raise signals.Interrupted(
-            numbers[0], f"Stopped after {population.samples:,} samples of each member. {hint()}"
+            signal, f"Stopped after {population.samples:,} samples of each member. {hint()}"
         )
-    if unsaved := next((one.saver.error for one in population.trainers if one.saver.error), None):
+    if unsaved := next((error for _, error in ends if error), None):
         raise UserError(unsaved)
 
 
 def table(population: Population, root: Path) -> str:
-    """Returns a table of the members: score, ancestor at the first generation, settings."""
+    """Returns a table of the members: score, ancestor at the first generation, settings. All ranks
+    call it.
+    """
+    scores: list[float | None] = population.gathered(
+        [one.evaluation.get("return", one.score) for one in population.trainers]
+    )
     generations = populations.read(root / populations.FILE)
     keys = [*population.vary]
     rows = []
-    for member, trainer in enumerate(population.trainers):
-        score: float | None = trainer.evaluation.get("return", trainer.score)
+    for member, score in enumerate(scores):
         rows.append(
             [
                 str(member),

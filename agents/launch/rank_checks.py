@@ -23,7 +23,7 @@ from megastep.agents.distributed.drift import first_difference, first_differing_
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import check, settings
 from megastep.agents.launch.rank import Team
-from megastep.agents.runs import checkpoint, folders, provenance
+from megastep.agents.runs import checkpoint, folders, populations, provenance
 from megastep.agents.training.trainer import Trainer
 
 #: Seconds within which a file of rank 0 must be visible on the other machines.
@@ -117,11 +117,15 @@ def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:
         return cfg
 
     def totals() -> dict[str, float] | None:
-        if not checkpoint.list_checkpoints(folder / "checkpoints"):
+        path = folder if checkpoint.list_checkpoints(folder / "checkpoints") else None
+        if populations.is_root(folder):
+            with contextlib.suppress(UserError):
+                path = populations.common_checkpoints(folder)[0]
+        if path is None:
             if not cfg.resume:
                 shutil.rmtree(folder, ignore_errors=True)
             return None
-        saved = folders.load_checkpoint(folder, cfg.trust).config["train"]
+        saved = folders.load_checkpoint(path, cfg.trust).config["train"]
         return {name: saved[name] for name in ("samples", "seconds")}
 
     if limits := from_rank_0(totals):

@@ -70,11 +70,11 @@ def run(cfg: settings.Train) -> Path | None:
     """
     if cfg.dry_run:
         return dry_run.show(cfg)
-    if cfg.population.size > 1 and cfg.population.member is None:
-        return population.run(cfg)
     if launcher.is_needed(cfg):
         return launcher.run(cfg)
     with rank.joined() as team:
+        if cfg.population.size > 1 and cfg.population.member is None:
+            return population.run(cfg, team)
         return train_here(cfg, team)
 
 

@@ -1,5 +1,8 @@
 """The members of a population: they train in turns, on a GPU on a stream each, and take over from
 each other every so many samples.
+
+With several ranks, each trains every R-th member as a single process would, and all decide the same
+from the scores of all. Only rank 0's clock counts.
 """
 
 from __future__ import annotations
@@ -9,21 +12,51 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
+from torch.utils._pytree import tree_map
 
 from megastep import global_generators
 from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.distributed.agreement import from_rank_0
+from megastep.agents.distributed.process_group import (
+    exchange,
+    from_rank,
+    gather_objects,
+    joint,
+    n_ranks,
+    rank,
+    unhurried,
+)
 from megastep.agents.population import decisions
 from megastep.agents.runs import json_lines, populations
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
 
 if TYPE_CHECKING:
+    from megastep.agents.networks.policy import Policy
     from megastep.agents.population.variation import Variation
     from megastep.agents.training.trainer import Trainer
-    from megastep.agents.types import Row
+    from megastep.agents.types import Learner, Row, StateDict
+
+T = TypeVar("T")
+
+
+class Learnt(NamedTuple):
+    """What a member has learnt: its policy, its learner, and what wrappers of its environment have
+    learnt, if anything.
+    """
+
+    policy: Policy
+    learner: Learner
+    wrappers: StateDict | None = None
+
+
+def hosted(size: int) -> range:
+    """Returns the numbers of the members that this rank trains: every R-th."""
+    with joint():
+        return range(rank(), size, n_ranks())
 
 
 class Turns:
@@ -66,8 +99,8 @@ class Population:
     A member that diverges goes on without learning, and copies another at the next generation.
 
     Args:
-        trainers: of the members, whose `checkpoint_seconds` are infinite. All but the first have it
-            as their `leader`.
+        trainers: of the members that this rank hosts, whose `checkpoint_seconds` are infinite. All
+            but the first have it as their `leader`.
         turns: in which they were made.
         folder: where `population.jsonl` is written.
         seed: that decisions are drawn with.
@@ -78,8 +111,11 @@ class Population:
         score: "running": members are ranked by the return of their last report; "evaluated": of
             their last evaluation.
         checkpoint_seconds: seconds between two checkpoints of all members.
+        size: members on all ranks; None: as many as there are trainers.
+        visitor: with several ranks, holds what a member of another one has learnt.
 
     Attributes:
+        members: numbers of the members that this rank hosts.
         settings: of each member, by key.
         generation: the number of the last one.
         n_diverged: how often each member has diverged.
@@ -97,28 +133,40 @@ class Population:
         explore: str = "factor",
         score: str = "running",
         checkpoint_seconds: float = 30.0,
+        size: int | None = None,
+        visitor: Learnt | None = None,
     ):
         self.trainers, self.turns, self.seed, self.every = [*trainers], turns, seed, every
+        self.size, self.visitor = size or len(trainers), visitor
+        self.members = hosted(self.size)
+        with joint():
+            self.rank, self.n_ranks = rank(), n_ranks()
         self.vary, self.exploit, self.explore, self.score = vary, exploit, explore, score
         self.checkpoint_seconds, self.saved_at = checkpoint_seconds, time.monotonic()
-        path = folder / populations.FILE
-        json_lines.truncate_after(path, self.samples)
-        generations = populations.read(path) if path.exists() else []
-        self.lines, self.generation = json_lines.JsonLines(path), len(generations) - 1
-        self.n_diverged = [0] * len(trainers)
+        self.path = folder / populations.FILE
+        with joint():
+            generations = from_rank_0(self._earlier)
+        self.lines = json_lines.JsonLines(self.path) if self.rank == 0 else None
+        self.generation = len(generations) - 1
+        self.n_diverged = [0] * self.size
         self.samples_at_round = self.leader.samples_at_report
         for trainer in trainers:
             trainer.nonfinite_guard.tolerates_divergence = True
         if generations:
             self._restore(generations)
         else:
-            members = range(len(trainers))
+            members = range(self.size)
             self.settings = [decisions.first(seed, member, vary) for member in members]
             self._write([None for _ in members], [*members])
 
+    def _earlier(self) -> list[list[Row]]:
+        """Returns the generations so far, and removes those after the checkpoints."""
+        json_lines.truncate_after(self.path, self.samples)
+        return populations.read(self.path) if self.path.exists() else []
+
     @property
     def leader(self) -> Trainer:
-        """The first member, whose clock decides."""
+        """The first member of this rank. The clock of rank 0's decides."""
         return self.trainers[0]
 
     @property
@@ -133,8 +181,8 @@ class Population:
                 n + int(row.get("diverged", 0))
                 for n, row in zip(self.n_diverged, rows, strict=True)
             ]
-        for member, trainer in enumerate(self.trainers):
-            with self.turns.of(member):
+        for i, (member, trainer) in enumerate(zip(self.members, self.trainers, strict=True)):
+            with self.turns.of(i):
                 trainer.set_settings(self.settings[member])
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
@@ -150,52 +198,63 @@ class Population:
 
         rounds = [trainer.rounds(ends) for trainer in self.trainers]
         try:
+            if self._is_round_left(rounds):
+                for i, trainer in enumerate(self.trainers):  # now all have compiled
+                    with self.turns.of(i):
+                        trainer.start_clock()
+                self._after_round()
             while self._is_round_left(rounds):
                 self._after_round()
         finally:
             for one in rounds:
                 one.close()
-            self.lines.close()
+            if self.lines is not None:
+                self.lines.close()
 
     def _is_round_left(self, rounds: Sequence[Generator[None]]) -> bool:
         """Has each member do an update; returns False when they have ended instead."""
         has_ended = []
-        for member, one in enumerate(rounds):
-            with self.turns.of(member):
+        for i, one in enumerate(rounds):
+            with self.turns.of(i):
                 has_ended.append(next(one, StopIteration) is StopIteration)
         return not any(has_ended)
 
     def _after_round(self) -> None:
-        leader, before = self.leader, self.samples_at_round
-        is_reported = leader.samples_at_report == leader.samples
-        if is_reported:
+        leader, before, is_due = self.leader, self.samples_at_round, False
+        if leader.samples_at_report == leader.samples:
             self.samples_at_round = self.samples
             is_due = self.samples // self.every > before // self.every
-            if is_due and leader.fraction_left > 0:
-                self.take_over()
+        seconds = time.monotonic() - self.saved_at
+        with joint():
+            rows = exchange([leader.fraction_left > 0, seconds >= self.checkpoint_seconds])
+        goes_on, saves = rows[0]
+        if is_due and goes_on:
+            self.take_over()
         self.meet()
-        if time.monotonic() - self.saved_at >= self.checkpoint_seconds:
+        if saves:
             self.save()
 
     def meet(self) -> None:
         """Gives the members' opponents each other's policies, where they play in a league."""
-        pools = [trainer.opponents for trainer in self.trainers]
-        updates = self.leader.updates
-        if not any(pool is not None and pool.is_due(updates) for pool in pools):
+        updates, pool = self.leader.updates, self.leader.opponents
+        if pool is None or not pool.is_due(updates):
             return
         self.turns.wait()
-        policies = [trainer.policy for trainer in self.trainers]
-        for member, pool in enumerate(pools):
-            if pool is not None:
-                pool.refresh_rivals([*policies[member + 1 :], *policies[:member]], updates)
+        for member in range(self.size):
+            learnt = self._of(pool.next_rival(member, self.size, updates), member)
+            if learnt is not None:
+                own = self._trainer(member).opponents
+                assert own is not None
+                own.refresh_rival(learnt.policy, updates)
         self.turns.wait()
 
     def save(self) -> None:
         """Begins to save a checkpoint of each member, once all have the last one."""
-        for trainer in self.trainers:
-            trainer.saver.wait()
-        for member, trainer in enumerate(self.trainers):
-            with self.turns.of(member):
+        with unhurried():
+            for trainer in self.trainers:
+                trainer.saver.wait()
+        for i, trainer in enumerate(self.trainers):
+            with self.turns.of(i):
                 trainer.save_checkpoint()
         self.saved_at = time.monotonic()
 
@@ -205,7 +264,7 @@ class Population:
         Raises:
             NonFiniteError: all members have diverged.
         """
-        scores = [self.score_of(trainer) for trainer in self.trainers]
+        scores = self.gathered([self.score_of(trainer) for trainer in self.trainers])
         if all(score == -math.inf for score in scores):
             raise NonFiniteError(
                 f"All {len(scores)} members diverged: choose a smaller range of learning rates",
@@ -218,8 +277,9 @@ class Population:
         )
         self.turns.wait()
         for member in decisions.order(made, scores):
-            self.copy(self.trainers[made[member].source], self.trainers[member])
-            self.trainers[member].set_settings(made[member].settings)
+            self.copy(made[member].source, member)
+            if member in self.members:
+                self._trainer(member).set_settings(made[member].settings)
         self.turns.wait()
         self.settings = [one.settings for one in made]
         self._write(scores, [one.source for one in made])
@@ -230,17 +290,53 @@ class Population:
             return -math.inf
         return trainer.evaluation.get("return") if self.score == "evaluated" else trainer.score
 
-    @staticmethod
-    def copy(source: Trainer, target: Trainer) -> None:
+    def gathered(self, values: Sequence[T]) -> list[T]:
+        """Returns a value of each member, from those of the members that this rank hosts."""
+        with joint():
+            by_rank = gather_objects([*values])
+        return [by_rank[n % self.n_ranks][n // self.n_ranks] for n in range(self.size)]
+
+    def copy(self, source: int, target: int) -> None:
         """Gives a member what another has learnt, in place: weights, optimizer, statistics."""
-        for one in source, target:
-            one.wait_for_collector()
-        copy_from = with_defaults(target.learner, LearnerOptions).copy_from
+        learnt = self._of(source, target)
+        if learnt is None:
+            return
+        trainer = self._trainer(target)
+        trainer.wait_for_collector()
+        copy_from = with_defaults(trainer.learner, LearnerOptions).copy_from
         assert copy_from is not None
-        copy_from(source.learner)
-        if learnt := optional(source.env, "wrapper_state")():
-            optional(target.env, "load_wrapper_state")(learnt, False)
-        target.nonfinite_guard.has_diverged = False
+        copy_from(learnt.learner)
+        if learnt.wrappers:
+            optional(trainer.env, "load_wrapper_state")(learnt.wrappers, False)
+        trainer.nonfinite_guard.has_diverged = False
+
+    def _trainer(self, member: int) -> Trainer:
+        return self.trainers[self.members.index(member)]
+
+    def _of(self, source: int, target: int) -> Learnt | None:
+        """Returns what a member has learnt where another is hosted, None elsewhere. All ranks call
+        it.
+        """
+        learnt = state = None
+        if source in self.members:
+            trainer = self._trainer(source)
+            trainer.wait_for_collector()
+            wrappers = optional(trainer.env, "wrapper_state")()
+            learnt = Learnt(trainer.policy, trainer.learner, wrappers)
+        if source % self.n_ranks == target % self.n_ranks:
+            return learnt
+        if learnt is not None:
+            parts = learnt.policy.state_dict(), learnt.learner.state_dict(), learnt.wrappers
+            state = tree_map(_on_host, parts)
+        with joint():
+            state = from_rank(source % self.n_ranks, state)
+        if target not in self.members:
+            return None
+        assert state is not None and self.visitor is not None
+        policy, learner, wrappers = state
+        self.visitor.policy.load_state_dict(policy)
+        self.visitor.learner.load_state_dict(learner)
+        return self.visitor._replace(wrappers=wrappers)
 
     def _write(self, scores: Sequence[float | None], sources: Sequence[int]) -> None:
         for member, (score, source) in enumerate(zip(scores, sources, strict=True)):
@@ -254,11 +350,18 @@ class Population:
                 row["diverged"] = 1
             of_settings = self.settings[member].items()
             row |= {f"{populations.KEY}{key}": value for key, value in of_settings}
-            self.lines.write(self.samples, row)
+            if self.lines is not None:
+                self.lines.write(self.samples, row)
         self.generation = max(self.generation, 0)
-        self.lines.file.sync()
+        if self.lines is not None:
+            self.lines.file.sync()
 
     def close(self) -> None:
         """Closes the members' environments and files."""
         for trainer in self.trainers:
             trainer.close()
+
+
+def _on_host(leaf: T) -> T:
+    """Returns a copy of a tensor on the CPU, and anything else as it is."""
+    return leaf.detach().to("cpu", copy=True) if isinstance(leaf, torch.Tensor) else leaf

@@ -4,7 +4,7 @@ some of the environments.
 Axes: N environments of A agents, B = N A lanes; M of the environments have opponents.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -56,7 +56,7 @@ class Opponents:
         matchups: (B,) bool by name, the lanes of environments played against "now" (the current
             policy), "past", "league" and "bot". Names without environments are absent.
         snapshots: the snapshots, as policies. Refreshed in place.
-        rivals: those of other members, which `refresh_rivals` sets; until then, of the policy.
+        rivals: those of other members, which `refresh_rival` sets; until then, of the policy.
         scripted: the bot, or None if it does not play.
 
     All other attributes are those of `env`.
@@ -202,22 +202,19 @@ class Opponents:
         self._refresh((n_updates // self.every - 1) % len(self.snapshots), policy)
 
     def is_due(self, n_updates: int) -> bool:
-        """Returns whether `refresh_rivals` replaces one after so many updates."""
+        """Returns whether `refresh_rival` replaces one after so many updates."""
         return bool(self.rivals) and n_updates % self.every == 0
 
-    def refresh_rivals(self, policies: Sequence[Policy], n_updates: int) -> None:
-        """Copies another member's policy into the oldest of the rivals, every `every` updates, the
-        members in turn.
-
-        Args:
-            policies: of the other members.
-            n_updates: of each member so far.
+    def next_rival(self, member: int, size: int, n_updates: int) -> int:
+        """Returns whose policy `refresh_rival` is to copy after so many updates: the members of a
+        population take turns, beginning with the one after this member.
         """
-        if not self.is_due(n_updates):
-            return
+        return (member + 1 + (n_updates // self.every - 1) % (size - 1)) % size
+
+    def refresh_rival(self, policy: Policy, n_updates: int) -> None:
+        """Copies another member's policy into the oldest of the rivals. Called when `is_due`."""
         number = n_updates // self.every - 1
-        index = len(self.snapshots) + number % len(self.rivals)
-        self._refresh(index, policies[number % len(policies)])
+        self._refresh(len(self.snapshots) + number % len(self.rivals), policy)
 
     def _refresh(self, index: int, policy: Policy) -> None:
         """Copies a policy into the opponent of an index, which forgets its episodes."""

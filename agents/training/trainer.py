@@ -186,7 +186,8 @@ class Trainer:
             env, policy, learner, self.collect, self.episode_stats, self.curriculum
         )
         self.nonfinite_guard = NonFiniteGuard(env, learner, lambda value: repeat_hint(self, value))
-        self.clock, self.timer = Stopwatch(), PhaseTimer(env.device, counts.finish_phase)
+        self.clock = Stopwatch() if leader is None else leader.clock
+        self.timer = PhaseTimer(env.device, counts.finish_phase)
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.samples_per_second = None
@@ -344,13 +345,17 @@ class Trainer:
         if self.opponents is not None:
             self.opponents.refresh_snapshots(self.policy, self.updates)
         if not self.clock.is_running:
-            if torch.device(self.env.device).type == "cuda":
-                torch.cuda.synchronize(self.env.device)
-            self.clock.start()
-            self.seconds_at_checkpoint = self.clock.seconds
-            self.samples_at_log, self.seconds_at_log = self.samples, self.clock.seconds
-            self.timer.pop()
+            self.start_clock()
         return losses
+
+    def start_clock(self) -> None:
+        """Begins to count seconds, once everything is compiled. Synchronises."""
+        if torch.device(self.env.device).type == "cuda":
+            torch.cuda.synchronize(self.env.device)
+        self.clock.start()
+        self.seconds_at_checkpoint = self.clock.seconds
+        self.samples_at_log, self.seconds_at_log = self.samples, self.clock.seconds
+        self.timer.pop()
 
     def follow_schedules(self, fraction: float) -> None:
         """Sets what has a schedule, of the learner and of the environment.

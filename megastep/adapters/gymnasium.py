@@ -34,7 +34,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             ``infos`` are there in every step then, with masks.
         dtype: of observations in floats. Default: float32 for arrays, the environment's float16 for
             tensors.
-        copy: return copies. Otherwise tensors are valid until the next step or reset.
+        copy: return copies, of which on a GPU up to 32 steps' share memory. Otherwise tensors are
+            valid until the next step or reset.
         render_mode: None, or ``rgb_array``, a drawing of each environment.
 
     Raises:

@@ -18,47 +18,12 @@ from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 __all__ = ["Copies", "Lanes", "ended", "fresh"]
 
 WORD = 4  # bytes
+BLOCK_BYTES = 2**25  # of copies that share memory, if there are several
 
 
 def ended(world: World) -> torch.Tensor:
     """Returns (B,) bool: where a world ends an episode."""
     return world["terminal"] | world["truncated"]
-
-
-class Copies:
-    """Copies a tree of tensors whose numbers change between the calls. On a GPU one kernel copies
-    all that fit.
-    """
-
-    def __init__(self, tree: Tree):
-        leaves, self._spec = _pytree.tree_flatten(tree)
-        fits = [leaf.is_cuda and _is_words(leaf) for leaf in leaves]
-        self._leaves = [*zip(leaves, fits)]
-        self._words = [_words(leaf) for leaf, fit in self._leaves if fit]
-        self._sizes = [*map(len, self._words)]
-
-    def __call__(self) -> Tree:
-        """Returns a copy as of now."""
-        parts = iter(torch.cat(self._words).split(self._sizes) if self._words else ())
-        copies = [
-            next(parts).view(leaf.dtype).view(leaf.shape) if fit else leaf.clone()
-            for leaf, fit in self._leaves
-        ]
-        return _pytree.tree_unflatten(copies, self._spec)
-
-
-def fresh(tree: Tree) -> Tree:
-    """Returns a copy of a tree of tensors."""
-    return Copies(tree)()
-
-
-def _is_words(leaf) -> bool:
-    is_aligned = leaf.nbytes % WORD == 0 and leaf.data_ptr() % WORD == 0
-    return leaf.is_contiguous() and leaf.itemsize <= WORD and is_aligned
-
-
-def _words(leaf) -> torch.Tensor:
-    return leaf.view(-1).view(torch.int32)
 
 
 Method = TypeVar("Method", bound=Callable)
@@ -75,6 +40,65 @@ def _in_plain_tensors(method: Method) -> Method:
             return method(*args, **kwargs)
 
     return cast(Method, call)
+
+
+class Copies:
+    """Copies a tree of tensors whose numbers change between the calls. On a GPU one kernel copies
+    all that fit, into memory whose views are made for several calls at once, since making a view
+    takes PyTorch as long as copying.
+
+    Args:
+        tree: the tensors.
+        n_at_once: copies that share memory, which is kept as long as any of them is.
+    """
+
+    def __init__(self, tree: Tree, n_at_once: int = 32):
+        self._n_at_once = n_at_once
+        leaves, self._spec = _pytree.tree_flatten(tree)
+        self._at = [i for i, leaf in enumerate(leaves) if leaf.is_cuda and _is_words(leaf)]
+        self._others = [(i, leaf) for i, leaf in enumerate(leaves) if i not in self._at]
+        self._leaves = [leaves[i] for i in self._at]
+        self._words = [_words(leaf) for leaf in self._leaves]
+        self._blank: list[tuple[torch.Tensor, ...]] = []
+
+    def __call__(self) -> Tree:
+        """Returns a copy as of now."""
+        copies: list = [None] * (len(self._at) + len(self._others))
+        if self._at:
+            self._blank = self._blank or self._block()
+            row, *parts = self._blank.pop()
+            torch.cat(self._words, out=row)
+            for i, part in zip(self._at, parts):
+                copies[i] = part
+        for i, leaf in self._others:
+            copies[i] = leaf.clone()
+        return _pytree.tree_unflatten(copies, self._spec)
+
+    @_in_plain_tensors
+    def _block(self) -> list[tuple[torch.Tensor, ...]]:
+        """Returns memory for some copies: all words of each, and a view per leaf."""
+        sizes = [*map(len, self._words)]
+        n_rows = min(max(BLOCK_BYTES // (WORD * sum(sizes)), 1), self._n_at_once)
+        block = self._words[0].new_empty(n_rows, sum(sizes))
+        parts = [
+            part.view(leaf.dtype).view(n_rows, *leaf.shape).unbind()
+            for part, leaf in zip(block.split(sizes, 1), self._leaves)
+        ]
+        return [*zip(block.unbind(), *parts)]
+
+
+def fresh(tree: Tree) -> Tree:
+    """Returns a copy of a tree of tensors."""
+    return Copies(tree, 1)()
+
+
+def _is_words(leaf) -> bool:
+    is_aligned = leaf.nbytes % WORD == 0 and leaf.data_ptr() % WORD == 0
+    return leaf.is_contiguous() and leaf.itemsize <= WORD and is_aligned
+
+
+def _words(leaf) -> torch.Tensor:
+    return leaf.view(-1).view(torch.int32)
 
 
 class Lanes:

@@ -18,8 +18,19 @@ if TYPE_CHECKING:
 
 __all__ = ["SHAPES", "Objects", "check_objects", "object_params"]
 
-#: {shape: number of lines it is drawn with}.
-SHAPES = {"disc": 6, "crate": 4, "door": 1}
+
+def _sides(*corners: tuple[float, float]) -> list[tuple[float, ...]]:
+    """Returns the ends of each side of a polygon."""
+    return [(*a, *b) for a, b in zip(corners, [*corners[1:], corners[0]])]
+
+
+_HALF = 0.8660254  # of a hexagon's height
+#: {shape: the ends (x, y, x, y) of each line it is drawn with, at a size of 1 m}.
+SHAPES = {
+    "disc": _sides((1, 0), (0.5, _HALF), (-0.5, _HALF), (-1, 0), (-0.5, -_HALF), (0.5, -_HALF)),
+    "crate": _sides((-1, -1), (1, -1), (1, 1), (-1, 1)),
+    "door": [(-1, 0, 1, 0)],
+}
 NUMBERS = {name: ENGINE.constants[name.upper()] for name in SHAPES}
 _BYTES = ENGINE.constants["OBJECT_BYTES"]
 MAX_OBJECTS = 256  # per environment, so that its lines fit into shared memory
@@ -97,11 +108,13 @@ class Objects(SetOnce):
         self.records = torch.zeros((n, len(shapes), _BYTES // 4), device=device)
         self.sizes.fill_(0.1)
         self.carriers.fill_(-1)
-        widths = torch.tensor([SHAPES[shape] for shape in shapes])
+        widths = torch.tensor([len(SHAPES[shape]) for shape in shapes])
         self.shapes = torch.tensor([NUMBERS[s] for s in shapes], dtype=torch.int32, device=device)
         self.line_starts = torch.cat([widths[:1] * 0, widths.cumsum(0)]).int().to(device)
         objects = torch.arange(len(shapes), dtype=torch.int32)
         self.line_object = objects.repeat_interleave(widths).to(device)
+        ends = [line for shape in shapes for line in SHAPES[shape]]
+        self.ends = torch.tensor(ends, dtype=torch.float32).to(device)
         self.lines = torch.zeros((n, int(widths.sum()), 2, 2), device=device)
         self.texels = torch.zeros((n, len(shapes), 4), device=device)
         self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
@@ -153,7 +166,7 @@ class Objects(SetOnce):
 
 _FIELDS = [
     *("shapes", "line_starts", "line_object", "palette", "extents", "objects", "lines", "texels"),
-    *("error_flag", "n_objects", "n_lines", "n_colours", "lit"),
+    *("error_flag", "n_objects", "n_lines", "n_colours", "lit", "ends"),
 ]
 _NONE = ENGINE.params.ObjectsParams(**dict.fromkeys(_FIELDS, 0))
 
@@ -206,6 +219,7 @@ def _pack(scenery, o) -> bytes:
         n_lines=n_lines,
         n_colours=o.n_colours,
         lit=int(o.lit),
+        ends=o.ends,
     )
 
 

@@ -55,8 +55,12 @@ UNREADABLE = (
 NAME = re.compile(r"(0|[1-9][0-9]{0,5})/([A-Za-z_][A-Za-z0-9_]{0,63})\.npy")
 
 
-def _open(path) -> "ZipFile":
-    """Opens a zip file. Raises ValueError if its table of contents exceeds MAX_DIRECTORY."""
+def open_zip(path: Path, max_directory: int) -> "ZipFile":
+    """Opens a zip file, unless its table of contents has more bytes than that.
+
+    Raises:
+        ValueError: what is wrong with the file, without its name.
+    """
     size = path.stat().st_size
     with path.open("rb") as file:
         # the end record, the longest comment after it, and zip64's two records before it
@@ -64,16 +68,16 @@ def _open(path) -> "ZipFile":
         start, tail = file.tell(), file.read()
     at = tail.rfind(b"PK\5\6")
     if at < 0 or len(tail) < at + 22:
-        raise ValueError("is not an .npz file, or is cut short")
+        raise ValueError("is no zip file, or is cut short")
     (directory,) = struct.unpack_from("<I", tail, at + 12)
     if at >= 20 and tail[at - 20 : at - 16] == b"PK\6\7":  # zip64, as of more than 65,535 arrays
         (record,) = struct.unpack_from("<Q", tail, at - 12)
         if record != start + at - 76 or tail[at - 76 : at - 72] != b"PK\6\6":
             raise ValueError("has a table of contents of zip64 that is out of place")
         (directory,) = struct.unpack_from("<Q", tail, at - 36)
-    if directory > MAX_DIRECTORY:
+    if directory > max_directory:
         raise ValueError(
-            f"lists more arrays than {MAX_GEOMETRIES:,} geometries have, which are the limit"
+            f"has a table of contents of {directory:,} bytes, but the limit is {max_directory:,}"
         )
     return zipfile.ZipFile(path)
 
@@ -135,7 +139,8 @@ def read_array(archive, entry) -> np.ndarray:
     """Returns the array of a zip entry. Raises ValueError if its header contradicts its size."""
     if entry.flag_bits & 1:
         raise ValueError("is encrypted")
-    content = archive.read(entry)
+    with archive.open(entry) as file:  # `archive.read` unpacks more than the entry claims
+        content = file.read(entry.file_size)
     length = slice(8, 12 if content[6:7] == b"\2" else 10)  # the bytes of the header's length
     offset = length.stop + int.from_bytes(content[length], "little")
     shape, fortran, dtype = _read_header(content[: min(offset, 1 << 16)])
@@ -185,7 +190,7 @@ def load(path: str | Path) -> list[dotdict]:
         raise ValueError(f"There is no geometry file {str(path)!r}. Set path to an .npz file.")
     place = ""
     try:
-        with _open(path) as archive:
+        with open_zip(path, MAX_DIRECTORY) as archive:
             geometries, length = [], 0.0
             for index, entries in sorted(_contents(archive).items()):
                 place = f", geometry {index}"

@@ -52,9 +52,10 @@ HD Float4 texel_of(const ObjectsParams& o, const Object& object, float light) {
     return {rgb[0], rgb[1], rgb[2], light};
 }
 
-// Line k of a placed object as agent a sees it, of 0 m if it does not: nobody sees what it carries.
-HD Float4 seen_line(const Object& object, int shape, int k, int a) {
+// Line l, of a placed object, as agent a sees it, of 0 m if it does not: nobody sees what it
+// carries.
+HD Float4 seen_line(const ObjectsParams& o, const Object& object, int l, int a) {
     if (!is_drawn(object) || object.carrier == a)
         return {0.f, 0.f, 0.f, 0.f};
-    return line_of(shape, k, object.size, pose_at(object.x, object.y, object.angle));
+    return line_of(o, l, object, pose_at(object.x, object.y, object.angle));
 }

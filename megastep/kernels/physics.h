@@ -24,13 +24,13 @@ HD float sweep_object(const ObjectsParams& o, int i, float px, float py, float d
     float x = object.x, y = object.y, reach = rho + 1.5f * object.size;  // beyond crates' corners
     if (!is_obstacle(object) || !boxes_meet(px, py, dx, dy, x, y, x, y, reach))
         return NO_CONTACT;
-    int shape = o.shapes[i % o.n_objects];
-    if (shape == DISC)
+    int k = i % o.n_objects;
+    if (o.shapes[k] == DISC)
         return sweep_point(px - x, py - y, dx, dy, rho + object.size);
     float contact = NO_CONTACT;
     Pose pose = pose_at(x, y, object.angle);
-    for (int k = 0; k < n_lines_of(shape); k++) {
-        Float4 line = line_of(shape, k, object.size, pose);
+    for (int l = o.line_starts[k]; l < o.line_starts[k + 1]; l++) {
+        Float4 line = line_of(o, l, object, pose);
         contact = minf(contact, sweep_segment(px, py, dx, dy, line.x, line.y, line.z, line.w, rho));
     }
     return contact;

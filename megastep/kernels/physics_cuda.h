@@ -73,6 +73,9 @@ DEVICE void move_agents(const PhysicsParams& p) {
     if (env >= p.scenery.n_envs)
         return;
     ThreadGroup group = group_of(p.threads_per_env);
+    if (with_objects)
+        for (int k = group.rank; k < p.objects.n_objects; k += group.size)
+            PREFETCH(objects_of(p.objects) + env * p.objects.n_objects + k);
     if (p.actions)
         for (int a = group.rank; a < n_agents; a += group.size)
             apply_action(p, env, env * n_agents + a);

@@ -358,7 +358,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
             settle(p.objects, s, object, layout, env * p.objects.n_objects + k);
         draw_texel(p, object, env, k, scratch.objects.data());
         for (int l = p.objects.line_starts[k]; l < p.objects.line_starts[k + 1]; l++)
-            draw_line(p, object, a, k, l, scratch.objects.data());
+            scratch.objects[l] = seen_line(p.objects, object, l, a);
     }
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);

@@ -42,12 +42,6 @@ HD void draw_texel(const RenderParams& p, const Object& object, int env, int k, 
     drawn[o.n_lines + k] = texel_of(o, object, o.lit ? o.texels[4 * i + 3] : 1.f);
 }
 
-// Draws line l of an environment's objects, one of object k, as agent a sees it into `drawn`.
-HD void draw_line(const RenderParams& p, const Object& object, int a, int k, int l, Float4* drawn) {
-    const ObjectsParams& o = p.objects;
-    drawn[l] = seen_line(object, o.shapes[k], l - o.line_starts[k], a);
-}
-
 // What a ray contributes to its pixel.
 struct RaySample {
     float red, green, blue, depth;

@@ -139,6 +139,8 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         tiles = half_of_screen(p.res, warp);
         __syncthreads();  // `seen` is clear
     }
+    if (drawn & OBJECTS && warp_lane < p.objects.n_objects)  // needed after the walls
+        PREFETCH(objects_of(p.objects) + env * p.objects.n_objects + warp_lane);
     int reads_both = is_split && (p.centre_line || p.agent_ray);  // halves of `nearest`
     for (int c = 0; c < p.n_cameras; c++) {
         int view = agent * p.n_cameras + c;

@@ -28,15 +28,15 @@ HD float light_on(const SceneryParams& s, int layout, float x, float y) {
 HD void update_object(const UpdateObjectsParams& p, int i) {
     const ObjectsParams& o = p.objects;
     const SceneryParams& s = p.scenery;
-    int env = i / o.n_objects, k = i % o.n_objects, first = o.line_starts[k];
+    int env = i / o.n_objects, k = i % o.n_objects;
     int layout = s.layout[env];
     if ((unsigned int)layout >= (unsigned int)s.n_layouts)
         layout = 0;  // which is flagged where it is rendered
     Object object = placed(objects_of(o)[i], s, p.positions, p.angles, env);
     settle(o, s, object, layout, i);
     Float4* lines = (Float4*)o.lines + env * (long long)o.n_lines;
-    for (int l = first; l < o.line_starts[k + 1]; l++)
-        lines[l] = seen_line(object, o.shapes[k], l - first, NOBODY);
+    for (int l = o.line_starts[k]; l < o.line_starts[k + 1]; l++)
+        lines[l] = seen_line(o, object, l, NOBODY);
     float light = o.lit && is_drawn(object) ? light_on(s, layout, object.x, object.y) : 1.f;
     ((Float4*)o.texels)[i] = texel_of(o, object, light);
 }

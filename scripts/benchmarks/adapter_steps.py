@@ -44,6 +44,10 @@ def adapters(device: torch.device) -> Iterator[dict]:
         for name, settings in (
             ("NEXT_STEP, tensors", dict(autoreset_mode="next_step", to_numpy=False)),
             ("NEXT_STEP, tensors, copy=False", dict(to_numpy=False, copy=False)),
+            (
+                "DISABLED, tensors, copy=False",
+                dict(autoreset_mode="disabled", to_numpy=False, copy=False),
+            ),
             ("DISABLED, tensors", dict(autoreset_mode="disabled", to_numpy=False)),
             ("DISABLED, tensors, with resets", dict(autoreset_mode="disabled", to_numpy=False)),
             ("SAME_STEP, tensors", dict(autoreset_mode="same_step", to_numpy=False)),

@@ -99,10 +99,14 @@ def main(argv: list[str] | None = None) -> int:
         help="samples per run, for duels, ablation, curricula, published",
     )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, metavar="TASK", help="for published")
-    parser.add_argument("--seconds", type=int, metavar="S", help="limit of a run, for published")
+    parser.add_argument(
+        "--seconds", type=int, metavar="S", help="of a run, for published, populations"
+    )
     parser.add_argument("--jobs", type=int, metavar="N", help="runs side by side, for published")
     parser.add_argument(
-        "--folder", type=Path, help="keeps run folders and measures those in it, for published"
+        "--folder",
+        type=Path,
+        help="keeps run folders and measures those in it, for published, search, league",
     )
     parser.add_argument("--commit", help="the commit to record, if git is not available")
     parser.add_argument(

@@ -14,6 +14,7 @@ from films import films
 from libraries import libraries
 from nsight_counters import counters
 from peers import peers
+from population_benchmarks import league, members, memory_search, search, small_members
 from published import published
 from replay_buffer import replay
 from scaling import ranks, scaling
@@ -53,4 +54,9 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "peers": peers,
     "scaling": scaling,
     "ranks": ranks,
+    "members": members,
+    "small_members": small_members,
+    "search": search,
+    "memory_search": memory_search,
+    "league": league,
 }

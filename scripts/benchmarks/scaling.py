@@ -51,30 +51,35 @@ def scaling(device: torch.device, envs: list[str] | None = None) -> Iterator[dic
 def ranks(
     device: torch.device, seeds: list[int] | None = None, budgets: list[int] | None = None
 ) -> Iterator[dict]:
-    """Explorer's return in training, of one GPU and of all: after 30 s (`--budgets`) with as many
-    environments on each GPU, and after equal samples with as many environments in all. A sample
-    per seed.
+    """Explorer's return in training, of one GPU and of all: after 10, 30 and 60 s (`--budgets`) of
+    one run with as many environments on each GPU, and after equal samples with as many environments
+    in all. A sample per seed.
     """
     *_, n = _counts(device)
-    seeds, n_envs = seeds or (1, 2, 3), N_ENVS[device.type]
-    for seconds in budgets or (30,):
-        for count in (1, n):
-            words = f"seconds={seconds}", f"env.n_envs={n_envs}"
+    seeds, n_envs, budgets = (
+        seeds or (1, 2, 3),
+        N_ENVS[device.type],
+        sorted(budgets or (10, 30, 60)),
+    )
+    for count in (1, n):
+        words = f"seconds={budgets[-1]}", f"env.n_envs={n_envs}"
+        curves = _curves(device, count, seeds, *words)
+        for seconds in budgets:
             yield measurement(
                 f"explorer, {seconds} s on {_devices(count, device)}: return in training",
                 "",
-                _returns(device, count, seeds, *words),
+                [[value for at, _, value in curve if at <= seconds][-1] for curve in curves],
             )
     samples = EQUAL_SAMPLES[device.type]
     for count in (1, n):
         words = f"samples={samples}", f"env.n_envs={n_envs // count}"
         what = f"explorer, {samples / 1e6:g} M samples, {n_envs:,} environments in all"
-        found = _returns(device, count, seeds, *words)
+        found = [curve[-1][-1] for curve in _curves(device, count, seeds, *words)]
         yield measurement(f"{what}, on {_devices(count, device)}: return in training", "", found)
 
 
-def _returns(device, n_ranks, seeds, *words):
-    """Returns the last mean return of a run per seed. Runs on one GPU share the GPUs."""
+def _curves(device, n_ranks, seeds, *words):
+    """Returns the learning curve of a run per seed. Runs on one GPU share the GPUs."""
     words = "env=explorer", "log_every=5", *words
     if n_ranks > 1 or device.type == "cpu":
         words += f"ranks={n_ranks}", f"device={device.type}"
@@ -83,11 +88,11 @@ def _returns(device, n_ranks, seeds, *words):
         n = torch.cuda.device_count()
         runs = [(*words, f"seed={seed}", f"device=cuda:{i % n}") for i, seed in enumerate(seeds)]
         batches = [runs[i : i + n] for i in range(0, len(runs), n)]
-    returns = []
+    curves = []
     for batch in batches:
         with trained(device, *batch) as folders:
-            returns += [learning_curve(folder)[-1][-1] for folder in folders]
-    return returns
+            curves += [learning_curve(folder) for folder in folders]
+    return curves
 
 
 def _counts(device):

@@ -111,6 +111,14 @@ def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents
     engine.check(c.agents)
 
 
+@pytest.mark.parametrize("operation", [physics, render, observe, geometry, explorer, spawn])
+def test_on_a_cpu_an_operation_raises_before_it_returns(operation):
+    c = boxes("cpu", 2)
+    c.scenery.layout[LAST] = 2
+    with pytest.raises(engine.EngineError, match=f"^Environment {LAST} .* layout"):
+        operation(c)
+
+
 @pytest.mark.parametrize("operation", [physics, render, observe, explorer, pointgoal])
 @pytest.mark.parametrize("field", ["positions", "angles"])
 def test_nonfinite_pose_is_named_by_every_operation(operation, field, device):

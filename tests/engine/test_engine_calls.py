@@ -224,6 +224,18 @@ def test_hidden_spawn_is_behind_a_wall_that_hides_all_of_it(low, high, is_hidden
     assert core.agents.positions[0, 1].tolist() == list(behind if is_hidden else in_sight)
 
 
+def test_agents_that_cannot_hide_spawn_furthest_from_the_others(device):
+    """All points are in sight and within 0.9 m: the last is the furthest."""
+    core = cuda.Core(scene.scenery([toys.box()], 2, 8, device=device))
+    core.agents.positions[:, 0] = 3.0
+    own = torch.tensor([(3.5, 3.0), (3.0, 3.6), (2.3, 3.0), (3.0, 2.1)], device=device)
+    points = own.repeat(1, 2, 1)
+    counts = torch.zeros((8, 2), dtype=torch.int32, device=device)
+    mask = torch.tensor([[False, True]], device=device).repeat(8, 1)
+    engine.spawn(core.scenery, core.agents, mask, points, counts, seed=1, hidden=True)
+    assert torch.equal(core.agents.positions[:, 1], own[3:].repeat(8, 1))
+
+
 # ---- Bad arguments ----
 
 

@@ -14,6 +14,7 @@ from megastep.capture import state_tree
 from megastep.geometries import toys
 from megastep.geometries.sources import homes
 from megastep.kernels.build import compile
+from megastep.kernels.build.launch import ENGINE
 from megastep.modules.spawning import cached_points
 from tests.helpers import twin
 from tests.helpers.cuda_on_cpu import ORDERS
@@ -320,6 +321,12 @@ def test_more_objects_than_fit_are_named(device):
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         engine.Objects(**dict(n_envs=1, shapes=["disc"], palette=PALETTE) | arguments)
+
+
+def test_more_objects_than_errors_can_name_are_refused(monkeypatch):
+    monkeypatch.setattr(torch, "zeros", pytest.fail)  # it would take 20 GB
+    with pytest.raises(ValueError, match=r"n_envs \* len\(shapes\) must be an integer from 1 to"):
+        engine.Objects(2**31 // ENGINE.constants["OBJECT_ERROR_KINDS"] + 1, ["disc"], PALETTE)
 
 
 def test_replaced_and_shrunken_tensors_are_refused():

@@ -247,6 +247,10 @@ def test_wrong_spaces_and_environments_are_named():
     with pytest.raises(ValueError, match="obs is MultiDiscrete.*, and not MultiImage or MultiVec"):
         FrameStack(Integers())
     with pytest.raises(
+        ValueError, match="env: int is not an Env: it has no n_envs, device, obs_sp"
+    ):
+        TimeLimit(3, n=3)
+    with pytest.raises(
         ValueError, match="TimeLimit begins episodes .* needs reset.seed=None, mask"
     ):
         TimeLimit(Old(), n=3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import arrdict, contract, envs
+from megastep import arrdict, contract, envs, plotting
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine import EngineError
 from megastep.envs.pong.step import pong_step
@@ -272,6 +272,16 @@ def test_image_is_what_the_left_side_sees():
     worlds = contract.rollout(env, 30)
     state = arrdict.numpyify(env.state(2))
     assert (env.image(state) == worlds[-1].obs[4, 0, 0].numpy()).all()
+
+
+def test_picture_has_the_ball_in_its_cell(monkeypatch):
+    discs = []
+    monkeypatch.setattr(plotting.Area, "disc", lambda *args, **_: discs.append(args[1:3]))
+    court = Court().place(x=20.5, y=9.25, vx=1, vy=0.75, left=5, right=6)
+    court.step()
+    envs.Pong.plot_state(arrdict.numpyify(court.env.state(0)))
+    last, ball = (20.5, 30 - 9.5), (21.5, 30 - 10.5)  # centres of cells, y up
+    assert discs == [(last, 0.5), (ball, 0.5)]
 
 
 def test_text_shows_the_score_and_the_court():

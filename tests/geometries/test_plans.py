@@ -10,16 +10,19 @@ from pathlib import Path
 import draw_plans
 import numpy as np
 import pytest
+import yaml
 
 from megastep import cubicasa as original
 from megastep import geometries, toys
 from megastep.agents.cli import entry
 from megastep.geometries import checks, imported
+from tests.helpers.archives import lying_zip
 
 imports = pytest.importorskip(
     "megastep.geometries.plans.imports", reason="needs the extra plans", exc_type=ImportError
 )
 safe, Options = imports.safe, imports.Options
+maps, outlines, shapely = imports.maps, imports.outlines, imports.shapely
 
 HOSTILE = Path(__file__).parents[1] / "data" / "hostile"
 EXPECTED = json.loads((HOSTILE / "EXPECTED.json").read_text())
@@ -28,8 +31,8 @@ SHARED = Path(__file__).parents[3] / "shared" / "data"
 REFUSED = {
     "bad_points_0.svg": "is no number",
     "bad_points_1.svg": "odd number",
-    "no_spaces.svg": "no Space",
-    "no_walls.svg": "no Wall",
+    "no_spaces.svg": "no room",
+    "no_walls.svg": "no wall",
     "empty_floorplan.svg": "empty",
     "empty_file.svg": "empty",
     "truncated.svg": "cut short",
@@ -219,16 +222,55 @@ def test_a_folder_that_cannot_be_written(capsys, data_folder):
     assert run(*words) == 2 and "cannot be written" in capsys.readouterr().err
 
 
+def test_archives_of_too_much_are_refused(tmp_path, monkeypatch):
+    path = HOSTILE / "ok_archive.zip"
+    for limit, message in (
+        ("MAX_MEMBERS", "has . files, more than 1"),
+        ("MAX_DIRECTORY", "has a table of contents of .* bytes, but the limit is 1"),
+        ("MAX_TOTAL", "unpacks to .* bytes, more than 1"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(safe, limit, 1)
+            with pytest.raises(ValueError, match=f"ok_archive.zip' {message}"):
+                list(safe.members(path, ".svg"))
+    monkeypatch.setattr(safe, "MAX_BYTES", 1 << 20)
+    path = archive_of(tmp_path / "a.tar.gz", {f"{i}.txt": bytes(1 << 20) for i in range(12)})
+    with pytest.raises(ValueError, match="a.tar.gz.* unpacks to more than the limit"):
+        list(safe.members(path, ".svg"))
+
+
+@pytest.mark.parametrize(
+    "fault, warning",
+    [
+        (('id="Floor-1"', 'id="Floor-1" transform="scale(40)"'), "check the scale"),
+        (('class="Wall', 'class="Fence'), "it has no wall"),
+        (('class="Space', 'class="Place'), "it has no room"),
+    ],
+)
+def test_a_floor_that_is_no_home_stops_no_other(fault, warning):
+    text = (HOSTILE / "ok_two_floors_side_by_side_hidden.svg").read_text()
+    first, mark, second = text.partition('id="Floor-2"')
+    member = safe.Member("house.svg", (first.replace(*fault) + mark + second).encode())
+    options = Options("cubicasa")
+    plan = imports.read(options, member)
+    (g,), (notes,) = plan.geometries, plan.notes
+    assert "1 floors are left out: it " in notes.warnings[0] and warning in notes.warnings[0]
+    np.testing.assert_array_equal(imports.first_home(options, member)[1].walls, g.walls)
+
+
 def test_bombs_in_archives_are_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.svg", bytes(300_000_000))
         archive.writestr("b.svg", bytes(15_000_000))
     archive_of(tmp_path / "b.tar.gz", {"a.svg": bytes(30_000_000), "b.svg": b"x"})
+    lying = lying_zip(tmp_path / "c.zip", "a.svg", b"<svg/>", zipfile.ZIP_DEFLATED, 1 << 26)
     tracemalloc.start()
     refusals = [m.refusal for m in safe.members(tmp_path / "a.zip", ".svg")]
     assert "300,000,000 bytes" in refusals[0] and "unpacks" in refusals[1]
     first, second = safe.members(tmp_path / "b.tar.gz", ".svg")
     assert "30,000,000 bytes" in first.refusal and second.content == b"x"
+    (member,) = safe.members(lying, ".svg")
+    assert "Bad CRC" in member.refusal
     assert tracemalloc.get_traced_memory()[1] < 5e7
     tracemalloc.stop()
 
@@ -329,6 +371,30 @@ def test_bad_maps(here, capsys):
     assert run("source=svg", "path=open.svg", "scale=1") == 2
     assert "enclose no floor" in capsys.readouterr().err
     assert not list(here.glob("*.npz"))
+
+
+def test_thresholds_of_ros_are_exclusive(here):
+    """A cell is free below free_thresh and a wall above occupied_thresh. 51 / 255 is 0.2."""
+    draw_plans.ros_map(here, "a", np.array([[50, 51, 204, 205]], np.uint8), 0.05)
+    text = (here / "a.yaml").read_text()
+    numbers = {"negate": 1, "free_thresh": 0.2, "occupied_thresh": 0.8}
+    (here / "a.yaml").write_text(json.dumps({**yaml.safe_load(text), **numbers}))
+    grid = maps.load(here / "a.yaml")
+    assert grid.free.tolist() == [[True, False, False, False]]
+    assert grid.unknown.tolist() == [[False, True, True, False]]
+
+
+def test_lights_hang_in_their_rooms():
+    """In the middle of a rectangle. The centroid of the other room, a U, is in the first."""
+    inner, home = shapely.box(2, 2, 5, 6), shapely.box(0, 0, 7, 6)
+    wall = inner.buffer(0.1, join_style="mitre") & home
+    outer, door = home - wall, shapely.box(3, 1.9, 4, 2)
+    drawing = outlines.Drawing([wall - inner], [inner, outer], [door], [])
+    g, notes = outlines.geometry_of(drawing, 0)
+    assert notes.n_reachable == 2 and checks.errors(g) == []
+    lights = g.lights.astype(float) - g.walls.min((0, 1))
+    np.testing.assert_allclose(lights[0], (3.5, 4), atol=0.04)  # slits of 3 cm are closed
+    assert outer.contains(shapely.Point(lights[1])) and not outer.contains(outer.centroid)
 
 
 @pytest.mark.slow

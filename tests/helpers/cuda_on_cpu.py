@@ -30,6 +30,7 @@ BACKEND = """
 #undef KERNEL
 #include "common/backend.h"
 #define BOUNDS(n_blocks)
+#define PREFETCH(address)
 constexpr unsigned int FULL_WARP = ~0u;
 """
 #: What a C++ compiler does not take: (expression, replacement).

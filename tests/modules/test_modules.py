@@ -361,7 +361,10 @@ def test_wrong_actions_are_named(name):
 def test_wrong_continuous_actions_are_named():
     move = modules.SimpleMovement(core_of([toys.box()]), control="continuous")
     right = torch.zeros((move.core.n_envs, 1, 3))
-    for wrong in (right[1:], right.mT, right.double(), right.long(), right[..., 0], None):
+    shrunken = right.clone()
+    shrunken.untyped_storage().resize_(8)
+    wrongs = right[1:], right.mT, right.double(), right.long(), right[..., 0], shrunken, None
+    for wrong in (*wrongs, right.to("meta")):
         with pytest.raises((TypeError, ValueError), match="^actions must be .*, 3 for each .* was"):
             move(dict(actions=wrong))
     for shape in (right.shape, (-1, 3)):

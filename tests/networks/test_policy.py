@@ -234,6 +234,7 @@ def learnt(policy, world, privileged, lanes, weights):
     # the same actions whatever the logits are
     actions = mapping(lambda leaf: (weights[0] > 0).long()[..., None])(now.logits)
     outputs = policy.terms(world.obs, starts, state, actions, privileged, lanes)
+    outputs.pop("features")
     assert all(output.dtype == torch.float32 for output in outputs.values())
     sum((w * output).sum() for w, output in zip(weights, outputs.values())).backward()
     gradients = {name: p.grad for name, p in policy.named_parameters()}

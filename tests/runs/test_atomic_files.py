@@ -37,6 +37,13 @@ def test_concurrent_writes_of_one_file_all_succeed(tmp_path, monkeypatch, worker
     assert all(done.is_set() for done in is_done) and os.listdir(tmp_path) == ["table.json"]
 
 
+def test_a_written_file_leaves_nothing_open(tmp_path):
+    n_open = len(os.listdir("/dev/fd"))
+    for _ in range(3):
+        write_atomically(tmp_path / "table.json", b"{}")
+    assert len(os.listdir("/dev/fd")) == n_open
+
+
 def left(tmp_path, monkeypatch, what, **faked):
     """Makes the temporary file or folder of a process that was killed."""
     with monkeypatch.context() as patch:

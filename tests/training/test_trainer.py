@@ -364,10 +364,10 @@ def test_checkpoint_reaches_no_further_than_the_files_on_disk(tmp_path, file):
 
     run = make_trainer(tmp_path)
     setattr(run, file, SimpleNamespace(sync=full_disk))
-    for is_last in (False, True):  # the last one is worth more than the files
-        run.save_checkpoint(is_last=is_last)
+    for options in ({}, {"is_last": True}):  # the last one is worth more than the files
+        run.save_checkpoint(**options)
         run.saver.wait()
-        assert len(checkpoint.list_checkpoints(tmp_path)) == is_last
+        assert len(checkpoint.list_checkpoints(tmp_path)) == len(options)
 
 
 def test_budget_ends_at_the_nearer_limit():

@@ -67,11 +67,6 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
     floors = [floor for floor in floors if any(floor[:4])]
     if not floors:
         raise ValueError("its floor plan is empty")
-    for floor in floors:
-        if not floor.walls:
-            raise ValueError("it has no Wall")
-        if not floor.rooms:
-            raise ValueError("it has no Space indoors")
     return floors
 
 

@@ -58,6 +58,23 @@ def geometry_of(options: Options, drawing: Drawing) -> tuple[dotdict, Notes]:
     return outlines.geometry_of(drawing, 0, options.sealed, tolerance)
 
 
+def _home(options, drawing) -> tuple[dotdict, Notes]:
+    """Does what `geometry_of` does. Raises ValueError also for a geometry that is no home."""
+    with _refused():
+        g, notes = geometry_of(options, drawing)
+        if (sentences := checks.errors(g)) and options.sealed:
+            raise ValueError("; ".join(sentences))
+        return g, notes
+
+
+def first_home(options: Options, member: safe.Member) -> tuple[Drawing, dotdict]:
+    """Returns the first floor of a file that is a home, and its geometry."""
+    for drawing in drawings(options, member.content or b""):
+        with contextlib.suppress(ValueError):
+            return drawing, _home(options, drawing)[0]
+    raise ValueError(f"{member.name!r} has no home")
+
+
 def read(options: Options, member: safe.Member) -> Plan:
     """Returns the plan of a file. A floor that is no home is a warning if another floor is one."""
     name = member.name
@@ -71,11 +88,7 @@ def read(options: Options, member: safe.Member) -> Plan:
         return Plan(name, [], [], _line(error))
     for drawing in floors:
         try:
-            with _refused():
-                g, notes = geometry_of(options, drawing)
-                if (sentences := checks.errors(g)) and options.sealed:
-                    raise ValueError("; ".join(sentences))
-                made.append((g, notes))
+            made.append(_home(options, drawing))
         except ValueError as error:
             refusals.append(_line(error))
     if not made:

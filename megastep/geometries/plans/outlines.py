@@ -98,11 +98,13 @@ def geometry_of(
     n_corners = int(shapely.get_num_coordinates(shapes).sum())
     if n_corners > MAX_CORNERS:
         raise ValueError(f"it has {n_corners:,} corners, but the limit is {MAX_CORNERS:,}")
-    check_extent([*drawing.walls, *drawing.rooms])
-    solids = shapely.union_all(drawing.walls)
     rooms = drawing.rooms if sealed else [*drawing.rooms, *drawing.outdoors]
     if not rooms:
         raise ValueError("it has no room" + " indoors" * bool(drawing.outdoors))
+    if not drawing.walls and drawing.floor is None:
+        raise ValueError("it has no wall")
+    check_extent([*drawing.walls, *drawing.rooms])
+    solids = shapely.union_all(drawing.walls)
     openings, n_sealed = _openings(drawing, solids, rooms) if sealed else (drawing.doors, 0)
     gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in openings])
     solids = solids.difference(gaps)

@@ -18,10 +18,13 @@ import numpy as np
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 
+from megastep.geometries import files
+
 MAX_BYTES = 20 << 20  # of a file
 MAX_MEMBERS = 200_000  # of an archive
+MAX_DIRECTORY = 64 << 20  # bytes of a zip's table of contents
 MAX_TOTAL = 8 << 30  # bytes of an archive, unpacked
-MAX_RATIO = 200  # of bytes unpacked to packed, of a member of over a megabyte
+MAX_RATIO = 200  # of bytes unpacked to packed, of a member of over a megabyte, and of a tar
 MAX_DEPTH = 200  # elements within elements
 MAX_ELEMENTS = 200_000
 MAX_POINTS = 100_000  # of one list
@@ -65,6 +68,8 @@ def members(path: Path, suffix: str) -> Iterator[Member]:
         reason = " ".join(str(error).split()) or type(error).__name__
         text = f"{str(path)!r} is damaged or cut short ({reason}); download it again"
         raise ValueError(text) from error
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r} {error}") from error
 
 
 def of_file(path: Path, name: str) -> Member:
@@ -93,14 +98,15 @@ def _is_outside(name) -> bool:
 
 
 def _of_zip(path, suffix) -> Iterator[Member]:
-    with zipfile.ZipFile(path) as archive:
+    with files.open_zip(path, MAX_DIRECTORY) as archive:
         entries = archive.infolist()
         if len(entries) > MAX_MEMBERS:
-            raise ValueError(f"{str(path)!r} has {len(entries):,} files, more than {MAX_MEMBERS:,}")
+            raise ValueError(f"has {len(entries):,} files, more than {MAX_MEMBERS:,}")
+        entries = [one for one in entries if one.filename.endswith(suffix) and not one.is_dir()]
+        if (total := sum(entry.file_size for entry in entries)) > MAX_TOTAL:
+            raise ValueError(f"unpacks to {total:,} bytes, more than {MAX_TOTAL:,}")
         for entry in sorted(entries, key=lambda entry: entry.filename):
             name, size = entry.filename, entry.file_size
-            if not name.endswith(suffix) or entry.is_dir():
-                continue
             if _is_outside(name):
                 yield Member(name, None, "its name leads out of the archive")
             elif entry.flag_bits & 1:
@@ -113,22 +119,30 @@ def _of_zip(path, suffix) -> Iterator[Member]:
                 yield Member(name, None, f"it unpacks to {size // entry.compress_size:,} times")
             else:
                 try:
-                    yield Member(name, archive.read(entry))
+                    with archive.open(entry) as file:  # `read` of the archive unpacks all there is
+                        content = file.read(size)
+                    yield Member(name, content)
                 except BROKEN as error:
                     yield Member(name, None, f"it is damaged: {error}")
 
 
 class _Capped:
-    """A stream of which no more than `left` bytes are read; whoever reads on sets it again."""
+    """A stream of which no more than `left` bytes are read; whoever reads on sets it again.
 
-    def __init__(self, file: IO[bytes] | gzip.GzipFile):
-        self.file, self.left, self.total = file, MAX_BYTES, MAX_TOTAL
+    Args:
+        raw: a file.
+        file: what it unpacks to.
+    """
+
+    def __init__(self, raw: IO[bytes], file: IO[bytes] | gzip.GzipFile):
+        self.raw, self.file, self.left, self.total = raw, file, MAX_BYTES, 0
 
     def read(self, n: int) -> bytes:
         content = self.file.read(n)
         self.left -= len(content)
-        self.total -= len(content)
-        if self.left < 0 or self.total < 0:
+        self.total += len(content)
+        limit = min(MAX_TOTAL, 4 * MAX_BYTES + MAX_RATIO * self.raw.tell())
+        if self.left < 0 or self.total > limit:
             raise tarfile.TarError("it unpacks to more than the limit")
         return content
 
@@ -137,11 +151,11 @@ def _of_tar(path, suffix) -> Iterator[Member]:
     with path.open("rb") as raw:
         is_packed = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
-        stream = _Capped(gzip.GzipFile(fileobj=raw) if is_packed else raw)
+        stream = _Capped(raw, gzip.GzipFile(fileobj=raw) if is_packed else raw)
         with tarfile.open(fileobj=stream, mode="r|") as archive:  # type: ignore[arg-type]
             for number, entry in enumerate(archive):
                 if number >= MAX_MEMBERS:
-                    raise ValueError(f"{str(path)!r} has more than {MAX_MEMBERS:,} files")
+                    raise ValueError(f"has more than {MAX_MEMBERS:,} files")
                 stream.left = MAX_BYTES + entry.size  # what follows is skipped or read
                 archive.members = []  # type: ignore[misc]  # which would keep all names
                 if not entry.isfile() or not entry.name.endswith(suffix):

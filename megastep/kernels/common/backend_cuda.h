@@ -23,6 +23,7 @@
 #define TO_INT(x) ((int)(x))
 #define RECIPROCAL(x) reciprocal(x)
 #define LOAD(address) load(address)
+#define PREFETCH(address) asm volatile("prefetch.global.L1 [%0];" ::"l"(address))
 #define OR_BITS(word, bits) atomicOr(word, bits)
 #define ADD(word, number) atomicAdd(word, number)
 #define COUNT_BITS(word) __popc(word)

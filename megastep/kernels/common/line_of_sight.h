@@ -38,10 +38,9 @@ HD unsigned int cut_by_objects(const ObjectsParams& o, const Group& group, int e
         Object object = objects_of(o)[env * o.n_objects + k];
         if (!is_obstacle(object))
             continue;
-        int shape = o.shapes[k];
         Pose pose = pose_at(object.x, object.y, object.angle);
-        for (int m = 0; m < n_lines_of(shape); m++) {
-            Float4 side = line_of(shape, m, object.size, pose);
+        for (int l = o.line_starts[k]; l < o.line_starts[k + 1]; l++) {
+            Float4 side = line_of(o, l, object, pose);
             for (int line = 0; line < 3; line++) {
                 float aside = (float)(line - 1);
                 cut |= (unsigned int)cuts(side.x, side.y, side.z, side.w, x, y, dx + aside * side_x,

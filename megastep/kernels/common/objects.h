@@ -34,6 +34,7 @@ struct ObjectsParams {
     int n_lines;
     int n_colours;
     int lit;  // 1: the layout's lights fall on them, else each has full light
+    const float* ends;  // (L, 4) of each line, of an object of size 1 at the origin
 };
 
 HD Object* objects_of(const ObjectsParams& o) { return (Object*)o.objects; }
@@ -49,33 +50,20 @@ HD int is_obstacle(const Object& object) {
     return object.solid && is_there(object) && object.carrier < 0;
 }
 
-HD int n_lines_of(int shape) { return shape == DISC ? 6 : shape == CRATE ? 4 : 1; }
-
-// Corner k of a shape of size 1 about its own origin.
-HD void corner_of(int shape, int k, float& x, float& y) {
-    if (shape == DISC) {  // a hexagon
-        int left = k == 2 || k == 3 || k == 4, beside = k == 0 || k == 3;
-        x = (left ? -1.f : 1.f) * (beside ? 1.f : 0.5f);
-        y = beside ? 0.f : (k < 3 ? 0.8660254f : -0.8660254f);
-    } else {
-        x = k == 0 || k == 3 ? -1.f : 1.f;
-        y = shape == DOOR ? 0.f : (k < 2 ? -1.f : 1.f);
-    }
-}
-
-// Line k of a shape of this size at a pose. Written with sums alone, as update_line.
-HD Float4 line_of(int shape, int k, float size, const Pose& pose) {
-    float ax, ay, bx, by, minus_sine = -pose.sine;
-    corner_of(shape, k, ax, ay);
-    corner_of(shape, k + 1 == n_lines_of(shape) && k ? 0 : k + 1, bx, by);
-    ax *= size;
-    ay *= size;
-    bx *= size;
-    by *= size;
+// A line with these ends at a size of 1, of an object of this size at a pose. Written with sums
+// alone, as update_line.
+HD Float4 line_at(const Float4& ends, float size, const Pose& pose) {
+    float ax = ends.x * size, ay = ends.y * size, bx = ends.z * size, by = ends.w * size;
+    float minus_sine = -pose.sine;
     return {pose.x + (pose.cosine * ax + minus_sine * ay),
             pose.y + (pose.sine * ax + pose.cosine * ay),
             pose.x + (pose.cosine * bx + minus_sine * by),
             pose.y + (pose.sine * bx + pose.cosine * by)};
+}
+
+// Line l of an environment's objects, one of this object at a pose.
+HD Float4 line_of(const ObjectsParams& o, int l, const Object& object, const Pose& pose) {
+    return line_at(LOAD((const Float4*)o.ends + l), object.size, pose);
 }
 
 // Returns 1 if a disc of this radius touches no obstacle of an environment. Crates and doors count
