@@ -49,7 +49,7 @@ wasm: $(SETUP)             ## build the kernels of web pages again, megastep/web
 	$(PYTHON) scripts/build_wasm.py
 
 docs: $(SETUP)             ## build the site in docs/_build; warnings are errors
-	test -d docs/play || $(PYTHON) scripts/pictures.py gallery
+	test -f docs/play/minimal.mp4 || $(PYTHON) scripts/pictures.py gallery
 	$(PYTHON) -m sphinx -W --keep-going -q docs docs/_build
 
 image:                     ## build the container image with buildah, try it; IMAGE_OPTIONS=--stand-in

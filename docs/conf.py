@@ -35,6 +35,7 @@ nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_execution_timeout = 600  # seconds a cell
 nb_merge_streams = True
+os.environ.pop("MPLBACKEND", None)  # a notebook's own shows figures
 os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]

@@ -197,12 +197,7 @@ class ParallelEncoder:
             import loky
 
             self._n_workers = self._n_workers or min(loky.cpu_count(), MAX_WORKERS)
-            self._pool = loky.ProcessPoolExecutor(
-                self._n_workers,
-                initializer=workers.end_with_parent,
-                initargs=(os.getpid(),),
-                env=workers.WORKER_ENV,
-            )
+            self._pool = workers.pool(self._n_workers)
         return self._pool
 
     def _add(self, image: np.ndarray | Future) -> None:

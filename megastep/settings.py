@@ -183,7 +183,7 @@ def settings_class(name: str, fields: Mapping[str, tuple], is_finite: bool = Tru
 
 def _field(hint, default) -> tuple:
     """Returns (type,) or (type, default) of an argument."""
-    if getattr(hint, "_is_protocol", False):
+    if inspect.isclass(hint) and getattr(hint, "_is_protocol", False):
         hint = Annotated[Any, pydantic.AfterValidator(functools.partial(_has_members, hint))]
     if default is inspect.Parameter.empty:
         return (Any if hint is None else hint,)

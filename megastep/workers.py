@@ -8,8 +8,12 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
-__all__ = ["WORKER_ENV", "end_with", "end_with_parent", "terminal_signals_blocked"]
+if TYPE_CHECKING:
+    from loky import ProcessPoolExecutor
+
+__all__ = ["WORKER_ENV", "end_with", "end_with_parent", "pool", "terminal_signals_blocked"]
 
 #: Environment variables of a worker process: one thread, no screen, and no GPU, because even an
 #: idle CUDA context takes half a gigabyte.
@@ -58,3 +62,15 @@ def end_with(is_running: Callable[[], bool]) -> None:
 def end_with_parent(parent: int) -> None:
     """As :func:`end_with`, for a child of process ``parent``. Can initialise a pool's workers."""
     end_with(lambda: os.getppid() == parent)
+
+
+def pool(n_workers: int) -> "ProcessPoolExecutor":
+    """Returns a pool of processes with :data:`WORKER_ENV`, which end with this one. Its first
+    workers start with the first call, which belongs inside :func:`terminal_signals_blocked`.
+    """
+    import loky
+
+    parent = (os.getpid(),)
+    return loky.ProcessPoolExecutor(
+        n_workers, initializer=end_with_parent, initargs=parent, env=WORKER_ENV
+    )

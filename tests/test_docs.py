@@ -105,4 +105,4 @@ def test_tests_of_all_faults_exist():
             # every case of a test may have a mark of its own
             is_of_tier = marks == {tier} - {""} or not marks and f"mark.{tier}" in decorators
             assert is_of_tier, (fault, path, name)
-    assert len(rows) == 92
+    assert len(rows) == 94

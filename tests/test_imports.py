@@ -160,6 +160,7 @@ OUTSIDE_USERS = {
         "megastep/geometries/plans/imports.py",
         "megastep/recording.py",
         "megastep/vector_processes.py",
+        "megastep/workers.py",
     ),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/evaluation/ratings.py",),

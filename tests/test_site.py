@@ -24,7 +24,8 @@ def site(tmp_path_factory):
     options = "-W", "--keep-going", "-q", "-E", "-b", "dummy", "-d", str(folder / "doctrees")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MEGASTEP_REPOSITORY", "https://example.org/megastep")
-        patch.setenv("PYTHONPATH", "")  # conf.py sets it; this restores it
+        patch.setenv("PYTHONPATH", "")  # conf.py changes both, which is undone here
+        patch.setenv("MPLBACKEND", "agg")
         return build_main([*options, str(DOCS), str(folder / "html")]), folder
 
 

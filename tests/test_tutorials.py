@@ -21,7 +21,7 @@ CONCEPTS = ["../performance.md"] + sorted(
 )
 #: Pages that take more than about three seconds on an idle core.
 LONG = {"deathmatch.md", "explorer.md", "from-python.md", "own-floor-plans.md", "scaling-out.md"}
-BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\w*)\n(.*?)```", re.S)
+BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\S*)[^\n]*\n(.*?)```", re.S)
 FILE = re.compile(r"(?:#|//|<!--) (\S+\.(?:py|h|cpp|cu|svg))(?: -->)?\n")
 PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"
 TIERS = {True: pytest.mark.nightly, False: pytest.mark.slow}
@@ -33,7 +33,7 @@ def follow(page, folder, patch):
     with pages.inside(folder, patch):
         for reason, language, body in BLOCK.findall((FOLDER / page).read_text()):
             file = FILE.match(body)
-            if reason:
+            if reason or language.startswith("{"):
                 continue
             if file:
                 path = folder / file[1]

@@ -7,6 +7,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from megastep.workers import terminal_signals_blocked
 from tests.helpers.processes import is_running
 
@@ -35,11 +37,10 @@ def test_processes_started_inside_never_receive_signals_of_the_terminal():
 #: Starts two workers, as recording does, in a process that has started none before, and prints
 #: what each of them blocks.
 POOL = """
-import loky
 from megastep import workers
 from tests.test_workers import blocked_signals
 with workers.terminal_signals_blocked():
-    pool = loky.ProcessPoolExecutor(2)
+    pool = workers.pool(2)
     masks = [pool.submit(blocked_signals, "self") for _ in range(2)]
 print(*(mask.result() for mask in masks))
 pool.shutdown()
@@ -52,6 +53,16 @@ def test_workers_of_the_first_pool_never_receive_signals_of_the_terminal():
     assert len(masks) == 2
     for mask in map(int, masks):
         assert all(mask >> number - 1 & 1 for number in (signal.SIGINT, signal.SIGHUP))
+
+
+#: Prints the process of a pool's worker, and waits.
+POOL_OF_ONE = """
+import os, time
+from megastep import workers
+with workers.terminal_signals_blocked():
+    print(workers.pool(1).submit(os.getpid).result(), flush=True)
+time.sleep(1000)
+"""
 
 
 #: Starts itself once more, as the process that is left behind and prints its number.
@@ -67,10 +78,11 @@ time.sleep(1000)
 """
 
 
-def test_worker_ends_soon_after_its_parent_is_killed():
+@pytest.mark.parametrize("code", [PARENT_AND_CHILD, POOL_OF_ONE], ids=["child", "pool"])
+def test_worker_ends_soon_after_its_parent_is_killed(code):
     parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT_AND_CHILD],
-        env={**os.environ, "CODE": PARENT_AND_CHILD},
+        [sys.executable, "-c", code],
+        env={**os.environ, "CODE": code},
         cwd=ROOT,
         stdout=subprocess.PIPE,
         text=True,

@@ -39,16 +39,18 @@ def adapters(device: torch.device) -> Iterator[dict]:
             native.step(arrdict(actions=actions[i % N_DECISIONS]))
 
         what = f"explorer, {n_envs:,} environments"
+        unkept = dict(to_numpy=False, copy=False)
         whole = seconds_per_call(numbered(step), device)
         yield rate(f"{what}, native", n_envs, whole)
         for name, settings in (
             ("NEXT_STEP, tensors", dict(autoreset_mode="next_step", to_numpy=False)),
-            ("NEXT_STEP, tensors, copy=False", dict(to_numpy=False, copy=False)),
+            ("NEXT_STEP, tensors, copy=False", unkept),
             (
                 "DISABLED, tensors, copy=False",
                 dict(autoreset_mode="disabled", to_numpy=False, copy=False),
             ),
             ("DISABLED, tensors", dict(autoreset_mode="disabled", to_numpy=False)),
+            ("DISABLED, tensors, copy=False", dict(autoreset_mode="disabled") | unkept),
             ("DISABLED, tensors, with resets", dict(autoreset_mode="disabled", to_numpy=False)),
             ("SAME_STEP, tensors", dict(autoreset_mode="same_step", to_numpy=False)),
             ("NEXT_STEP, arrays", dict()),

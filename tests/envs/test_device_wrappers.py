@@ -296,7 +296,7 @@ def test_code_and_commands_of_the_page_work(here, monkeypatch):
             more = ("learner.n_minibatches=2",)
             more += () if "env=gymnasium" in words else ("geometry=box", "env.res=16")
             assert train.main([*words, *small, *more]) == 0, words
-        from my_wrappers import PaidTurns  # pyright: ignore[reportMissingImports]
+        from my_wrappers import PaidTurns
 
         plain, paid = (envs.explorer.Explorer(4, [toys.box()], device="cpu") for _ in range(2))
         paid = PaidTurns(paid, cost=0.25)

@@ -98,6 +98,13 @@ def test_refused(name, words):
     assert not plan.geometries and words in plan.refusal and "\n" not in plan.refusal
 
 
+def test_files_of_too_many_elements_are_refused(monkeypatch):
+    monkeypatch.setattr(safe, "MAX_ELEMENTS", 50)
+    assert safe.xml(b"<svg>" + b"<g/>" * 49 + b"</svg>") is not None
+    with pytest.raises(ValueError, match="or 50$"):
+        safe.xml(b"<svg>" + b"<g/>" * 50 + b"</svg>")
+
+
 def test_rooms_without_doors_have_walls():
     (g,) = plan_of("ok_closed_room_needs_interior_ring.svg").geometries
     assert len(g.walls) == 12, "two rooms and the outline"
@@ -125,6 +132,16 @@ def test_houseexpo():
     lengths = np.hypot(*(g.walls[:, 1] - g.walls[:, 0]).T)
     assert lengths.sum() == pytest.approx(2 * (7 + 4) + 2 * 3 + 2 * 0.1 - 2 * 0.1, abs=0.3)
     assert (x.min(), y.min(), x.max(), y.max()) == pytest.approx((1, 1, 8, 5))
+    np.testing.assert_allclose(g.doors, [[(5.05, 2), (5.05, 3)]], atol=0.01)
+
+
+def test_doorways_of_houseexpo():
+    """A stub of a wall leaves a doorway of 1 m; a corner, a niche and a wide gap are none."""
+    verts = [(0, 0), (8, 0), (8, 5), (6, 5), (6, 4.5), (5, 4.5), (5, 5), (4.1, 5), (4.1, 1), (4, 1)]
+    verts += [(4, 5), (0, 5), (0, 3), (1, 3), (1, 2.9), (0, 2.9)]
+    plan = json.dumps({"verts": verts, "room_category": {"room": [[0, 0, 4, 5], [4.1, 0, 8, 5]]}})
+    (g,) = imports.read(Options("houseexpo"), safe.Member("a.json", plan.encode())).geometries
+    np.testing.assert_allclose(g.doors, [[(5.05, 1), (5.05, 2)]], atol=0.01)
 
 
 def run(*words):

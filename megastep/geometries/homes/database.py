@@ -12,7 +12,6 @@ disk in the same format.
 import functools
 import hashlib
 import io
-import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -157,13 +156,5 @@ def _generate(seeds, density, clutter) -> bytes:
     n_workers = min(loky.cpu_count(), len(seeds) // SEEDS_EACH)
     if n_workers < 2:
         return pack([make(seed) for seed in seeds])
-    with (
-        workers.terminal_signals_blocked(),
-        loky.ProcessPoolExecutor(
-            n_workers,
-            initializer=workers.end_with_parent,
-            initargs=(os.getpid(),),
-            env=workers.WORKER_ENV,
-        ) as pool,
-    ):
+    with workers.terminal_signals_blocked(), workers.pool(n_workers) as pool:
         return pack(list(pool.map(make, seeds, chunksize=10)))

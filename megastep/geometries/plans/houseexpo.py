@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import shapely
+from shapely.geometry.polygon import orient
 
 from megastep.geometries.plans import outlines
 from megastep.geometries.plans.outlines import Drawing
@@ -15,6 +16,9 @@ TOLERANCE = 0.02  # metres, by which outlines are simplified
 MIN_BOX = 0.3  # m2 of floor that only this box has
 MIN_ROOM = 1.0  # m2 of floor outside all boxes that are a room too
 MAX_CORNERS = 100_000
+ROUGH = 0.06  # metres, by which outlines are simplified to find the ends of walls
+THICK = 0.6  # metres; walls end in edges of up to that length
+WIDTHS = (0.5, 2.0)  # metres; of doorways
 
 
 def _refuse(text) -> float:
@@ -55,7 +59,37 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
             taken = taken.union(box)
     rest = floor.difference(shapely.union_all([room.buffer(0.05) for room in rooms]))
     rooms += [part for part in outlines.polygons(rest) if part.area >= MIN_ROOM]
-    return [Drawing([], rooms or [floor], [], [], floor)]
+    return [Drawing([], rooms or [floor], _doorways(floor), [], floor)]
+
+
+def _doorways(floor) -> list[shapely.Polygon]:
+    """Returns the doorways of a floor, which marks none: the floor between the end of a wall, a
+    short edge with floor around both of its corners, and what the wall would meet if it went on.
+    """
+    outline, doors, middles = orient(shapely.simplify(floor, ROUGH)), [], []
+    for ring in (outline.exterior, *outline.interiors):
+        points = np.array(ring.coords[:-1])
+        steps = np.roll(points, -1, 0) - points  # the floor is on their left
+        lengths = np.hypot(*steps.T)
+        units = steps / lengths[:, None]
+        before, after = np.roll(units, 1, 0), np.roll(units, -1, 0)
+        turns = before[:, 0] * units[:, 1] - before[:, 1] * units[:, 0]  # sines; right is below 0
+        is_end = (turns < -0.7) & (np.roll(turns, -1) < -0.7) & (lengths <= THICK)
+        for i in np.nonzero(is_end)[0]:
+            start, ahead = points[i] + steps[i] / 2, before[i] - after[i]
+            ahead = ahead / np.hypot(*ahead)
+            ray = shapely.LineString([start + 0.01 * ahead, start + WIDTHS[1] * ahead])
+            hit = ray.intersection(outline.boundary)
+            if hit.is_empty:
+                continue
+            width = 0.01 + shapely.Point(ray.coords[0]).distance(hit)
+            middle = shapely.Point(start + width / 2 * ahead)
+            is_new = all(middle.distance(other) > THICK for other in middles)
+            if width >= WIDTHS[0] and lengths[i] < width and is_new:
+                middles.append(middle)
+                line = shapely.LineString([start, start + width * ahead])
+                doors.append(line.buffer(lengths[i] / 2, **outlines.MITRE))
+    return doors
 
 
 def _numbers(value, width, name) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
@@ -168,16 +167,7 @@ def run(
         for batch in batches:
             keep(batch, _read_all(options, batch))
     elif (second := next(batches, None)) is not None:
-        with (
-            _killed(),
-            workers.terminal_signals_blocked(),
-            loky.ProcessPoolExecutor(
-                n_processes,
-                initializer=workers.end_with_parent,
-                initargs=(os.getpid(),),
-                env=workers.WORKER_ENV,
-            ) as pool,
-        ):
+        with _killed(), workers.terminal_signals_blocked(), workers.pool(n_processes) as pool:
             submit = functools.partial(pool.submit, _read_all, options)
             pending = [(second, submit(second))]
             for batch in batches:

@@ -105,7 +105,9 @@ def geometry_of(
         raise ValueError("it has no wall")
     check_extent([*drawing.walls, *drawing.rooms])
     solids = shapely.union_all(drawing.walls)
-    openings, n_sealed = _openings(drawing, solids, rooms) if sealed else (drawing.doors, 0)
+    openings, n_sealed = drawing.doors, 0
+    if sealed and drawing.floor is None:
+        openings, n_sealed = _openings(drawing, solids, rooms)
     gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in openings])
     solids = solids.difference(gaps)
     floor = drawing.floor
