@@ -113,6 +113,9 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     keys and groups.
     """
     set_ranks(tree, typed)
+    if "population.member" in typed:
+        text = "is set by a population; give population.size, or member= of one with init=RUN"
+        raise ConfigErrors([("population.member", text)])
     tree.setdefault("logger", {})  # as it is with logger=none
     for key, kind in QUANTITIES.items():
         if key in tree:

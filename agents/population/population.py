@@ -362,6 +362,6 @@ class Population:
             trainer.close()
 
 
-def _on_host(leaf: T) -> T:
+def _on_host(leaf: object) -> object:
     """Returns a copy of a tensor on the CPU, and anything else as it is."""
     return leaf.detach().to("cpu", copy=True) if isinstance(leaf, torch.Tensor) else leaf

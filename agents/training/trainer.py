@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.training.profiler import Profiler
     from megastep.agents.types import Learner, RolloutLike, RunLogger, SaverLike, StateDict
+    from megastep.coefficients import Coefficients
 
 
 #: Updates that the host may be ahead of a GPU. The learning rate of an update follows the clock at
@@ -104,7 +105,8 @@ class Trainer:
 
     Raises:
         ValueError: the budget anneals the learning rate of a learner without `set_lr`; the
-            curriculum has no use for the environment or the learner.
+            curriculum has no use for the environment or the learner; `timetable` has a setting that
+            cannot change.
     """
 
     def __init__(
@@ -157,6 +159,8 @@ class Trainer:
         if options.coefficients is not None:
             self.coefficients.append(options.coefficients)
         self.scheduled: dict[str, float] = {}
+        for key in {key for _, values in timetable for key in values}:
+            self._owner(key)  # raises if there is none
         if budget.anneal != "never" and not self.set_lr:
             raise ValueError(
                 f"{type(learner).__name__} has no set_lr(lr), so its learning rate cannot fall "
@@ -386,14 +390,21 @@ class Trainer:
         """
         self.wait_for_collector()
         for key, value in values.items():
-            part, _, name = key.partition(".")
-            owners = [self.learner_coefficients] if part == "learner" else self.coefficients
-            owners = [one for one in owners if one is not None and name in one.values]
-            if not owners:
-                raise ValueError(f"{key} cannot change while training")
-            owners[0].set(**{name: value})
+            self._owner(key).set(**{key.partition(".")[2]: value})
             if key == "learner.lr":
                 self.lr = self.learner.lr = value
+
+    def _owner(self, key) -> Coefficients:
+        """Returns what holds a setting that may change. Raises ValueError if nothing does."""
+        part, _, name = key.partition(".")
+        owners = [self.learner_coefficients] if part == "learner" else self.coefficients
+        for one in owners:
+            if one is not None and name in one.values:
+                return one
+        raise ValueError(
+            f"{key} cannot change while training: the learner and the environment have no such "
+            "number"
+        )
 
     def _set_lr(self, lr_fraction) -> None:
         """Sets the learning rate of an update, if it changes and the learner does not do so."""

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from megastep.agents.cli import train
 from megastep.agents.runs import checkpoint, json_lines, populations
 from tests.helpers import ranks, tiny
 from tests.helpers.processes import HUNG, ROOT, finished, start
@@ -108,9 +107,3 @@ def test_a_league_over_ranks_equals_one_in_one_process(here):
     assert_equal(here / "of-2", here / "of-1")
     won = [json_lines.read(here / f"of-2/member-{n}/metrics.jsonl")[-1] for n in range(3)]
     assert any("episode/return/league" in row for row in won)
-
-
-def test_more_ranks_than_members_are_refused(here, capsys):
-    assert train.main([*WORDS, "ranks=4"]) == 2
-    assert "4 is more than population.size=3" in capsys.readouterr().err
-    assert not (here / "P").exists()

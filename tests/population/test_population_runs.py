@@ -1,5 +1,6 @@
 """Populations, from the command line."""
 
+import json
 import random
 import shutil
 import time
@@ -213,7 +214,8 @@ BAD = {
     "schedule": (["learner.lr={from:1e-3,to:1e-4}"], "is a schedule"),
     "size": (["population.size=1"], "needs several members"),
     "evaluated": (["population.score=evaluated"], "evaluate_every"),
-    "ranks": (["ranks=2"], "one process"),
+    "ranks": (["ranks=4"], "more than population.size=3"),
+    "member": (["population.member=1"], "is set by a population"),
     "file": (["population.size=1", "population.vary={}", "population.schedule=x"], "no file 'x'"),
 }
 
@@ -224,6 +226,14 @@ def test_bad_input_is_one_sentence(here, capsys, case):
     err = refused(capsys, *POPULATION, "samples=64", *words)
     assert any(part in err for part in text.split("|")), err
     assert "Traceback" not in err and not (here / "P").exists()
+
+
+def test_a_schedule_of_settings_that_the_agent_lacks_is_refused(here, capsys):
+    row = {"samples": 0, "generation": 0, "member": 0, "from": 0, "score": 1.0}
+    (here / "other.jsonl").write_text(json.dumps(row | {"settings/env.kill_reward": 2.0}) + "\n")
+    err = refused(capsys, *SMALL, "samples=64", "population.schedule=other.jsonl", "folder=one")
+    assert "env.kill_reward cannot change while training" in err and "Traceback" not in err
+    assert not (here / "one").exists()
 
 
 class WithoutCopies(PPO):
