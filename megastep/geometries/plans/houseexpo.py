@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import shapely
+from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
 from megastep.geometries.plans import outlines
@@ -62,7 +63,7 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
     return [Drawing([], rooms or [floor], _doorways(floor), [], floor)]
 
 
-def _doorways(floor) -> list[shapely.Polygon]:
+def _doorways(floor) -> list[BaseGeometry]:
     """Returns the doorways of a floor, which marks none: the floor between the end of a wall, a
     short edge with floor around both of its corners, and what the wall would meet if it went on.
     """
