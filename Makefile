@@ -88,4 +88,4 @@ lock:                      ## resolve the versions in requirements/ anew; needs 
 	$(BASE) scripts/lock.py
 
 clean:                     ## delete .venv, build folders and caches
-	rm -rf .venv docs/_build docs/play build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv docs/_build docs/jupyter_execute docs/play build dist *.egg-info .pytest_cache .ruff_cache

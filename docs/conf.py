@@ -28,7 +28,7 @@ author = copyright = "the megastep authors"
 release = version = package.version().split()[-1]
 
 extensions = ["myst_nb", "sphinx.ext.linkcode"]
-exclude_patterns = ["_build", "play"]
+exclude_patterns = ["_build", "play", "jupyter_execute"]
 # Notebooks run in an empty folder, with the package of this repository.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True

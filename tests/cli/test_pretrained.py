@@ -430,10 +430,10 @@ def test_agent_of_the_package(path):
     assert decision.logits.isfinite().all() and world.reward.isfinite().all()
 
 
-#: {agent: source, its settings, homes, episodes in each; the least mean of some metrics}, counted by
-#: hand. By their cards: success 0.989 and SPL 0.81; coverage 0.990 and return 22.2; found 37.2, of
-#: which an agent without memory finds half, and 69.9, which differs by 18 from maze to maze; success
-#: 0.996.
+#: {agent: source, its settings, homes, episodes in each; the least mean of some metrics}, counted
+#: by hand. By their cards: success 0.989 and SPL 0.81; coverage 0.990 and return 22.2; found 37.2,
+#: of which an agent without memory finds half; found 69.9, 18 more or less from maze to maze;
+#: success 0.996.
 FIRST_EPISODES = {
     "pointgoal_anywhere": ("bench", {}, 51, 2, {"success": 0.94, "spl": 0.76}),
     "explorer_anywhere": ("homes", {}, 24, 1, {"coverage": 0.97, "return": 16}),

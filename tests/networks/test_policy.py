@@ -133,6 +133,8 @@ def test_bare_spaces():
     world = arrdict(obs=torch.randn(B, 1, 4), reset=torch.ones(B, dtype=torch.bool))
     decision, _ = policy(world, policy.initial(B), sample=False)
     assert torch.equal(decision.actions, decision.logits.argmax(-1))
+    samples = [policy(world, policy.initial(B))[0].actions for _ in range(20)]
+    assert len(torch.stack(samples).unique(dim=0)) > 1, "it samples unless it is told not to"
 
 
 def test_seed_determines_weights_and_actions():

@@ -209,7 +209,7 @@ def _choices(names, sizes) -> dotdict:
     return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)})
 
 
-def identifiers(keys: Iterable[Any], reserved: Collection[str] = RESERVED) -> list[str]:
+def identifiers(keys: Iterable[object], reserved: Collection[str] = RESERVED) -> list[str]:
     """Returns a name for each key: `a-b` becomes a_b, 0 becomes part_0, `type` becomes type_."""
     names = []
     for key in keys:
