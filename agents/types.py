@@ -279,7 +279,7 @@ class OpponentPool(Protocol):
     """The part of `selfplay.opponents.Opponents` that a trainer uses."""
 
     env: Env  # without the opponents
-    scripted: Any  # the bot, or None
+    scripted: object  # the bot, or None
 
     def refresh_snapshots(self, policy: Actor, n_updates: int) -> None:
         """Replaces the oldest snapshot by the policy if it is time to."""
