@@ -33,7 +33,7 @@ struct ObjectsParams {
     int n_objects;           // 0: there are none
     int n_lines;
     int n_colours;
-    int lit;  // 1: the layout's lights fall on them, else each has full light
+    int lit;            // 1: the layout's lights fall on them, else each has full light
     const float* ends;  // (L, 4) of each line, of an object of size 1 at the origin
 };
 
