@@ -5,11 +5,14 @@ No class needs to inherit from the protocols: any object with these attributes i
 environment that are controlled independently, B = N A lanes.
 """
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-import torch
+if TYPE_CHECKING:  # processes of environments do without PyTorch
+    import torch
 
 __all__ = [
     "DEFAULTS",
@@ -209,6 +212,8 @@ class PolicyLike(Protocol):
 
 def is_stored(tensor: torch.Tensor) -> bool:
     """Returns whether a tensor has memory and lies inside its storage; PyTorch crashes else."""
+    import torch
+
     if tensor.layout is not torch.strided:
         return False
     if tensor.is_contiguous():

@@ -233,7 +233,10 @@ def imports(path):
     return names
 
 
-GRAPH = {name: imports(path) for name, path in MODULES.items()}
+@pytest.fixture(scope="module")
+def graph():
+    """What each module imports."""
+    return {name: imports(path) for name, path in MODULES.items()}
 
 
 def top_level(name):
@@ -413,8 +416,8 @@ RULES = (
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
-def test_sources_keep_the_rule(rule):
-    assert not list(rule(GRAPH))
+def test_sources_keep_the_rule(rule, graph):
+    assert not list(rule(graph))
 
 
 def test_tests_and_scripts_import_megastep_agents():
@@ -464,16 +467,16 @@ PLANTED = [
 
 
 @pytest.mark.parametrize("rule, name, target", PLANTED)
-def test_a_planted_import_is_named(rule, name, target):
-    assert name in GRAPH and target not in GRAPH[name]
-    planted = {**GRAPH, name: GRAPH[name] | {target}}
+def test_a_planted_import_is_named(rule, name, target, graph):
+    assert name in graph and target not in graph[name]
+    planted = {**graph, name: graph[name] | {target}}
     (sentence,) = rule(planted)
     assert name in sentence
     assert target in sentence or f"import {top_level(target)}" in sentence
 
 
-def test_a_planted_cycle_is_named():
-    planted = {**GRAPH, "megastep.dotdict": GRAPH["megastep.dotdict"] | {"megastep.arrdict"}}
+def test_a_planted_cycle_is_named(graph):
+    planted = {**graph, "megastep.dotdict": graph["megastep.dotdict"] | {"megastep.arrdict"}}
     (sentence,) = no_import_cycles(planted)
     assert "megastep.arrdict" in sentence and "megastep.dotdict" in sentence
 
@@ -486,8 +489,8 @@ def test_a_planted_cycle_is_named():
         (agents_rows, "megastep.agents.new.part"),
     ],
 )
-def test_a_module_without_a_row_is_named(rule, name):
-    assert list(rule({**GRAPH, name: set()})) == [f"{name} has no row in the rules"]
+def test_a_module_without_a_row_is_named(rule, name, graph):
+    assert list(rule({**graph, name: set()})) == [f"{name} has no row in the rules"]
 
 
 def test_imports_are_read_from_anywhere_in_a_file(tmp_path, monkeypatch):

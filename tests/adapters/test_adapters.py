@@ -69,8 +69,9 @@ def test_ids_are_those_of_all_environments():
     assert env.num_envs == 6 and env.spec.id == "megastep/Deathmatch-v0"
 
 
-def test_registering_imports_no_torch():
-    code = "import gymnasium, sys; from megastep.adapters.registration import register; register();"
+def test_registering_and_processes_of_environments_import_no_torch():
+    code = "import gymnasium, sys, megastep.vector_processes;"
+    code += "from megastep.adapters.registration import register; register();"
     code += "assert 'torch' not in sys.modules and 'megastep/Pong-v0' in gymnasium.registry"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
