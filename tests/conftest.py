@@ -6,8 +6,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")  # each worker imports torch, in seconds
 
-import copy
 import functools
+import pickle
 from pathlib import Path
 
 import loky
@@ -29,6 +29,13 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if item.get_closest_marker("cuda"):
                 item.add_marker(pytest.mark.skip(reason="there is no GPU"))
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Imports no file without tests of the tier that is chosen."""
+    tier = config.option.markexpr
+    if tier in ("slow", "nightly") and collection_path.name.startswith("test_"):
+        return f"mark.{tier}" not in collection_path.read_text() or None
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -75,8 +82,8 @@ def composed_once():
         name = JobRuntime.instance().get("name")
         key = str((method, name, arguments, options, blocks.applied))
         if key not in cached:
-            cached[key] = method(loader, *arguments, **options)
-        return copy.deepcopy(cached[key])
+            cached[key] = pickle.dumps(method(loader, *arguments, **options))
+        return pickle.loads(cached[key])  # in a tenth of the time of copy.deepcopy
 
     def load_once(loader, *arguments, **options):
         config = once(loader, load, *arguments, **options)

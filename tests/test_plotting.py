@@ -391,9 +391,10 @@ def test_importing_the_simulator_and_training_imports_no_optional_package():
         "import sys; import megastep; assert 'torch' not in sys.modules; "
         "from megastep import core, modules, envs, plotting; "
         "assert 'hydra' not in sys.modules; "
+        "from megastep.agents import api; "
         "from megastep.agents.cli import train; "
-        "print([m for m in ('matplotlib', 'tensorboard', 'av', 'IPython', 'wandb', 'loky') if m in "
-        "sys.modules])"
+        "print([m for m in ('matplotlib', 'tensorboard', 'av', 'IPython', 'wandb', 'loky', "
+        "'megastep.adapters') if m in sys.modules])"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert process.stdout == "[]\n", process.stderr

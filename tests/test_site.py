@@ -13,26 +13,9 @@ FOLDER = "notebooks"
 NOTEBOOKS = sorted(page.stem for page in (DOCS / FOLDER).glob("*.md"))
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """The exit code of a build, and its folder. All but the writing of HTML, which is half of the
-    time: notebooks run, links and anchors are resolved.
-    """
-    from sphinx.cmd.build import build_main
-
-    folder = tmp_path_factory.mktemp("site")
-    options = "-W", "--keep-going", "-q", "-E", "-b", "dummy", "-d", str(folder / "doctrees")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MEGASTEP_REPOSITORY", "https://example.org/megastep")
-        patch.setenv("PYTHONPATH", "")  # conf.py changes both, which is undone here
-        patch.setenv("MPLBACKEND", "agg")
-        return build_main([*options, str(DOCS), str(folder / "html")]), folder
-
-
-@pytest.fixture
-def outputs(request, site):
-    """What a notebook printed, and what its cells show: (text, kinds)."""
-    path = site[1] / "jupyter_execute" / FOLDER / f"{request.param}.ipynb"
+def outputs(folder, notebook):
+    """Returns what a notebook of a site printed, and the numbers of its pictures and films."""
+    path = folder / "jupyter_execute" / FOLDER / f"{notebook}.ipynb"
     cells = json.loads(path.read_text())["cells"]
     all_of = [output for cell in cells for output in cell.get("outputs", ())]
     text = "".join("".join(output.get("text", "")) for output in all_of)
@@ -42,23 +25,28 @@ def outputs(request, site):
 
 
 @pytest.mark.slow
-def test_site_builds_without_warnings(site):
-    assert site[0] == 0
+def test_site_builds_without_warnings_and_its_notebooks_show_what_they_say(tmp_path, monkeypatch):
+    """All but the writing of HTML, which is half of the time: notebooks run, links and anchors are
+    resolved.
+    """
+    from sphinx.cmd.build import build_main
+
+    options = "-W", "--keep-going", "-q", "-E", "-b", "dummy", "-d", str(tmp_path / "doctrees")
+    monkeypatch.setenv("MEGASTEP_REPOSITORY", "https://example.org/megastep")
+    monkeypatch.setenv("PYTHONPATH", "")  # conf.py changes both, which is undone here
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    assert build_main([*options, str(DOCS), str(tmp_path / "html")]) == 0
+    an_expert_and_a_trained_agent_are_shown(*outputs(tmp_path, "quick-tour"))
+    memory_of_a_trained_agent_knows_more_than_its_view(*outputs(tmp_path, "inside-an-agent"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("outputs", ["quick-tour"], indirect=True)
-def test_quick_tour_shows_an_expert_and_a_trained_agent(outputs):
-    text, n_pictures, n_films = outputs
+def an_expert_and_a_trained_agent_are_shown(text, n_pictures, n_films):
     by_chance, by_expert = map(int, re.findall(r"^(\d+) pieces of wall", text, re.M))
     assert by_expert > 3 * by_chance > 0
     assert (n_pictures, n_films) == (2, 2)  # a home and a curve; an expert and Pong
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("outputs", ["inside-an-agent"], indirect=True)
-def test_memory_of_a_trained_agent_knows_more_than_its_view(outputs):
-    text, n_pictures, _ = outputs
+def memory_of_a_trained_agent_knows_more_than_its_view(text, n_pictures, _):
     scores = dict(re.findall(r"^(\w+) +which way +(\S+)", text, re.M))
     view, untrained, memory = (float(scores[name]) for name in ("view", "untrained", "memory"))
     assert memory > 0.1 + max(view, untrained)

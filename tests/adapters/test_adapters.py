@@ -76,12 +76,6 @@ def test_registering_and_processes_of_environments_import_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-def test_training_imports_no_adapter():
-    code = "import megastep.agents.cli.train, megastep.agents.api, megastep.envs, sys;"
-    code += "assert not [m for m in sys.modules if m.startswith('megastep.adapters')]"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
-
-
 @pytest.mark.parametrize("in_numpy", (True, False))
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_modes_show_the_same_episodes(mode, in_numpy):

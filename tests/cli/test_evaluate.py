@@ -544,7 +544,7 @@ def test_evaluate_refuses_another_environment(trained, tmp_path):
 
 def test_episodes_are_written_one_by_one(explorer):
     """The rows' means are those of the table, and each home has as many."""
-    bench = settings("run=x", "geometry=bench", "geometry.n=4", script="evaluate").geometry
+    bench = settings("run=x", "geometry=homes", "geometry.n=4", script="evaluate").geometry
     bots = ["random", "explorer"]
     written = evaluate.run(configured(run=str(explorer), geometry=bench, baseline=bots))
     result = json.loads(written.read_text())
@@ -566,7 +566,7 @@ def test_episodes_are_written_one_by_one(explorer):
         assert len(spots) == 8
     columns = result["episodes"]
     assert columns["return"] == [float(row["return"]) for row in rows]
-    assert columns["source"] == ["bench"] * 24 if "source" in columns else True
+    assert columns["source"] == ["homes"] * 24 if "source" in columns else True
 
 
 def test_episodes_from_python(explorer):

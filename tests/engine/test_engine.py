@@ -84,8 +84,7 @@ VIEWS = [
 #: Numbers of environments and agents, and a seed. The last are thorough.
 ROUNDS = [
     *((2, 1, 0), (2, 4, 1)),
-    *(pytest.param(4, n, s, marks=pytest.mark.slow) for n, s in ((1, 1), (4, 0))),
-    *(pytest.param(4, n, s, marks=pytest.mark.nightly) for n, s in ((1, 0), (4, 1))),
+    *(pytest.param(4, n, s, marks=pytest.mark.nightly) for n in (1, 4) for s in (0, 1)),
 ]
 
 

@@ -104,12 +104,12 @@ def test_cpu_and_gpu_agree_on_every_bit(settings, amount, monkeypatch):
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu, monkeypatch):
     """The threads of a block run in three orders, blocks in two."""
-    expected = trajectory("cpu", n_steps=4, **settings)
+    expected = trajectory("cpu", n_steps=2, **settings)
     cuda_on_cpu.install(monkeypatch)
     pretend(monkeypatch, amount, settings["n_agents"])
     for order in ORDERS:
         monkeypatch.setattr(cuda_on_cpu, "order", order)
-        assert not any(differing(expected, trajectory("cpu", n_steps=4, **settings)))
+        assert not any(differing(expected, trajectory("cpu", n_steps=2, **settings)))
     can_split = settings["res"] > 32 and 32 % settings.get("subsample", 1) == 0
     kernel = dict(many="render", some="render_unspilled", few="render_split")[amount]
     if amount == "few" and not can_split:

@@ -1,5 +1,5 @@
 """No agent ever passes a wall or gets stuck: half a million agent steps that try to, ten million in
-the slow tests, a hundred million on a GPU.
+the nightly tests, a hundred million on a GPU.
 """
 
 import math
@@ -51,7 +51,7 @@ def test_no_agent_passes_a_wall(name):
     check(walls.run(name, STEPS_PER_COURSE // 20, 256), STEPS_PER_COURSE // 20)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", COURSES)
 def test_no_agent_passes_a_wall_or_gets_stuck_in_many_steps(name):
     total = walls.run(name, STEPS_PER_COURSE, 2048)

@@ -151,10 +151,8 @@ def walk(g, route):
 @pytest.mark.parametrize(
     "source, n",
     [
-        *(
-            pytest.param(source, n, marks=pytest.mark.slow)
-            for source, n in [("homes", 8), ("maze", 2)]
-        ),
+        pytest.param("maze", 2, marks=pytest.mark.slow),
+        pytest.param("homes", 8, marks=pytest.mark.nightly),
         pytest.param("bench", 4, marks=pytest.mark.nightly),
     ],
 )

@@ -143,9 +143,7 @@ def test_comparisons_see_a_mask_that_is_not_used_and_a_number_that_is_none():
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(
-            kind, marks=pytest.mark.slow if kind in ("lstm", "masked") else pytest.mark.nightly
-        )
+        pytest.param(kind, marks=pytest.mark.slow if kind == "masked" else pytest.mark.nightly)
         for kind in KINDS
     ],
 )

@@ -34,10 +34,6 @@ matplotlib.use("Agg")
 
 COMB = np.array([[[1, y], [4, y]] for y in np.arange(1.2, 4.3, 0.2)], np.float32)
 L_SHAPE = [(0, 0, 400, 600), (400, 0, 700, 250)]  # centimetres
-#: Homes that the slow tests generate, and those that the nightly ones do.
-MANY = pytest.mark.parametrize(
-    "n", [pytest.param(100, marks=pytest.mark.slow), pytest.param(1000, marks=pytest.mark.nightly)]
-)
 
 
 @pytest.fixture(scope="module")
@@ -295,9 +291,9 @@ def test_a_density_that_is_none_is_refused(density):
         geometries.sample("homes", 2, density=density)
 
 
-@MANY
-def test_many_dense_homes_pass_the_checks(n):
-    plans = [homes.generate(seed, density=plan.DENSEST) for seed in range(10_000, 10_000 + n)]
+@pytest.mark.nightly
+def test_many_dense_homes_pass_the_checks():
+    plans = [homes.generate(seed, density=plan.DENSEST) for seed in range(10_000, 11_000)]
     assert [(g.id, error) for g in plans for error in check_homes.errors(g)] == []
     assert 190 < np.median([len(g.walls) for g in plans]) < 215
 
@@ -319,9 +315,9 @@ def test_cluttered_homes_pass_the_checks(cluttered):
     assert [(g.id, error) for g in some for error in check_homes.errors(g, True)] == []
 
 
-@MANY
-def test_many_cluttered_homes_pass_the_checks(n):
-    plans = [homes.generate(seed, density=3, clutter=1) for seed in range(10_000, 10_000 + n)]
+@pytest.mark.nightly
+def test_many_cluttered_homes_pass_the_checks():
+    plans = [homes.generate(seed, density=3, clutter=1) for seed in range(10_000, 11_000)]
     assert [(g.id, error) for g in plans for error in check_homes.errors(g, True)] == []
     assert 195 < np.median([len(g.walls) for g in plans]) < 215
 

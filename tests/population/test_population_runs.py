@@ -314,11 +314,8 @@ def test_members_of_a_league_meet_each_other_and_resume_with_the_same_bits(here,
     assert "opponents.league" in err and "population.size=2" in err
 
 
-@pytest.mark.parametrize(
-    "n_kills",
-    [pytest.param(3, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.nightly)],
-)
-def test_population_that_is_killed_at_random_moments_has_the_same_bits(here, n_kills):
+@pytest.mark.nightly
+def test_population_that_is_killed_at_random_moments_has_the_same_bits(here, n_kills=30):
     """By SIGKILL: every third time whenever it starts, otherwise after it has saved, in whatever it
     does then.
     """

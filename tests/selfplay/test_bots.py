@@ -144,7 +144,7 @@ def test_what_a_seeker_remembers_is_worth_finds():
     "homes, opponent, least",
     [
         pytest.param(HOMES, "bot", 0.6, marks=pytest.mark.slow, id="homes-bot"),
-        pytest.param(DENSE, "random", 0.8, marks=pytest.mark.slow, id="dense-random"),
+        pytest.param(DENSE, "random", 0.8, marks=pytest.mark.nightly, id="dense-random"),
         pytest.param(HOMES, "random", 0.8, marks=pytest.mark.nightly, id="homes-random"),
         pytest.param(DENSE, "bot", 0.6, marks=pytest.mark.nightly, id="dense-bot"),
     ],

@@ -50,8 +50,9 @@ def test_profiled_run_has_a_trace_a_table_and_the_same_metrics(device, learner, 
 
 
 def test_run_that_ends_early_has_a_profile_of_fewer_updates(capsys):
-    assert train.main([*WORDS, "folder=run", "profile=1000"]) == 0
-    assert table_of("run")[0].startswith(f"Updates {N_SKIPPED + 1} to 12 on cpu")
+    words = [*WORDS, f"samples={(N_SKIPPED + 2) * tiny.UPDATE}", "folder=run", "profile=1000"]
+    assert train.main(words) == 0
+    assert table_of("run")[0].startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 2} on cpu")
 
 
 def test_operations_are_counted_per_update(tmp_path):
