@@ -20,7 +20,8 @@ CONCEPTS = ["../performance.md"] + sorted(
     if "```python" in page.read_text()
 )
 #: Pages that take more than about three seconds on an idle core.
-LONG = {"deathmatch.md", "explorer.md", "from-python.md", "own-floor-plans.md", "scaling-out.md"}
+LONG = {"deathmatch.md", "explorer.md", "from-python.md", "keys-and-memory.md"}
+LONG |= {"own-floor-plans.md", "scaling-out.md", "training.md"}
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\S*)[^\n]*\n(.*?)```", re.S)
 FILE = re.compile(r"(?:#|//|<!--) (\S+\.(?:py|h|cpp|cu|svg))(?: -->)?\n")
 PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"
