@@ -14,6 +14,7 @@ from films import films
 from libraries import libraries
 from nsight_counters import counters
 from peers import peers
+from plan_statistics import plans
 from population_benchmarks import league, members, memory_search, search, small_members
 from published import published
 from replay_buffer import replay
@@ -37,6 +38,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "replay": replay,
     "pong": pong,
     "paths": paths,
+    "plans": plans,
     "checkpoints": checkpoints,
     "films": films,
     "exported": exported,
