@@ -110,13 +110,18 @@ def test_plans_benchmark_measures_imported_and_generated_homes(tmp_path, monkeyp
         (tmp_path / source).mkdir()
         shutil.copy(paths.ROOT / "tests/data/hostile" / name, tmp_path / source)
     monkeypatch.setattr(plan_statistics, "N_BENCH", 2)
+    monkeypatch.setattr(plan_statistics, "DENSE", {"bench": ("bench", {})})
+    monkeypatch.setattr(plan_statistics, "N_DENSE", 1)
     monkeypatch.setattr(
         plan_statistics.imports, "generated_homes", lambda: sample("homes", 3, "all")
     )
     rows = [*catalogue.BENCHMARKS["plans"](torch.device("cpu"), tmp_path)]
-    assert [row["n"] for row in rows] == 9 * [1] + 9 * [1] + 8 * [3] + 3 * [1]
     values = {row["what"]: row["value"] for row in rows}
+    assert len(values) == len(rows) == 9 + 9 + 11 + 10 + 3
     assert values["CubiCasa5k, rooms"] == 2
+    assert (
+        0.9 < values["bench, room width"] < 2 * values["bench, longest of a home's shortest paths"]
+    )
     assert values["HouseExpo, rooms that an agent can reach"] == 100
     assert values["bench, homes that do not pass"] == 0
 
