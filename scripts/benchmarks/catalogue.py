@@ -9,7 +9,7 @@ from adapter_steps import adapters
 from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
-from exported_agents import exported
+from exported_agents import exported, pages
 from films import films
 from libraries import libraries
 from nsight_counters import counters
@@ -42,6 +42,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "checkpoints": checkpoints,
     "films": films,
     "exported": exported,
+    "pages": pages,
     "compile": compile_kernels,
     "first": first_step,
     "startup": startup,
