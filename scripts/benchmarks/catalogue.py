@@ -14,7 +14,7 @@ from films import films
 from libraries import libraries
 from nsight_counters import counters
 from peers import peers
-from population_benchmarks import league, members, memory_search, search, small_members
+from population_benchmarks import copies, league, members, memory_search, search, small_members
 from published import published
 from replay_buffer import replay
 from scaling import ranks, scaling
@@ -56,6 +56,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "ranks": ranks,
     "members": members,
     "small_members": small_members,
+    "copies": copies,
     "search": search,
     "memory_search": memory_search,
     "league": league,
