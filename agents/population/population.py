@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+#: Updates of each member that compile kernels and, on a GPU, record graphs: of all members together
+#: these take much longer than of one.
+N_PREPARING = 3
+
 
 class Learnt(NamedTuple):
     """What a member has learnt: its policy, its learner, and what wrappers of its environment have
@@ -199,14 +203,14 @@ class Population:
         def ends() -> bool:
             return stop() or any(one.is_stopped or one.is_reached for one in self.trainers)
 
-        rounds = [trainer.rounds(ends) for trainer in self.trainers]
+        rounds, n_rounds = [trainer.rounds(ends) for trainer in self.trainers], 0
         try:
-            if self._is_round_left(rounds):
-                for i, trainer in enumerate(self.trainers):  # now all have compiled
-                    with self.turns.of(i):
-                        trainer.start_clock()
-                self._after_round()
             while self._is_round_left(rounds):
+                n_rounds += 1
+                if n_rounds <= N_PREPARING:  # seconds count from the last of these on
+                    for i, trainer in enumerate(self.trainers):
+                        with self.turns.of(i):
+                            trainer.start_clock()
                 self._after_round()
         finally:
             for one in rounds:

@@ -91,7 +91,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--budgets", nargs="+", type=int, metavar="SECONDS", help="for train and learners"
     )
-    parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds and learners")
+    parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds, learners, scaling")
     parser.add_argument(
         "--samples",
         type=int,

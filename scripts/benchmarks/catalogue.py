@@ -15,7 +15,7 @@ from libraries import libraries
 from nsight_counters import counters
 from peers import peers
 from plan_statistics import plans
-from population_benchmarks import league, members, memory_search, search, small_members
+from population_benchmarks import copies, league, members, memory_search, search, small_members
 from published import published
 from replay_buffer import replay
 from scaling import ranks, scaling
@@ -59,6 +59,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "ranks": ranks,
     "members": members,
     "small_members": small_members,
+    "copies": copies,
     "search": search,
     "memory_search": memory_search,
     "league": league,
