@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from torch.utils import _pytree
 
 from megastep import envs
 from megastep.adapters.lanes import Copies, Lanes, ended, fresh
@@ -119,11 +120,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if stepped is not self._stepped:  # on a GPU the same each time
             self._stepped, self._parts = stepped, self._tensors(*stepped)
             self._copies = Copies(self._parts)
+            floats = filter(torch.is_floating_point, _pytree.tree_leaves(self._parts["obs"]))
+            self._is_as_wanted = all(leaf.dtype == self.dtype for leaf in floats)
         parts = self._copies() if self.copy else self._parts
-        infos = self._infos(parts, self._as_dtype(parts.get("final_obs", {})))
-        infos |= self._mask_infos(parts["mask"])
+        obs, final_obs = parts["obs"], parts.get("final_obs", {})
+        if not self._is_as_wanted:
+            obs, final_obs = self._as_dtype(obs), self._as_dtype(final_obs)
         flags = parts["terminal"], parts["truncated"]
-        return self._as_dtype(parts["obs"]), parts["reward"], *flags, infos
+        infos = self._infos(parts, final_obs) | self._mask_infos(parts["mask"])
+        return obs, parts["reward"], *flags, infos
 
     def _tensors(self, world, final, over) -> dict[str, Tree]:
         """Returns what a step returns, without copies."""
