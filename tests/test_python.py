@@ -103,6 +103,9 @@ def test_errors_are_those_of_the_command_line_and_nothing_is_written(here):
     ]
     with pytest.raises(UserError, match="env.n_env: no such key; did you mean env.n_envs?"):
         megastep.make("explorer", n_env=3)
+    with pytest.raises(ConfigErrors) as unknown:
+        megastep.make("explorr", n_envs=4)  # and nothing of its settings
+    assert unknown.value.errors == [("env", "'explorr' is unknown; did you mean explorer?")]
     with pytest.raises(UserError, match="run folder nor a pretrained agent"):
         megastep.load("explorer_anywere")
     with pytest.raises(UserError, match="learner.lr: object has no words"):

@@ -186,7 +186,8 @@ class Composer:
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))
         except ConfigErrors as error:
-            errors += error.errors
+            of_words = {key for key, _ in errors}  # what follows from them is not said again
+            errors += [(key, text) for key, text in error.errors if key not in of_words]
         if errors + secret:
             raise ConfigErrors(errors + secret)
         return chosen, config

@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from megastep.agents.distributed import environment
@@ -79,6 +80,7 @@ The most common words:
 #: What may differ when a run is repeated.
 REPEATABLE = (
     "rerun",
+    "member",
     "folder",
     "device",
     "trust",
@@ -120,7 +122,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     for key, kind in QUANTITIES.items():
         if key in tree:
             tree[key] = settings.quantity(tree[key], kind)
-    tree = with_member(tree, "init")
+    tree = with_member(with_member(tree, "init"), "rerun")
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if tree.get("resume") == AUTO and "rerun" not in given:
         given.remove("resume")  # what there is to resume is looked up when training begins
@@ -129,24 +131,31 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     if not given:
         return tree
     how, allowed = given[0], {"resume": RESUMABLE, "rerun": REPEATABLE}.get(given[0], typed)
+    path = folders.find(tree[how], "best" if how == "init" else None)
+    whole = populations.is_root(path)
+    allowed = [*allowed, *["ranks"] * whole]  # members have the same bits on any number of ranks
     if refused := [key for key in typed if not {key, key.split(".")[0]} & {*allowed}]:
         raise ConfigErrors((key, CURES[how]) for key in refused)
-    path = folders.find(tree[how], None if how == "resume" else "best")
     if how != "init" and agent_file.is_agent_file(path):
         raise UserError(
             f"{tree[how]} is a pretrained agent, which has the weights only. init={tree[how]} "
             f"starts a new run from it; {how}= takes the run's folder"
         )
+    if how == "rerun":  # `latest` is another run once this one has begun
+        tree |= {"rerun": str(folders.folder_of(path))}
     # a run in use is refused before its checkpoints are read, which come and go, by rank 0
     is_locked = how == "resume" and environment.rank() == 0
     with folders.locked(folders.folder_of(path)) if is_locked else contextlib.nullcontext():
-        whole = populations.is_root(path)
-        if whole:
+        if whole and how == "resume":
             path = populations.common_checkpoints(path)[0]
+        elif whole:
+            path = populations.folder_of(path, 0)
         loaded = folders.load_checkpoint(path, tree.get("trust") is True)
     saved = loaded.config["train"]
     if whole:  # the first member's settings, but for what it is itself
         saved["population"]["member"] = None
+        if saved.get("rerun"):
+            saved["rerun"] = str(Path(saved["rerun"]).parent)
     elif how != "init" and saved.get("population", {}).get("member") is not None:
         saved["ranks"] = 1  # those of its population
     if how == "init":

@@ -445,10 +445,6 @@ def population_errors(cfg: "Train") -> dict[str, object]:
         and isinstance(cfg.ranks, int)
         and cfg.ranks > chosen.size
         and f"{cfg.ranks} is more than population.size={chosen.size}; each rank needs a member",
-        "rerun": is_many
-        and chosen.member is None
-        and cfg.rerun is not None
-        and "repeats a single run; give a member's folder",
         "resume": is_many
         and cfg.resume == "auto"
         and "cannot be auto for a population yet; give resume=RUN, its folder",

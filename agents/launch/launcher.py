@@ -155,11 +155,14 @@ class Job:
             self.cleared.add(self.attempt)
             self.send(signal.SIGKILL)
         if [*self.folder.glob(f"pid-{self.attempt + 1}-*")]:
-            ending = self.ending_of(self.attempt) or self.unknown_ending()
+            ending = self.ending_of(self.attempt)
+            if ending is None or ending.code > 128:  # torchrun's signal to the remaining ranks
+                problem = "A rank was killed or ended without a message"
+            else:
+                problem = ending.text.partition(" To continue: ")[0]
             self.attempt += 1
-            again = f"Restarting, {self.attempt} of restarts={self.cfg.restarts}"
-            problem = ending.text.partition(" To continue: ")[0]
-            console.warn(" ".join(filter(None, [problem, f"{again}."])))
+            again = f"Restarting, {self.attempt} of restarts={self.cfg.restarts}."
+            console.warn(f"{problem.rstrip('.')}. {again}")
 
     def ending(self) -> Ending:
         """Returns how the ranks ended."""

@@ -18,7 +18,7 @@ from megastep.agents.errors import ConfigErrors, EnvFailed, NonFinite, UserError
 from megastep.agents.evaluation import in_training
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
-from megastep.agents.launch import again, finishing, gpu, rank, rank_checks, signals
+from megastep.agents.launch import again, compare, finishing, gpu, rank, rank_checks, signals
 from megastep.agents.population import decisions
 from megastep.agents.population.population import Learnt, Population, Turns, hosted
 from megastep.agents.runs import folders, populations, provenance
@@ -86,6 +86,8 @@ def _run(cfg, team) -> Path:
             best = populations.member(root)
             with process_group.unhurried():
                 finishing.finish(cfg, best, samples)
+            if cfg.rerun:
+                compare.population(root, Path(cfg.rerun))
             console.say(
                 f"Trained {samples:,} samples of each member. The best is in {best}\n"
                 f"To evaluate it: {folders.command_of('evaluate', 'run', root)}"
@@ -118,9 +120,11 @@ def member_settings(cfg: settings.Train, member: int) -> settings.Train:
     for part in ("learner", "env"):
         values = {key[len(part) + 1 :]: x for key, x in drawn.items() if key.startswith(f"{part}.")}
         cfg = settings.changed(cfg, **{part: settings.changed(getattr(cfg, part), **values)})
+    rerun = cfg.rerun and str(populations.folder_of(Path(cfg.rerun), member))
     return settings.changed(
         cfg,
         seed=decisions.member_seed(seed, member),
+        rerun=rerun,
         population=settings.changed(cfg.population, member=member),
         keep_checkpoints=max(KEPT, cfg.keep_checkpoints),
         folder=None,
@@ -153,6 +157,9 @@ def make(
         provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, [])
         trainers.append(trainer)
     turns.wait()
+    repeated = None
+    if cfg.rerun:
+        repeated = populations.samples_of_generations(Path(cfg.rerun) / populations.FILE)
     visitor = None
     if len(members) < chosen.size:
         env = trainers[0].env
@@ -161,7 +168,7 @@ def make(
     return Population(
         *(trainers, turns, root, cfg.seed, chosen.every, chosen.vary),
         *(chosen.exploit, chosen.explore, chosen.score, cfg.checkpoint_seconds),
-        *(chosen.size, visitor),
+        *(chosen.size, visitor, repeated),
     )
 
 

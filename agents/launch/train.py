@@ -15,7 +15,6 @@ from megastep.agents.distributed import process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
 from megastep.agents.distributed.drift import DriftError
 from megastep.agents.errors import (
-    Differs,
     EnvFailed,
     NonFinite,
     UserError,
@@ -26,6 +25,7 @@ from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import (
     again,
+    compare,
     dry_run,
     finishing,
     gpu,
@@ -179,7 +179,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             learnt = f"All other rollouts were used; the run is in {folder}"
             raise NonFinite(f"{nonfinite}. {learnt}{hint}")
         if cfg.rerun and is_first:
-            compare(folder, folders.folder_of(folders.find(cfg.rerun)))
+            compare.run(folder, Path(cfg.rerun))
         if is_first:
             console.say(f"{result}. The run is in {folder}\n{next_command(cfg, folder)}")
     return folder
@@ -215,17 +215,3 @@ def saved_by(trainer: Trainer, folder: Path) -> str:
     text = trainer.saver.error or "The latest updates could not be saved"
     text = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else text
     return f"{text}. {folders.to_continue(folder)}"
-
-
-def compare(folder: Path, original: Path) -> None:
-    """Checks that two runs have the same metrics, byte for byte. Raises Differs if not."""
-    ours, theirs = ((run / "metrics.jsonl").read_bytes() for run in (folder, original))
-    if ours == theirs:
-        console.say(f"metrics.jsonl equals that of {original}, byte for byte.")
-        return
-    pairs = enumerate(itertools.zip_longest(ours.split(b"\n"), theirs.split(b"\n")), 1)
-    number = next(number for number, (one, other) in pairs if one != other)
-    raise Differs(
-        f"metrics.jsonl differs from that of {original} from line {number} on; equal bits need the "
-        f"same versions, device and threads: see {provenance.FILE} of both"
-    )

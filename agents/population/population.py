@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -41,6 +41,10 @@ if TYPE_CHECKING:
     from megastep.agents.types import Learner, Row, StateDict
 
 T = TypeVar("T")
+
+#: Updates of each member that compile kernels and, on a GPU, record graphs: of all members together
+#: these take much longer than of one.
+N_PREPARING = 3
 
 
 class Learnt(NamedTuple):
@@ -113,6 +117,7 @@ class Population:
         checkpoint_seconds: seconds between two checkpoints of all members.
         size: members on all ranks; None: as many as there are trainers.
         visitor: with several ranks, holds what a member of another one has learnt.
+        repeated: the samples after which the generations are, if another population is repeated.
 
     Attributes:
         members: numbers of the members that this rank hosts.
@@ -135,6 +140,7 @@ class Population:
         checkpoint_seconds: float = 30.0,
         size: int | None = None,
         visitor: Learnt | None = None,
+        repeated: Collection[int] | None = None,
     ):
         self.trainers, self.turns, self.seed, self.every = [*trainers], turns, seed, every
         self.size, self.visitor = size or len(trainers), visitor
@@ -142,6 +148,7 @@ class Population:
         with joint():
             self.rank, self.n_ranks = rank(), n_ranks()
         self.vary, self.exploit, self.explore, self.score = vary, exploit, explore, score
+        self.repeated = repeated
         self.checkpoint_seconds, self.saved_at = checkpoint_seconds, time.monotonic()
         self.path = folder / populations.FILE
         with joint():
@@ -196,14 +203,14 @@ class Population:
         def ends() -> bool:
             return stop() or any(one.is_stopped or one.is_reached for one in self.trainers)
 
-        rounds = [trainer.rounds(ends) for trainer in self.trainers]
+        rounds, n_rounds = [trainer.rounds(ends) for trainer in self.trainers], 0
         try:
-            if self._is_round_left(rounds):
-                for i, trainer in enumerate(self.trainers):  # now all have compiled
-                    with self.turns.of(i):
-                        trainer.start_clock()
-                self._after_round()
             while self._is_round_left(rounds):
+                n_rounds += 1
+                if n_rounds <= N_PREPARING:  # seconds count from the last of these on
+                    for i, trainer in enumerate(self.trainers):
+                        with self.turns.of(i):
+                            trainer.start_clock()
                 self._after_round()
         finally:
             for one in rounds:
@@ -224,9 +231,12 @@ class Population:
         if leader.samples_at_report == leader.samples:
             self.samples_at_round = self.samples
             is_due = self.samples // self.every > before // self.every
+        is_left = leader.fraction_left > 0
+        if self.repeated is not None:  # when a budget was spent, the clock may have decided
+            is_due, is_left = self.samples in self.repeated, True
         seconds = time.monotonic() - self.saved_at
         with joint():
-            rows = exchange([leader.fraction_left > 0, seconds >= self.checkpoint_seconds])
+            rows = exchange([is_left, seconds >= self.checkpoint_seconds])
         goes_on, saves = rows[0]
         if is_due and goes_on:
             self.take_over()

@@ -89,6 +89,22 @@ def read(path: Path) -> "list[list[Row]]":
     return [[*group] for _, group in itertools.groupby(rows, lambda row: row["generation"])]
 
 
+def samples_of_generations(path: Path) -> set[int]:
+    """Returns the samples of each member after which it may have copied another.
+
+    Raises:
+        UserError: the file holds no generations.
+    """
+    try:
+        first, *others = read(path)
+        return {int(rows[0]["samples"]) for rows in others}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path} does not hold the generations of its population ({error}), so it cannot be "
+            "repeated; init=RUN starts a new run from the best member's weights"
+        ) from None
+
+
 def settings_of(row: "Row") -> dict[str, float]:
     """Returns the settings in a row, by key."""
     return {key[len(KEY) :]: value for key, value in row.items() if key.startswith(KEY)}

@@ -8,10 +8,19 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from torch.utils import _pytree
 
 from megastep import envs
 from megastep.adapters.lanes import Copies, Lanes, ended, fresh
-from megastep.adapters.spaces import gymnasium_space, row, stacked, to_numpy, without_agents
+from megastep.adapters.spaces import (
+    action_mask,
+    gymnasium_space,
+    int8,
+    row,
+    stacked,
+    to_numpy,
+    without_agents,
+)
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
 
@@ -31,7 +40,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             last. ``SAME_STEP``: at once; ``infos`` have the last observation as ``final_obs``, and
             all lanes are rendered twice. ``DISABLED``: by ``reset(options={"reset_mask": mask})``.
         to_numpy: return arrays; otherwise tensors on the device, without synchronising. Tensors of
-            ``infos`` are there in every step then, with masks.
+            ``infos`` are there in every step then, with masks. Where the environment allows some
+            actions only, ``infos["action_mask"]`` says which in every step: int8 arrays, or bool.
         dtype: of observations in floats. Default: float32 for arrays, the environment's float16 for
             tensors.
         copy: return copies, of which on a GPU up to 32 steps' share memory. Otherwise tensors are
@@ -94,7 +104,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         world = self.lanes.reset(seed, mask)
         if self.to_numpy:
             self._ended = np.zeros_like(self._ended) if mask is None else to_numpy(ended(world))
-        return self._converted(world["obs"]), {}
+        infos = self._masks(world) if self.to_numpy else self._mask_infos(fresh(self._mask(world)))
+        return self._converted(world["obs"]), infos
 
     def step(self, actions: Tree) -> tuple[Tree, Tree, Tree, Tree, dict[str, Tree]]:
         """Steps all lanes. Returns (observations, rewards, terminations, truncations, infos)."""
@@ -109,15 +120,20 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if stepped is not self._stepped:  # on a GPU the same each time
             self._stepped, self._parts = stepped, self._tensors(*stepped)
             self._copies = Copies(self._parts)
+            floats = filter(torch.is_floating_point, _pytree.tree_leaves(self._parts["obs"]))
+            self._is_as_wanted = all(leaf.dtype == self.dtype for leaf in floats)
         parts = self._copies() if self.copy else self._parts
-        infos = self._infos(parts, self._as_dtype(parts.get("final_obs", {})))
+        obs, final_obs = parts["obs"], parts.get("final_obs", {})
+        if not self._is_as_wanted:
+            obs, final_obs = self._as_dtype(obs), self._as_dtype(final_obs)
         flags = parts["terminal"], parts["truncated"]
-        return self._as_dtype(parts["obs"]), parts["reward"], *flags, infos
+        infos = self._infos(parts, final_obs) | self._mask_infos(parts["mask"])
+        return obs, parts["reward"], *flags, infos
 
     def _tensors(self, world, final, over) -> dict[str, Tree]:
         """Returns what a step returns, without copies."""
         parts: dict[str, Tree] = {name: final[name] for name in OUTCOMES}
-        parts |= dict(over=over, metrics=dict(final.get("metrics", {})))
+        parts |= dict(over=over, metrics=dict(final.get("metrics", {})), mask=self._mask(world))
         parts["obs"] = without_agents(self.env.obs_space, world["obs"])
         if self.mode is AutoresetMode.SAME_STEP:
             parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
@@ -129,6 +145,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         is_same_step = self.mode is AutoresetMode.SAME_STEP
         self._ended = np.zeros_like(self._ended) if is_same_step else parts["over"]
         infos = self._numpy_infos(parts, final) if parts["over"].any() else {}
+        infos |= self._masks(world)
         flags = parts["terminal"], parts["truncated"]
         return self._converted(world["obs"]), parts["reward"], *flags, infos
 
@@ -142,6 +159,22 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if isinstance(obs, Mapping):
             return {key: self._as_dtype(part) for key, part in obs.items()}
         return obs.to(self.dtype) if obs.is_floating_point() else obs
+
+    def _mask(self, world) -> dict[str, Tree]:
+        """Returns the mask of the actions that are allowed now, if the environment gives one."""
+        if "mask" not in world:
+            return {}
+        return {"action_mask": action_mask(self.env.action_space, world["mask"])}
+
+    def _mask_infos(self, mask) -> dict[str, Tree]:
+        return mask and mask | {
+            "_action_mask": torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        }
+
+    def _masks(self, world) -> dict[str, Tree]:
+        """Returns the mask as arrays, int8 as Gymnasium's spaces sample by."""
+        mask = int8(to_numpy(self._mask(world)))
+        return mask and mask | {"_action_mask": np.ones(self.num_envs, bool)}
 
     def _infos(self, parts, final_obs) -> dict[str, Tree]:
         """Returns Gymnasium's infos: each key with a mask of the lanes that have it."""
@@ -225,15 +258,15 @@ class SingleEnv(gymnasium.Env):
     ) -> tuple[Tree, dict[str, Tree]]:
         """Begins an episode. Returns (observation, info)."""
         super().reset(seed=seed)
-        obs, _ = self.vector.reset(seed=seed, options=options)
-        return row(obs, 0), {}
+        obs, infos = self.vector.reset(seed=seed, options=options)
+        return row(obs, 0), _info(infos)
 
     def step(self, action: Tree) -> tuple[Tree, float, bool, bool, dict[str, Tree]]:
         """Returns (observation, reward, terminated, truncated, info)."""
         actions = stacked([action])
         obs, reward, terminated, truncated, infos = self.vector.step(actions)
-        info = {key: float(value[0]) for key, value in infos.items() if not key.startswith("_")}
-        return row(obs, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        flags = bool(terminated[0]), bool(truncated[0])
+        return row(obs, 0), float(reward[0]), *flags, _info(infos)
 
     def render(self) -> np.ndarray | None:
         """Returns a drawing (H, W, 3) uint8 if ``render_mode`` is ``rgb_array``."""
@@ -243,6 +276,15 @@ class SingleEnv(gymnasium.Env):
     def close(self) -> None:
         """Closes the environment."""
         self.vector.close()
+
+
+def _info(infos) -> dict[str, Tree]:
+    """Returns the info of the only lane."""
+    return {
+        key: row(value, 0) if key == "action_mask" else float(value[0])
+        for key, value in infos.items()
+        if not key.startswith("_")
+    }
 
 
 def make_vector(

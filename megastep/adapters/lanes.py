@@ -18,7 +18,7 @@ from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 __all__ = ["Copies", "Lanes", "ended", "fresh"]
 
 WORD = 4  # bytes
-BLOCK_BYTES = 2**25  # of copies that share memory, if there are several
+BLOCK_BYTES = 2**27  # of copies that share memory, if there are several
 
 
 def ended(world: World) -> torch.Tensor:
@@ -201,12 +201,18 @@ class Lanes:
 
         return arrdict(actions=spaces.map(converted, self.env.action_space, actions))
 
-    @_in_plain_tensors
     def step(self, actions: Tree) -> tuple[World, World, torch.Tensor]:
         """Returns (world, final world, where an episode ended). With ``same_step``, the first has
         the first observation where an episode ended, and the final world its last one; otherwise
         both are the same. On a GPU the same objects each time.
         """
+        if isinstance(self._step, Graph):  # which reads the decision, so inference mode may stay
+            with torch.no_grad():
+                return self._step(self.decision(actions))
+        return self._eager_step(actions)
+
+    @_in_plain_tensors
+    def _eager_step(self, actions) -> tuple[World, World, torch.Tensor]:
         decision = self.decision(actions)
         if self._step is None:
             step = self._same_step if self._is_same_step else self._next_step

@@ -9,7 +9,15 @@ import pettingzoo
 import torch
 
 from megastep.adapters.lanes import Lanes
-from megastep.adapters.spaces import gymnasium_space, row, stacked, to_numpy, without_agents
+from megastep.adapters.spaces import (
+    action_mask,
+    gymnasium_space,
+    int8,
+    row,
+    stacked,
+    to_numpy,
+    without_agents,
+)
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
 
@@ -22,7 +30,8 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
     All agents leave together, when the game is over: ``env.game_over``, or by default where the
     episodes of all agents end at once. An agent whose own episode ends before, as by a death in
     Deathmatch, plays on in the next step; its ``info`` has ``terminal`` or ``truncated`` then, and
-    the episode's metrics. Play Deathmatch in rounds, ``resample=True``: otherwise it never ends.
+    the episode's metrics. Where the environment allows some actions only, each ``info`` has them as
+    ``action_mask``, int8. Play Deathmatch in rounds, ``resample=True``: otherwise it never ends.
 
     Args:
         env: the environment, of one environment. Agents have the names of its ``roles``, or
@@ -70,7 +79,8 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
     ) -> tuple[dict[str, Tree], dict[str, dict]]:
         """Begins a game. Returns (observations, infos) by agent. ``options`` are ignored."""
         self.agents = [*self.possible_agents]
-        return self._observations(self.lanes.reset(seed)), {agent: {} for agent in self.agents}
+        world = self.lanes.reset(seed)
+        return self._observations(world), self._masks(world)
 
     def step(self, actions: Mapping[str, Tree]) -> tuple[dict, dict, dict, dict, dict]:
         """Steps all agents. Returns (observations, rewards, terminations, truncations, infos) by
@@ -84,10 +94,10 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         names = "reward", "terminal", "truncated"
         values = to_numpy({name: world[name] for name in names})
         metrics = to_numpy(dict(world.get("metrics", {})))
-        infos = {}
+        infos = self._masks(world)
         for i, agent in enumerate(self.agents):
             flags = {name: True for name in names[1:] if values[name][i]}
-            infos[agent] = flags and flags | {k: float(v[i]) for k, v in metrics.items()}
+            infos[agent] |= flags and flags | {k: float(v[i]) for k, v in metrics.items()}
         rewards, terminations, truncations = (
             dict(zip(self.agents, values[name].tolist())) for name in names
         )
@@ -101,6 +111,13 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
     def _observations(self, world) -> dict[str, Tree]:
         batch = to_numpy(without_agents(self.env.obs_space, world["obs"], torch.float32))
         return {agent: row(batch, i) for i, agent in enumerate(self.possible_agents)}
+
+    def _masks(self, world) -> dict[str, dict]:
+        """Returns an info for each agent, with the actions that are allowed to it now."""
+        if "mask" not in world:
+            return {agent: {} for agent in self.agents}
+        batch = int8(to_numpy(action_mask(self.env.action_space, world["mask"])))
+        return {agent: {"action_mask": row(batch, i)} for i, agent in enumerate(self.agents)}
 
     def render(self) -> np.ndarray | None:
         """Returns a drawing (H, W, 3) uint8 if ``render_mode`` is ``rgb_array``."""

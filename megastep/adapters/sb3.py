@@ -9,13 +9,15 @@ import torch
 from stable_baselines3.common.vec_env import VecEnv
 
 from megastep.adapters.lanes import Lanes
-from megastep.adapters.spaces import gymnasium_space, row, to_numpy, without_agents
+from megastep.adapters.spaces import action_mask, gymnasium_space, row, to_numpy, without_agents
 from megastep.types import Env, Tree, optional
 
 __all__ = ["SB3VecEnv"]
 
 #: Lanes above which the library's Python and NumPy take most of the time.
 MANY_LANES = 4096
+#: What sb3-contrib's learners with masks call, in lanes that have it.
+ACTION_MASKS = "action_masks"
 
 
 class SB3VecEnv(VecEnv):
@@ -23,7 +25,8 @@ class SB3VecEnv(VecEnv):
     in ``VecMonitor`` for statistics of episodes.
 
     A lane begins its next episode in the step that ends one, by a masked reset; the last
-    observation is ``infos[lane]["terminal_observation"]``.
+    observation is ``infos[lane]["terminal_observation"]``. Where the environment allows some
+    actions only, ``env_method("action_masks")`` says which, as sb3-contrib's ``MaskablePPO`` asks.
 
     Args:
         env: the environment, whose resets take masks.
@@ -44,6 +47,7 @@ class SB3VecEnv(VecEnv):
             )
         self.render_mode = None
         self._actions: Tree = None
+        self._masks: np.ndarray | None = None  # (B, n), of all agents of a lane side by side
         super().__init__(
             n,
             gymnasium_space(env.obs_space, torch.float32),
@@ -53,6 +57,11 @@ class SB3VecEnv(VecEnv):
     def _observations(self, world) -> Tree:
         return to_numpy(without_agents(self.env.obs_space, world["obs"], torch.float32))
 
+    def _keep_masks(self, world) -> None:
+        if "mask" in world:
+            masks = to_numpy(action_mask(self.env.action_space, world["mask"]))
+            self._masks = masks.reshape(self.num_envs, -1)
+
     def reset(self) -> Tree:
         """Begins episodes in all lanes, with the seeds of ``seed``, if it was called. Returns
         observations.
@@ -61,6 +70,7 @@ class SB3VecEnv(VecEnv):
         world = self.lanes.reset(None if None in seeds else seeds)
         self._reset_seeds()
         self._reset_options()
+        self._keep_masks(world)
         return self._observations(world)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -70,6 +80,7 @@ class SB3VecEnv(VecEnv):
     def step_wait(self) -> tuple[Tree, np.ndarray, np.ndarray, list[dict]]:
         """Returns (observations, rewards, dones, infos)."""
         world, final, ended = self.lanes.step(self._actions)
+        self._keep_masks(world)
         over, truncated = to_numpy(ended), to_numpy(final["truncated"])
         infos: list[dict] = [{} for _ in range(self.num_envs)]
         if over.any():
@@ -87,6 +98,8 @@ class SB3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list:
         """Returns an attribute of the environment, once per lane."""
+        if attr_name == ACTION_MASKS:
+            return self.env_method(attr_name, indices=indices)
         value = self.render_mode if attr_name == "render_mode" else getattr(self.env, attr_name)
         return [value for _ in self._get_indices(indices)]
 
@@ -103,7 +116,13 @@ class SB3VecEnv(VecEnv):
         indices: int | Iterable[int] | None = None,
         **kwargs: object,
     ) -> list:
-        """Calls a method of the environment once. Returns its result, once per lane."""
+        """Calls a method of the environment once. Returns its result, once per lane; of
+        ``action_masks`` each lane's own, (n,) bool.
+        """
+        if method_name == ACTION_MASKS:
+            if self._masks is None:
+                raise AttributeError(f"{type(self.env).__name__} masks no actions, or is not reset")
+            return [self._masks[lane] for lane in self._get_indices(indices)]
         result = getattr(self.env, method_name)(*args, **kwargs)
         return [result for _ in self._get_indices(indices)]
 

@@ -11,7 +11,7 @@ import torch
 from megastep import spaces
 from megastep.types import Space, Tree
 
-__all__ = ["gymnasium_space", "row", "stacked", "to_numpy", "without_agents"]
+__all__ = ["action_mask", "gymnasium_space", "int8", "row", "stacked", "to_numpy", "without_agents"]
 
 NUMPY = {torch.uint8: np.uint8, torch.float16: np.float16, torch.float32: np.float32}
 
@@ -55,11 +55,27 @@ def without_agents(space: Space, values: Tree, dtype: torch.dtype | None = None)
     return values.to(dtype) if dtype and values.is_floating_point() else values
 
 
+def action_mask(space: Space, mask: Tree) -> Tree:
+    """Returns the mask (B, A, n) bool of a world, or a dict of those of some action spaces, without
+    an axis of one agent per lane.
+    """
+    if isinstance(mask, Mapping):
+        return {key: action_mask(space[key], part) for key, part in mask.items()}
+    return mask[:, 0] if space.shape[0] == 1 else mask
+
+
 def to_numpy(tree: Tree) -> Tree:
     """Returns a tree of tensors as arrays that share no memory with them."""
     if isinstance(tree, Mapping):
         return {key: to_numpy(part) for key, part in tree.items()}
     return tree.detach().to("cpu", copy=True).numpy()
+
+
+def int8(tree: Tree) -> Tree:
+    """Returns a tree of arrays as int8, as Gymnasium's spaces take masks."""
+    if isinstance(tree, Mapping):
+        return {key: int8(part) for key, part in tree.items()}
+    return tree.astype(np.int8)
 
 
 def row(tree: Tree, lane: int | np.integer) -> Tree:

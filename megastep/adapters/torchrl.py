@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from megastep import spaces
 from megastep.adapters.lanes import Lanes, ended, fresh
-from megastep.adapters.spaces import without_agents
+from megastep.adapters.spaces import action_mask, without_agents
 from megastep.types import Env, Tree, optional
 
 __all__ = ["TorchRLEnv"]
@@ -22,7 +22,8 @@ class TorchRLEnv(EnvBase):
     environment's device.
 
     Lanes begin episodes when TorchRL resets them, by a masked reset. Observations are the keys of
-    the observation space, or ``observation``; ``privileged`` is one more, if there is one.
+    the observation space, or ``observation``; ``privileged`` is one more, if there is one, and
+    ``action_mask``, where the environment allows some actions only.
 
     Args:
         env: the environment, whose resets take masks.
@@ -45,6 +46,11 @@ class TorchRLEnv(EnvBase):
             {key: _spec(part, n, dtype, on) for key, part in self._space.items()}, shape=[n], **on
         )
         actions = env.action_space
+        world = self.lanes.reset()
+        self._is_masked = "mask" in world
+        if self._is_masked:
+            mask = action_mask(actions, world["mask"])
+            self.observation_spec["action_mask"] = _mask_spec(mask, n, on)
         self.action_spec = _spec(actions, n, torch.float32, on)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, **on)
         flags = "done", "terminated", "truncated"
@@ -58,6 +64,8 @@ class TorchRLEnv(EnvBase):
         named = _named(world["obs"], "observation")
         named = {key: named[key] if key in named else world[key] for key in self._space}
         parts = without_agents(self._space, named)
+        if self._is_masked:
+            parts["action_mask"] = action_mask(self.megastep.action_space, world["mask"])
         flags = dict(done=ended(world), terminated=world["terminal"], truncated=world["truncated"])
         parts = fresh(parts | flags | dict(reward=world["reward"]))
         parts = {
@@ -87,6 +95,13 @@ class TorchRLEnv(EnvBase):
 
 def _named(space, name) -> Mapping:
     return space if isinstance(space, Mapping) else {name: space}
+
+
+def _mask_spec(mask, n, on) -> TensorSpec:
+    """Returns the spec of a mask, a tensor or a dict of them."""
+    if isinstance(mask, Mapping):
+        return Composite({k: _mask_spec(part, n, on) for k, part in mask.items()}, shape=[n], **on)
+    return Categorical(2, shape=mask.shape, dtype=torch.bool, **on)
 
 
 def _spec(space, n, dtype, on) -> TensorSpec:

@@ -45,10 +45,6 @@ def adapters(device: torch.device) -> Iterator[dict]:
         for name, settings in (
             ("NEXT_STEP, tensors", dict(autoreset_mode="next_step", to_numpy=False)),
             ("NEXT_STEP, tensors, copy=False", unkept),
-            (
-                "DISABLED, tensors, copy=False",
-                dict(autoreset_mode="disabled", to_numpy=False, copy=False),
-            ),
             ("DISABLED, tensors", dict(autoreset_mode="disabled", to_numpy=False)),
             ("DISABLED, tensors, copy=False", dict(autoreset_mode="disabled") | unkept),
             ("DISABLED, tensors, with resets", dict(autoreset_mode="disabled", to_numpy=False)),

@@ -91,7 +91,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--budgets", nargs="+", type=int, metavar="SECONDS", help="for train and learners"
     )
-    parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds and learners")
+    parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds, learners, scaling")
     parser.add_argument(
         "--samples",
         type=int,
@@ -106,7 +106,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--folder",
         type=Path,
-        help="keeps run folders and measures those in it, for published, search, league",
+        help="keeps run folders and measures those in it, for published, search, league; "
+        "has cubicasa/ and houseexpo/, for plans",
     )
     parser.add_argument("--commit", help="the commit to record, if git is not available")
     parser.add_argument(

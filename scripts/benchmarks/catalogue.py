@@ -9,12 +9,13 @@ from adapter_steps import adapters
 from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
-from exported_agents import exported
+from exported_agents import exported, pages
 from films import films
 from libraries import libraries
 from nsight_counters import counters
 from peers import peers
-from population_benchmarks import league, members, memory_search, search, small_members
+from plan_statistics import plans
+from population_benchmarks import copies, league, members, memory_search, search, small_members
 from published import published
 from replay_buffer import replay
 from scaling import ranks, scaling
@@ -37,9 +38,11 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "replay": replay,
     "pong": pong,
     "paths": paths,
+    "plans": plans,
     "checkpoints": checkpoints,
     "films": films,
     "exported": exported,
+    "pages": pages,
     "compile": compile_kernels,
     "first": first_step,
     "startup": startup,
@@ -56,6 +59,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "ranks": ranks,
     "members": members,
     "small_members": small_members,
+    "copies": copies,
     "search": search,
     "memory_search": memory_search,
     "league": league,

@@ -1,4 +1,4 @@
-"""The benchmark `exported`: how long a packaged agent takes to act in another runtime."""
+"""The benchmarks `exported` and `pages`: packaged agents in other runtimes and in web pages."""
 
 import tempfile
 from collections.abc import Iterator
@@ -8,6 +8,8 @@ import torch
 from timing import measurement, seconds_per_call
 
 import megastep
+from megastep.agents import pretrained
+from megastep.agents.cli import web
 from megastep.agents.cli.export import export
 from megastep.agents.export import runtimes
 from megastep.agents.export.step import Step
@@ -29,3 +31,11 @@ def exported(device: torch.device) -> Iterator[dict]:
         inputs = step.tensors(env.reset(), run.policy.initial(1))
         seconds = seconds_per_call(lambda: act(inputs), torch.device("cpu"))
     yield measurement(f"{AGENT}, one lane", "us/step", [1e6 * each for each in seconds])
+
+
+def pages(device: torch.device) -> Iterator[dict]:
+    """Sizes of the web pages of the packaged agents, one file each."""
+    for name in pretrained.names():
+        with tempfile.TemporaryDirectory() as folder:
+            path = web.write(name, file=str(Path(folder) / "page.html"))
+            yield measurement(f"{name}, page", "MB", [path.stat().st_size / 1e6])

@@ -1,10 +1,12 @@
-"""Benchmarks of populations: `members`, `small_members`, `search`, `memory_search`, `league`.
+"""Benchmarks of populations: `members`, `small_members`, `copies`, `search`, `memory_search` and
+`league`.
 
 Options: `--seconds` of training per run; `--seeds`; `--folder` keeps the run folders, and those
 that are there already are not trained again.
 """
 
 import contextlib
+import functools
 import itertools
 import math
 import shutil
@@ -17,9 +19,12 @@ from pathlib import Path
 
 import torch
 from paths import ROOT
-from timing import measurement
+from timing import measurement, seconds_per_call
 from training_runs import metric_mean, newest_evaluation, rates, share_of_duels_won
 
+from megastep.agents.cli.compose import Composer
+from megastep.agents.cli.scripts import TRAIN
+from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.runs import populations
 
 NO_FINISH = "finish.evaluate=false", "finish.record=false"
@@ -53,6 +58,30 @@ def members(device: torch.device, seconds: int = 30) -> Iterator[dict]:
 def small_members(device: torch.device, seconds: int = 30) -> Iterator[dict]:
     """The same of 64 members with 256 lanes each, and of one run with 16,384 lanes."""
     yield from _rates(device, seconds, *SMALL_MEMBERS[device.type])
+
+
+def copies(device: torch.device) -> Iterator[dict]:
+    """Milliseconds in which a member takes over what another has learnt: weights, optimizer and
+    statistics, of Explorer's policies with LSTMs of 128 and 256 units.
+    """
+    for width in (128, 256):
+        trainers = []
+        with _parent(None) as parent:
+            for name in ("source", "target"):
+                words = "env=explorer", "env.n_envs=64", f"agent.width={width}", f"device={device}"
+                cfg = Composer(TRAIN).settings([*words, "samples=1e12"])
+                (parent / name).mkdir()
+                trainer = make_trainer(cfg, parent / name, device)
+                trainer.rollout = trainer.collect()
+                trainer.update()  # the optimizer has a state from here on
+                trainers.append(trainer)
+            source, target = (trainer.learner for trainer in trainers)
+            copy = functools.partial(target.copy_from, source)
+            seconds = seconds_per_call(copy, device)
+            for trainer in trainers:
+                trainer.close()
+        what = f"Explorer, LSTM-{width}, a member takes over from another"
+        yield measurement(what, "ms", [1e3 * one for one in seconds])
 
 
 def search(

@@ -23,7 +23,7 @@ def scaling(device: torch.device, envs: list[str] | None = None) -> Iterator[dic
     """Samples per second of training with default settings per GPU, on one GPU and on 2, 4 and 8 as
     far as there are, in turn, three times each; and the time of an all-reduce of the gradients.
     """
-    for env in envs or ("explorer", "pointgoal"):
+    for env in map(str.lower, envs or ("Explorer", "PointGoal")):
         by_count = {n: [] for n in _counts(device)}
         for _ in range(N_ROUNDS):
             for n, found in by_count.items():

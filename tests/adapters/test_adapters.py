@@ -225,6 +225,97 @@ def test_an_agent_that_dies_plays_on_until_its_round_is_over():
     assert all(truncated[a] or terminated[a] for a in env.possible_agents)
 
 
+# ---- Masks of actions ----
+
+
+class Masked(envs.Pong):
+    """Pong in which a paddle may not do again what it did last."""
+
+    def reset(self, seed=None, mask=None):
+        return self._masked(super().reset(seed=seed, mask=mask))
+
+    def step(self, decision):
+        self.last = decision.actions
+        return self._masked(super().step(decision))
+
+    def _masked(self, world):
+        last = getattr(self, "last", torch.zeros(len(world.reward), 1, dtype=torch.int64))
+        options = torch.arange(self.action_space.n_actions)
+        return arrdict.arrdict(world, mask=options != last[..., None])
+
+
+def masked(n=4, **settings):
+    return Masked(n, limit=8, device="cpu", **settings)
+
+
+def allowed(actions):
+    return np.arange(3) != np.asarray(actions)[..., None]
+
+
+@pytest.mark.parametrize("mode", (NEXT, SAME))
+@pytest.mark.parametrize("in_numpy", (True, False))
+def test_infos_of_gymnasium_have_the_mask_of_each_step(mode, in_numpy):
+    env = adapters.VectorEnv(masked(), mode, to_numpy=in_numpy)
+    _, infos = env.reset(seed=1)
+    for _ in range(20):
+        mask = infos["action_mask"]
+        assert mask.dtype == (np.int8 if in_numpy else torch.bool) and infos["_action_mask"].all()
+        rows = [np.asarray(row, np.int8) for row in mask]
+        actions = np.array([env.single_action_space.sample(mask=row) for row in rows])
+        assert all(row[action] == 1 for row, action in zip(rows, actions))
+        *_, infos = env.step(actions)
+        assert np.array_equal(np.asarray(infos["action_mask"], bool), allowed(actions))
+
+
+def test_single_environments_and_players_have_the_mask():
+    env = adapters.SingleEnv(masked(1))
+    _, info = env.reset(seed=1)
+    assert info["action_mask"].tolist() == [0, 1, 1]
+    *_, info = env.step(2)
+    assert info["action_mask"].tolist() == [1, 1, 0] and info["action_mask"].dtype == np.int8
+    tests = pytest.importorskip("pettingzoo.test")
+    game = adapters.ParallelEnv(masked(1, self_play=True))
+    tests.parallel_api_test(game, num_cycles=30)
+    game.reset(seed=1)
+    *_, infos = game.step({"left": 1, "right": 2})
+    assert {agent: info["action_mask"].tolist() for agent, info in infos.items()} == {
+        "left": [1, 0, 1],
+        "right": [1, 1, 0],
+    }
+
+
+def test_stable_baselines_asks_for_the_mask():
+    pytest.importorskip("stable_baselines3")
+    env = adapters.SB3VecEnv(masked())
+    env.reset()
+    assert env.has_attr("action_masks") and not adapters.SB3VecEnv(pong()).has_attr("action_masks")
+    env.step(np.array([0, 1, 2, 1]))
+    masks = np.stack(env.env_method("action_masks"))
+    assert np.array_equal(masks, allowed([0, 1, 2, 1]))
+    assert np.array_equal(env.env_method("action_masks", indices=[2])[0], allowed(2))
+    ppo = pytest.importorskip("sb3_contrib").MaskablePPO
+    model = ppo("MlpPolicy", env, n_steps=8, batch_size=16, n_epochs=1, device="cpu")
+    model.learn(64)
+    observations = env.reset()
+    for _ in range(20):
+        mask = np.stack(env.env_method("action_masks"))
+        actions, _ = model.predict(observations, action_masks=mask)
+        assert mask[np.arange(4), actions].all()
+        observations, *_ = env.step(actions)
+
+
+def test_torchrl_acts_by_the_mask():
+    torchrl_envs = pytest.importorskip("torchrl.envs")
+    env = adapters.TorchRLEnv(masked())
+    torchrl_envs.utils.check_env_specs(env)
+    assert "action_mask" not in adapters.TorchRLEnv(pong()).observation_spec
+    rollout = torchrl_envs.TransformedEnv(env, torchrl_envs.ActionMask()).rollout(
+        20, break_when_any_done=False
+    )
+    assert rollout["action_mask"].gather(2, rollout["action"][..., None]).all()
+    assert not rollout["action_mask"].all() and rollout["next", "done"].any()
+
+
 # ---- TorchRL, Stable-Baselines3, rsl_rl ----
 
 

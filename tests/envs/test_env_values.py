@@ -135,7 +135,8 @@ def test_numbers_beyond_a_box_are_a_warning():
         UserWarning, match="Far-v0: .*it has 6.0 in lane 0.* It is used as it is"
     ) as w:
         worlds = contract.rollout(env, 25)
-    assert len(w) == 1 and worlds[10].obs.tolist() == [[[10.0]], [[10.0]]]
+    assert len(w) == 1 and w[0].filename == contract.__file__, "the line that steps"
+    assert worlds[10].obs.tolist() == [[[10.0]], [[10.0]]]
 
 
 def test_actions_that_are_not_finite_are_named():

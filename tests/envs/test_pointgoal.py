@@ -5,7 +5,8 @@ import pytest
 import torch
 from test_geodesics import room
 
-from megastep import arrdict, contract, envs
+from megastep import arrdict, contract, engine, envs
+from megastep.engine import devices
 from megastep.geometries import sample
 
 FORWARD, LEFT = 3, 1
@@ -196,3 +197,13 @@ def test_distance_is_kept_where_the_field_is_infinite():
 def test_bad_settings(settings, words):
     with pytest.raises(ValueError, match=words):
         make_env(**settings)
+
+
+def test_as_many_environments_are_made_as_fit(monkeypatch):
+    """Each takes 8 bytes per pixel and 64 more."""
+    n_envs, n_bytes = 200, 8 * 256 + 64
+    settings = dict(geometries=[room(width=8.0)], device="cpu", res=256, subsample=1)
+    monkeypatch.setattr(devices, "free_memory", lambda device: (n_envs + 0.01) * n_bytes / 0.95)
+    envs.PointGoal(n_envs, **settings)
+    with pytest.raises(engine.EngineError, match="201 environments need .* at most 200 fit"):
+        envs.PointGoal(n_envs + 1, **settings)

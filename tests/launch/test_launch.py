@@ -168,11 +168,24 @@ def test_errors_of_launched_run(monkeypatch):
     assert error.value.args == (143 - 128, "Stopped after 3 samples")
 
 
-def test_restart_is_announced(monkeypatch, capsys):
-    lost = Ending(launcher.LOST, "rank 1 hangs. Its last checkpoint is intact. To continue: train")
-    assert launched(monkeypatch, lost, Ending(folder="run"))
-    sentence = "rank 1 hangs. Its last checkpoint is intact. Restarting, 1 of restarts=1."
-    assert capsys.readouterr().err == f"warning: {sentence}\n"
+@pytest.mark.parametrize(
+    "ending, text",
+    [
+        (
+            Ending(launcher.LOST, "rank 1 hangs. Its last checkpoint is intact. To continue: t"),
+            "rank 1 hangs. Its last checkpoint is intact",
+        ),
+        (
+            Ending(launcher.LOST, "rank 1 hangs. Nothing was saved"),
+            "rank 1 hangs. Nothing was saved",
+        ),
+        (Ending(143, "stopped by SIGTERM"), "A rank was killed or ended without a message"),
+        (None, "A rank was killed or ended without a message"),
+    ],
+)
+def test_restart_is_announced(monkeypatch, capsys, ending, text):
+    assert launched(monkeypatch, ending, Ending(folder="run"))
+    assert capsys.readouterr().err == f"warning: {text}. Restarting, 1 of restarts=1.\n"
 
 
 class Failed(Exception):

@@ -3,6 +3,8 @@
 Kernels run on a GPU, and on a CPU from the same source (`tests/helpers/cuda_on_cpu.py`).
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch.nn import functional
@@ -380,6 +382,19 @@ def test_each_width_has_a_kernel_that_fits():
     names = {f"mingru_step_{width}" for width in mingru_step.WIDTHS}
     assert mingru_step.LIBRARY.cuda_operations.keys() == names
     assert max(map(mingru_step._shared, mingru_step.WIDTHS)) <= 227 * 1024  # of Hopper
+
+
+def test_the_kernel_takes_one_step_of_the_widths_it_has(monkeypatch):
+    hopper = SimpleNamespace(major=9, shared_memory_per_block_optin=227 * 1024)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: hopper)
+    on_gpu = dict(is_cuda=True, dtype=torch.bfloat16, device="cuda")
+
+    def is_supported(n_steps, width):
+        return mingru_step.is_supported(SimpleNamespace(shape=(n_steps, B, width), **on_gpu))
+
+    width = mingru_step.WIDTHS[0]
+    assert is_supported(1, width)
+    assert not is_supported(2, width) and not is_supported(1, width + 1)
 
 
 def step_inputs(n_lanes, width, is_exact=False):

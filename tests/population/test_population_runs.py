@@ -4,6 +4,7 @@ import json
 import random
 import shutil
 import time
+from pathlib import Path
 
 import pytest
 import yaml
@@ -11,6 +12,8 @@ import yaml
 from megastep.agents.algorithms.learner import GradientLearner
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.cli import entry, train
+from megastep.agents.errors import Differs
+from megastep.agents.launch import compare
 from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations
 from tests.cli.test_exact_resume import CASES, differences
@@ -134,6 +137,41 @@ def test_killed_and_interrupted_population_has_the_same_bits(here, monkeypatch, 
     run("resume=P")
     assert_equal(here / "P", here / "left-alone")
     assert "bit for bit" not in capsys.readouterr().out
+
+
+def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
+    """Its budget was extended, and no generation was where the first one ended. The repetition is
+    killed and resumed.
+    """
+    run(*POPULATION, "samples=1024")
+    run("resume=P", "more_samples=1536")
+    generations = populations.read(here / "P" / populations.FILE)
+    assert [rows[0]["samples"] for rows in generations] == [0, 512, 1536, 2048]
+    assert any(row["from"] != row["member"] for rows in generations for row in rows)
+    step, calls = Population.take_over, []
+
+    def interrupted(self):
+        calls.append(1)
+        if len(calls) == 3:
+            raise Killed
+        step(self)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Population, "take_over", interrupted)
+        train.main(["rerun=latest", "folder=again", "checkpoint_seconds=1e-9"])
+    capsys.readouterr()
+    run("resume=again")
+    assert "of all 3 members equal those of P, byte for byte" in capsys.readouterr().out
+    assert_equal(here / "P", here / "again")
+
+    with open("P/member-1/metrics.jsonl", "a") as file:
+        file.write("{}\n")
+    with pytest.raises(Differs, match="member-1/metrics.jsonl differs from that of P from line"):
+        compare.population(Path("again"), Path("P"))
+    (here / "P" / populations.FILE).unlink()
+    err = refused(capsys, "rerun=P", "folder=third")
+    assert "population.jsonl does not hold the generations" in err and err.count("\n") == 1
+    assert not Path("third").exists()
 
 
 def replayed(here, root, folder):

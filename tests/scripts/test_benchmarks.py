@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import shutil
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import engine_operations
 import env_steps
 import nsight_counters
 import paths
+import plan_statistics
 import pytest
 import random_walks
 import records
@@ -20,6 +22,7 @@ import timing
 import torch
 
 from megastep import arrdict
+from megastep.geometries import sample
 
 RECORD_KEYS = {
     *("benchmark", "what", "value", "unit", "lower", "upper", "n"),
@@ -100,6 +103,27 @@ def test_benchmark_appends_json_lines(name, n_records, device, tiny_benchmarks, 
         assert row["on"].startswith("CPU, ") == (device == "cpu")
         assert (row["driver"] is None) == (device == "cpu")
     assert len(capsys.readouterr().out.splitlines()) == 2 + len(rows)
+
+
+def test_plans_benchmark_measures_imported_and_generated_homes(tmp_path, monkeypatch):
+    for source, name in ("cubicasa", "ok_two_rooms.svg"), ("houseexpo", "houseexpo_ok.json"):
+        (tmp_path / source).mkdir()
+        shutil.copy(paths.ROOT / "tests/data/hostile" / name, tmp_path / source)
+    monkeypatch.setattr(plan_statistics, "N_BENCH", 2)
+    monkeypatch.setattr(plan_statistics, "DENSE", {"bench": ("bench", {})})
+    monkeypatch.setattr(plan_statistics, "N_DENSE", 1)
+    monkeypatch.setattr(
+        plan_statistics.imports, "generated_homes", lambda: sample("homes", 3, "all")
+    )
+    rows = [*catalogue.BENCHMARKS["plans"](torch.device("cpu"), tmp_path)]
+    values = {row["what"]: row["value"] for row in rows}
+    assert len(values) == len(rows) == 9 + 9 + 11 + 10 + 3
+    assert values["CubiCasa5k, rooms"] == 2
+    assert (
+        0.9 < values["bench, room width"] < 2 * values["bench, longest of a home's shortest paths"]
+    )
+    assert values["HouseExpo, rooms that an agent can reach"] == 100
+    assert values["bench, homes that do not pass"] == 0
 
 
 def test_step_benchmark_measures_explorer_as_trained(tiny_benchmarks, monkeypatch):

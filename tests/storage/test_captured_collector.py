@@ -72,6 +72,16 @@ def test_opponents_are_captured(monkeypatch):
     assert isinstance(graph, Graph) and not messages
 
 
+def test_a_rollout_starts_where_the_last_ended_although_a_recording_steps_too(monkeypatch):
+    graphs_on_cpu.install(monkeypatch, may_wait=True)
+    env = ENVS["minimal"]()
+    collect = PPO(policy_for(env), n_steps=4, n_minibatches=1).collector(env)
+    collect.can_capture = True
+    ended = collect().obs[-1].clone()
+    started = collect().obs[0]
+    assert isinstance(collect.graph, Graph) and torch.equal(started, ended)
+
+
 class Tired(envs.Minimal):
     """Counts its steps in an array of NumPy."""
 
