@@ -22,10 +22,10 @@ KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -na
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
 
-test: $(SETUP)             ## run the fast tests: 4 to 11 minutes on two cores
+test: $(SETUP)             ## run the fast tests: 3 to 10 minutes on two cores
 	$(PYTEST)
 
-test-slow: $(SETUP)        ## run the thorough tests: 6 to 14 minutes; .ci/run runs them as well
+test-slow: $(SETUP)        ## run the thorough tests: 5 to 11 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 
 test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour; SEED=2 makes others

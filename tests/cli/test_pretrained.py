@@ -443,8 +443,13 @@ FIRST_EPISODES = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FIRST_EPISODES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.nightly if name == "memory_15" else pytest.mark.slow)
+        for name in FIRST_EPISODES
+    ],
+)
 @torch.no_grad()
 def test_agent_of_the_package_does_what_its_card_says(name):
     source, settings, n_homes, n_each, least = FIRST_EPISODES[name]

@@ -322,7 +322,7 @@ def at_any_moment(here, seed):
 @pytest.mark.parametrize(
     "seed",
     [
-        pytest.param(seed, marks=pytest.mark.slow if seed < 2 else pytest.mark.nightly)
+        pytest.param(seed, marks=pytest.mark.nightly if seed else pytest.mark.slow)
         for seed in range(50)
     ],
 )

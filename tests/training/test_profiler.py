@@ -28,7 +28,7 @@ def events_of(folder):
     return json.loads(gzip.open(Path(folder, "profile.json.gz")).read())["traceEvents"]
 
 
-@pytest.mark.parametrize("learner", ["ppo", pytest.param("vtrace", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("learner", ["ppo", pytest.param("vtrace", marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("device", DEVICES)
 def test_profiled_run_has_a_trace_a_table_and_the_same_metrics(device, learner, capsys):
     words = [*WORDS, f"device={device}", f"learner={learner}"]
