@@ -44,7 +44,7 @@ T = TypeVar("T")
 
 #: Updates of each member that compile kernels and, on a GPU, record graphs: of all members together
 #: these take much longer than of one.
-N_PREPARING = 3
+N_PREPARING = {"cpu": 1, "cuda": 3}
 
 
 class Learnt(NamedTuple):
@@ -207,7 +207,9 @@ class Population:
         try:
             while self._is_round_left(rounds):
                 n_rounds += 1
-                if n_rounds <= N_PREPARING:  # seconds count from the last of these on
+                if (
+                    n_rounds <= N_PREPARING[self.turns.device.type]
+                ):  # seconds count from the last of these on
                     for i, trainer in enumerate(self.trainers):
                         with self.turns.of(i):
                             trainer.start_clock()

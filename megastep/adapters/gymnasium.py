@@ -121,10 +121,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             self._stepped, self._parts = stepped, self._tensors(*stepped)
             self._copies = Copies(self._parts)
             floats = filter(torch.is_floating_point, _pytree.tree_leaves(self._parts["obs"]))
-            self._is_as_wanted = all(leaf.dtype == self.dtype for leaf in floats)
+            self._casts = any(leaf.dtype != self.dtype for leaf in floats)
         parts = self._copies() if self.copy else self._parts
         obs, final_obs = parts["obs"], parts.get("final_obs", {})
-        if not self._is_as_wanted:
+        if self._casts:
             obs, final_obs = self._as_dtype(obs), self._as_dtype(final_obs)
         flags = parts["terminal"], parts["truncated"]
         infos = self._infos(parts, final_obs) | self._mask_infos(parts["mask"])

@@ -544,9 +544,9 @@ def test_evaluate_refuses_another_environment(trained, tmp_path):
 
 def test_episodes_are_written_one_by_one(explorer):
     """The rows' means are those of the table, and each home has as many."""
-    bench = settings("run=x", "geometry=homes", "geometry.n=4", script="evaluate").geometry
+    homes = settings("run=x", "geometry=homes", "geometry.n=4", script="evaluate").geometry
     bots = ["random", "explorer"]
-    written = evaluate.run(configured(run=str(explorer), geometry=bench, baseline=bots))
+    written = evaluate.run(configured(run=str(explorer), geometry=homes, baseline=bots))
     result = json.loads(written.read_text())
     with open(written.with_suffix(".csv"), newline="") as file:
         rows = [*csv.DictReader(file)]

@@ -16,6 +16,7 @@ from megastep.agents.errors import Differs
 from megastep.agents.launch import compare
 from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations
+from megastep.agents.training.trainer import Trainer
 from tests.cli.test_exact_resume import CASES, differences
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, forked
@@ -82,6 +83,23 @@ def test_members_have_the_bits_of_runs_alone(here, device):
         populations.settings_of(row) for row in populations.read(here / "P" / "population.jsonl")[0]
     ]
     assert len({one["learner.lr"] for one in settings}) == 3
+
+
+@pytest.mark.parametrize(
+    "device, n", [("cpu", 1), pytest.param("cuda", 3, marks=pytest.mark.cuda)], ids=["cpu", "cuda"]
+)
+def test_seconds_count_once_all_members_are_prepared(monkeypatch, device, n):
+    """Their clock is started again after each update that compiles or records."""
+    start, started_at = Trainer.start_clock, []
+
+    def started(self):
+        started_at.append(self.updates)
+        start(self)
+
+    monkeypatch.setattr(Trainer, "start_clock", started)
+    run(*POPULATION, "samples=2560", f"device={device}")
+    first, *others = started_at  # a trainer starts it by itself after its first update
+    assert first == 1 and others == [update for update in range(1, n + 1) for _ in range(3)]
 
 
 class Killed(BaseException):
