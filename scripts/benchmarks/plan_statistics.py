@@ -11,7 +11,6 @@ from timing import measurement
 from megastep import geometries
 from megastep.envs.pointgoal.goals import all_geodesics
 from megastep.geometries import checks
-from megastep.geometries.plans import imports
 
 TITLES = {"cubicasa": "CubiCasa5k", "houseexpo": "HouseExpo"}
 DENSE = {
@@ -28,14 +27,17 @@ def plans(device: torch.device, folder: Path | None = None) -> Iterator[dict]:
     HouseExpo in `--folder`, which has them in `cubicasa/` and `houseexpo/`; a sample is a home, a
     room or a path. And how many of the benchmark's homes do not pass `megastep check`.
     """
+    from megastep.geometries.plans import imports  # and with it what only plans need
+
     for source, title in TITLES.items() if folder else ():
         found, _ = imports.run(imports.Options(source), folder / source, lambda n: None, 1)
-        yield from _of_homes(title, [g for plan in found for g in plan.geometries])
+        homes = [g for plan in found for g in plan.geometries]
+        yield from _of_homes(title, homes, imports.statistics)
         notes = [note for plan in found for note in plan.notes]
         share = sum(note.n_reachable for note in notes) / sum(note.n_rooms for note in notes)
         yield measurement(f"{title}, rooms that an agent can reach", "%", [100 * share])
-    for title, homes in _generated():
-        yield from _of_homes(title, homes)
+    for title, homes in {"generated": imports.generated_homes(), **_dense()}.items():
+        yield from _of_homes(title, homes, imports.statistics)
         yield from _of_paths(title, homes)
     sentences = [checks.errors(g) for g in geometries.sample("bench", N_BENCH, split="all")]
     counts = {
@@ -47,14 +49,15 @@ def plans(device: torch.device, folder: Path | None = None) -> Iterator[dict]:
         yield measurement(f"bench, homes {what}", f"of {len(sentences)}", [count])
 
 
-def _generated() -> Iterator[tuple[str, list]]:
-    yield "generated", imports.generated_homes()
-    for title, (source, options) in DENSE.items():
-        yield title, geometries.sample(source, N_DENSE, split="all", **options)
+def _dense() -> dict[str, list]:
+    return {
+        title: geometries.sample(source, N_DENSE, split="all", **options)
+        for title, (source, options) in DENSE.items()
+    }
 
 
-def _of_homes(title, homes) -> Iterator[dict]:
-    rows = [imports.statistics(g) for g in homes]
+def _of_homes(title, homes, statistics) -> Iterator[dict]:
+    rows = [statistics(g) for g in homes]
     for name in rows[0]:
         if name == "doors" and "doors" not in homes[0]:
             continue  # they are not marked

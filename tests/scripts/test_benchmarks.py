@@ -23,6 +23,7 @@ import torch
 
 from megastep import arrdict
 from megastep.geometries import sample
+from megastep.geometries.plans import imports
 
 RECORD_KEYS = {
     *("benchmark", "what", "value", "unit", "lower", "upper", "n"),
@@ -105,6 +106,12 @@ def test_benchmark_appends_json_lines(name, n_records, device, tiny_benchmarks, 
     assert len(capsys.readouterr().out.splitlines()) == 2 + len(rows)
 
 
+def test_benchmarks_start_without_what_only_importing_floor_plans_needs():
+    code = "import sys; sys.modules.update(shapely=None, svgelements=None); import catalogue"
+    folder = paths.ROOT / "scripts" / "benchmarks"
+    subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
+
+
 def test_plans_benchmark_measures_imported_and_generated_homes(tmp_path, monkeypatch):
     for source, name in ("cubicasa", "ok_two_rooms.svg"), ("houseexpo", "houseexpo_ok.json"):
         (tmp_path / source).mkdir()
@@ -112,9 +119,7 @@ def test_plans_benchmark_measures_imported_and_generated_homes(tmp_path, monkeyp
     monkeypatch.setattr(plan_statistics, "N_BENCH", 2)
     monkeypatch.setattr(plan_statistics, "DENSE", {"bench": ("bench", {})})
     monkeypatch.setattr(plan_statistics, "N_DENSE", 1)
-    monkeypatch.setattr(
-        plan_statistics.imports, "generated_homes", lambda: sample("homes", 3, "all")
-    )
+    monkeypatch.setattr(imports, "generated_homes", lambda: sample("homes", 3, "all"))
     rows = [*catalogue.BENCHMARKS["plans"](torch.device("cpu"), tmp_path)]
     values = {row["what"]: row["value"] for row in rows}
     assert len(values) == len(rows) == 9 + 9 + 11 + 10 + 3
