@@ -71,25 +71,24 @@ class Turns:
     def __init__(self, n: int, device: torch.device):
         self.device, is_on_gpu = device, device.type == "cuda"
         self.streams = [torch.cuda.Stream(device) for _ in range(n)] if is_on_gpu else None
-        self.generators = [self._generators() for _ in range(n)]
+        current = global_generators.Held.current()
+        self.of_host = [current.copied() for _ in range(n)]
+        self.of_gpu = [torch.cuda.get_rng_state(device) for _ in range(n)] if is_on_gpu else None
 
     @contextlib.contextmanager
     def of(self, member: int) -> Iterator[None]:
         """What is done inside is this member's."""
-        of_host, of_gpu = self.generators[member]
-        global_generators.restore(of_host)
-        if of_gpu is not None:
-            torch.cuda.set_rng_state(of_gpu, self.device)
+        outside = global_generators.Held.current()
+        self.of_host[member].install()
         with contextlib.ExitStack() as stack:
+            stack.callback(outside.install)
             if self.streams is not None:
+                torch.cuda.set_rng_state(self.of_gpu[member], self.device)
                 stack.enter_context(torch.cuda.stream(self.streams[member]))
             yield
-        self.generators[member] = self._generators()
-
-    def _generators(self) -> tuple[dict[str, tuple], torch.Tensor | None]:
-        is_on_gpu = self.device.type == "cuda"
-        of_gpu = torch.cuda.get_rng_state(self.device) if is_on_gpu else None
-        return global_generators.states(), of_gpu
+            self.of_host[member] = global_generators.Held.current()
+            if self.of_gpu is not None:
+                self.of_gpu[member] = torch.cuda.get_rng_state(self.device)
 
     def wait(self) -> None:
         """Waits until all members have done what is launched."""

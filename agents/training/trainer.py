@@ -191,7 +191,7 @@ class Trainer:
         )
         self.nonfinite_guard = NonFiniteGuard(env, learner, lambda value: repeat_hint(self, value))
         self.clock = Stopwatch() if leader is None else leader.clock
-        self.timer = PhaseTimer(env.device, counts.finish_phase)
+        self.timer = PhaseTimer(env.device, counts.finish_phase) if leader is None else None
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.samples_per_second = None
@@ -294,11 +294,12 @@ class Trainer:
         Args:
             is_stopped: a signal stops this rank.
         """
-        with waiting():
-            self.timer.wait(MAX_AHEAD * len(PHASES))
         if self.leader is not None:
             assert self.leader.latest_plan is not None
             return self.leader.latest_plan
+        assert self.timer is not None
+        with waiting():
+            self.timer.wait(MAX_AHEAD * len(PHASES))
         seconds = self.clock.seconds
         seconds_since = seconds - self.seconds_at_checkpoint
         plan = Plan(
@@ -316,7 +317,8 @@ class Trainer:
         if self.profiler is not None:
             with unhurried():
                 self.profiler.start(phase)
-        self.timer.start(phase)
+        if self.timer is not None:
+            self.timer.start(phase)
 
     def wait_for_collector(self) -> None:
         """Waits until an async collector has stopped stepping the environment."""
@@ -359,7 +361,8 @@ class Trainer:
         self.clock.start()
         self.seconds_at_checkpoint = self.clock.seconds
         self.samples_at_log, self.seconds_at_log = self.samples, self.clock.seconds
-        self.timer.pop()
+        if self.timer is not None:
+            self.timer.pop()
 
     def follow_schedules(self, fraction: float) -> None:
         """Sets what has a schedule, of the learner and of the environment.
@@ -437,7 +440,8 @@ class Trainer:
             perf/collect: seconds of collecting since the last report, on a GPU of the GPU; with
                 `learner.lag`, as far as the learner waits for it.
             perf/update: seconds of updates, in the same way.
-            perf/rest: seconds of everything else: statistics, logging, checkpoints, evaluations.
+            perf/rest: seconds of everything else: statistics, logging, checkpoints, evaluations. Of
+                a population, whose members' work overlaps, the first alone has these three.
             perf/seconds_to_stop: seconds of training at which an evaluation reached `stop`.
             perf/memory_allocated: on a GPU, bytes of tensors.
             perf/memory_reserved: on a GPU, bytes that PyTorch has reserved.
@@ -490,7 +494,8 @@ class Trainer:
             n_samples = self.samples - self.samples_at_log
             self.samples_per_second = n_samples / (seconds - self.seconds_at_log)
             perf["perf/rate"] = self.samples_per_second
-            perf |= {f"perf/{phase}": time for phase, time in self.timer.pop().items()}
+            phases = {} if self.timer is None else self.timer.pop()
+            perf |= {f"perf/{phase}": seconds_of for phase, seconds_of in phases.items()}
         perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
         self.updates_at_log = self.updates
