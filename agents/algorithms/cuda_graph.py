@@ -73,7 +73,7 @@ class CudaGraphUpdate:
         """Returns the metrics in one tensor, of which a single kernel makes a copy."""
         metrics = self.update(rollout)
         self._names = [*metrics]
-        return torch.stack([*metrics.values()])
+        return torch.stack([*metrics.values()]).detach()
 
     def _warm_up(self, rollout) -> Metrics:
         # PyTorch would warn of gradients accumulated on another stream, which this one waits for
