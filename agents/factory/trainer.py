@@ -52,6 +52,7 @@ def make_trainer(
     make_evaluator: Callable | None = None,
     leader: Trainer | None = None,
     n_members: int = 1,
+    homes: list[dict] | None = None,
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
@@ -65,12 +66,15 @@ def make_trainer(
             environment of the training and the device, such as `evaluation.in_training.Evaluator`.
         leader: the first member of a population, for the others.
         n_members: trainers of a population that memory is to hold from this one on.
+        homes: the floor plans to train in, if they are made already.
     """
     number, n_ranks = process_group.rank(), process_group.n_ranks()
     seed = rank_seed(cfg.seed, number)
     seed_everything(seed)
+    if homes is None:
+        homes = factory.homes(cfg.env, cfg.geometry, "training")
     where = {
-        "geometries": factory.homes(cfg.env, cfg.geometry, "training"),
+        "geometries": homes,
         "seed": seed,
         "device": device,
         "privileged": cfg.agent.critic == "asymmetric",

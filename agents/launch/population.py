@@ -138,7 +138,9 @@ def make(
     rank.
     """
     chosen, trainers, members = cfg.population, [], hosted(cfg.population.size)
-    turns = Turns(len(members), device)
+    turns, homes = Turns(len(members), device), None
+    if cfg.geometry.name.startswith("megastep."):  # another's may draw from global generators
+        homes = factory.homes(cfg.env, cfg.geometry, "training")
     for i, member in enumerate(members):
         own = member_settings(cfg, member)
         if checkpoints:
@@ -151,6 +153,7 @@ def make(
                 make_evaluator=in_training.Evaluator,
                 leader=trainers[0] if trainers else None,
                 n_members=1 if trainers else len(members),
+                homes=homes,
             )
         trainer.checkpoint_seconds = math.inf
         folders.write_config(folder, trainer.saver.config["train"])

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from megastep.agents import factory
 from megastep.agents.algorithms.learner import GradientLearner
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.cli import entry, train
@@ -17,6 +18,7 @@ from megastep.agents.launch import compare
 from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations
 from megastep.agents.training.trainer import Trainer
+from megastep.geometries import sample
 from tests.cli.test_exact_resume import CASES, differences
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, forked
@@ -83,6 +85,24 @@ def test_members_have_the_bits_of_runs_alone(here, device):
         populations.settings_of(row) for row in populations.read(here / "P" / "population.jsonl")[0]
     ]
     assert len({one["learner.lr"] for one in settings}) == 3
+
+
+def own_homes(n=2, split="training", seed=1):
+    return sample("box", n, split=split)
+
+
+@pytest.mark.parametrize("source, n", [("box", 1), (f"{__name__}:own_homes", 3)])
+def test_members_share_floor_plans_that_nothing_but_settings_decides(here, monkeypatch, source, n):
+    n_made, homes = [], factory.homes
+
+    def counted(*arguments):
+        n_made.append(1)
+        return homes(*arguments)
+
+    monkeypatch.setattr(factory, "homes", counted)
+    words = "env=explorer", f"geometry={source}", "samples=512", "population.every=1e9"
+    run(*words, *POPULATION[1:-3], "folder=P")
+    assert len(n_made) == n
 
 
 @pytest.mark.parametrize(
