@@ -122,9 +122,7 @@ class Held(NamedTuple):
     def current(cls) -> "Held":
         """Returns the current ones."""
         torch = sys.modules.get("torch")
-        return cls(
-            _NUMPY.get_bit_generator(), random.getstate(), torch and torch.get_rng_state()
-        )
+        return cls(_NUMPY.get_bit_generator(), random.getstate(), torch and torch.get_rng_state())
 
     def copied(self) -> "Held":
         """Returns ones that go on alike and apart."""

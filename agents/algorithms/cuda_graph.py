@@ -84,4 +84,3 @@ class CudaGraphUpdate:
             metrics = self.update(rollout)
         torch.cuda.current_stream().wait_stream(self.stream)
         return metrics
-

@@ -73,7 +73,7 @@ class Turns:
         self.streams = [torch.cuda.Stream(device) for _ in range(n)] if is_on_gpu else None
         current = global_generators.Held.current()
         self.of_host = [current.copied() for _ in range(n)]
-        self.of_gpu = [torch.cuda.get_rng_state(device) for _ in range(n)] if is_on_gpu else None
+        self.of_gpu = [torch.cuda.get_rng_state(device)] * n if is_on_gpu else []
 
     @contextlib.contextmanager
     def of(self, member: int) -> Iterator[None]:
@@ -87,7 +87,7 @@ class Turns:
                 stack.enter_context(torch.cuda.stream(self.streams[member]))
             yield
             self.of_host[member] = global_generators.Held.current()
-            if self.of_gpu is not None:
+            if self.streams is not None:
                 self.of_gpu[member] = torch.cuda.get_rng_state(self.device)
 
     def wait(self) -> None:
