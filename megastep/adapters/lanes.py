@@ -94,7 +94,7 @@ def _builder(tree) -> Callable:
     """
     if not isinstance(tree, Mapping):
         return next
-    kind: Callable = type(tree)
+    kind = cast(Callable, type(tree))
     parts = [(key, _builder(part)) for key, part in tree.items()]
     return lambda leaves: kind({key: part(leaves) for key, part in parts})
 
