@@ -21,7 +21,7 @@ from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.agents.selfplay.bots.seekers import Mapper, Oracle, Wanderer
 from megastep.agents.selfplay.bots.walker import Walker
 from megastep.arrdict import arrdict
-from megastep.geometries import sample
+from megastep.geometries import memory_mazes, sample
 from megastep.modules.spawning import distances
 from tests.helpers.games import Matrix
 
@@ -116,6 +116,32 @@ def test_an_oracle_finds_an_object_every_few_seconds(device):
     env = envs.Memory(8, sample("memory_maze", 8, split="test"), device=device, res=8, subsample=1)
     play(env, Oracle(env), 150)
     assert env.found.float().mean() > 3 and env.found.min() > 0
+
+
+@pytest.mark.parametrize(
+    "maze, pose, velocity, goal",
+    [
+        pytest.param(4736, (3.94, 6.524, 146.26), (0.0, 0.0), (3.122, 3.81), id="at-a-corner"),
+        pytest.param(4627, (7.785, 5.572, 27.8), (0.24, 0.12), (5.967, 4.749), id="at-a-wall"),
+        pytest.param(4788, (9.277, 6.994, 30.3), (-0.19, 0.32), (2.289, 2.446), id="two-ways"),
+    ],
+)
+def test_an_oracle_neither_stands_nor_walks_to_and_fro(maze, pose, velocity, goal, device):
+    """Where none of its pushes brings it on, or two ways are about as long."""
+    mazes = [memory_mazes.generate(maze, size=15)]
+    env = envs.Memory(1, mazes, device=device, objects=2, res=8, subsample=1)
+    bot, world, agents = Oracle(env), env.reset(), env.core.agents
+    state = bot.initial(1, device)
+    agents.positions[0, 0] = torch.tensor(pose[:2])
+    agents.angles[0, 0] = pose[2]
+    agents.velocity[0, 0] = torch.tensor(velocity)
+    env.cue[0], env.objects.all.positions[0, 0] = 0, torch.tensor(goal)
+    for _ in range(200):
+        decision, state = bot(world, state)
+        world = env.step(decision)
+        if env.found.any():
+            break
+    assert env.found.any()
 
 
 def test_a_mapper_explores_until_it_has_found():

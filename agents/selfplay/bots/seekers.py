@@ -17,6 +17,8 @@ from megastep.arrdict import arrdict
 BLOCK = 2  # squares of 0.3 m per side of a landmark's block: a maze's cell has a landmark
 LAST = 1.5  # metres, at most, of the last leg of a way: from a landmark straight to an object
 FAR = 100.0  # metres that a longer last leg is worth
+NEARBY = 0.5  # metres from a place at which a lane has not left it
+PATIENCE, TURNS = 20, 3  # steps at a place after which a lane turns, and for how many
 
 
 class Oracle:
@@ -44,8 +46,13 @@ class Oracle:
         return seeker
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state: nothing to remember, (n,) bool."""
-        return arrdict(nothing=torch.zeros(n_lanes, dtype=torch.bool, device=device))
+        """Returns the initial state: the `place` that it has not left, (n, 2) metres, and
+        for how many steps, `stay` (n,) int64.
+        """
+        return arrdict(
+            place=torch.zeros(n_lanes, 2, device=device),
+            stay=torch.zeros(n_lanes, dtype=torch.int64, device=device),
+        )
 
     def __call__(
         self,
@@ -57,7 +64,21 @@ class Oracle:
         """Returns (arrdict(actions (n, 1)), next state)."""
         pose = self.steering.pose()
         near = self.steering.near(pose)
-        return self.walk_to(self.cued(), *self.ways(pose, near), pose, near), arrdict(state)
+        decision = self.walk_to(self.cued(), *self.ways(pose, near), pose, near)
+        return self.unstick(decision, state, pose)
+
+    def unstick(self, decision: arrdict, state: Mapping, pose: Pose) -> tuple[arrdict, arrdict]:
+        """Returns the decision, to turn where a lane does not leave a place, and the next state.
+
+        Where none of the few directions in which it can push brings a lane on, it would stand or
+        walk to and fro for ever. Once it has turned, it pushes in others.
+        """
+        has_left = (pose.position - state["place"]).norm(dim=-1) > NEARBY
+        stay = torch.where(has_left, 0, state["stay"] + 1)
+        place = torch.where(has_left[:, None], pose.position, state["place"])
+        is_stuck = stay % (PATIENCE + TURNS) >= PATIENCE
+        turn = arrdict(actions=self.steering.turn.expand_as(decision["actions"]))
+        return _chosen(is_stuck, turn, decision), arrdict(state, place=place, stay=stay)
 
     def cued(self) -> torch.Tensor:
         """Returns the object to find of each lane, (n,) int64."""
@@ -112,9 +133,12 @@ class Mapper(Oracle):
         super().__init__(env, Explorer)
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state: that of an `Explorer`, and `known` (n, K) bool."""
+        """Returns the initial state: those of an `Oracle` and an `Explorer`, and `known` (n, K)
+        bool.
+        """
         known = torch.zeros(n_lanes, self.positions.shape[1], dtype=torch.bool, device=device)
-        return arrdict(self.otherwise.initial(n_lanes, device), known=known)
+        state = super().initial(n_lanes, device)
+        return arrdict(state, **self.otherwise.initial(n_lanes, device), known=known)
 
     def __call__(
         self,
@@ -133,7 +157,7 @@ class Mapper(Oracle):
         aim = self.steering.aim(pose, near, explored["target"])
         to_frontier = self.steering.decide(pose, aim, aim)
         decision = _chosen(known.gather(1, k[:, None]), to_object, to_frontier)
-        return decision, arrdict(explored, known=known)
+        return self.unstick(decision, arrdict(state, **explored, known=known), pose)
 
 
 class Wanderer(Oracle):
@@ -145,8 +169,8 @@ class Wanderer(Oracle):
         super().__init__(env, Walker)
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state, that of a `Walker`."""
-        return self.otherwise.initial(n_lanes, device)
+        """Returns the initial state: those of an `Oracle` and a `Walker`."""
+        return arrdict(super().initial(n_lanes, device), **self.otherwise.initial(n_lanes, device))
 
     def __call__(
         self,
@@ -160,13 +184,14 @@ class Wanderer(Oracle):
         near = self.steering.near(pose)
         ways = self.ways(pose, near)
         to_object = self.walk_to(k, *ways, pose, near)
-        wandering, state = self.otherwise(world, state, sample, generator)
+        wandering, walked = self.otherwise(world, state, sample, generator)
         sees = self.in_view(pose, *ways[:2]).gather(1, k[:, None])
-        return _chosen(sees, to_object, wandering), arrdict(state)
+        decision = _chosen(sees, to_object, wandering)
+        return self.unstick(decision, arrdict(state, **walked), pose)
 
 
 def _chosen(condition, decision, other) -> arrdict:
-    """Returns a decision where the condition, (n, 1) bool, is true, and the other elsewhere."""
+    """Returns a decision where the condition, (n,) or (n, 1) bool, is true, elsewhere the other."""
     actions = decision["actions"]
     condition = condition.view(-1, *[1] * (actions.ndim - 1))
     return arrdict(actions=torch.where(condition, actions, other["actions"]))

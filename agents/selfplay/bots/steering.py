@@ -16,7 +16,8 @@ from megastep.types import n_lanes
 
 REACH = 2.5  # metres to which an agent walks straight, if it can
 PROGRESS = 0.3, 0.05  # metres by which the next node is nearer to the target, if there is one
-DETOUR = 100.0  # metres that this is worth
+LONGER = 1.0  # metres by which the way by the next node is longer than the shortest, at most
+DETOUR = 100.0  # metres that each of these is worth
 AT_NODE = 0.1  # metres within which an agent has reached a node
 TOUCH = 0.01  # metres to a wall that may have stopped an agent
 GAIN = 3.2  # of the share of its speed that an agent loses per step: 4/s with momentum
@@ -64,6 +65,7 @@ class Steering:
         else:
             self.actions = torch.arange(len(moves), device=moves.device)
         self.moves, self.retained = moves, 1 - env.movement.damping
+        self.turn = self.actions[moves[:, 2].argmax()]
         self.plans = Plans(
             env.core.scenery, env.spawner.points, env.core.agents.radius, goals, block
         )
@@ -117,10 +119,12 @@ class Steering:
         plans, exits = self.plans, self.plans.exits[node].long()
         left = plans.lengths[exits, target[:, None]]
         lengths = left + plans.metres[node]
-        # a node on the way that is too near brings an agent that stands on it nowhere
+        # a node on the way that is too near brings an agent that stands on it nowhere, and one that
+        # is far behind leads it past nodes from which the next node is this one
         here = plans.lengths[node, target][:, None]
-        for metres in PROGRESS:
-            lengths = lengths + DETOUR * (left > here - metres)
+        is_near, is_nowhere = (left > here - metres for metres in PROGRESS)
+        is_behind = lengths > here + LONGER
+        lengths = lengths + DETOUR * (is_near | is_behind) + DETOUR * is_nowhere
         following = plans.nodes[exits.gather(1, lengths.argmin(1, True))[:, 0]]
         end = plans.targets[pose.plan, target]
         straight = plans.straight(pose.plan, pose.position, torch.stack([following, end], 1))
