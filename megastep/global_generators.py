@@ -4,14 +4,19 @@ them: its numbers then do not depend on which others step in the same process, o
 Workers import it, so PyTorch's is one of them only where PyTorch is imported.
 """
 
+from __future__ import annotations
+
 import contextlib
 import copy
 import random
 import sys
 from collections.abc import Collection, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import torch
 
 __all__ = [
     "KINDS",
@@ -114,17 +119,17 @@ class Held(NamedTuple):
     NumPy's as the generator itself, since exchanging states takes it thirty times as long.
     """
 
-    numpy: Any
+    numpy: object
     python: tuple
-    torch: Any
+    torch: torch.Tensor | None
 
     @classmethod
-    def current(cls) -> "Held":
+    def current(cls) -> Held:
         """Returns the current ones."""
         torch = sys.modules.get("torch")
         return cls(_NUMPY.get_bit_generator(), random.getstate(), torch and torch.get_rng_state())
 
-    def copied(self) -> "Held":
+    def copied(self) -> Held:
         """Returns ones that go on alike and apart."""
         return self._replace(numpy=copy.deepcopy(self.numpy))
 
