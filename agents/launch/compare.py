@@ -12,7 +12,12 @@ METRICS = "metrics.jsonl"
 
 def run(folder: Path, original: Path) -> None:
     """Checks that two runs have the same metrics. Raises Differs if not."""
-    _check(METRICS, folder, original)
+    generation = populations.first_copy(original)
+    cause = generation and (
+        f"in generation {generation} it copied another member, which a run of its own cannot: "
+        f"rerun={original.parent} repeats the whole population"
+    )
+    _check(METRICS, folder, original, cause or "")
     console.say(f"{METRICS} equals that of {original}, byte for byte.")
 
 
@@ -29,13 +34,13 @@ def population(folder: Path, original: Path) -> None:
     )
 
 
-def _check(name: str, folder: Path, original: Path) -> None:
+def _check(name: str, folder: Path, original: Path, cause: str = "") -> None:
     ours, theirs = ((one / name).read_bytes() for one in (folder, original))
     if ours == theirs:
         return
     pairs = enumerate(itertools.zip_longest(ours.split(b"\n"), theirs.split(b"\n")), 1)
     number = next(number for number, (one, other) in pairs if one != other)
-    raise Differs(
-        f"{name} differs from that of {original} from line {number} on; equal bits need the same "
-        f"versions, device and threads: see {provenance.FILE} of both"
+    cause = cause or (
+        f"equal bits need the same versions, device and threads: see {provenance.FILE} of both"
     )
+    raise Differs(f"{name} differs from that of {original} from line {number} on; {cause}")

@@ -105,6 +105,17 @@ def samples_of_generations(path: Path) -> set[int]:
         ) from None
 
 
+def first_copy(folder: Path) -> int | None:
+    """Returns the generation in which a member first copied another; None if it never did, or if
+    this is the folder of no member.
+    """
+    path, number = folder.parent / FILE, folder.name.removeprefix(PREFIX)
+    if not (number.isdecimal() and path.exists()):
+        return None
+    rows = [rows[int(number)] for rows in read(path)]
+    return next((int(row["generation"]) for row in rows if row["from"] != row["member"]), None)
+
+
 def settings_of(row: "Row") -> dict[str, float]:
     """Returns the settings in a row, by key."""
     return {key[len(KEY) :]: value for key, value in row.items() if key.startswith(KEY)}

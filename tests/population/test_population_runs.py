@@ -202,6 +202,12 @@ def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
     assert "of all 3 members equal those of P, byte for byte" in capsys.readouterr().out
     assert_equal(here / "P", here / "again")
 
+    copied = next(row for rows in generations for row in rows if row["from"] != row["member"])
+    words = "rerun=P", f"member={copied['member']}", "folder=one"
+    err = refused(capsys, *words, code=Differs.code)
+    assert f"in generation {copied['generation']} it copied another member" in err
+    assert "rerun=P repeats the whole population" in err
+
     with open("P/member-1/metrics.jsonl", "a") as file:
         file.write("{}\n")
     with pytest.raises(Differs, match="member-1/metrics.jsonl differs from that of P from line"):
