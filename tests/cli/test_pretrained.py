@@ -438,7 +438,7 @@ FIRST_EPISODES = {
     "pointgoal_anywhere": ("bench", {}, 51, 2, {"success": 0.94, "spl": 0.76}),
     "explorer_anywhere": ("homes", {}, 24, 1, {"coverage": 0.97, "return": 16}),
     "memory_9": ("memory_maze", {}, 16, 1, {"found": 32}),
-    "memory_15": ("memory_maze", {"size": 15}, 4, 1, {"found": 42}),
+    "memory_15": ("memory_maze", {"size": 15}, 4, 1, {"found": 55}),
     "keys_anywhere": ("homes", {}, 24, 1, {"success": 0.9}),
 }
 
