@@ -206,9 +206,8 @@ class Population:
         try:
             while self._is_round_left(rounds):
                 n_rounds += 1
-                if (
-                    n_rounds <= N_PREPARING[self.turns.device.type]
-                ):  # seconds count from the last of these on
+                # seconds count from the last of these on
+                if n_rounds <= N_PREPARING[self.turns.device.type]:
                     for i, trainer in enumerate(self.trainers):
                         with self.turns.of(i):
                             trainer.start_clock()

@@ -107,13 +107,14 @@ def samples_of_generations(path: Path) -> set[int]:
 
 def first_copy(folder: Path) -> int | None:
     """Returns the generation in which a member first copied another; None if it never did, or if
-    this is the folder of no member.
+    no file says so.
     """
-    path, number = folder.parent / FILE, folder.name.removeprefix(PREFIX)
-    if not (number.isdecimal() and path.exists()):
+    try:
+        number = int(folder.name.removeprefix(PREFIX))
+        rows = [rows[number] for rows in read(folder.parent / FILE)]
+        return next((int(row["generation"]) for row in rows if row["from"] != row["member"]), None)
+    except (OSError, ValueError, KeyError, IndexError, TypeError):
         return None
-    rows = [rows[int(number)] for rows in read(path)]
-    return next((int(row["generation"]) for row in rows if row["from"] != row["member"]), None)
 
 
 def settings_of(row: "Row") -> dict[str, float]:

@@ -236,14 +236,14 @@ def plot_memory(records: list[dict], path: Path) -> None:
 
 
 def plot_scaling(records: list[dict], path: Path) -> None:
-    """Plots samples per second over the number of GPUs, from `scaling`, beside linear scaling: on
-    the machine that was measured last.
+    """Plots samples per second over the number of GPUs, from `scaling`, beside linear scaling: of
+    the commit and on the machine that were measured last.
     """
     series = {}
     records = [record for record in records if record["benchmark"] == "scaling"]
     for record in newest(records):
         match = re.fullmatch(r"(\w+), training on (\d+) GPUs?", record["what"])
-        if match and record["on"] == records[-1]["on"]:
+        if match and all(record[key] == records[-1][key] for key in ("commit", "on")):
             series.setdefault(match[1], {})[int(match[2])] = record["value"]
     if not series:
         return

@@ -207,6 +207,8 @@ def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
     err = refused(capsys, *words, code=Differs.code)
     assert f"in generation {copied['generation']} it copied another member" in err
     assert "rerun=P repeats the whole population" in err
+    assert populations.first_copy(Path("P/member-9")) is None
+    assert populations.first_copy(Path("one")) is None
 
     with open("P/member-1/metrics.jsonl", "a") as file:
         file.write("{}\n")

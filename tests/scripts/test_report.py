@@ -104,12 +104,16 @@ def test_learning_curves_are_mean_and_range_of_seeds(tmp_path):
     assert "3 seeds" in (tmp_path / "results.svg").read_text()
 
 
-def test_scaling_is_plotted_for_the_machine_measured_last(tmp_path):
+def test_scaling_is_plotted_for_the_machine_and_commit_measured_last(tmp_path):
+    older = [
+        record(f"pong, training on {n}", 1.0, on="A", commit="xyz", benchmark="scaling")
+        for n in ("1 GPU", "2 GPUs")
+    ]
     rows = [
         record(f"explorer, training on {n} GPU{'s' * (n > 1)}", rate, on=on, benchmark="scaling")
         for on, rates in (("Z", [100.0, 150.0]), ("A", [10.0, 20.0]))
         for n, rate in enumerate(rates, 1)
     ]
-    figures.plot_scaling(rows, tmp_path / "both.svg")
+    figures.plot_scaling(older + rows, tmp_path / "both.svg")
     figures.plot_scaling(rows[2:], tmp_path / "last.svg")
     assert (tmp_path / "both.svg").read_text() == (tmp_path / "last.svg").read_text()
