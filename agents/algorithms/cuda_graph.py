@@ -6,7 +6,6 @@ import torch
 
 from megastep.agents.distributed.segments import SegmentedGraph
 from megastep.agents.generator import SeededGenerator
-from megastep.agents.storage.copies import copy_all
 from megastep.agents.types import RolloutLike
 
 # Updates that run eagerly before the capture, since libraries initialise themselves in the first.
@@ -25,7 +24,7 @@ class CudaGraphUpdate:
     same object every time.
 
     Args:
-        update: a function of a rollout that returns tensors by name and never synchronises.
+        update: a function of a rollout that returns tensors () by name and never synchronises.
         device: device of the policy; need not be the current GPU.
         graph: whether to capture. A CPU always runs eagerly.
         generators: the generators that `update` draws from.
@@ -50,7 +49,7 @@ class CudaGraphUpdate:
         generators.
         """
         self.graph: SegmentedGraph | None = None
-        self._rollout = None
+        self._rollout, self._names = None, []
         self._n_warm_ups_left = _N_WARM_UPS
 
     def __call__(self, rollout: RolloutLike) -> Metrics:
@@ -63,12 +62,18 @@ class CudaGraphUpdate:
                 return self._warm_up(rollout)
             if self._rollout is not rollout:
                 generators = [generator.on(self.device) for generator in self.generators]
-                self.graph = SegmentedGraph(lambda: self.update(rollout), self.stream, generators)
+                self.graph = SegmentedGraph(lambda: self._packed(rollout), self.stream, generators)
                 self._rollout = rollout
             graph = self.graph
             assert graph is not None
             graph.replay()
-            return _copies(graph.output)
+            return dict(zip(self._names, graph.output.clone().unbind()))
+
+    def _packed(self, rollout) -> torch.Tensor:
+        """Returns the metrics in one tensor, of which a single kernel makes a copy."""
+        metrics = self.update(rollout)
+        self._names = [*metrics]
+        return torch.stack([*metrics.values()]).detach()
 
     def _warm_up(self, rollout) -> Metrics:
         # PyTorch would warn of gradients accumulated on another stream, which this one waits for
@@ -79,9 +84,3 @@ class CudaGraphUpdate:
             metrics = self.update(rollout)
         torch.cuda.current_stream().wait_stream(self.stream)
         return metrics
-
-
-def _copies(metrics) -> dict[str, torch.Tensor]:
-    copies = {name: torch.empty_like(value) for name, value in metrics.items()}
-    copy_all((copies[name], value) for name, value in metrics.items())
-    return copies

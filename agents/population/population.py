@@ -78,10 +78,23 @@ class Turns:
     @contextlib.contextmanager
     def of(self, member: int) -> Iterator[None]:
         """What is done inside is this member's."""
-        outside = global_generators.Held.current()
+        with _undone(), self._only(member):
+            yield
+
+    def each(self, call: Callable[[int], T]) -> list[T]:
+        """Calls a function of each member in turn, as inside `of`. Returns the results."""
+        results = []
+        with _undone():
+            for member in range(len(self.of_host)):
+                with self._only(member):
+                    results.append(call(member))
+        return results
+
+    @contextlib.contextmanager
+    def _only(self, member) -> Iterator[None]:
+        """Leaves the host's global generators as the member did."""
         self.of_host[member].install()
         with contextlib.ExitStack() as stack:
-            stack.callback(outside.install)
             if self.streams is not None:
                 torch.cuda.set_rng_state(self.of_gpu[member], self.device)
                 stack.enter_context(torch.cuda.stream(self.streams[member]))
@@ -94,6 +107,16 @@ class Turns:
         """Waits until all members have done what is launched."""
         if self.streams is not None:
             torch.cuda.synchronize(self.device)
+
+
+@contextlib.contextmanager
+def _undone() -> Iterator[None]:
+    """Brings the host's global generators back."""
+    outside = global_generators.Held.current()
+    try:
+        yield
+    finally:
+        outside.install()
 
 
 class Population:
@@ -187,9 +210,7 @@ class Population:
                 n + int(row.get("diverged", 0))
                 for n, row in zip(self.n_diverged, rows, strict=True)
             ]
-        for i, (member, trainer) in enumerate(zip(self.members, self.trainers, strict=True)):
-            with self.turns.of(i):
-                trainer.set_settings(self.settings[member])
+        self.turns.each(lambda i: self.trainers[i].set_settings(self.settings[self.members[i]]))
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Trains all members until the budget is spent, one of them ends, or `stop()` returns True,
@@ -208,9 +229,7 @@ class Population:
                 n_rounds += 1
                 # seconds count from the last of these on
                 if n_rounds <= N_PREPARING[self.turns.device.type]:
-                    for i, trainer in enumerate(self.trainers):
-                        with self.turns.of(i):
-                            trainer.start_clock()
+                    self.turns.each(lambda i: self.trainers[i].start_clock())
                 self._after_round()
         finally:
             for one in rounds:
@@ -219,12 +238,16 @@ class Population:
                 self.lines.close()
 
     def _is_round_left(self, rounds: Sequence[Generator[None]]) -> bool:
-        """Has each member do an update; returns False when they have ended instead."""
-        has_ended = []
-        for i, one in enumerate(rounds):
-            with self.turns.of(i):
-                has_ended.append(next(one, StopIteration) is StopIteration)
-        return not any(has_ended)
+        """Has each member do an update; returns False when they have ended instead.
+
+        When reports are due, all updates are launched before the first report waits for its own.
+        """
+        is_reported = (self.leader.updates + 1) % self.leader.log_every == 0
+        for _ in range(1 + is_reported):
+            ended = self.turns.each(lambda i: next(rounds[i], StopIteration) is StopIteration)
+            if any(ended):
+                return False
+        return True
 
     def _after_round(self) -> None:
         leader, before, is_due = self.leader, self.samples_at_round, False
@@ -263,9 +286,7 @@ class Population:
         with unhurried():
             for trainer in self.trainers:
                 trainer.saver.wait()
-        for i, trainer in enumerate(self.trainers):
-            with self.turns.of(i):
-                trainer.save_checkpoint()
+        self.turns.each(lambda i: self.trainers[i].save_checkpoint())
         self.saved_at = time.monotonic()
 
     def take_over(self) -> None:

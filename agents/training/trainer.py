@@ -227,7 +227,9 @@ class Trainer:
             pass
 
     def rounds(self, stop: Callable[[], bool] = lambda: False) -> Generator[None, None, None]:
-        """Trains as `train` does, and yields after each update, when its report is written."""
+        """Trains as `train` does, and yields after each update: before its report, if there is one
+        every `log_every` updates, and when it is written.
+        """
         try:
             self.snapshot_saver(self)
             self.callbacks("on_start", self)
@@ -244,6 +246,7 @@ class Trainer:
                 with unhurried():
                     self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
+                    yield
                     self.samples_at_report = self.samples
                     self.log(losses)
                     is_sound = self.nonfinite_guard.check(self.rollout)

@@ -288,11 +288,10 @@ def test_captured_unroll_matches_steps(bf16):
 
 
 def whole_sequence(
-    device, dtype, seed, n_steps, n_lanes, nan_before_reset=False, is_residual=False
+    device, dtype, seed, n_steps, n_lanes, nan_before_reset=False, is_residual=False, width=256
 ):
-    """Returns outputs, last cell and gradients of a sequence of 256 units."""
+    """Returns outputs, last cell and gradients of a sequence."""
     torch.manual_seed(seed)
-    width = lstm_module.lstm_sequence.WIDTH
     inputs = dict(
         x=torch.randn(n_steps, n_lanes, width).bfloat16().float(),
         reset=torch.rand(n_steps, n_lanes) < 0.2,
@@ -311,33 +310,37 @@ def whole_sequence(
 
 
 @pytest.mark.parametrize(
-    "n_steps, n_lanes, is_residual", [(2, 1, False), (2, 1, True), (5, 45, True)]
+    "n_steps, n_lanes, is_residual, width",
+    [(2, 1, False, 256), (2, 1, True, 256), (5, 45, True, 256), (5, 45, True, 128)],
 )
 def test_sequence_on_chip_matches_float32_in_every_order(
-    cuda_on_cpu, monkeypatch, n_steps, n_lanes, is_residual
+    cuda_on_cpu, monkeypatch, n_steps, n_lanes, is_residual, width
 ):
-    case = 0, n_steps, n_lanes, False, is_residual
+    case = 0, n_steps, n_lanes, False, is_residual, width
     expected = whole_sequence("cpu", torch.float32, *case)
     cuda_on_cpu.install(monkeypatch)
     monkeypatch.setattr(lstm_module.lstm_sequence, "is_supported", lambda x: True)
     results = cuda_on_cpu.in_every_order(lambda: whole_sequence("cpu", torch.bfloat16, *case))
     assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
-    assert {"lstm_sequence_forward_256", "lstm_sequence_backward_256"} <= cuda_on_cpu.launched
+    names = {f"lstm_sequence_{direction}_{width}" for direction in ("forward", "backward")}
+    assert names <= cuda_on_cpu.launched
 
 
 @pytest.mark.cuda
+@pytest.mark.parametrize("width", lstm_module.lstm_sequence.WIDTHS)
 @pytest.mark.parametrize("n_steps, n_lanes", [(2, 1), (9, 33), (32, 1024), (17, 4100)])
-def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes):
-    x = torch.empty(n_steps, n_lanes, 256, dtype=torch.bfloat16, device="cuda")
+def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, width):
+    x = torch.empty(n_steps, n_lanes, width, dtype=torch.bfloat16, device="cuda")
     assert lstm_module.lstm_sequence.is_supported(x)
-    first = whole_sequence("cuda", torch.bfloat16, 0, n_steps, n_lanes)
-    second = whole_sequence("cuda", torch.bfloat16, 0, n_steps, n_lanes)
+    case = 0, n_steps, n_lanes, False, False, width
+    first = whole_sequence("cuda", torch.bfloat16, *case)
+    second = whole_sequence("cuda", torch.bfloat16, *case)
     assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))
-    expected = whole_sequence("cuda", torch.float32, 0, n_steps, n_lanes)
+    expected = whole_sequence("cuda", torch.float32, *case)
     assert_close(NAMES, first, expected, SLACK[torch.bfloat16])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lstm_module.lstm_sequence, "is_supported", lambda x: False)
-        by_steps = whole_sequence("cuda", torch.bfloat16, 0, n_steps, n_lanes)
+        by_steps = whole_sequence("cuda", torch.bfloat16, *case)
     assert_close(NAMES, first, by_steps, SLACK[torch.bfloat16])
     errors = [
         [((leaf - other).norm() / other.norm()).item() for leaf, other in zip(leaves, expected)]

@@ -1,7 +1,7 @@
 """The LSTM over a whole sequence on a GPU with clusters of blocks (Hopper and later): one kernel
 forward and one backward, whose recurrent weights stay on the chip from the first step to the last.
 
-T steps, B lanes, W = 256 units. All tensors are contiguous, on one GPU. Gates, weights, outputs and
+T steps, B lanes, W units, 128 or 256. All tensors are contiguous, on one GPU. Gates, weights, outputs and
 their gradients are bfloat16, states are float32, resets are bool.
 """
 
@@ -17,7 +17,7 @@ from megastep.kernels.build.launch import Blocks, launch
 LIBRARY = KernelLibrary(
     Path(__file__).parent / "clusters", (*FAST_CUDA_FLAGS, "--device-as-default-execution-space")
 )
-WIDTH = 256
+WIDTHS = 128, 256
 MIN_STEPS = 2  # for one step, loading the weights takes longer than the products
 MAX_STEPS = LIBRARY.constants["MAX_STEPS"]
 _THREADS = LIBRARY.constants["SEQUENCE_THREADS"]
@@ -26,8 +26,7 @@ _LANES = LIBRARY.constants["SEQUENCE_LANES"]
 Unrolled = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, tuple]
 #: Those of the gates, of the bias, and of the output and the cell before the sequence, if needed.
 Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor | None]
-_RANKS = WIDTH // LIBRARY.constants["BLOCK_UNITS"]  # blocks of a cluster
-_MEMORY = max(LIBRARY.constants[f"{name}_MEMORY"] for name in ("FORWARD", "BACKWARD"))
+_BLOCK_UNITS = LIBRARY.constants["BLOCK_UNITS"]
 
 
 def is_supported(x: torch.Tensor) -> bool:
@@ -35,14 +34,15 @@ def is_supported(x: torch.Tensor) -> bool:
     if not (
         x.is_cuda
         and x.dtype == torch.bfloat16
-        and x.shape[-1] == WIDTH
+        and x.shape[-1] in WIDTHS
         and MIN_STEPS <= len(x) <= MAX_STEPS
         and x.numel()
     ):
         return False
     # consumer GPUs of the same generations have clusters too, but less shared memory
     gpu = torch.cuda.get_device_properties(x.device)
-    return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= _MEMORY
+    needed = max(_memory(direction, x.shape[-1]) for direction in ("forward", "backward"))
+    return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= needed
 
 
 def forward(gates, weight, reset, output, cell, needs_backward, residual=None) -> Unrolled:
@@ -62,20 +62,20 @@ def forward(gates, weight, reset, output, cell, needs_backward, residual=None) -
         residual, and the last cell (B, W) float32, and what to pass on to `backward`, two tensors
         or two times None.
     """
-    n_steps, n_lanes, _ = gates.shape
+    (n_steps, n_lanes, _), width = gates.shape, weight.shape[1]
     n_clusters = -(-n_lanes // _LANES)
-    outputs = gates.new_empty(n_steps, n_lanes, WIDTH)
+    outputs = gates.new_empty(n_steps, n_lanes, width)
     hiddens = torch.empty_like(outputs)
     after, last_cell = torch.empty_like(output), torch.empty_like(cell)
     saved = None, None
     if needs_backward:
-        lead = n_steps, n_clusters, _RANKS
+        lead = n_steps, n_clusters, width // _BLOCK_UNITS
         saved = (
             gates.new_empty(*lead, _LANES // 8, _THREADS, 8),
             cell.new_empty(*lead, _LANES // 8, _THREADS, 2),
         )
     launch(
-        *_where("forward", gates.device, n_clusters),
+        *_where("forward", width, gates.device, n_clusters),
         gates=gates,
         weight=weight,
         reset=reset,
@@ -111,13 +111,13 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell) -> Grad
         The gradients of the gates (T, B, 4 W), of a bias (4 W,) float32, which is their sum, and of
         the output and the cell before the sequence, (B, W) float32.
     """
-    n_steps, n_lanes, _ = d_outputs.shape
+    n_steps, n_lanes, width = d_outputs.shape
     n_clusters = -(-n_lanes // _LANES)
-    d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * WIDTH)
-    d_bias = saved_cells.new_empty(n_clusters, 4 * WIDTH)
-    d_last_output, d_last_cell = (saved_cells.new_empty(n_lanes, WIDTH) for _ in range(2))
+    d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * width)
+    d_bias = saved_cells.new_empty(n_clusters, 4 * width)
+    d_last_output, d_last_cell = (saved_cells.new_empty(n_lanes, width) for _ in range(2))
     launch(
-        *_where("backward", weight.device, n_clusters),
+        *_where("backward", width, weight.device, n_clusters),
         weight=weight.T.contiguous(),
         reset=reset,
         saved_gates=saved_gates,
@@ -136,8 +136,15 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell) -> Grad
     return d_gates, sum_rows(d_bias), d_last_output, d_last_cell
 
 
-def _where(direction, device, n_clusters) -> tuple[KernelLibrary, str, torch.device, Blocks]:
+def _where(
+    direction, width, device, n_clusters
+) -> tuple[KernelLibrary, str, torch.device, Blocks]:
     """Returns the arguments of a launch but its fields."""
-    shared = LIBRARY.constants[f"{direction.upper()}_MEMORY"]
-    blocks = Blocks(_RANKS * n_clusters, threads=_THREADS, shared=shared)
-    return LIBRARY, f"lstm_sequence_{direction}_{WIDTH}", device, blocks
+    n_blocks = width // _BLOCK_UNITS * n_clusters
+    blocks = Blocks(n_blocks, threads=_THREADS, shared=_memory(direction, width))
+    return LIBRARY, f"lstm_sequence_{direction}_{width}", device, blocks
+
+
+def _memory(direction, width) -> int:
+    """Returns the bytes of shared memory that a block needs."""
+    return LIBRARY.constants[f"{direction.upper()}_MEMORY_{width}"]

@@ -61,8 +61,8 @@ DEVICE void load_columns(unsigned int (&parts)[C][2], const Bits* row, int lanes
 
 // Adds the product of this warp's weights and of `right` to `sums`. `right` has a row of K numbers
 // per lane, in pieces of N numbers; `piece` numbers lie between two pieces of a row.
-template <int K, int N, int C>
-DEVICE void multiply(float (&sums)[2][C][4], const unsigned int (&left)[2][K / 16][4],
+template <int K, int N, int TILES, int C>
+DEVICE void multiply(float (&sums)[TILES][C][4], const unsigned int (&left)[TILES][K / 16][4],
                      const Bits* right, int piece, const Thread& me) {
     const Bits* row = right + (8 * (me.warp_lane >> 4) + (me.warp_lane & 7)) * (N + PAD) +
                       8 * (me.warp_lane >> 3 & 1);
@@ -74,7 +74,7 @@ DEVICE void multiply(float (&sums)[2][C][4], const unsigned int (&left)[2][K / 1
         if (next < K)
             load_columns(parts[(k + 1) & 1], row + next / N * piece + next % N, 8 * (N + PAD));
 #pragma unroll
-        for (int tile = 0; tile < 2; tile++)
+        for (int tile = 0; tile < TILES; tile++)
 #pragma unroll
             for (int j = 0; j < C; j++)
                 multiply_add(sums[tile][j], left[tile][k], parts[k & 1][j][0], parts[k & 1][j][1]);
@@ -356,7 +356,8 @@ template <int W>
 DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     constexpr int RANKS = W / UNITS;
     constexpr int SENT = UNITS * (int)sizeof(float);  // by a block, per lane
-    static_assert(W == 256, "a warp multiplies two tiles of 16 units");
+    constexpr int ROWS = W / (THREADS / 32), TILES = ROWS / 16;  // of a warp
+    static_assert(ROWS % 16 == 0, "a warp multiplies whole tiles of 16 units");
     BackwardMemory<W>& memory = *(BackwardMemory<W>*)shared_memory;
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
@@ -379,16 +380,16 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     };
     begin_d_output(n_steps - 1);
 
-    // Rows: the units whose outputs fed the gates, 32 per warp. Columns: this block's gates.
-    unsigned int weights[2][GATES / 16][4];
+    // Rows: the units whose outputs fed the gates, ROWS per warp. Columns: this block's gates.
+    unsigned int weights[TILES][GATES / 16][4];
     const Bits* weight = (const Bits*)p.weight + policy * W * (4 * W);
 #pragma unroll
-    for (int tile = 0; tile < 2; tile++)
+    for (int tile = 0; tile < TILES; tile++)
 #pragma unroll
         for (int k = 0; k < GATES / 16; k++)
 #pragma unroll
             for (int part = 0; part < 4; part++) {
-                int row = 32 * me.warp + 16 * tile + me.g + 8 * (part & 1);
+                int row = ROWS * me.warp + 16 * tile + me.g + 8 * (part & 1);
                 int i = 16 * k + 2 * me.q + 8 * (part >> 1), gate = i / UNITS;
                 weights[tile][k][part] = *(const unsigned int*)(weight + row * (4 * W) + gate * W +
                                                                 rank * UNITS + i % UNITS);
@@ -505,13 +506,13 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         if (G::NUMBER)
             wait_for_copies<0>();
         __syncthreads();
-        float sums[2][C][4] = {};
+        float sums[TILES][C][4] = {};
         multiply<GATES, GATES>(sums, weights, &memory.d_gates[G::FIRST_LANE][0], 0, me);
 #pragma unroll
-        for (int tile = 0; tile < 2; tile++)
+        for (int tile = 0; tile < TILES; tile++)
 #pragma unroll
             for (int upper = 0; upper < 2; upper++) {
-                int row = 32 * me.warp + 16 * tile + me.g + 8 * upper;
+                int row = ROWS * me.warp + 16 * tile + me.g + 8 * upper;
                 const float* target = &memory.parts[t & 1][G::NUMBER][rank][row % UNITS][2 * me.q];
                 unsigned int there = address_in(target, row / UNITS);
                 unsigned int arrivals = address_in(&memory.arrivals[t & 1][G::NUMBER], row / UNITS);
@@ -565,9 +566,19 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     cluster_barrier();  // no block ends while another sends to it
 }
 
-static_assert(sizeof(ForwardMemory<256>) == FORWARD_MEMORY);
-static_assert(sizeof(BackwardMemory<256>) == BACKWARD_MEMORY);
+static_assert(sizeof(ForwardMemory<128>) == FORWARD_MEMORY_128);
+static_assert(sizeof(BackwardMemory<128>) == BACKWARD_MEMORY_128);
+static_assert(sizeof(ForwardMemory<256>) == FORWARD_MEMORY_256);
+static_assert(sizeof(BackwardMemory<256>) == BACKWARD_MEMORY_256);
 
+KERNEL BOUNDS(2) lstm_sequence_forward_128(LstmSequenceForwardParams p) {
+    wait_for_previous();
+    lstm_forward<128>(p);
+}
+KERNEL BOUNDS(2) lstm_sequence_backward_128(LstmSequenceBackwardParams p) {
+    wait_for_previous();
+    lstm_backward<128>(p);
+}
 KERNEL BOUNDS(4) lstm_sequence_forward_256(LstmSequenceForwardParams p) {
     wait_for_previous();
     lstm_forward<256>(p);
