@@ -1,8 +1,8 @@
 """The LSTM over a whole sequence on a GPU with clusters of blocks (Hopper and later): one kernel
 forward and one backward, whose recurrent weights stay on the chip from the first step to the last.
 
-T steps, B lanes, W units, 128 or 256. All tensors are contiguous, on one GPU. Gates, weights, outputs and
-their gradients are bfloat16, states are float32, resets are bool.
+T steps, B lanes, W units, 128 or 256. All tensors are contiguous, on one GPU. Gates, weights,
+outputs and their gradients are bfloat16, states are float32, resets are bool.
 """
 
 from pathlib import Path
@@ -136,9 +136,7 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell) -> Grad
     return d_gates, sum_rows(d_bias), d_last_output, d_last_cell
 
 
-def _where(
-    direction, width, device, n_clusters
-) -> tuple[KernelLibrary, str, torch.device, Blocks]:
+def _where(direction, width, device, n_clusters) -> tuple[KernelLibrary, str, torch.device, Blocks]:
     """Returns the arguments of a launch but its fields."""
     n_blocks = width // _BLOCK_UNITS * n_clusters
     blocks = Blocks(n_blocks, threads=_THREADS, shared=_memory(direction, width))
