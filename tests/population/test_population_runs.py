@@ -1,5 +1,6 @@
 """Populations, from the command line."""
 
+import itertools
 import json
 import random
 import shutil
@@ -85,6 +86,21 @@ def test_members_have_the_bits_of_runs_alone(here, device):
         populations.settings_of(row) for row in populations.read(here / "P" / "population.jsonl")[0]
     ]
     assert len({one["learner.lr"] for one in settings}) == 3
+
+
+def test_all_members_are_launched_before_a_report_waits(here, monkeypatch):
+    events = []
+    for name in ("update", "log"):
+        method = getattr(Trainer, name)
+
+        def noted(*arguments, name=name, method=method):
+            events.append(name)
+            return method(*arguments)
+
+        monkeypatch.setattr(Trainer, name, noted)
+    run(*POPULATION, "samples=1024", "population.every=1e9")
+    groups = {(name, len([*group])) for name, group in itertools.groupby(events)}
+    assert groups == {("update", 6), ("log", 3)}
 
 
 def own_homes(n=2, split="training", seed=1):

@@ -11,7 +11,7 @@ import torch
 from megastep.kernels.build.compile import EngineError, bindings, check_status, cpu, cuda
 from megastep.kernels.build.kernel_library import KERNELS, KernelLibrary
 
-__all__ = ["ENGINE", "Blocks", "launch", "observed"]
+__all__ = ["ENGINE", "Blocks", "launch", "observed", "without_early_starts"]
 
 #: The engine's operations.
 ENGINE = KernelLibrary(KERNELS)
@@ -25,6 +25,8 @@ _ALLOWED_SHARED: dict[tuple[object, int], int] = {}
 Observer = Callable[[KernelLibrary, str, bytes], None]
 #: What is told of launches on a CPU.
 _OBSERVERS: list[Observer] = []
+#: How many `without_early_starts` are open, in all threads.
+_n_without_early_starts = 0
 
 
 class Blocks(NamedTuple):
@@ -97,6 +99,7 @@ def launch(
         driver, _ = bindings()
         stream = torch.cuda.current_stream(index).cuda_stream
         is_early = operation in library.early_operations and _can_start_early(index)
+        is_early = is_early and not _n_without_early_starts
         call = _config(blocks, stream, is_early), function, ctypes.addressof(arguments), 0
         status = driver.cuLaunchKernelEx(*call)
         if int(status[0]) == INVALID_CONTEXT:
@@ -113,6 +116,21 @@ def observed(observer: Observer) -> Iterator[None]:
         yield
     finally:
         _OBSERVERS.remove(observer)
+
+
+@contextlib.contextmanager
+def without_early_starts() -> Iterator[None]:
+    """Kernels launched or recorded inside, by any thread, start when the one before them has ended.
+
+    Others may start earlier and wait on the GPU, which saves a single stream time. Where many
+    streams share a GPU, those that wait take the place of those that could run.
+    """
+    global _n_without_early_starts
+    _n_without_early_starts += 1
+    try:
+        yield
+    finally:
+        _n_without_early_starts -= 1
 
 
 def _missing(library, operation, suffix, other) -> EngineError:
