@@ -48,17 +48,31 @@ class Result(NamedTuple):
         value, percent, lower, upper = self._parts()
         return f"{self.metric} {value}{percent} ({lower} to {upper})"
 
-    def contains(self, value: float) -> bool:
-        """Returns true if a value, rounded as the interval's bounds are, lies in the interval."""
+    def agrees(self, found: "Interval") -> bool:
+        """Returns true if a 95 % interval, rounded as the stated one is, has a number in common
+        with it: a run on another kind of machine is another sample of the same training.
+        """
         _, percent, *bounds = self._parts()
         decimals = max(len(bound.partition(".")[2]) for bound in bounds)
         lower, upper = map(float, bounds)
-        return lower <= round(100 * value if percent else value, decimals) <= upper
+        _, *ends = (round(100 * end if percent else end, decimals) for end in found)
+        return ends[0] <= upper and lower <= ends[1]
 
     def _parts(self) -> Sequence[str]:
         match = STATED.fullmatch(self.text)
         assert match is not None
         return match.groups(default="")
+
+
+class Interval(NamedTuple):
+    """A value and its 95 % interval."""
+
+    value: float
+    lower: float
+    upper: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.4g} ({self.lower:.4g} to {self.upper:.4g})"
 
 
 class Row(NamedTuple):
@@ -149,7 +163,7 @@ def reproduce(row: Row) -> int:
     words = [*row.train.split(), *finish, device, f"folder={folder}"]
     if code := command.run_command(scripts.TRAIN, words):
         return code
-    values = []
+    found = []
     for evaluate, group in itertools.groupby(row.results, lambda result: result.evaluate):
         words = [f"run={folder}", device, "baseline=false", *evaluate.split()]
         if code := command.run_command(scripts.EVALUATE, words):
@@ -157,37 +171,40 @@ def reproduce(row: Row) -> int:
         tables = (folder / "evaluations").glob("*.json")
         newest = max(tables, key=lambda path: path.stat().st_mtime_ns)
         rows = json.loads(newest.read_bytes())["rows"]
-        values += [value_of(rows, result.metric) for result in group]
-    return compare(row, folder, values)
+        found += [found_in(rows, result.metric) for result in group]
+    return compare(row, folder, found)
 
 
-def value_of(rows: list[dict], metric: str) -> float:
+def found_in(rows: list[dict], metric: str) -> Interval:
     """Returns a number of an evaluation's table: the fraction of duels won against the opponent of
     this name, else the mean return or a metric's mean.
     """
+    cells, key = rows[0], metric
     if "against" in rows[0]:
-        return next(row["won"] for row in rows if row["against"] == metric)
-    return rows[0]["return"] if metric == "return" else rows[0]["metrics"][metric]["mean"]
+        cells, key = next(row for row in rows if row["against"] == metric), "won"
+    elif metric != "return":
+        cells, key = rows[0]["metrics"][metric], "mean"
+    return Interval(cells[key], cells["lower"], cells["upper"])
 
 
-def compare(row: Row, folder: Path, values: Sequence[float]) -> int:
+def compare(row: Row, folder: Path, found: Sequence[Interval]) -> int:
     """Prints how a run's results compare with those stated, and writes reproduction.json into its
     folder. Returns the exit code.
 
     Args:
-        values: one for each of the row's results.
+        found: a number for each of the row's results.
     """
     metrics = (folder / "metrics.jsonl").read_bytes()
     samples = json_lines.read(folder / "metrics.jsonl")[-1]["samples"]
     here, digest = machine(row.device), hashlib.sha256(metrics).hexdigest()
     is_exact, sentence = compare_bits(row.exact, here, digest)
-    are_inside = [*map(Result.contains, row.results, values)]
-    is_reproduced = all(are_inside) and is_exact is not False
-    for result, value, is_inside in zip(row.results, values, are_inside, strict=True):
-        verdict = "inside" if is_inside else "OUTSIDE"
-        console.say(f"{verdict}: {value:.4g}, stated {result}, docs/lab/{result.page}")
+    agree = [*map(Result.agrees, row.results, found)]
+    is_reproduced = all(agree) and is_exact is not False
+    for result, number, agrees in zip(row.results, found, agree, strict=True):
+        verdict = "agrees" if agrees else "DIFFERS"
+        console.say(f"{verdict}: {number}, stated {result}, docs/lab/{result.page}")
     console.say(sentence)
-    if not all(are_inside) and "samples=" not in row.train:
+    if not all(agree) and "samples=" not in row.train:
         console.say(
             f"The run had {samples:,} samples; in the same seconds a slower or busier machine has "
             "fewer"
@@ -197,7 +214,7 @@ def compare(row: Row, folder: Path, values: Sequence[float]) -> int:
         "row": row.name,
         "is_reproduced": is_reproduced,
         "samples": samples,
-        "values": {str(result): value for result, value in zip(row.results, values)},
+        "values": {str(result): number.value for result, number in zip(row.results, found)},
         "exact": {**here, "sha256": digest},
     }
     with user_errors(f"{folder} cannot be written: "):

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from megastep.agents.cli import command, entry, reproduce, scripts
-from megastep.agents.cli.reproduce import Result, Row
+from megastep.agents.cli.reproduce import Interval, Result, Row
 from megastep.agents.launch import gpu
 from tests.helpers import tiny
 
@@ -67,18 +67,18 @@ def test_words_of_a_row_compose(row):
 
 
 @pytest.mark.parametrize(
-    "text, inside, outside",
+    "text, agreeing, differing",
     [
-        ("0.999 (0.997 to 1)", (0.9966, 1.0), (0.9964,)),
-        ("29.1 (27.2 to 31.0)", (27.2, 31.04), (27.1, 31.06)),
-        ("92.9 % (91.9 to 93.9)", (0.919, 0.93), (0.918, 0.94)),
-        ("-6.4 | -6.8 to -6.1", (-6.8, -6.1), (-6.9, -6.0)),
+        ("0.999 (0.997 to 1)", [(0.99, 0.9966), (1.0, 1.0)], [(0.99, 0.9964)]),
+        ("29.1 (27.2 to 31.0)", [(20, 27.2), (31.04, 40), (20, 40)], [(20, 27.1), (31.06, 40)]),
+        ("92.9 % (91.9 to 93.9)", [(0.9, 0.919), (0.92, 0.93)], [(0.9, 0.918), (0.94, 0.95)]),
+        ("-6.4 | -6.8 to -6.1", [(-9, -6.8), (-6.1, -5)], [(-9, -6.9), (-6.0, -5)]),
     ],
 )
-def test_interval_contains_a_value_rounded_as_its_bounds(text, inside, outside):
+def test_intervals_with_a_number_in_common_agree(text, agreeing, differing):
     result = Result("page.md", "line", "", "return", text)
-    assert all(map(result.contains, inside))
-    assert not any(map(result.contains, outside))
+    assert all(result.agrees(Interval(sum(ends) / 2, *ends)) for ends in agreeing)
+    assert not any(result.agrees(Interval(sum(ends) / 2, *ends)) for ends in differing)
 
 
 @pytest.mark.parametrize(
@@ -98,11 +98,12 @@ def test_metrics_are_compared_on_the_same_kind_of_machine(known, is_exact, words
 
 
 def test_values_of_an_evaluation_and_of_duels():
-    rows = [{"return": 3.0, "metrics": {"spl": {"mean": 0.5}}}, {"return": 1.0, "metrics": {}}]
-    assert reproduce.value_of(rows, "return") == 3
-    assert reproduce.value_of(rows, "spl") == 0.5
-    rows = [{"against": "random", "won": 0.9}, {"against": "bot", "won": 0.3}]
-    assert reproduce.value_of(rows, "bot") == 0.3
+    spl = {"mean": 0.5, "lower": 0.4, "upper": 0.6}
+    rows = [{"return": 3.0, "lower": 2.0, "upper": 4.0, "metrics": {"spl": spl}}, {"return": 1.0}]
+    assert reproduce.found_in(rows, "return") == (3, 2, 4)
+    assert reproduce.found_in(rows, "spl") == (0.5, 0.4, 0.6)
+    random, bot = {"against": "random"}, {"against": "bot", "won": 0.3, "lower": 0.2, "upper": 0.4}
+    assert reproduce.found_in([random, bot], "bot") == (0.3, 0.2, 0.4)
 
 
 @pytest.mark.slow
@@ -138,7 +139,8 @@ def test_each_place_is_evaluated_once(tmp_path, monkeypatch, capsys):
         folder = Path(re.search(r"(?:folder|run)=(\S+)", calls[-1])[1])
         (folder / "evaluations").mkdir(parents=True, exist_ok=True)
         (folder / "metrics.jsonl").write_text('{"samples": 64}\n')
-        rows = [{"return": len(calls), "metrics": {"spl": {"mean": 0.5}}}]
+        n, spl = len(calls), {"mean": 0.5, "lower": 0.5, "upper": 0.5}
+        rows = [{"return": n, "lower": n - 0.2, "upper": n + 0.2, "metrics": {"spl": spl}}]
         (folder / f"evaluations/{len(calls)}.json").write_text(json.dumps({"rows": rows}))
 
     monkeypatch.setattr(command, "run_command", run_command)
@@ -150,16 +152,17 @@ def test_each_place_is_evaluated_once(tmp_path, monkeypatch, capsys):
     assert training.startswith("train env=minimal samples=64 ") and "device=cpu" in training
     assert "geometry" not in homes and bench.endswith(" geometry=bench")
     shown = capsys.readouterr().out
-    assert "inside: 2, stated return 2" in shown and "OUTSIDE: 3, stated return 2" in shown
+    assert "agrees: 2 (1.8 to 2.2), stated return 2" in shown
+    assert "DIFFERS: 3 (2.8 to 3.2), stated return 2" in shown
 
 
-def test_a_result_outside_its_interval_is_not_reproduced(tmp_path, capsys):
+def test_a_result_that_differs_is_not_reproduced(tmp_path, capsys):
     (tmp_path / "metrics.jsonl").write_text('{"samples": 64}\n')
     row = Row("slow", "cpu", "env=minimal seconds=9", [NOTHING])
-    assert reproduce.compare(row, tmp_path, [0.0]) == 0
-    assert reproduce.compare(row, tmp_path, [1.0]) == 1
+    assert reproduce.compare(row, tmp_path, [Interval(0, 0, 0)]) == 0
+    assert reproduce.compare(row, tmp_path, [Interval(1, 1, 2)]) == 1
     shown = capsys.readouterr().out
-    assert "OUTSIDE: 1, stated return 0 (0 to 0), docs/lab/page.md" in shown
+    assert "DIFFERS: 1 (1 to 2), stated return 0 (0 to 0), docs/lab/page.md" in shown
     assert "The run had 64 samples" in shown
 
 
@@ -167,7 +170,7 @@ def test_other_bytes_on_the_same_kind_of_machine_are_not_reproduced(tmp_path, mo
     monkeypatch.setattr(reproduce, "machine", lambda device: HERE)
     (tmp_path / "metrics.jsonl").write_text('{"samples": 64}\n')
     row = Row("row", "cpu", "env=minimal samples=64", [NOTHING], exact=[HERE | {"sha256": "b"}])
-    assert reproduce.compare(row, tmp_path, [0.0]) == 1
+    assert reproduce.compare(row, tmp_path, [Interval(0, 0, 0)]) == 1
 
 
 # ---- The command ----
