@@ -499,7 +499,7 @@ class Population:
     vary: dict[str, Variation] = dataclasses.field(default_factory=dict)
     exploit: Literal["truncation", "tournament"] = "truncation"
     explore: Literal["factor", "resample"] = "factor"
-    score: Literal["running", "evaluated"] = "running"
+    score: str = "running"
     schedule: str | None = None
     member: int | None = None
 

@@ -25,9 +25,12 @@ from megastep.agents.runs import folders, populations, provenance
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
 from megastep.kernels.build.launch import without_early_starts
+from megastep.settings import closest
 
 if TYPE_CHECKING:
     import torch
+
+    from megastep.agents.training.trainer import Trainer
 
 T = TypeVar("T")
 
@@ -156,6 +159,7 @@ def make(
                 n_members=1 if trainers else len(members),
                 homes=homes,
             )
+        check_score(chosen.score, trainer)
         trainer.checkpoint_seconds = math.inf
         folders.write_config(folder, trainer.saver.config["train"])
         provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, [])
@@ -174,6 +178,14 @@ def make(
         *(chosen.exploit, chosen.explore, chosen.score, cfg.checkpoint_seconds),
         *(chosen.size, visitor, repeated),
     )
+
+
+def check_score(score: str, trainer: "Trainer") -> None:
+    """Raises ConfigErrors if a trainer's reports have nothing of this name."""
+    known = [populations.RUNNING, populations.EVALUATED, *trainer.stats_names]
+    if score not in known:
+        text = f"{score} is no mean over episodes here; {closest(score, known)}"
+        raise ConfigErrors([("population.score", text)])
 
 
 def _train(cfg, root, population) -> None:
@@ -218,8 +230,12 @@ def table(population: Population, root: Path) -> str:
     """Returns a table of the members: score, ancestor at the first generation, settings. All ranks
     call it.
     """
+    is_return = population.score in (populations.RUNNING, populations.EVALUATED)
     scores: list[float | None] = population.gathered(
-        [one.evaluation.get("return", one.score) for one in population.trainers]
+        [
+            one.evaluation.get("return", one.score) if is_return else population.score_of(one)
+            for one in population.trainers
+        ]
     )
     generations = populations.read(root / populations.FILE)
     keys = [*population.vary]
@@ -228,10 +244,11 @@ def table(population: Population, root: Path) -> str:
         rows.append(
             [
                 str(member),
-                "" if score is None else f"{score:.4g}",
+                "" if score in (None, -math.inf) else f"{score:.4g}",
                 str(populations.lineage(generations, member)[0]),
                 *(f"{population.settings[member][key]:.3g}" for key in keys),
                 str(population.n_diverged[member] or ""),
             ]
         )
-    return console.table(["member", "return", "descends from", *keys, "diverged"], rows)
+    title = "return" if is_return else population.score
+    return console.table(["member", title, "descends from", *keys, "diverged"], rows)

@@ -134,8 +134,8 @@ class Population:
             report after so many, and none when the budget is spent.
         vary: the settings that differ, by key, and what they may be.
         exploit, explore: as for `decisions.decide`.
-        score: "running": members are ranked by the return of their last report; "evaluated": of
-            their last evaluation.
+        score: what members are ranked by: "running", the return of their last report; "evaluated",
+            that of their last evaluation; or another of the last report's `Trainer.stats_names`.
         checkpoint_seconds: seconds between two checkpoints of all members.
         size: members on all ranks; None: as many as there are trainers.
         visitor: with several ranks, holds what a member of another one has learnt.
@@ -319,7 +319,11 @@ class Population:
         """Returns a member's score: minus infinity if it has diverged, None if it is unknown."""
         if trainer.nonfinite_guard.has_diverged:
             return -math.inf
-        return trainer.evaluation.get("return") if self.score == "evaluated" else trainer.score
+        if self.score == populations.EVALUATED:
+            return trainer.evaluation.get("return")
+        if self.score == populations.RUNNING or trainer.score is None:
+            return trainer.score
+        return trainer.last_stats.get(f"episode/{self.score}")
 
     def gathered(self, values: Sequence[T]) -> list[T]:
         """Returns a value of each member, from those of the members that this rank hosts."""

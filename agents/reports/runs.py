@@ -52,7 +52,7 @@ class Run(NamedTuple):
     def score(self, metric: str = "episode/return") -> float | None:
         """Returns the mean of a metric over the last reports, of returns weighted by episodes."""
         if metric == "episode/return":
-            return scores.mean_return(self.metrics)
+            return scores.mean(self.metrics)
         values = [row[metric] for row in self.metrics if row.get(metric) is not None][-10:]
         return sum(values) / len(values) if values else None
 

@@ -6,6 +6,8 @@ import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import yaml
+
 from megastep.agents.errors import UserError
 from megastep.agents.runs import checkpoint, json_lines, scores
 
@@ -13,6 +15,8 @@ if TYPE_CHECKING:
     from megastep.agents.types import Row
 
 FILE, PREFIX, KEY = "population.jsonl", "member-", "settings/"
+#: What `population.score` may be beside the name of an episode statistic.
+RUNNING, EVALUATED = "running", "evaluated"
 
 
 def folder_of(root: Path, member: int) -> Path:
@@ -31,16 +35,30 @@ def members(root: Path) -> list[Path]:
     return [*itertools.takewhile(Path.is_dir, paths)]
 
 
-def score_of(folder: Path) -> float | None:
-    """Returns a member's last evaluated return, else the mean return of its last reports."""
+def score_of(folder: Path, ranked_by: str = RUNNING) -> float | None:
+    """Returns a member's last evaluated return, else the mean return of its last reports; if its
+    population ranks by another episode statistic, the mean of that.
+    """
     rows = json_lines.read(folder / "metrics.jsonl") if (folder / "metrics.jsonl").exists() else []
+    if ranked_by not in (RUNNING, EVALUATED):
+        return scores.mean(rows, ranked_by)
     evaluated = [row["eval/return"] for row in rows if row.get("eval/return") is not None]
-    return evaluated[-1] if evaluated else scores.mean_return(rows)
+    return evaluated[-1] if evaluated else scores.mean(rows)
+
+
+def _ranked_by(root) -> str:
+    """Returns the `population.score` of a population."""
+    try:
+        config = yaml.safe_load((folder_of(root, 0) / "config.yaml").read_text("utf-8"))
+        return config["population"]["score"]
+    except (OSError, yaml.YAMLError, KeyError, TypeError):
+        return RUNNING
 
 
 def best(root: Path) -> int:
     """Returns the number of the member with the highest score, the first of equal ones."""
-    found = [score_of(folder) for folder in members(root)]
+    ranked_by = _ranked_by(root)
+    found = [score_of(folder, ranked_by) for folder in members(root)]
     return max(range(len(found)), key=lambda n: (-1e400 if found[n] is None else found[n], -n))
 
 

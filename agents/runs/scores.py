@@ -11,22 +11,24 @@ if TYPE_CHECKING:
     from megastep.agents.types import Row
 
 
-def mean_return(rows: "list[Row]", n_reports: int = 10) -> float | None:
-    """Returns the score of a training run: the mean return of the episodes that ended in its last
-    reports. None if no episode finished.
+def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float | None:
+    """Returns the score of a training run: the mean of what the episodes that ended in its last
+    reports returned, or of another of their statistics. None if no episode finished.
 
-    Each episode counts once. `episode/return` is a mean over a window of `episode/window` episodes,
+    Each episode counts once. `episode/NAME` is a mean over a window of `episode/window` episodes,
     which may include some from earlier reports (`training.episode_stats`).
 
     Args:
         rows: the objects of `metrics.jsonl`.
+        name: of the statistic.
         n_reports: number of last reports.
     """
     total, n_episodes, end = 0.0, 0, len(rows)
     while end > max(0, len(rows) - n_reports):
         n_in_mean = rows[end - 1].get("episode/window", 0)
-        if n_in_mean:
-            total += n_in_mean * rows[end - 1]["episode/return"]
+        value = rows[end - 1].get(f"episode/{name}")
+        if n_in_mean and value is not None:
+            total += n_in_mean * value
             n_episodes += n_in_mean
         end, n_before = end - 1, n_in_mean - rows[end - 1].get("episode/count", 0)
         while end > 0 and n_before > 0:  # their episodes are part of that window
@@ -43,7 +45,7 @@ def outcome(result: Path) -> dict[str, float | None]:
     Returns:
         `evaluated`: the return in an evaluation (for a run, its last), or the fraction of duels
         won against the first opponent; `lower` and `upper`: its 95 % interval. `score`: a run's
-        `mean_return`; for an evaluation, the same as `evaluated`. Each is None if unknown.
+        `mean`; for an evaluation, the same as `evaluated`. Each is None if unknown.
     """
     files, rows = [result], []
     if is_run := result.is_dir():
@@ -53,5 +55,5 @@ def outcome(result: Path) -> dict[str, float | None]:
     tables = [json.loads(file.read_text())["rows"][0] for file in files if file.suffix == ".json"]
     row = next((row for row in tables if not is_run or "return" in row), {})
     evaluated = row.get("return", row.get("won"))
-    score = mean_return(rows) if is_run else evaluated
+    score = mean(rows) if is_run else evaluated
     return dict(score=score, evaluated=evaluated, lower=row.get("lower"), upper=row.get("upper"))

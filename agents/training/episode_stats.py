@@ -250,6 +250,13 @@ class EpisodeStats:
             stats |= {name: n for name, n in by_name.items() if name not in stats}
         return stats
 
+    @property
+    def names(self) -> list[str]:
+        """The means that `pop` may return, without `episode/`."""
+        of_all = ["return", "length", *self.metrics]
+        parts = *self.groups, *self.sources
+        return [*of_all, *(f"{name}/{part}" for part in parts for name in of_all)]
+
     def _means(self, report, totals) -> dict[str, float]:
         """Returns counts and means by name from the sums of a report and those of a window."""
         n, returns, _, lengths, *metrics = totals

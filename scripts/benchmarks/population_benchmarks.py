@@ -42,8 +42,15 @@ N_MEMBERS = {"cuda": 8, "cpu": 4}
 EVERY = {"cuda": 20_000_000, "cpu": 5_000}
 EXPLORER, MEMORY = ("env=explorer", "geometry=bench"), ("experiment=memory_9",)
 DEATHMATCH = ("experiment=deathmatch",)
-LEAGUE = "opponents.league=0.5", "opponents.past=0.2", "opponents.bot=0.1"
+LEAGUE = (
+    "opponents.league=0.5",
+    "opponents.past=0.2",
+    "opponents.bot=0.1",
+    "population.score=won/league",
+)
 OPPONENTS = "opponents.snapshots=8", "opponents.every=200"
+#: Environments of each member: as many updates per second as the single run has with 8,192.
+LEAGUE_ENVS = {"cuda": 1024, "cpu": 64}
 EPISODES = {"cuda": 1024, "cpu": 64}
 NEVER = 10**15  # samples: no generation
 
@@ -112,9 +119,10 @@ def league(
     seeds: Sequence[int] = (1,),
     folder: Path | None = None,
 ) -> Iterator[dict]:
-    """Deathmatch: the best of a league of 8 against a single run of the same wall time, and each of
-    the two against the hunter: duels in unseen homes, a draw being half; and of those that were
-    decided, the share that was won, with its 95 % interval (Wilson).
+    """Deathmatch: the best of a league of 8, which have fewer environments each and are ranked by
+    the duels that they win, against a single run of the same wall time, and each of the two against
+    the hunter: duels in unseen homes, a draw being half; and of those that were decided, the share
+    that was won, with its 95 % interval (Wilson).
     """
     n = N_MEMBERS[device.type]
     with _parent(folder) as parent:
@@ -122,11 +130,12 @@ def league(
             words = (*DEATHMATCH, *OPPONENTS, f"seed={seed}")
             size = f"population.size={n}", VARY, f"population.every={EVERY[device.type]}"
             single = _trained(parent, f"single-{seed}", device, seconds, *words)
+            size = *size, f"env.n_envs={LEAGUE_ENVS[device.type]}"
             group = _trained(parent, f"league-{seed}", device, seconds, *words, *LEAGUE, *size)
             best = populations.member(group)
             title = f"deathmatch, {seconds} s, seed {seed}"
             for name, run, others in (
-                (f"best of a league of {n}", best, [single, "hunter"]),
+                (f"best of a league of {n} ranked by duels", best, [single, "hunter"]),
                 ("single run", single, ["hunter"]),
             ):
                 rows = _evaluated(run, device, f"against=[{','.join(map(str, others))}]")

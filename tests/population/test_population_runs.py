@@ -17,7 +17,7 @@ from megastep.agents.cli import entry, train
 from megastep.agents.errors import Differs
 from megastep.agents.launch import compare
 from megastep.agents.population.population import Population
-from megastep.agents.runs import checkpoint, json_lines, populations
+from megastep.agents.runs import checkpoint, json_lines, populations, scores
 from megastep.agents.training.trainer import Trainer
 from megastep.geometries import sample
 from tests.cli.test_exact_resume import CASES, differences
@@ -300,6 +300,21 @@ def test_a_member_that_diverges_is_replaced_and_named(here, capsys):
     assert "diverged" in capsys.readouterr().out
 
 
+def test_members_are_ranked_by_another_statistic_of_their_last_report(here, capsys):
+    run(*POPULATION, LONG, "population.score=length")
+    assert " length " in capsys.readouterr().out
+    reports = [json_lines.read(here / f"P/member-{n}/metrics.jsonl") for n in range(3)]
+    generations = populations.read(here / "P" / populations.FILE)
+    assert any("score" in row for rows in generations for row in rows)
+    for rows in generations[1:]:
+        for row, of_member in zip(rows, reports, strict=True):
+            report = next(one for one in of_member if one["samples"] == row["samples"])
+            if "score" in row:
+                assert row["score"] == report["episode/length"]
+    lengths = [scores.mean(rows, "length") for rows in reports]
+    assert populations.best(here / "P") == lengths.index(max(lengths))
+
+
 BAD = {
     "key": (["population.vary={agent.width: {min: 8, max: 16}}"], "agent.width cannot vary"),
     "near": (["population.vary={learner.lrr: {min: 1, max: 2}}"], "did you mean learner.lr"),
@@ -314,6 +329,8 @@ BAD = {
     "schedule": (["learner.lr={from:1e-3,to:1e-4}"], "is a schedule"),
     "size": (["population.size=1"], "needs several members"),
     "evaluated": (["population.score=evaluated"], "evaluate_every"),
+    "score": (["population.score=lenght"], "did you mean length"),
+    "league": (["population.score=won/league"], "no mean over episodes here"),
     "ranks": (["ranks=4"], "more than population.size=3"),
     "member": (["population.member=1"], "is set by a population"),
     "file": (["population.size=1", "population.vary={}", "population.schedule=x"], "no file 'x'"),
@@ -392,7 +409,7 @@ def test_members_of_a_league_meet_each_other_and_resume_with_the_same_bits(here,
     words = [*small, "env=pong", "env.self_play=true", "env.points=1", "env.n_envs=8"]
     words += ["opponents.league=0.5", "opponents.past=0.25", "opponents.snapshots=2"]
     words += ["opponents.every=3", "population.size=3", "population.every=240", "logger=none"]
-    words += [VARY, "samples=480"]
+    words += [VARY, "samples=480", "population.score=won/league"]
     run(*words, "folder=L", "checkpoint_seconds=1e-9", "keep_checkpoints=99")
     shutil.copytree("L", "left-alone")
     won = [json_lines.read(here / f"L/member-{n}/metrics.jsonl")[-1] for n in range(3)]
