@@ -24,7 +24,6 @@ from megastep.agents.population.population import Learnt, Population, Turns, hos
 from megastep.agents.runs import folders, populations, provenance
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
-from megastep.kernels.build.launch import without_early_starts
 from megastep.settings import closest
 
 if TYPE_CHECKING:
@@ -198,7 +197,7 @@ def _train(cfg, root, population) -> None:
         with (
             env_failures.told(cfg.env, root, hint, population.rank),
             signals.handled(rank.announce) as numbers,
-            without_early_starts(),
+            engine.without_early_starts(),
             progress if population.rank == 0 else contextlib.nullcontext(),
             contextlib.closing(population),
         ):

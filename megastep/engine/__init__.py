@@ -20,6 +20,7 @@ from megastep.engine.resets import Resets
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.engine.spawning import spawn, uniform
 from megastep.kernels.build.compile import EngineError
+from megastep.kernels.build.launch import without_early_starts
 
 __all__ = [
     "AGENT_RADIUS",
@@ -51,4 +52,5 @@ __all__ = [
     "uniform",
     "update_agent_geometry",
     "update_objects",
+    "without_early_starts",
 ]

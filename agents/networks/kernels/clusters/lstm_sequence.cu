@@ -355,7 +355,7 @@ struct BackwardMemory {
 template <int W>
 DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int SENT = UNITS * (int)sizeof(float);  // by a block, per lane
+    constexpr int SENT = UNITS * (int)sizeof(float);             // by a block, per lane
     constexpr int ROWS = W / (THREADS / 32), TILES = ROWS / 16;  // of a warp
     static_assert(ROWS % 16 == 0, "a warp multiplies whole tiles of 16 units");
     BackwardMemory<W>& memory = *(BackwardMemory<W>*)shared_memory;
