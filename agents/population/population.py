@@ -243,7 +243,9 @@ class Population:
         When reports are due, all updates are launched before the first report waits for its own.
         """
         is_reported = (self.leader.updates + 1) % self.leader.log_every == 0
-        for _ in range(1 + is_reported):
+        for turn in range(1 + is_reported):
+            if turn and self.leader.evaluate_every is not None:
+                self.turns.wait()  # the clock pauses, and counts what is launched before
             ended = self.turns.each(lambda i: next(rounds[i], StopIteration) is StopIteration)
             if any(ended):
                 return False
