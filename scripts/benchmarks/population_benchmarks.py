@@ -46,6 +46,7 @@ LEAGUE = (
     "opponents.league=0.5",
     "opponents.past=0.2",
     "opponents.bot=0.1",
+    "opponents.snapshots=4",  # and as many rivals, each of which is launched on its own
     "population.score=won/league",
 )
 OPPONENTS = "opponents.snapshots=8", "opponents.every=200"
