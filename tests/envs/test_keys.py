@@ -1,12 +1,14 @@
 """Keys: every episode can be solved, and its rules by hand."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from megastep import contract, envs, toys
 from megastep.arrdict import arrdict
-from megastep.envs.keys.episodes import OPEN, Areas, cached_episodes, episodes
+from megastep.envs.keys.episodes import OPEN, Areas, _doors, cached_episodes, episodes
 from megastep.envs.keys.step import keys_step
 from megastep.geometries import sample
 from megastep.modules.objects import REACH
@@ -71,6 +73,17 @@ def check_episodes(n_homes, n, n_colours=N_COLOURS, **options):
 def test_every_episode_can_be_solved_and_needs_a_door():
     counts = check_episodes(6, 12)
     assert counts[N_COLOURS] > 40
+
+
+def test_no_way_leads_around_a_door_through_areas_too_small_for_points():
+    """Areas 1 and 2 have a door between them; 3, 4 and 5 are too small, and lead around it."""
+    sides = np.array([(1, 2), (1, 3), (3, 4), (4, 2), (5, 1), (1, 1), (0, 2)])
+    areas = SimpleNamespace(labels=np.arange(6)[None], sides=sides)
+    random = np.random.default_rng(1)
+    zones, opened, states = _doors(areas, [0], N_COLOURS, random)
+    assert zones[1] != zones[2] and len(opened) == 1
+    assert 0 <= states[0] < N_COLOURS
+    assert states[1:].tolist() == [OPEN, OPEN, N_COLOURS, OPEN, OPEN, OPEN]
 
 
 @pytest.mark.nightly

@@ -197,7 +197,21 @@ def _doors(areas, usable, n_colours, random) -> tuple[np.ndarray, list, np.ndarr
         lies = reached[int(random.integers(len(reached)))]
         opened.append((states[k], lies, behind))
         reached.append(behind)
+    _lock_ways_around(areas, usable, zones, n_colours, states)
     return np.array(zones), opened, states
+
+
+def _lock_ways_around(areas, usable, zones, locked, states) -> None:
+    """Locks doorways, open ones of areas too small for a point, that lead from zone to zone."""
+    joined = [~area if zone < 0 else zone for area, zone in enumerate(zones)]
+    for k, (a, b) in enumerate(areas.sides.tolist()):
+        if k in usable or not a or not b:
+            continue
+        inner, outer = sorted((joined[a], joined[b]))
+        if 0 <= inner < outer:
+            states[k] = locked
+        else:
+            joined = [outer if one == inner else one for one in joined]
 
 
 def _points(points, zones, opened, random) -> list | None:
