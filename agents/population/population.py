@@ -325,7 +325,7 @@ class Population:
             return trainer.evaluation.get("return")
         if self.score == populations.RUNNING or trainer.score is None:
             return trainer.score
-        return trainer.last_stats.get(f"episode/{self.score}")
+        return trainer.reported_stats.get(f"episode/{self.score}")
 
     def gathered(self, values: Sequence[T]) -> list[T]:
         """Returns a value of each member, from those of the members that this rank hosts."""

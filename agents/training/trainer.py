@@ -96,7 +96,7 @@ class Trainer:
             of few episodes is luck, and would mark the first checkpoint as the best.
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
-        last_stats: name -> value, the episode statistics of the last report.
+        reported_stats: name -> value, the episode statistics of the last report.
         evaluation: name -> the last value that the evaluator measured.
         lost: what could not be restored of a resumed run and begins anew, a clause each; if any,
             the run does not continue bit for bit.
@@ -196,7 +196,7 @@ class Trainer:
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.samples_per_second = None
-        self.latest_stats, self.last_stats = {}, {}
+        self.latest_stats, self.reported_stats = {}, {}
         self.samples_at_log = self.updates_at_log = self.samples_at_report = 0
         self.seconds_at_log = self.seconds_at_checkpoint = 0.0
         self.updates_at_checkpoint, self.lost = None, []
@@ -484,7 +484,7 @@ class Trainer:
             n_restarts = torch.tensor([n_restarts], device=self.env.device)
             stats["episode/restarts"] = int(sum_over_ranks(n_restarts))
         self.latest_stats.update(stats)
-        self.last_stats = stats
+        self.reported_stats = stats
         if self.read_lr:
             self.lr = self.read_lr()
         schedules = (name for name in self.scheduled if name != "lr")

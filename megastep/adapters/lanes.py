@@ -18,7 +18,7 @@ from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 __all__ = ["Copies", "Lanes", "ended", "fresh"]
 
 WORD = 4  # bytes
-BLOCK_BYTES = 2**27  # of copies that share memory, if there are several
+BLOCK_BYTES, BLOCK_ROWS = 2**27, 32  # at most, of copies that share memory
 
 
 def ended(world: World) -> torch.Tensor:
@@ -45,15 +45,10 @@ def _in_plain_tensors(method: Method) -> Method:
 class Copies:
     """Copies a tree of tensors whose numbers change between the calls. On a GPU one kernel copies
     all that fit, into memory whose views are made for several calls at once, since making a view
-    takes PyTorch as long as copying.
-
-    Args:
-        tree: the tensors.
-        n_at_once: copies that share memory, which is kept as long as any of them is.
+    takes PyTorch as long as copying. It is kept as long as any of these copies is.
     """
 
-    def __init__(self, tree: Tree, n_at_once: int = 32):
-        self._n_at_once = n_at_once
+    def __init__(self, tree: Tree):
         leaves = _pytree.tree_leaves(tree)
         self._built = _builder(tree)
         self._at = [i for i, leaf in enumerate(leaves) if leaf.is_cuda and _is_words(leaf)]
@@ -79,7 +74,7 @@ class Copies:
     def _block(self) -> list[tuple[torch.Tensor, ...]]:
         """Returns memory for some copies: all words of each, and a view per leaf."""
         sizes = [*map(len, self._words)]
-        n_rows = min(max(BLOCK_BYTES // (WORD * sum(sizes)), 1), self._n_at_once)
+        n_rows = min(max(BLOCK_BYTES // (WORD * sum(sizes)), 1), BLOCK_ROWS)
         block = self._words[0].new_empty(n_rows, sum(sizes))
         parts = [
             part.view(leaf.dtype).view(n_rows, *leaf.shape).unbind()
@@ -99,9 +94,10 @@ def _builder(tree) -> Callable:
     return lambda leaves: kind({key: part(leaves) for key, part in parts})
 
 
+@_in_plain_tensors
 def fresh(tree: Tree) -> Tree:
-    """Returns a copy of a tree of tensors."""
-    return Copies(tree, 1)()
+    """Returns a copy of a tree of tensors: for one, memory of its own for each is quickest."""
+    return _builder(tree)(leaf.clone() for leaf in _pytree.tree_leaves(tree))
 
 
 def _is_words(leaf) -> bool:

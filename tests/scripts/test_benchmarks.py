@@ -23,7 +23,6 @@ import torch
 
 from megastep import arrdict
 from megastep.geometries import sample
-from megastep.geometries.plans import imports
 
 RECORD_KEYS = {
     *("benchmark", "what", "value", "unit", "lower", "upper", "n"),
@@ -113,6 +112,7 @@ def test_benchmarks_start_without_what_only_importing_floor_plans_needs():
 
 
 def test_plans_benchmark_measures_imported_and_generated_homes(tmp_path, monkeypatch):
+    imports = pytest.importorskip("megastep.geometries.plans.imports", exc_type=ImportError)
     for source, name in ("cubicasa", "ok_two_rooms.svg"), ("houseexpo", "houseexpo_ok.json"):
         (tmp_path / source).mkdir()
         shutil.copy(paths.ROOT / "tests/data/hostile" / name, tmp_path / source)
