@@ -96,7 +96,7 @@ REPEATABLE = (
 #: The keys that may be written with units, and their kind.
 QUANTITIES = {
     **dict.fromkeys(("seconds", "more_seconds", "checkpoint_seconds"), "seconds"),
-    **dict.fromkeys(("samples", "more_samples"), "samples"),
+    **dict.fromkeys(("samples", "more_samples", "population.every"), "samples"),
 }
 #: The keys that take a run, each with what is said of a key that cannot go with it.
 CURES = {
@@ -120,8 +120,10 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
         raise ConfigErrors([("population.member", text)])
     tree.setdefault("logger", {})  # as it is with logger=none
     for key, kind in QUANTITIES.items():
-        if key in tree:
-            tree[key] = settings.quantity(tree[key], kind)
+        group, _, name = key.rpartition(".")
+        part = tree.get(group) if group else tree
+        if isinstance(part, dict) and name in part:
+            part[name] = settings.quantity(part[name], kind)
     tree = with_member(with_member(tree, "init"), "rerun")
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if tree.get("resume") == AUTO and "rerun" not in given:
