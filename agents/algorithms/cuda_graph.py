@@ -24,7 +24,8 @@ class CudaGraphUpdate:
     same object every time.
 
     Args:
-        update: a function of a rollout that returns tensors () by name and never synchronises.
+        update: a function of a rollout that returns tensors () by name, if any, and never
+            synchronises.
         device: device of the policy; need not be the current GPU.
         graph: whether to capture. A CPU always runs eagerly.
         generators: the generators that `update` draws from.
@@ -56,24 +57,30 @@ class CudaGraphUpdate:
         """Performs one update. The tensors it returns are not overwritten by the next one."""
         if self.stream is None:
             return self.update(rollout)
+        if self.graph is None or self._rollout is not rollout:
+            return self._first(rollout)
+        return self._replayed(self.graph)
+
+    def _first(self, rollout) -> Metrics:
         with torch.cuda.device(self.device):
             if self._n_warm_ups_left:
                 self._n_warm_ups_left -= 1
                 return self._warm_up(rollout)
-            if self._rollout is not rollout:
-                generators = [generator.on(self.device) for generator in self.generators]
-                self.graph = SegmentedGraph(lambda: self._packed(rollout), self.stream, generators)
-                self._rollout = rollout
-            graph = self.graph
-            assert graph is not None
-            graph.replay()
-            return dict(zip(self._names, graph.output.clone().unbind()))
+            assert self.stream is not None
+            generators = [generator.on(self.device) for generator in self.generators]
+            self.graph = SegmentedGraph(lambda: self._packed(rollout), self.stream, generators)
+            self._rollout = rollout
+            return self._replayed(self.graph)
 
-    def _packed(self, rollout) -> torch.Tensor:
+    def _replayed(self, graph) -> Metrics:
+        graph.replay()
+        return dict(zip(self._names, graph.output.clone().unbind())) if self._names else {}
+
+    def _packed(self, rollout) -> torch.Tensor | None:
         """Returns the metrics in one tensor, of which a single kernel makes a copy."""
         metrics = self.update(rollout)
         self._names = [*metrics]
-        return torch.stack([*metrics.values()]).detach()
+        return torch.stack([*metrics.values()]).detach() if metrics else None
 
     def _warm_up(self, rollout) -> Metrics:
         # PyTorch would warn of gradients accumulated on another stream, which this one waits for

@@ -11,12 +11,12 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from megastep import spaces
+from megastep.agents.networks import products
 from megastep.agents.networks.kernels import duelling as kernels
 from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.outputs import FORBIDDEN, Output, gather
-from megastep.agents.networks.precision import cast, compute_dtype, product
-from megastep.agents.private_ops import linear_relu
+from megastep.agents.networks.precision import cast, compute_dtype
 
 
 class DuellingOutput(Output):
@@ -150,7 +150,7 @@ class _DuellingValues(torch.autograd.Function):
         *parameters, shape = parameters_and_shape
         lead, x = x.shape[:-1], x.flatten(0, -2)
         weight, bias = (cast(leaf, x.dtype) for leaf in (hidden_weight, hidden_bias))
-        hidden = linear_relu(x, weight, bias)
+        hidden = products.layer(x, weight, bias, has_relu=True)
         parameters = [aligned(p.detach()) for p in parameters]
         values = kernels.values(hidden, parameters, shape)
         value_weight, _, advantage_weight, _ = parameters
@@ -163,5 +163,5 @@ class _DuellingValues(torch.autograd.Function):
         x, weight, hidden, *weights = ctx.saved_tensors
         lead, d_values = d_values.shape[:-2], d_values.flatten(0, -3).contiguous()
         d_hidden, gradients = kernels.backward(hidden, *weights, d_values=d_values)
-        d_x = (d_hidden @ weight).unflatten(0, lead) if ctx.needs_input_grad[0] else None
-        return d_x, product(d_hidden.T, x), *gradients, None
+        d_x = products.of_inputs(d_hidden, weight).unflatten(0, lead) if ctx.needs_input_grad[0] else None
+        return d_x, products.of_weights(d_hidden, x), *gradients, None

@@ -10,11 +10,12 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from megastep.agents.networks import products
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.kernels import heads as kernels
 from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.outputs import MultiDiscreteOutput
-from megastep.agents.networks.precision import cast, product
+from megastep.agents.networks.precision import cast
 
 
 def fit(output: nn.Module, critic: Critic, features: torch.Tensor, encoded: torch.Tensor) -> bool:
@@ -72,8 +73,8 @@ class _JointHeads(torch.autograd.Function):
         biases = [cast(bias, dtype, kernels.MULTIPLE) for bias in parameters[1:6:2]]
         of_features, of_privileged = weights[2].split(width, 1)
         weight = torch.cat([*weights[:2], of_features])
-        columns = torch.addmm(torch.cat(biases), features, weight.T)
-        columns[:, sizes.starts[1] :].addmm_(privileged, of_privileged.T)
+        columns = products.layer(features, weight, torch.cat(biases))
+        products.add_layer(columns[:, sizes.starts[1] :], privileged, of_privileged)
         results = kernels.forward(columns, target, actions, value, sizes)
         ctx.sizes = sizes
         ctx.save_for_backward(
@@ -94,13 +95,13 @@ class _JointHeads(torch.autograd.Function):
         )
         first_score, first_hidden, _ = sizes.starts
         d_hidden = d[:, first_hidden:]
-        d_weight = product(d.T, features)
-        d_hidden_weight = [d_weight[first_hidden:], product(d_hidden.T, privileged)]
+        d_weight = products.of_weights(d, features)
+        d_hidden_weight = [d_weight[first_hidden:], products.of_weights(d_hidden, privileged)]
         scores = slice(first_score, first_score + n_scores)
         return (
             *(None, None, None, None),
-            (d @ weight).unflatten(0, lead),
-            (d_hidden @ of_privileged).unflatten(0, lead),
+            products.of_inputs(d, weight).unflatten(0, lead),
+            products.of_inputs(d_hidden, of_privileged).unflatten(0, lead),
             *(d_weight[: sizes.n_predicted], d_biases[: sizes.n_predicted]),
             *(d_weight[scores], d_biases[scores]),
             *(torch.cat(d_hidden_weight, 1), d_biases[first_hidden:]),

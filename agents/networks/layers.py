@@ -2,7 +2,7 @@
 
 Each has a plain form in PyTorch, which runs on a CPU, in float32 on a GPU, and for whatever the
 fused form does not cover. Where bfloat16 is the compute dtype, the fused form runs: kernels of
-`megastep.agents.networks.kernels.layers` around PyTorch's matrix products. Its weights' gradients
+`megastep.agents.networks.kernels.layers` around matrix products. Its weights' gradients
 are float32 sums that are never rounded to bfloat16.
 
 `...` any leading axes, such as (T, B) time and lanes.
@@ -14,12 +14,11 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks import linear_cpu
+from megastep.agents.networks import linear_cpu, products
 from megastep.agents.networks.kernels import layers as kernels
 from megastep.agents.networks.kernels.library import aligned_rows
-from megastep.agents.networks.precision import cast, compute_dtype, product
+from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.agents.networks.running_norm import RunningNorm
-from megastep.agents.private_ops import linear_relu
 
 Activation = Callable[[torch.Tensor], torch.Tensor]
 
@@ -71,13 +70,10 @@ class _Linear(torch.autograd.Function):
         weight, bias = (cast(leaf, dtype, multiple=8) for leaf in (weight, bias))
         parts = [part.flatten(0, -2) for part in parts]
         weights = weight.split([part.shape[1] for part in parts], 1)
-        if has_relu and len(parts) == 1:
-            y = linear_relu(parts[0], weight, bias)
-        else:
-            y = torch.addmm(bias, parts[0], weights[0].T)
-            for part, its_weight in zip(parts[1:], weights[1:], strict=True):
-                y.addmm_(part, its_weight.T)
-            y = y.relu_() if has_relu else y
+        y = products.layer(parts[0], weights[0], bias, has_relu and len(parts) == 1)
+        for part, its_weight in zip(parts[1:], weights[1:], strict=True):
+            products.add_layer(y, part, its_weight)
+        y = y.relu_() if has_relu and len(parts) > 1 else y
         ctx.save_for_backward(weight, *parts, *[y] * has_relu)
         return y[:, : ctx.n_outputs].unflatten(0, lead)
 
@@ -91,12 +87,12 @@ class _Linear(torch.autograd.Function):
         d, d_bias = kernels.bias_gradient(aligned_rows(d), *activated)
         d_weight, d_parts = None, [None] * len(parts)
         if ctx.needs_input_grad[0]:
-            d_weights = [product(d.T, part) for part in parts]
+            d_weights = [products.of_weights(d, part) for part in parts]
             d_weight = torch.cat(d_weights, 1) if len(parts) > 1 else d_weights[0]
             d_weight = d_weight[: ctx.n_outputs]
         for i, its_weight in enumerate(weight.split([part.shape[1] for part in parts], 1)):
             if ctx.needs_input_grad[3 + i]:
-                d_parts[i] = (d @ its_weight).unflatten(0, lead)
+                d_parts[i] = products.of_inputs(d, its_weight).unflatten(0, lead)
         return d_weight, d_bias[: ctx.n_outputs], None, *d_parts
 
 

@@ -20,11 +20,12 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from megastep.agents.networks import products
+from megastep.agents.networks.kernels import few_rows, lstm_sequence
 from megastep.agents.networks.kernels import lstm as kernels
-from megastep.agents.networks.kernels import lstm_sequence
 from megastep.agents.networks.kernels.library import aligned, check_shapes, is_plain
 from megastep.agents.networks.lstm_cpu import CpuSequence, fits
-from megastep.agents.networks.precision import cast, cast_joined, compute_dtype, product
+from megastep.agents.networks.precision import cast, cast_joined, compute_dtype
 from megastep.arrdict import arrdict
 
 if TYPE_CHECKING:
@@ -138,7 +139,7 @@ def _unroll_on_chip(
     x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual
 ) -> lstm_sequence.Unrolled:
     """`_unroll` in one kernel after the inputs' product."""
-    gates, residual = F.linear(x, input_weight, bias), x if is_residual else None
+    gates, residual = products.layer(x, input_weight, bias), x if is_residual else None
     return lstm_sequence.forward(gates, weight, reset, output, cell, needs_backward, residual)
 
 
@@ -207,15 +208,11 @@ class _Sequence(torch.autograd.Function):
             weight, reset, saved, d_outputs, d_cell, needs_state
         )
         flat = d_gates.flatten(0, 1)
-        if ctx.is_residual:
-            d_x = torch.addmm(d_sum.flatten(0, 1), flat, input_weight).view_as(x)
-        else:
-            d_x = d_gates @ input_weight
         return (
-            d_x,
-            product(flat.T, x.flatten(0, 1)),
+            products.of_inputs(d_gates, input_weight, d_sum if ctx.is_residual else None),
+            products.of_weights(flat, x.flatten(0, 1)),
             d_bias.float(),
-            product(flat.T, hiddens.flatten(0, 1)),
+            products.of_weights(flat, hiddens.flatten(0, 1)),
             None,
             d_output,
             d_cell,
@@ -287,8 +284,11 @@ class LSTM(nn.Module):
         dtype = compute_dtype(self.recurrent.weight)
         weight = cast_joined((self.input.weight, self.recurrent.weight), dtype)
         bias = cast(self.input.bias, dtype)
-        last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
         x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
+        if self.width in few_rows.WIDTHS and few_rows.is_supported(x, weight):
+            output, after = few_rows.lstm_step(x, weight, bias, reset, state, is_residual)
+            return output[None], after
+        last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
         output, joined = torch.empty_like(x), x.new_empty(len(x), 2 * self.width)
         after = map(torch.empty_like, (last_output, last_cell))
         after = arrdict(zip(("output", "cell"), after))

@@ -27,10 +27,11 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from megastep.agents.networks import products
 from megastep.agents.networks.kernels import mingru as kernels
 from megastep.agents.networks.kernels import mingru_step
 from megastep.agents.networks.kernels.library import aligned, check_shapes, is_plain
-from megastep.agents.networks.precision import cast, compute_dtype, product
+from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict
 
@@ -113,7 +114,7 @@ class _Sequence(torch.autograd.Function):
         needs_backward = has_grad and any(ctx.needs_input_grad)
         if not needs_backward and mingru_step.is_supported(x):
             return mingru_step.forward(x, weight, bias, reset, start, is_residual)
-        gates = F.linear(x, weight, bias)
+        gates = products.layer(x, weight, bias)
         outputs, last = torch.empty_like(x), torch.empty_like(start)
         states = torch.empty_like(x) if is_residual and needs_backward else None
         residual = x if is_residual else None
@@ -143,7 +144,7 @@ class _Sequence(torch.autograd.Function):
             d_x = d_residual
         else:  # in one operation, a CPU would add up the product's sums in another order
             d_x = d_residual.add_((flat @ weight).view_as(x))
-        return d_x, product(flat.T, x.flatten(0, 1)), d_bias, None, d_start, None, None
+        return d_x, products.of_weights(flat, x.flatten(0, 1)), d_bias, None, d_start, None, None
 
 
 class MinGRU(nn.Module):

@@ -136,10 +136,3 @@ def compute_dtype(weight: torch.Tensor) -> torch.dtype:
     """
     device = weight.device.type
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weight.dtype
-
-
-def product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Returns the float32 product of two matrices of one dtype. A GPU does not round it to that."""
-    if a.is_cuda and a.dtype != torch.float32:
-        return torch.mm(a, b, out_dtype=torch.float32)
-    return (a @ b).float()

@@ -73,18 +73,23 @@ class Turns:
         self.streams = [torch.cuda.Stream(device) for _ in range(n)] if is_on_gpu else None
         current = global_generators.Held.current()
         self.of_host = [current.copied() for _ in range(n)]
-        self.of_gpu = [torch.cuda.get_rng_state(device)] * n if is_on_gpu else []
+        self.gpu_generator, self.of_gpu = None, []
+        if is_on_gpu:
+            torch.cuda.init()
+            index = torch.cuda.current_device() if device.index is None else device.index
+            self.gpu_generator = torch.cuda.default_generators[index]
+            self.of_gpu = [self.gpu_generator.get_state()] * n
 
     @contextlib.contextmanager
     def of(self, member: int) -> Iterator[None]:
         """What is done inside is this member's."""
-        with _undone(), self._only(member):
+        with self._undone(), self._only(member):
             yield
 
     def each(self, call: Callable[[int], T]) -> list[T]:
         """Calls a function of each member in turn, as inside `of`. Returns the results."""
         results = []
-        with _undone():
+        with self._undone():
             for member in range(len(self.of_host)):
                 with self._only(member):
                     results.append(call(member))
@@ -92,31 +97,33 @@ class Turns:
 
     @contextlib.contextmanager
     def _only(self, member) -> Iterator[None]:
-        """Leaves the host's global generators as the member did."""
+        """Leaves the member's stream, and the host's global generators as the member did."""
         self.of_host[member].install()
-        with contextlib.ExitStack() as stack:
-            if self.streams is not None:
-                torch.cuda.set_rng_state(self.of_gpu[member], self.device)
-                stack.enter_context(torch.cuda.stream(self.streams[member]))
-            yield
-            self.of_host[member] = global_generators.Held.current()
-            if self.streams is not None:
-                self.of_gpu[member] = torch.cuda.get_rng_state(self.device)
+        if self.streams is not None and self.gpu_generator is not None:
+            self.gpu_generator.set_state(self.of_gpu[member])
+            torch.cuda.set_stream(self.streams[member])
+        yield
+        self.of_host[member] = global_generators.Held.current()
+        if self.gpu_generator is not None:
+            self.of_gpu[member] = self.gpu_generator.get_state()
+
+    @contextlib.contextmanager
+    def _undone(self) -> Iterator[None]:
+        """Brings the current stream and the host's global generators back."""
+        outside = global_generators.Held.current()
+        stream = contextlib.nullcontext()
+        if self.streams is not None:
+            stream = torch.cuda.stream(torch.cuda.current_stream(self.device))
+        try:
+            with stream:
+                yield
+        finally:
+            outside.install()
 
     def wait(self) -> None:
         """Waits until all members have done what is launched."""
         if self.streams is not None:
             torch.cuda.synchronize(self.device)
-
-
-@contextlib.contextmanager
-def _undone() -> Iterator[None]:
-    """Brings the host's global generators back."""
-    outside = global_generators.Held.current()
-    try:
-        yield
-    finally:
-        outside.install()
 
 
 class Population:
@@ -223,7 +230,9 @@ class Population:
         def ends() -> bool:
             return stop() or any(one.is_stopped or one.is_reached for one in self.trainers)
 
-        rounds, n_rounds = [trainer.rounds(ends) for trainer in self.trainers], 0
+        # the leader asks for all
+        rounds, n_rounds = [one.rounds(ends) for one in self.trainers[:1]], 0
+        rounds += [one.rounds() for one in self.trainers[1:]]
         try:
             while self._is_round_left(rounds):
                 n_rounds += 1

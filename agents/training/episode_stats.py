@@ -117,8 +117,9 @@ class EpisodeStats:
             rows = [counts & (source_of_row == source) for source in range(len(self.sources))]
             by_source = torch.stack([self._sum(one, values, metrics) for one in rows], 1)
         self._add_sums(self._sum(counts, values, metrics), by_source)
-        self.returns = _sum_since(returns, last_end, slice(-1, None))[0]
-        self.lengths = _sum_since(lengths, last_end, slice(-1, None))[0]
+        # in place, as a CUDA graph wants it
+        self.returns.copy_(_sum_since(returns, last_end, slice(-1, None))[0])
+        self.lengths.copy_(_sum_since(lengths, last_end, slice(-1, None))[0])
         self.is_whole |= done.any(0)
 
     def _is_fused(self, reward, learns, metrics) -> bool:

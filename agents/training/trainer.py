@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 import torch
 
+from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue
 from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
@@ -169,7 +170,7 @@ class Trainer:
             )
         self.collect = learner.collector(env)
         self.collector_options = with_defaults(self.collect, CollectorOptions)
-        self.rollout = self.collect.rollout
+        self.rollout = self.usual_rollout = self.collect.rollout
         self.curriculum = make_curriculum and make_curriculum(env, learner, self.rollout)
         allocate_layouts = self.collector_options.allocate_layouts
         if optional(env, "layout") is None or not allocate_layouts:
@@ -187,6 +188,8 @@ class Trainer:
             skip_first=desync,
             sources=layout_sources,
         )
+        device = torch.device(env.device)
+        self.count_episodes = CudaGraphUpdate(self._count_episodes, device, graph=True)
         self.run_state = RunState(
             env, policy, learner, self.collect, self.episode_stats, self.curriculum
         )
@@ -346,14 +349,8 @@ class Trainer:
         self._set_lr(lr_fraction)
         losses = self.learner.update(rollout)
         self.start("rest")
-        self.episode_stats.add(
-            rollout.reward,
-            rollout.reset,
-            rollout.terminal | rollout.truncated,
-            rollout.learns[:-1],
-            rollout.metrics,
-            rollout.layouts if self.episode_stats.sources else None,
-        )
+        is_usual = rollout is self.usual_rollout
+        (self.count_episodes if is_usual else self._count_episodes)(rollout)
         if self.curriculum is not None:
             self.curriculum.update(rollout)
         self.samples += rollout.n_steps * rollout.n_lanes * n_ranks()
@@ -363,6 +360,17 @@ class Trainer:
         if not self.clock.is_running:
             self.start_clock()
         return losses
+
+    def _count_episodes(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        self.episode_stats.add(
+            rollout.reward,
+            rollout.reset,
+            rollout.terminal | rollout.truncated,
+            rollout.learns[:-1],
+            rollout.metrics,
+            rollout.layouts if self.episode_stats.sources else None,
+        )
+        return {}
 
     def start_clock(self) -> None:
         """Begins to count seconds, once everything is compiled. Synchronises."""

@@ -1,0 +1,131 @@
+"""Layers for few lanes on a GPU: each against its plain form in float64."""
+
+import pytest
+import torch
+from torch.nn import functional
+
+from megastep.agents.networks.kernels import few_rows
+from megastep.arrdict import arrdict
+
+SLACK = dict(rtol=0, atol=2e-2)  # of numbers rounded to bfloat16
+
+
+def matrix(n_rows, n_columns, scale=1.0, n_more=8):
+    """Returns a matrix of bfloat16, some columns of a wider one."""
+    return (torch.randn(n_rows, n_columns + n_more) * scale).bfloat16()[:, :n_columns]
+
+
+def product_inputs(n, k, m, where="cpu"):
+    """Returns rows x (N, K), weight (M, K), bias (M,), and gradients or addends (N, M), (N, K)."""
+    torch.manual_seed(0)
+    x, weight, d = matrix(n, k), matrix(m, k, k**-0.5), matrix(n, m)
+    bias, onto = torch.randn(m).bfloat16(), torch.randn(n, k).bfloat16()
+    return [leaf.to(where) for leaf in (x, weight, bias, d, onto)]
+
+
+def products(x, weight, bias, d, addend):
+    """Returns what each function does."""
+    onto = d.clone()
+    return (
+        few_rows.layer(x, weight, bias),
+        few_rows.layer(x, weight, bias, has_relu=True),
+        few_rows.layer(x, weight, onto=onto),
+        few_rows.of_inputs(d, weight),
+        few_rows.of_inputs(d, weight, addend),
+        few_rows.of_weights(d, x),
+    )
+
+
+def plain_products(x, weight, bias, d, addend):
+    x, weight, bias, d, addend = (leaf.double() for leaf in (x, weight, bias, d, addend))
+    outputs = functional.linear(x, weight, bias)
+    results = outputs, outputs.relu(), d + x @ weight.T, d @ weight, addend + d @ weight
+    return *(result.bfloat16() for result in results), (d.T @ x).float()
+
+
+def check_products(inputs, results):
+    for result, expected in zip(results, plain_products(*inputs), strict=True):
+        torch.testing.assert_close(result, expected, rtol=1e-2, atol=1e-2)
+    # a sum that is not rounded to bfloat16
+    torch.testing.assert_close(results[-1], plain_products(*inputs)[-1], rtol=1e-4, atol=1e-3)
+
+
+def step_inputs(n_lanes, width):
+    """Returns x (B, W), weight, bias, resets (B,) and a state that is NaN where it is reset."""
+    torch.manual_seed(0)
+    x, weight = torch.randn(n_lanes, width), torch.randn(4 * width, 2 * width) / width**0.5
+    reset = torch.rand(n_lanes) < 0.3
+    output = torch.randn(n_lanes, width).tanh().bfloat16().float()
+    state = arrdict(output=output, cell=torch.randn(n_lanes, width))
+    for leaf in state.values():
+        leaf[reset] = torch.nan
+    bias = torch.randn(4 * width)
+    return *(leaf.bfloat16() for leaf in (x, weight, bias)), reset, state
+
+
+def plain_step(x, weight, bias, reset, state, is_residual):
+    """Returns output, the same without the residual, and the cell."""
+    before = {key: leaf.double().masked_fill(reset[:, None], 0.0) for key, leaf in state.items()}
+    joined = torch.cat([x.double(), before["output"]], 1)
+    i, f, g, o = functional.linear(joined, weight.double(), bias.double()).chunk(4, 1)
+    cell = f.sigmoid() * before["cell"] + i.sigmoid() * g.tanh()
+    output = o.sigmoid() * cell.tanh()
+    return output + x.double() if is_residual else output, output, cell
+
+
+PRODUCTS = pytest.mark.parametrize("n, k, m", [(1, 8, 8), (37, 264, 24), (1100, 72, 136)])
+STEPS = pytest.mark.parametrize(
+    "n_lanes, width, is_residual", [(1, 128, False), (37, 128, True), (70, 256, True)]
+)
+
+
+def check_step(results, inputs, is_residual):
+    output, state = results
+    for result, expected in zip(
+        (output, state.output, state.cell), plain_step(*inputs, is_residual), strict=True
+    ):
+        torch.testing.assert_close(result.double(), expected, **SLACK)
+
+
+@PRODUCTS
+def test_products_match_the_plain_form_in_every_order(cuda_on_cpu, monkeypatch, n, k, m):
+    inputs = product_inputs(n, k, m)
+    cuda_on_cpu.install(monkeypatch)
+    check_products(inputs, cuda_on_cpu.in_every_order(lambda: products(*inputs)))
+    names = {f"product_of_{name}" for name in ("layer", "inputs", "weights")}
+    assert names <= cuda_on_cpu.launched
+
+
+@STEPS
+def test_step_matches_the_plain_form_in_every_order(
+    cuda_on_cpu, monkeypatch, n_lanes, width, is_residual
+):
+    inputs = step_inputs(n_lanes, width)
+    cuda_on_cpu.install(monkeypatch)
+
+    def step():
+        output, state = few_rows.lstm_step(*inputs, is_residual)
+        return output, state.output, state.cell
+
+    output, *leaves = cuda_on_cpu.in_every_order(step)
+    check_step((output, arrdict(zip(("output", "cell"), leaves))), inputs, is_residual)
+    assert cuda_on_cpu.launched == {f"lstm_step_{width}"}
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n, k, m", [(1, 8, 8), (256, 264, 128), (2048, 128, 512), (1100, 72, 136)])
+def test_products_match_the_plain_form_and_are_repeatable(n, k, m):
+    inputs = product_inputs(n, k, m, "cuda")
+    results = products(*inputs)
+    check_products(inputs, results)
+    assert all(map(torch.equal, results, products(*inputs)))
+
+
+@pytest.mark.cuda
+@STEPS
+def test_step_matches_the_plain_form_and_is_repeatable(n_lanes, width, is_residual):
+    *leaves, state = step_inputs(n_lanes, width)
+    inputs = [*(leaf.cuda() for leaf in leaves), state.map(torch.Tensor.cuda)]
+    results, again = (few_rows.lstm_step(*inputs, is_residual) for _ in range(2))
+    check_step(results, inputs, is_residual)
+    assert torch.equal(results[0], again[0]) and torch.equal(results[1].cell, again[1].cell)
