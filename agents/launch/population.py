@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import gc
 import math
 import shutil
 from collections.abc import Callable
@@ -163,6 +164,9 @@ def make(
         folders.write_config(folder, trainer.saver.config["train"])
         provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, [])
         trainers.append(trainer)
+        # Each recording of a CUDA graph looks for garbage: not among all that the members have.
+        gc.collect()
+        gc.freeze()
     turns.wait()
     repeated = None
     if cfg.rerun:
