@@ -30,6 +30,7 @@ from megastep.agents.networks import (
     policy,
     value_output,
 )
+from megastep.agents.networks.kernels import few_rows
 from megastep.agents.selfplay import mixed_policy
 from megastep.agents.storage import copies, rollout
 from megastep.arrdict import arrdict
@@ -72,6 +73,11 @@ def plain_lstm() -> None:
 
     replace("is_supported", lambda x: False, lstm.lstm_sequence)
     replace("_act", act, lstm.LSTM)
+
+
+def plain_products() -> None:
+    """Matrix products of few rows are PyTorch's, and so are those of an LSTM that acts."""
+    replace("is_supported", lambda *matrices: False, few_rows)
 
 
 def plain_mingru() -> None:
@@ -144,6 +150,7 @@ def plain_order() -> None:
 PARTS = {
     "streams": plain_streams,
     "lstm": plain_lstm,
+    "products": plain_products,
     "mingru": plain_mingru,
     "heads": plain_heads,
     "conv": plain_conv,

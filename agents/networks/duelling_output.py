@@ -163,5 +163,7 @@ class _DuellingValues(torch.autograd.Function):
         x, weight, hidden, *weights = ctx.saved_tensors
         lead, d_values = d_values.shape[:-2], d_values.flatten(0, -3).contiguous()
         d_hidden, gradients = kernels.backward(hidden, *weights, d_values=d_values)
-        d_x = products.of_inputs(d_hidden, weight).unflatten(0, lead) if ctx.needs_input_grad[0] else None
+        d_x = None
+        if ctx.needs_input_grad[0]:
+            d_x = products.of_inputs(d_hidden, weight).unflatten(0, lead)
         return d_x, products.of_weights(d_hidden, x), *gradients, None

@@ -85,7 +85,8 @@ class _Linear(torch.autograd.Function):
         lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
         d = nn.functional.pad(d.flatten(0, -2), (0, n_padding)) if n_padding else d.flatten(0, -2)
         d, d_bias = kernels.bias_gradient(aligned_rows(d), *activated)
-        d_weight, d_parts = None, [None] * len(parts)
+        d_weight = None
+        d_parts: list[torch.Tensor | None] = [None] * len(parts)
         if ctx.needs_input_grad[0]:
             d_weights = [products.of_weights(d, part) for part in parts]
             d_weight = torch.cat(d_weights, 1) if len(parts) > 1 else d_weights[0]

@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
-from torch.nn import functional as F
 
 from megastep.agents.networks import products
 from megastep.agents.networks.kernels import mingru as kernels

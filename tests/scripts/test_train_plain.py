@@ -13,7 +13,9 @@ TINY = "experiment=deathmatch geometry=box env.n_envs=8 seconds=null finish.reco
 
 def test_an_unknown_part_is_refused(capsys):
     assert train_plain.main(["lstm,head"]) == 2
-    assert "unknown part 'head'. Available: streams, lstm, mingru, heads" in capsys.readouterr().err
+    assert (
+        "unknown part 'head'. Available: streams, lstm, products, mingru" in capsys.readouterr().err
+    )
     assert train_plain.chosen("all") == [*train_plain.PARTS] and train_plain.chosen("none") == []
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import torch
 
-from megastep.agents.networks.kernels.library import aligned
 from megastep.agents.networks.kernels.layers import sum_rows
+from megastep.agents.networks.kernels.library import aligned
 from megastep.arrdict import arrdict
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
@@ -87,7 +87,9 @@ def of_weights(d: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     return parts[0] if n_parts == 1 else sum_rows(parts.flatten(1)).view(parts.shape[1:])
 
 
-def _multiply(operation, left, right, result, n_inner, bias=None, addend=None, has_relu=False):
+def _multiply(
+    operation, left, right, result, n_inner, bias=None, addend=None, has_relu=False
+) -> None:
     n_parts, (n_rows, n_columns) = result.shape[:-2].numel(), result.shape[-2:]
     blocks = Blocks(
         -(-n_columns // _TILE) * n_parts,
