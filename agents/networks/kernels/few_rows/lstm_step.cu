@@ -14,9 +14,9 @@
 #include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
 
-constexpr int COLUMNS = 2;              // of eight lanes, of a warp
+constexpr int COLUMNS = 2;  // of eight lanes, of a warp
 constexpr int WARP_LANES = 8 * COLUMNS;
-constexpr int INNER = 32;               // numbers of the inner axis at once
+constexpr int INNER = 32;  // numbers of the inner axis at once
 
 static_assert(STEP_LANES == STEP_THREADS / 32 * WARP_LANES && STEP_UNITS == 8, "see above");
 
@@ -54,7 +54,8 @@ DEVICE void lstm_step(const LstmStepParams& p) {
     constexpr int UNIT_BLOCKS = W / 8;
     int thread = threadIdx.x % 32, g = thread / 4, q = thread % 4, n = p.n_lanes;
     int first_unit = 8 * (blockIdx.x % UNIT_BLOCKS), unit = first_unit + g;
-    int first_lane = WARP_LANES * (blockIdx.x / UNIT_BLOCKS * (STEP_THREADS / 32) + threadIdx.x / 32);
+    int first_lane =
+        WARP_LANES * (blockIdx.x / UNIT_BLOCKS * (STEP_THREADS / 32) + threadIdx.x / 32);
     if (first_lane >= n)
         return;
     const Bits* weight = (const Bits*)p.weight + (long long)unit * 2 * W + 8 * q;

@@ -1,8 +1,8 @@
 // Matrix products of few rows, in blocks that leave a multiprocessor to several others.
 //
-// A block computes 64 x 64 results, a warp 32 x 32 of them. Steps of 64 numbers of the inner axis are
-// copied to shared memory, one while the one before is multiplied. A matrix is copied as it is in
-// memory, and transposed as it is loaded from there.
+// A block computes 64 x 64 results, a warp 32 x 32 of them. Steps of 64 numbers of the inner axis
+// are copied to shared memory, one while the one before is multiplied. A matrix is copied as it is
+// in memory, and transposed as it is loaded from there.
 #include "bits.h"
 #include "constants.h"
 #include "params.h"
@@ -138,7 +138,7 @@ DEVICE void multiply(const ProductParams& p) {
     for (int i = 0; i < 2; i++)
 #pragma unroll
         for (int j = 0; j < 4; j++) {
-            const float(&x)[4] = sums[i][j];
+            const float (&x)[4] = sums[i][j];
             write_results(p, row + 16 * i, column + 8 * j, part, x[0], x[1]);
             write_results(p, row + 16 * i + 8, column + 8 * j, part, x[2], x[3]);
         }
