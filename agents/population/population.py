@@ -240,6 +240,7 @@ class Population:
                 # seconds count from the last of these on
                 if n_rounds <= N_PREPARING[self.turns.device.type]:
                     self.turns.each(lambda i: self.trainers[i].start_clock())
+                    self.saved_at = time.monotonic()
                 self._after_round()
         finally:
             for one in rounds:
