@@ -7,7 +7,8 @@ cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell w
 additions away.
 
 The part between two matrix products is written here in PyTorch. On a GPU it is a kernel with the
-same arguments (`megastep.agents.networks.kernels.lstm`). GPUs with clusters of blocks run a
+same arguments (`megastep.agents.networks.kernels.lstm`); acting with few lanes, one kernel has the
+product, too (`megastep.agents.networks.kernels.few_rows`). GPUs with clusters of blocks run a
 whole sequence, products included, in one kernel (`megastep.agents.networks.kernels.lstm_sequence`),
 and so does a CPU if W is a multiple of 16 (`megastep.agents.networks.lstm_cpu`).
 """

@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.nn import functional
 
+from megastep.agents.networks import products as chosen
 from megastep.agents.networks.kernels import few_rows
 from megastep.arrdict import arrdict
 
@@ -85,6 +86,45 @@ def check_step(results, inputs, is_residual):
         (output, state.output, state.cell), plain_step(*inputs, is_residual), strict=True
     ):
         torch.testing.assert_close(result.double(), expected, **SLACK)
+
+
+def test_kernels_take_few_rows_of_whole_words(cuda_on_cpu, monkeypatch):
+    capability = [9, 0]
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: tuple(capability))
+
+    def takes(*matrices):
+        return few_rows.is_supported(*map(cuda_on_cpu.tensor, matrices))
+
+    most, weight = torch.zeros(few_rows.MAX_ROWS, 16).bfloat16(), torch.zeros(24, 16).bfloat16()
+    assert takes(most, weight) and takes(most[:1], weight) and takes(most[:, 8:], weight[:, 8:])
+    assert not takes(torch.cat([most, most[:1]]), weight) and not takes(most[:0], weight)
+    assert not takes(most.float(), weight) and not takes(most, weight.float())
+    assert not takes(most[:, :12], weight[:, :12]) and not takes(most[:, 1:9], weight[:, :8])
+    assert not takes(weight.T, weight)
+    assert not few_rows.is_supported(most, weight)  # on a CPU
+    capability[0] = 7
+    assert not takes(most, weight)
+
+
+@pytest.mark.parametrize("is_few", [False, True])
+def test_products_are_the_same_by_kernels_and_by_pytorch(cuda_on_cpu, monkeypatch, is_few):
+    """In float64, but for the kernels."""
+    inputs = x, weight, bias, d, addend = product_inputs(21, 16, 24)
+    if is_few:
+        cuda_on_cpu.install(monkeypatch)
+        monkeypatch.setattr(few_rows, "is_supported", lambda *matrices: True)
+    else:
+        x, weight, bias, d, addend = (leaf.double() for leaf in inputs)
+    onto = d.clone()
+    chosen.add_layer(onto, x, weight)
+    results = [
+        chosen.layer(x.view(3, 7, -1), weight, bias).flatten(0, 1),
+        chosen.layer(x, weight, bias, has_relu=True),
+        onto,
+        chosen.of_inputs(d.view(3, 7, -1), weight).flatten(0, 1),
+        chosen.of_inputs(d, weight, addend),
+    ]
+    check_products(inputs, [result.bfloat16() for result in results] + [chosen.of_weights(d, x)])
 
 
 @PRODUCTS
