@@ -53,6 +53,8 @@ OPPONENTS = "opponents.snapshots=8", "opponents.every=200"
 #: Environments of each member: as many updates per second as the single run has with 8,192.
 LEAGUE_ENVS = {"cuda": 1024, "cpu": 64}
 EPISODES = {"cuda": 1024, "cpu": 64}
+#: Duels of each pair: the interval of a share is then 0.015 on either side.
+DUELS = {"cuda": 4096, "cpu": 64}
 NEVER = 10**15  # samples: no generation
 
 
@@ -139,7 +141,8 @@ def league(
                 (f"best of a league of {n} ranked by duels", best, [single, "hunter"]),
                 ("single run", single, ["hunter"]),
             ):
-                rows = _evaluated(run, device, f"against=[{','.join(map(str, others))}]")
+                opponents = f"against=[{','.join(map(str, others))}]"
+                rows = _evaluated(run, device, opponents, episodes=DUELS[device.type])
                 for other, row in zip(others, rows):
                     row["against"] = "the single run" if other is single else "the hunter"
                     what = f"{title}, {name}"
@@ -213,11 +216,10 @@ def _trained(parent, name, device, seconds, *words) -> Path:
     return run
 
 
-def _evaluated(run, device, *words) -> list[dict]:
+def _evaluated(run, device, *words, episodes=None) -> list[dict]:
     """Evaluates a run. Returns the rows of its table."""
-    _run(
-        "evaluate.py", f"run={run}", f"device={device}", f"episodes={EPISODES[device.type]}", *words
-    )
+    episodes = episodes or EPISODES[device.type]
+    _run("evaluate.py", f"run={run}", f"device={device}", f"episodes={episodes}", *words)
     return newest_evaluation(run)
 
 
