@@ -5,7 +5,7 @@ import functools
 import gc
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -164,9 +164,6 @@ def make(
         folders.write_config(folder, trainer.saver.config["train"])
         provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, [])
         trainers.append(trainer)
-        # Each recording of a CUDA graph looks for garbage: not among all that the members have.
-        gc.collect()
-        gc.freeze()
     turns.wait()
     repeated = None
     if cfg.rerun:
@@ -202,6 +199,7 @@ def _train(cfg, root, population) -> None:
             env_failures.told(cfg.env, root, hint, population.rank),
             signals.handled(rank.announce) as numbers,
             engine.without_early_starts(),
+            _without_garbage(),
             progress if population.rank == 0 else contextlib.nullcontext(),
             contextlib.closing(population),
         ):
@@ -227,6 +225,19 @@ def _train(cfg, root, population) -> None:
         )
     if unsaved := next((error for _, error in ends if error), None):
         raise UserError(unsaved)
+
+
+@contextlib.contextmanager
+def _without_garbage() -> Iterator[None]:
+    """What there is now is not looked through for garbage inside, as each recording of a CUDA graph
+    does: of many members, that would take longer than the recording.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def table(population: Population, root: Path) -> str:

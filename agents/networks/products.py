@@ -22,7 +22,7 @@ def layer(
         has_relu: applies a ReLU.
     """
     rows = x.flatten(0, -2)
-    if few_rows.is_supported(rows, weight):
+    if few_rows.is_supported(rows, weight) and not len(weight) % 8 and bias.is_contiguous():
         outputs = few_rows.layer(rows, weight, bias, has_relu)
     elif has_relu:
         outputs = linear_relu(rows, weight, bias)
@@ -51,7 +51,8 @@ def of_inputs(
     """
     rows = d.flatten(0, -2)
     flat = None if addend is None else addend.flatten(0, -2)
-    if few_rows.is_supported(rows, weight, *() if flat is None else (flat,)):
+    addends = () if flat is None else (flat,)
+    if few_rows.is_supported(rows, weight, *addends) and all(x.is_contiguous() for x in addends):
         result = few_rows.of_inputs(rows, weight, flat)
     else:
         result = rows @ weight if flat is None else torch.addmm(flat, rows, weight)

@@ -8,7 +8,6 @@ from the scores of all. Only rank 0's clock counts.
 from __future__ import annotations
 
 import contextlib
-import gc
 import math
 import time
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
@@ -408,7 +407,6 @@ class Population:
         """Closes the members' environments and files."""
         for trainer in self.trainers:
             trainer.close()
-        gc.unfreeze()  # what was frozen while they were made
 
 
 def _on_host(leaf: object) -> object:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import operator
 from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
@@ -19,6 +20,7 @@ from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.errors import user_errors
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.runs.saver import NoSaver
+from megastep.agents.storage.rollout import Rollout
 from megastep.agents.training.budget import Budget, Stopwatch, evaluation_in, reaches
 from megastep.agents.training.callbacks import Callbacks
 from megastep.agents.training.closing import close_env
@@ -32,7 +34,6 @@ from megastep.types import Env, optional
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.runs.annealing import AnnealingRecord
-    from megastep.agents.storage.rollout import Rollout
     from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.training.profiler import Profiler
     from megastep.agents.types import Learner, RolloutLike, RunLogger, SaverLike, StateDict
@@ -170,7 +171,7 @@ class Trainer:
             )
         self.collect = learner.collector(env)
         self.collector_options = with_defaults(self.collect, CollectorOptions)
-        self.rollout = self.usual_rollout = self.collect.rollout
+        self.rollout = self.collect.rollout
         self.curriculum = make_curriculum and make_curriculum(env, learner, self.rollout)
         allocate_layouts = self.collector_options.allocate_layouts
         if optional(env, "layout") is None or not allocate_layouts:
@@ -190,6 +191,7 @@ class Trainer:
         )
         device = torch.device(env.device)
         self.count_episodes = CudaGraphUpdate(self._count_episodes, device, graph=True)
+        self.counted_tensors: list[torch.Tensor | None] = []
         self.run_state = RunState(
             env, policy, learner, self.collect, self.episode_stats, self.curriculum
         )
@@ -349,8 +351,8 @@ class Trainer:
         self._set_lr(lr_fraction)
         losses = self.learner.update(rollout)
         self.start("rest")
-        is_usual = rollout is self.usual_rollout
-        (self.count_episodes if is_usual else self._count_episodes)(rollout)
+        keeps = self._keeps_tensors(rollout)
+        (self.count_episodes if keeps else self._count_episodes)(rollout)
         if self.curriculum is not None:
             self.curriculum.update(rollout)
         self.samples += rollout.n_steps * rollout.n_lanes * n_ranks()
@@ -360,6 +362,17 @@ class Trainer:
         if not self.clock.is_running:
             self.start_clock()
         return losses
+
+    def _keeps_tensors(self, rollout: Rollout) -> bool:
+        """Returns whether a rollout is in the memory that it was in at the first update, as a CUDA
+        graph wants it. A user's own rollout may replace its tensors, and so may a callback.
+        """
+        if type(rollout) is not Rollout:
+            return False
+        names = "reward", "starts", "terminal", "truncated", "learns", "layouts"
+        tensors = [getattr(rollout, name) for name in names] + [*rollout.metrics.values()]
+        self.counted_tensors = self.counted_tensors or tensors
+        return all(map(operator.is_, tensors, self.counted_tensors))
 
     def _count_episodes(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         self.episode_stats.add(

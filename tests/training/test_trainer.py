@@ -564,3 +564,26 @@ def test_reports_have_what_the_evaluator_measures(tmp_path):
     run.train()
     assert seen == [run.policy] * 2
     assert all(row["eval/answer"] == 42 and "eval/unknown" not in row for row in run.logger)
+
+
+def test_a_graph_counts_episodes_only_where_rollouts_keep_their_memory(tmp_path):
+    run, by_graph = make_trainer(tmp_path), []
+
+    def graph(rollout):  # stands for the CUDA graph, which reads the memory of the first update
+        by_graph.append(run.updates)
+        return run._count_episodes(rollout)
+
+    run.count_episodes = graph
+    for update in range(6):
+        run.rollout = run.collect()
+        kept = run.rollout
+        if update == 2:
+            run.rollout.reward = run.rollout.reward.clone()  # as a callback may
+        if update == 3:
+            run.rollout.reward = run.counted_tensors[0]
+        if update == 5:
+            run.rollout = SimpleNamespace(**vars(kept), reset=kept.reset)  # a user's own
+            run.learner.update = lambda rollout: {}
+        run.update()
+    assert by_graph == [0, 1, 3, 4]
+    assert run.episode_stats.pop()["episode/count"] > 0
