@@ -1,4 +1,4 @@
-"""Layers for few lanes on a GPU: each against its plain form in float64."""
+"""Products of few rows on a GPU, and the LSTM's step: each against its plain form in float64."""
 
 import pytest
 import torch

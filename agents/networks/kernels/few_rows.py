@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.library import aligned
 from megastep.arrdict import arrdict
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
@@ -17,8 +18,7 @@ from megastep.kernels.build.launch import Blocks, launch
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "few_rows", FAST_CUDA_FLAGS)
 _SIZES = LIBRARY.constants
-_TILE = _SIZES["TILE"]
-_PART = 512  # numbers of the inner axis, of a gradient of weights
+_TILE, _STEPS_OF_PART = _SIZES["TILE"], 8
 WIDTHS = 128, 256
 MAX_ROWS = _SIZES["MAX_ROWS"]
 
@@ -81,24 +81,10 @@ def of_weights(d: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         d: (N, M), that of its outputs.
         x: (N, K), its inputs.
     """
-    n_parts = -(-len(d) // _PART)
+    n_parts = -(-len(d) // (_TILE * _STEPS_OF_PART))
     parts = d.new_empty(n_parts, d.shape[1], x.shape[1], dtype=torch.float32)
     _multiply("product_of_weights", d, x, parts, len(d))
-    return parts[0] if n_parts == 1 else _sum(parts)
-
-
-def _sum(parts) -> torch.Tensor:
-    sums = torch.empty_like(parts[0])
-    n_words = sums.numel() // 4
-    blocks = Blocks(-(-n_words // _SIZES["TILE_THREADS"]), threads=_SIZES["TILE_THREADS"])
-    launch(
-        *(LIBRARY, "sum_parts", parts.device, blocks),
-        parts=parts,
-        sums=sums,
-        n_parts=len(parts),
-        n_words=n_words,
-    )
-    return sums
+    return parts[0] if n_parts == 1 else sum_rows(parts.flatten(1)).view(parts.shape[1:])
 
 
 def _multiply(

@@ -16,6 +16,7 @@
 
 constexpr int COLUMNS = 2;  // of eight lanes, of a warp
 constexpr int WARP_LANES = 8 * COLUMNS;
+constexpr int INNER = 32;  // numbers of the inner axis at once
 
 static_assert(STEP_LANES == STEP_THREADS / 32 * WARP_LANES && STEP_UNITS == 8, "see above");
 

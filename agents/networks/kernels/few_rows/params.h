@@ -19,14 +19,6 @@ struct ProductParams {
     int is_float;
 };
 
-// The sum of the parts of a product.
-struct SumPartsParams {
-    const float* parts;  // (n_parts, 4 n_words)
-    float* sums;         // (4 n_words)
-    int n_parts;
-    int n_words;
-};
-
 // A step of the LSTM: B lanes, W units. Gates are in the order input, forget, candidate, output.
 struct LstmStepParams {
     const void* x;               // (B, W) bfloat16

@@ -1,24 +1,19 @@
 // Matrix products of few rows, in blocks that leave a multiprocessor to several others.
 //
-// A block computes 64 x 64 results, a warp 32 x 32 of them. Steps of 32 numbers of the inner axis
-// are copied to shared memory, three while the one before is multiplied. A matrix is copied as it
-// is in memory, and transposed as it is loaded from there.
+// A block computes 64 x 64 results, a warp 32 x 32 of them. Steps of 64 numbers of the inner axis
+// are copied to shared memory, one while the one before is multiplied. A matrix is copied as it is
+// in memory, and transposed as it is loaded from there.
 #include "bits.h"
 #include "constants.h"
 #include "params.h"
 #include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
 
-constexpr int STAGES = 4;  // steps that are in shared memory
+constexpr int ROW = TILE + 8;  // numbers from a row to the next, so that rows are in other banks
+constexpr int MATRIX = TILE * ROW;
 constexpr int WARP_TILE = 32;
 
-// Numbers from a row to the next: eight more than it has, so that rows are in other banks.
-template <bool is_transposed>
-constexpr int ROW = (is_transposed ? TILE : INNER) + 8;
-constexpr int MATRIX = TILE * ROW<false>;
-
-static_assert(INNER * ROW<true> <= MATRIX, "a matrix fits either way");
-static_assert(TILE_BYTES == STAGES * 2 * MATRIX * sizeof(Bits), "steps of two matrices");
+static_assert(TILE_BYTES == 2 * 2 * MATRIX * sizeof(Bits), "two steps of two matrices");
 static_assert(TILE_THREADS == 32 * (TILE / WARP_TILE) * (TILE / WARP_TILE), "warps fill a block");
 
 extern __shared__ __align__(128) unsigned char shared_memory[];
@@ -30,20 +25,19 @@ struct Side {
     int first, n;
 };
 
-// Begins to copy a step's numbers of the inner axis. If they are its rows in memory, the matrix is
+// Begins to copy 64 numbers of the inner axis. If they are its rows in memory, the matrix is
 // transposed. What does not exist is 0.
 template <bool is_transposed>
 DEVICE void begin_matrix(Bits* target, const Side& side, int first_inner, int end) {
 #pragma unroll
-    for (int i = threadIdx.x; i < TILE * INNER / 8; i += TILE_THREADS) {
-        constexpr int WORDS = (is_transposed ? TILE : INNER) / 8;  // of a row in memory
-        int row = i / WORDS, column = i % WORDS * 8;
+    for (int i = threadIdx.x; i < TILE * TILE / 8; i += TILE_THREADS) {
+        int row = i / (TILE / 8), column = i % (TILE / 8) * 8;
         int outer = side.first + (is_transposed ? column : row);
         int inner = first_inner + (is_transposed ? row : column);
         bool exists = outer < side.n && inner < end;
         long long at = is_transposed ? inner * side.stride + outer : outer * side.stride + inner;
-        begin_copy_or_clear<16>(target + row * ROW<is_transposed> + column,
-                                side.numbers + (exists ? at : 0), exists);
+        begin_copy_or_clear<16>(target + row * ROW + column, side.numbers + (exists ? at : 0),
+                                exists);
     }
 }
 
@@ -56,9 +50,9 @@ DEVICE void load_square(unsigned int (&near)[2], unsigned int (&far)[2], const B
     outer += is_right ? high : low;
     inner += is_right ? low : high;
     if (is_transposed)
-        load_transposed(near, far, matrix + (inner + thread % 8) * ROW<true> + outer);
+        load_transposed(near, far, matrix + (inner + thread % 8) * ROW + outer);
     else
-        load_matrices(near, far, matrix + (outer + thread % 8) * ROW<false> + inner);
+        load_matrices(near, far, matrix + (outer + thread % 8) * ROW + inner);
 }
 
 DEVICE unsigned int& pair_at(void* array, long long index) {
@@ -94,29 +88,28 @@ DEVICE void multiply(const ProductParams& p) {
     Side left = {(const Bits*)p.left, p.left_stride, (int)blockIdx.y * TILE, p.n_rows};
     Side right = {(const Bits*)p.right, p.right_stride, (int)(blockIdx.x % n_tiles) * TILE,
                   p.n_columns};
-    int n_steps = (p.n_inner + INNER - 1) / INNER, per_part = (n_steps + p.n_parts - 1) / p.n_parts;
+    int n_steps = (p.n_inner + TILE - 1) / TILE, per_part = (n_steps + p.n_parts - 1) / p.n_parts;
     int first = part * per_part, last = min(first + per_part, n_steps);
     auto matrix = [&](int step, int side) {
-        return (Bits*)shared_memory + (2 * (step % STAGES) + side) * MATRIX;
+        return (Bits*)shared_memory + (2 * (step & 1) + side) * MATRIX;
     };
     auto begin = [&](int step) {
         if (step < last) {
-            begin_matrix<is_left_transposed>(matrix(step, 0), left, step * INNER, p.n_inner);
-            begin_matrix<is_right_transposed>(matrix(step, 1), right, step * INNER, p.n_inner);
+            begin_matrix<is_left_transposed>(matrix(step, 0), left, step * TILE, p.n_inner);
+            begin_matrix<is_right_transposed>(matrix(step, 1), right, step * TILE, p.n_inner);
         }
         end_group();
     };
     int warp = threadIdx.x / 32, g = threadIdx.x % 32 / 4, q = threadIdx.x % 4;
     int row = warp / 2 * WARP_TILE, column = warp % 2 * WARP_TILE;
     float sums[2][4][4] = {};
-    for (int step = first; step < first + STAGES - 1; step++)
-        begin(step);
+    begin(first);
     for (int step = first; step < last; step++) {
-        wait_for_copies<STAGES - 2>();
-        __syncthreads();  // the step is here, and the one before is no longer read
-        begin(step + STAGES - 1);
+        begin(step + 1);
+        wait_for_copies<1>();
+        __syncthreads();
 #pragma unroll
-        for (int k = 0; k < INNER; k += 16) {
+        for (int k = 0; k < TILE; k += 16) {
             unsigned int rows[2][4], columns[4][2];
 #pragma unroll
             for (int i = 0; i < 2; i++) {
@@ -137,6 +130,7 @@ DEVICE void multiply(const ProductParams& p) {
                 for (int j = 0; j < 4; j++)
                     multiply_add(sums[i][j], rows[i], columns[j][0], columns[j][1]);
         }
+        __syncthreads();
     }
     row += left.first + g;
     column += right.first + 2 * q;
@@ -164,17 +158,4 @@ KERNEL BOUNDS(128) product_of_inputs(ProductParams p) {
 KERNEL BOUNDS(128) product_of_weights(ProductParams p) {
     wait_for_previous();
     multiply<true, true>(p);
-}
-
-KERNEL BOUNDS(128) sum_parts(SumPartsParams p) {
-    wait_for_previous();
-    int i = blockIdx.x * blockDim.x + threadIdx.x;
-    if (i >= p.n_words)
-        return;
-    float4 sum = {0.f, 0.f, 0.f, 0.f};
-    for (int part = 0; part < p.n_parts; part++) {
-        float4 x = ((const float4*)p.parts)[(long long)part * p.n_words + i];
-        sum = {sum.x + x.x, sum.y + x.y, sum.z + x.z, sum.w + x.w};
-    }
-    ((float4*)p.sums)[i] = sum;
 }
