@@ -1,5 +1,6 @@
 """The matrix products of layers and of their gradients: those of few rows on a GPU by kernels of
-our own, see `megastep.agents.networks.kernels.few_rows`, and others by PyTorch.
+our own, see `megastep.agents.networks.kernels.few_rows`, and others by PyTorch. Gradients of
+weights are always by PyTorch, which splits the rows that they add up.
 
 N rows, K inputs, M outputs; `...` any leading axes. All matrices of a product have one dtype.
 """
@@ -67,8 +68,6 @@ def of_weights(d: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
         d: (N, M), that of its outputs.
         x: (N, K), its inputs.
     """
-    if few_rows.is_supported(d, x):
-        return few_rows.of_weights(d, x)
     if d.is_cuda and d.dtype != torch.float32:
         return torch.mm(d.T, x, out_dtype=torch.float32)
     return (d.T @ x).float()

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import torch
 
-from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.library import aligned
 from megastep.arrdict import arrdict
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
@@ -18,7 +17,7 @@ from megastep.kernels.build.launch import Blocks, launch
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "few_rows", FAST_CUDA_FLAGS)
 _SIZES = LIBRARY.constants
-_TILE, _STEPS_OF_PART = _SIZES["TILE"], 8
+_TILE = _SIZES["TILE"]
 WIDTHS = 128, 256
 MAX_ROWS = _SIZES["MAX_ROWS"]
 
@@ -74,29 +73,12 @@ def of_inputs(
     return result
 
 
-def of_weights(d: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """Returns the gradient (M, K) float32 of a layer's weights.
-
-    Args:
-        d: (N, M), that of its outputs.
-        x: (N, K), its inputs.
-    """
-    n_parts = -(-len(d) // (_TILE * _STEPS_OF_PART))
-    parts = d.new_empty(n_parts, d.shape[1], x.shape[1], dtype=torch.float32)
-    _multiply("product_of_weights", d, x, parts, len(d))
-    return parts[0] if n_parts == 1 else sum_rows(parts.flatten(1)).view(parts.shape[1:])
-
-
 def _multiply(
     operation, left, right, result, n_inner, bias=None, addend=None, has_relu=False
 ) -> None:
-    n_parts, (n_rows, n_columns) = result.shape[:-2].numel(), result.shape[-2:]
-    blocks = Blocks(
-        -(-n_columns // _TILE) * n_parts,
-        -(-n_rows // _TILE),
-        _SIZES["TILE_THREADS"],
-        _SIZES["TILE_BYTES"],
-    )
+    n_rows, n_columns = result.shape
+    n_tiles = -(-n_columns // _TILE), -(-n_rows // _TILE)
+    blocks = Blocks(*n_tiles, _SIZES["TILE_THREADS"], _SIZES["TILE_BYTES"])
     launch(
         *(LIBRARY, operation, left.device, blocks),
         left=left,
@@ -107,12 +89,10 @@ def _multiply(
         n_rows=n_rows,
         n_columns=n_columns,
         n_inner=n_inner,
-        n_parts=n_parts,
         left_stride=left.stride(0),
         right_stride=right.stride(0),
-        result_stride=result.stride(-2),
+        result_stride=result.stride(0),
         has_relu=int(has_relu),
-        is_float=int(result.dtype == torch.float32),
     )
 
 

@@ -3,20 +3,18 @@
 
 // A matrix product: (M, K) times (K, N). Strides are numbers from one row in memory to the next.
 struct ProductParams {
-    const void* left;    // bfloat16: (M, K), or (K, M) in memory
+    const void* left;    // (M, K) bfloat16
     const void* right;   // bfloat16: (N, K) in memory, or (K, N)
     const void* bias;    // (N) bfloat16; null: none
     const void* addend;  // (M, N) bfloat16, with the stride of the result; null: none
-    void* result;        // (M, N) bfloat16; or (parts, M, N) float32, a sum for each part of K
+    void* result;        // (M, N) bfloat16
     int n_rows;          // M
     int n_columns;       // N, a multiple of 8
     int n_inner;         // K
-    int n_parts;         // of K, 1 if the result is bfloat16
     int left_stride;     // a multiple of 8, as the other strides
     int right_stride;
     int result_stride;
     int has_relu;
-    int is_float;
 };
 
 // A step of the LSTM: B lanes, W units. Gates are in the order input, forget, candidate, output.

@@ -60,14 +60,9 @@ DEVICE unsigned int& pair_at(void* array, long long index) {
 }
 
 // Writes two neighbouring results.
-DEVICE void write_results(const ProductParams& p, int row, int column, int part, float x, float y) {
+DEVICE void write_results(const ProductParams& p, int row, int column, float x, float y) {
     if (row >= p.n_rows || column >= p.n_columns)
         return;
-    if (p.is_float) {
-        long long at = ((long long)part * p.n_rows + row) * p.n_columns + column;
-        *(float2*)((float*)p.result + at) = {x, y};
-        return;
-    }
     long long at = (long long)row * p.result_stride + column;
     if (p.bias) {
         unsigned int bias = pair_at((void*)p.bias, column);
@@ -82,20 +77,17 @@ DEVICE void write_results(const ProductParams& p, int row, int column, int part,
     pair_at(p.result, at) = p.has_relu ? pack_relu(x, y) : pack_bfloat16(x, y);
 }
 
-template <bool is_left_transposed, bool is_right_transposed>
+template <bool is_right_transposed>
 DEVICE void multiply(const ProductParams& p) {
-    int n_tiles = (p.n_columns + TILE - 1) / TILE, part = blockIdx.x / n_tiles;
     Side left = {(const Bits*)p.left, p.left_stride, (int)blockIdx.y * TILE, p.n_rows};
-    Side right = {(const Bits*)p.right, p.right_stride, (int)(blockIdx.x % n_tiles) * TILE,
-                  p.n_columns};
-    int n_steps = (p.n_inner + TILE - 1) / TILE, per_part = (n_steps + p.n_parts - 1) / p.n_parts;
-    int first = part * per_part, last = min(first + per_part, n_steps);
+    Side right = {(const Bits*)p.right, p.right_stride, (int)blockIdx.x * TILE, p.n_columns};
+    int n_steps = (p.n_inner + TILE - 1) / TILE;
     auto matrix = [&](int step, int side) {
         return (Bits*)shared_memory + (2 * (step & 1) + side) * MATRIX;
     };
     auto begin = [&](int step) {
-        if (step < last) {
-            begin_matrix<is_left_transposed>(matrix(step, 0), left, step * TILE, p.n_inner);
+        if (step < n_steps) {
+            begin_matrix<false>(matrix(step, 0), left, step * TILE, p.n_inner);
             begin_matrix<is_right_transposed>(matrix(step, 1), right, step * TILE, p.n_inner);
         }
         end_group();
@@ -103,8 +95,8 @@ DEVICE void multiply(const ProductParams& p) {
     int warp = threadIdx.x / 32, g = threadIdx.x % 32 / 4, q = threadIdx.x % 4;
     int row = warp / 2 * WARP_TILE, column = warp % 2 * WARP_TILE;
     float sums[2][4][4] = {};
-    begin(first);
-    for (int step = first; step < last; step++) {
+    begin(0);
+    for (int step = 0; step < n_steps; step++) {
         begin(step + 1);
         wait_for_copies<1>();
         __syncthreads();
@@ -114,7 +106,7 @@ DEVICE void multiply(const ProductParams& p) {
 #pragma unroll
             for (int i = 0; i < 2; i++) {
                 unsigned int near[2], far[2];
-                load_square<is_left_transposed, false>(near, far, matrix(step, 0), row + 16 * i, k);
+                load_square<false, false>(near, far, matrix(step, 0), row + 16 * i, k);
                 rows[i][0] = near[0];
                 rows[i][1] = near[1];
                 rows[i][2] = far[0];
@@ -139,23 +131,18 @@ DEVICE void multiply(const ProductParams& p) {
 #pragma unroll
         for (int j = 0; j < 4; j++) {
             const float (&x)[4] = sums[i][j];
-            write_results(p, row + 16 * i, column + 8 * j, part, x[0], x[1]);
-            write_results(p, row + 16 * i + 8, column + 8 * j, part, x[2], x[3]);
+            write_results(p, row + 16 * i, column + 8 * j, x[0], x[1]);
+            write_results(p, row + 16 * i + 8, column + 8 * j, x[2], x[3]);
         }
 }
 
 // Of a layer: inputs, and weights (N, K).
 KERNEL BOUNDS(128) product_of_layer(ProductParams p) {
     wait_for_previous();
-    multiply<false, false>(p);
+    multiply<false>(p);
 }
 // Of the inputs' gradient: that of the outputs, and weights (K, N).
 KERNEL BOUNDS(128) product_of_inputs(ProductParams p) {
     wait_for_previous();
-    multiply<false, true>(p);
-}
-// Of the weights' gradient: that of the outputs (K, M), and inputs (K, N).
-KERNEL BOUNDS(128) product_of_weights(ProductParams p) {
-    wait_for_previous();
-    multiply<true, true>(p);
+    multiply<true>(p);
 }
