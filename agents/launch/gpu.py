@@ -14,9 +14,18 @@ from pathlib import Path
 from megastep.agents import console
 
 
+def ask_for_queues() -> None:
+    """Has the driver make 32 queues for streams instead of 8, unless the user says how many: a
+    population has a stream for each member, and streams that share a queue wait for each other.
+    Call it before the driver starts.
+    """
+    os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
+
+
 @functools.cache
 def driver() -> ctypes.CDLL | None:
     """Returns the initialised driver library; None without a driver or a GPU."""
+    ask_for_queues()  # whatever is trained: settings are composed while the driver starts
     with contextlib.suppress(OSError):
         library = ctypes.CDLL("libcuda.so.1")
         if library.cuInit(0) == 0:

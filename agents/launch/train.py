@@ -70,8 +70,8 @@ def run(cfg: settings.Train) -> Path | None:
     """
     if cfg.dry_run:
         return dry_run.show(cfg)
-    if cfg.population.size > 1:  # members' streams share the GPU's queues, of which CUDA makes 8
-        os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
+    if cfg.population.size > 1:  # not from a command line, where the driver has started
+        gpu.ask_for_queues()
     if launcher.is_needed(cfg):
         return launcher.run(cfg)
     with rank.joined() as team:

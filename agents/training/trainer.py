@@ -471,12 +471,12 @@ class Trainer:
             perf/collect: seconds of collecting since the last report, on a GPU of the GPU; with
                 `learner.lag`, as far as the learner waits for it.
             perf/update: seconds of updates, in the same way.
-            perf/rest: seconds of everything else: statistics, logging, checkpoints, evaluations. Of
-                a population, whose members' work overlaps, the first alone has these three.
+            perf/rest: seconds of everything else: statistics, logging, checkpoints, evaluations.
             perf/seconds_to_stop: seconds of training at which an evaluation reached `stop`.
             perf/memory_allocated: on a GPU, bytes of tensors.
             perf/memory_reserved: on a GPU, bytes that PyTorch has reserved.
-            perf/memory_peak: on a GPU, the most bytes of tensors so far.
+            perf/memory_peak: on a GPU, the most bytes of tensors so far. Of a population, whose
+                members share the GPU, the first alone has these three, and the times of phases.
 
         Raises the errors that `env.check()` does, and DriftError if the ranks' weights differ.
         """
@@ -528,7 +528,8 @@ class Trainer:
             perf["perf/rate"] = self.samples_per_second
             phases = {} if self.timer is None else self.timer.pop()
             perf |= {f"perf/{phase}": seconds_of for phase, seconds_of in phases.items()}
-        perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
+        memory = {} if self.leader is not None else device_memory(self.env.device)
+        perf |= {f"perf/memory_{name}": n for name, n in memory.items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
         self.updates_at_log = self.updates
         with unhurried():
