@@ -1,4 +1,4 @@
-"""The GPU's driver as the command line starts it."""
+"""Queues of the GPU for streams."""
 
 import ctypes
 import os
