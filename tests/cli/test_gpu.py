@@ -1,5 +1,6 @@
 """GPUs are found before PyTorch is imported, at a stand-in for the driver."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -11,6 +12,25 @@ from megastep.agents.cli import scripts, train
 from megastep.agents.launch import gpu
 from megastep.agents.runs import checkpoint
 from tests.helpers.tiny import TINY, settings
+
+#: Prints how many times as long as one stream 32 take that do the same, each on its own.
+STREAMS = """
+from megastep.agents.launch import gpu
+gpu.start_driver()
+gpu.wake("cuda")
+import time, torch
+streams = [torch.cuda.Stream() for _ in range(32)]
+def seconds(n):
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    for stream in streams[:n]:
+        with torch.cuda.stream(stream):
+            torch.cuda._sleep(20_000_000)
+    torch.cuda.synchronize()
+    return time.perf_counter() - start
+seconds(32)
+print(seconds(32) / seconds(1))
+"""
 
 
 class Driver:
@@ -48,6 +68,14 @@ def installed(monkeypatch):
 
     yield install
     gpu.driver.cache_clear()
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    """The environment variables of a process whose driver has not started."""
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    os.environ.pop("CUDA_DEVICE_MAX_CONNECTIONS", None)
+    return os.environ
 
 
 @pytest.mark.parametrize(
@@ -130,3 +158,21 @@ assert torch.cuda.memory_allocated() == 0
 assert (torch.ones(8, device="cuda") @ torch.ones(8, device="cuda")).item() == 8
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("users, expected", [(None, "32"), ("4", "4")])
+def test_queues_are_asked_for_before_the_driver_starts(environment, installed, users, expected):
+    seen, driver = [], installed(Driver())
+    driver.cuInit = lambda flags: seen.append(os.environ["CUDA_DEVICE_MAX_CONNECTIONS"]) or 0
+    if users:
+        environment["CUDA_DEVICE_MAX_CONNECTIONS"] = users
+    assert gpu.driver() is driver
+    assert seen == [expected]
+
+
+@pytest.mark.cuda
+def test_32_streams_run_side_by_side(environment):
+    done = subprocess.run(
+        [sys.executable, "-c", STREAMS], capture_output=True, text=True, env=environment, check=True
+    )
+    assert float(done.stdout) < 2  # 4 with the 8 queues of CUDA's
