@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import torch
 
+from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
@@ -49,7 +50,9 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
         `actor_state`.
     """
     world, state = actor_state["world"], actor_state["state"]
-    rollout.state[:] = state
+    copy_all(zip(leaves(rollout.state), leaves(state), strict=True))
+    # actions are stored before a user's code sees them, which also is in what steps on the host
+    is_ours = type(env).__module__.startswith("megastep.envs.") and optional(env, "capturable")
     features = []
     with policy.compute_dtype():
         seen = rollout.store_world(0, world)
@@ -57,14 +60,15 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
             with torch.autocast(rollout.reward.device.type, enabled=False):
                 optional(env, "begin_step")()
             decision, state = policy(seen, state)
-            rollout.store_decision(t, decision)
+            if not is_ours:
+                rollout.store_decision(t, decision)
             if rollout.values is not None:
                 features.append(decision["features"])
             with torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
             layout = None if rollout.layouts is None else optional(env, "layout")
-            seen = rollout.store_outcome(t, world, layout)
+            seen = rollout.store_outcome(t, world, layout, decision if is_ours else None)
 
         if rollout.values is not None:
             features.append(policy(seen, state, sample=False)[0]["features"])
@@ -73,8 +77,7 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     # A non-finite hidden state would otherwise last until the lane's episode ends.
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=_stored(world), state=state)
-    for target, source in zip(leaves(actor_state), leaves(after), strict=True):
-        target.copy_(source)
+    copy_all(zip(leaves(actor_state), leaves(after), strict=True))
     return actor_state
 
 

@@ -133,19 +133,25 @@ class Rollout:
         """Stores the actions of time t, and log-probabilities if the decision has them. Call it
         before the environment steps, which may change actions in place.
         """
-        pairs = _pairs(self.actions, t, decision["actions"])
-        if "logprobs" in decision:
-            pairs.append((self.logprobs[t], decision["logprobs"]))
-        copy_all(pairs)
+        copy_all(self._of_decision(t, decision))
 
-    def store_outcome(self, t: int, world: arrdict, layout: torch.Tensor | None = None) -> arrdict:
+    def store_outcome(
+        self,
+        t: int,
+        world: arrdict,
+        layout: torch.Tensor | None = None,
+        decision: Mapping | None = None,
+    ) -> arrdict:
         """Stores the world after the action of time t: reward, episode end, metrics in row t, the
         observation in row t + 1. Returns `world(t + 1)`, the stored observation.
 
         Args:
             layout: (N,) integers, the environments' layouts in that world, if they are stored.
+            decision: is stored with it, as `store_decision` does.
         """
         pairs = [*self._of_transition(t, world), *self._of_world(t + 1, world)]
+        if decision is not None:
+            pairs += self._of_decision(t, decision)
         if layout is not None:
             n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
             by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
@@ -153,6 +159,13 @@ class Rollout:
             pairs.append((self.layouts[t], self.select_lanes(by_lane)))
         copy_all(pairs)
         return self.world(t + 1)
+
+    def _of_decision(self, t, decision) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Returns (target, source) pairs for a decision at time t."""
+        pairs = _pairs(self.actions, t, decision["actions"])
+        if "logprobs" in decision:
+            pairs.append((self.logprobs[t], decision["logprobs"]))
+        return pairs
 
     def _of_world(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Returns (target, source) pairs for the observation of time t."""

@@ -5,14 +5,15 @@ time and key.
 import pytest
 import torch
 
-from megastep import spaces
+from megastep import contract, envs, geometries, spaces
 from megastep.agents.algorithms.returns import gae
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector, collect, initial_actor_state
 from megastep.agents.storage.rollout import Rollout, without_last
-from megastep.arrdict import arrdict
+from megastep.arrdict import arrdict, clone
 from megastep.capture import state_tree
 from megastep.dotdict import leaves
+from tests.helpers import web
 
 B, T = 6, 5
 
@@ -136,6 +137,22 @@ def test_actions_are_stored_as_they_were_chosen():
     for t, actions in enumerate(env.actions):
         assert torch.equal(rollout.actions.move[t], actions.move)
         assert torch.equal(rollout.actions.fire[t], actions.fire)
+
+
+@pytest.mark.parametrize("name", [*web.ENVS, "minimal"])
+def test_environments_of_megastep_leave_actions_as_they_are(name):
+    """Their actions are stored after the step, with what came of them."""
+    homes = geometries.sample("homes", 3, seed=7)
+    minimal = envs.Minimal(geometries=homes, n_envs=3, device="cpu")
+    env = minimal if name == "minimal" else web.made(name)
+    assert type(env).__module__.startswith("megastep.envs.")
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        actions = contract.random_actions(env, generator)
+        before = clone(actions)
+        env.step(arrdict(actions=actions))
+        assert contract.same(actions, before)
 
 
 def test_logprobs_and_values_match_unroll():
