@@ -70,7 +70,7 @@ def run(cfg: settings.Train) -> Path | None:
     """
     if cfg.dry_run:
         return dry_run.show(cfg)
-    if cfg.population.size > 1:  # not from a command line, where the driver has started
+    if cfg.population.size > 1:  # from Python; a command has asked before its driver started
         gpu.ask_for_queues()
     if launcher.is_needed(cfg):
         return launcher.run(cfg)

@@ -51,7 +51,8 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     """
     world, state = actor_state["world"], actor_state["state"]
     copy_all(zip(leaves(rollout.state), leaves(state), strict=True))
-    # actions are stored before a user's code sees them, which also is in what steps on the host
+    # A user's code may change actions, also inside an environment that steps on the host: there
+    # they are stored before the step, elsewhere with what comes of it.
     is_ours = type(env).__module__.startswith("megastep.envs.") and optional(env, "capturable")
     features = []
     with policy.compute_dtype():
