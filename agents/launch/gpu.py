@@ -25,7 +25,7 @@ def ask_for_queues() -> None:
 @functools.cache
 def driver() -> ctypes.CDLL | None:
     """Returns the initialised driver library; None without a driver or a GPU."""
-    ask_for_queues()  # whatever is trained: settings are composed while the driver starts
+    ask_for_queues()  # for every command, as the driver starts before settings are known
     with contextlib.suppress(OSError):
         library = ctypes.CDLL("libcuda.so.1")
         if library.cuInit(0) == 0:

@@ -241,15 +241,12 @@ def _without_garbage() -> Iterator[None]:
 
 
 def table(population: Population, root: Path) -> str:
-    """Returns a table of the members: score, ancestor at the first generation, settings. All ranks
-    call it.
+    """Returns a table of the members: the score by which commands find the best, ancestor at the
+    first generation, settings. All ranks call it, once all members have written their metrics.
     """
-    is_return = population.score in (populations.RUNNING, populations.EVALUATED)
-    scores: list[float | None] = population.gathered(
-        [
-            one.evaluation.get("return", one.score) if is_return else population.score_of(one)
-            for one in population.trainers
-        ]
+    folders = [trainer.saver.folder.parent for trainer in population.trainers]
+    scores = population.gathered(
+        [populations.score_of(folder, population.score) for folder in folders]
     )
     generations = populations.read(root / populations.FILE)
     keys = [*population.vary]
@@ -258,11 +255,12 @@ def table(population: Population, root: Path) -> str:
         rows.append(
             [
                 str(member),
-                "" if score in (None, -math.inf) else f"{score:.4g}",
+                "" if score is None else f"{score:.4g}",
                 str(populations.lineage(generations, member)[0]),
                 *(f"{population.settings[member][key]:.3g}" for key in keys),
                 str(population.n_diverged[member] or ""),
             ]
         )
+    is_return = population.score in (populations.RUNNING, populations.EVALUATED)
     title = "return" if is_return else population.score
     return console.table(["member", title, "descends from", *keys, "diverged"], rows)

@@ -3,6 +3,7 @@
 import itertools
 import json
 import random
+import re
 import shutil
 import time
 from pathlib import Path
@@ -301,8 +302,10 @@ def test_a_member_that_diverges_is_replaced_and_named(here, capsys):
 
 
 def test_members_are_ranked_by_another_statistic_of_their_last_report(here, capsys):
-    run(*POPULATION, LONG, "population.score=length")
-    assert " length " in capsys.readouterr().out
+    world = *tiny.TINY, *tiny.SHORT_EPISODES  # of different lengths
+    run(*world, *POPULATION[len(SMALL) - 3 :], LONG, "population.score=length")
+    out = capsys.readouterr().out
+    assert " length " in out
     reports = [json_lines.read(here / f"P/member-{n}/metrics.jsonl") for n in range(3)]
     generations = populations.read(here / "P" / populations.FILE)
     assert any("score" in row for rows in generations for row in rows)
@@ -312,7 +315,10 @@ def test_members_are_ranked_by_another_statistic_of_their_last_report(here, caps
             if "score" in row:
                 assert row["score"] == report["episode/length"]
     lengths = [scores.mean(rows, "length") for rows in reports]
-    assert populations.best(here / "P") == lengths.index(max(lengths))
+    assert lengths != [rows[-1]["episode/length"] for rows in reports]
+    assert re.findall(r"(?m)^│ \d +│ ([\d.]+) ", out) == [f"{length:.4g}" for length in lengths]
+    best = lengths.index(max(lengths))
+    assert populations.best(here / "P") == best and f"P/member-{best}\n" in out
 
 
 BAD = {
