@@ -28,12 +28,12 @@ from megastep.agents.runs import (
     formats,
     populations,
     provenance,
-    repeat,
     saver,
 )
 from megastep.agents.runs.rank_files import RankFiles
-from megastep.agents.training import budget, loggers
+from megastep.agents.training import budget, loggers, repeat
 from megastep.agents.training.profiler import Profiler
+from megastep.agents.training.snapshots import SnapshotSaver
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.imports import import_object
@@ -131,7 +131,7 @@ def make_trainer(
             snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
             writers = dict(
                 on_log=on_log,
-                snapshot_saver=saver.SnapshotSaver(snapshots, cfg.snapshots),
+                snapshot_saver=SnapshotSaver(snapshots, cfg.snapshots),
                 annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
                 profiler=Profiler(folder, cfg.profile, device) if cfg.profile else None,
             )

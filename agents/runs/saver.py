@@ -1,4 +1,4 @@
-"""Saves checkpoints of a run, and snapshots of the weights at even intervals of the budget."""
+"""Saves checkpoints of a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from megastep.agents.runs import checkpoint, checkpoint_format
 from megastep.agents.runs.rank_files import RankFiles
 
 if TYPE_CHECKING:
-    from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import Config, Row, StateDict
 
 #: A replay buffer of up to this many bytes is in every checkpoint.
@@ -259,25 +258,3 @@ def _free_memory() -> float:
 
 def _nbytes(state) -> int:
     return sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
-
-
-class SnapshotSaver:
-    """Saves what the policy acts with at the end of each of `n` equal parts of the budget.
-
-    `evaluate.py ratings=true` compares these snapshots. :class:`Trainer` calls it once per update.
-
-    Args:
-        saver: writes the snapshots.
-        n: number of snapshots; 0 for none.
-    """
-
-    def __init__(self, saver: Saver, n: int):
-        self.saver, self.n = saver, n
-        self.n_parts_done = None
-
-    def __call__(self, trainer: Trainer) -> None:
-        n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
-        if self.n_parts_done is not None and n_parts_done > self.n_parts_done:
-            self.saver(trainer.samples, trainer.run_state.of_policy())
-            self.saver.wait()
-        self.n_parts_done = n_parts_done

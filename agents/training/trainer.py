@@ -18,7 +18,6 @@ from megastep.agents.distributed.plan import Plan, agree
 from megastep.agents.distributed.process_group import counts, n_ranks, rank, unhurried, waiting
 from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.errors import user_errors
-from megastep.agents.runs.run_state import RunState
 from megastep.agents.runs.saver import NoSaver
 from megastep.agents.storage.rollout import Rollout
 from megastep.agents.training.budget import Budget, Stopwatch, evaluation_in, reaches
@@ -28,6 +27,7 @@ from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, l
 from megastep.agents.training.loggers import NoLogger
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import PHASES, PhaseTimer, device_memory
+from megastep.agents.training.run_state import RunState
 from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
@@ -73,7 +73,7 @@ class Trainer:
             the first after each so many. A checkpoint follows, whose score is the return that was
             measured; other checkpoints have none. None: all reports.
         stop: by name, what the evaluator must measure at least for the run to end.
-        snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
+        snapshot_saver: such as `snapshots.SnapshotSaver`: called with the trainer before the first
             update and after each.
         repeat_hint: returns how to meet the first NaN or infinity of the run again, as the rest of
             a sentence, see `NonFiniteGuard`; it gets the trainer, too.
