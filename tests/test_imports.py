@@ -48,7 +48,7 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("errors", "generator", "package", "private_ops", "types"),
+    ("errors", "generator", "package", "types"),
     ("distributed",),
     ("console", "networks"),
     ("storage",),

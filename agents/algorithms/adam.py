@@ -10,7 +10,6 @@ from types import MappingProxyType
 import torch
 
 from megastep.agents.algorithms.kernels import LIBRARY
-from megastep.agents.private_ops import adamw_
 from megastep.agents.types import StateDict
 from megastep.kernels.build.launch import Blocks, launch
 
@@ -112,7 +111,19 @@ class Adam:
             rows = [(p, p.grad, *moments) for p, *moments in members if p.grad is not None]
             if rows:
                 lr = self.lr if factor == 1 else self.lr * factor
-                adamw_(rows, self.n_steps, lr, self.betas, weight_decay, self.eps, is_taken)
+                torch._fused_adamw_(
+                    *map(list, zip(*rows)),
+                    max_exp_avg_sqs=[],
+                    state_steps=[self.n_steps] * len(rows),
+                    lr=lr,
+                    beta1=self.betas[0],
+                    beta2=self.betas[1],
+                    weight_decay=weight_decay,
+                    eps=self.eps,
+                    amsgrad=False,
+                    maximize=False,
+                    found_inf=(~is_taken).float(),
+                )
 
     def step_on_gpu(
         self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None, max_norm: float

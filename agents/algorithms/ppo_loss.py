@@ -11,7 +11,6 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import masked_mean
-from megastep.agents.private_ops import scale_all
 from megastep.arrdict import arrdict
 from megastep.coefficients import on_device
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
@@ -139,5 +138,5 @@ class _FusedLoss(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_loss, d_metrics) -> tuple[torch.Tensor | None, ...]:
         # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
-        gradients = scale_all(ctx.saved_tensors, d_loss)
+        gradients = torch._foreach_mul(ctx.saved_tensors, d_loss)
         return *gradients, *[None] * (7 - len(gradients))

@@ -13,7 +13,6 @@ from megastep.agents.distributed import symmetric_memory
 from megastep.agents.distributed.bucket import Layout
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
-from megastep.agents.private_ops import copy_all_
 from megastep.agents.types import Moments
 
 
@@ -133,7 +132,7 @@ def average_gradients(
         bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)
         *parts, pooled = bucket.split([*sizes, len(numbers)])
         parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
-        copy_all_([*parts, *pooled.unbind()], [*gradients, *numbers])
+        torch._foreach_copy_([*parts, *pooled.unbind()], [*gradients, *numbers])
         all_reduce(bucket.mul_(n_valid))
         n = pooled[-1].clone()
         bucket /= n.clamp(min=1)

@@ -16,7 +16,6 @@ from torch.nn import functional as F
 from megastep import spaces
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.outputs import Output
-from megastep.agents.private_ops import standard_gamma
 
 # Actions closer to a bound count as this far from it: atanh would be infinite.
 _MAX_X = 1 - 2**-20
@@ -142,7 +141,7 @@ class BetaOutput(_BoundedOutput):
         self, logits: torch.Tensor, generator: torch.Generator | None = None
     ) -> torch.Tensor:
         """Samples actions."""
-        alpha, beta = standard_gamma(logits, generator).chunk(2, -1)
+        alpha, beta = torch._standard_gamma(logits, generator).chunk(2, -1)
         return self._actions(2 * alpha / (alpha + beta) - 1)
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:

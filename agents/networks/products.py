@@ -8,7 +8,6 @@ N rows, K inputs, M outputs; `...` any leading axes. All matrices of a product h
 import torch
 
 from megastep.agents.networks.kernels import few_rows
-from megastep.agents.private_ops import linear_relu
 
 
 def layer(
@@ -26,7 +25,7 @@ def layer(
     if few_rows.is_supported(rows, weight) and not len(weight) % 8 and bias.is_contiguous():
         outputs = few_rows.layer(rows, weight, bias, has_relu)
     elif has_relu:
-        outputs = linear_relu(rows, weight, bias)
+        outputs = torch._addmm_activation(bias, rows, weight.T)
     else:
         outputs = torch.addmm(bias, rows, weight.T)
     return outputs.unflatten(0, x.shape[:-1])

@@ -13,7 +13,6 @@ from collections.abc import Callable
 import torch
 
 from megastep.agents.networks.policy import Policy
-from megastep.agents.private_ops import copy_all_
 from megastep.agents.storage.collector import Collector, initial_actor_state
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import StateDict
@@ -39,7 +38,7 @@ class _Slot:
         self.end = None
 
     def copy_weights(self) -> None:
-        copy_all_([*self.weights.values()], self.sources)
+        torch._foreach_copy_([*self.weights.values()], self.sources)
 
 
 class AsyncCollector:
