@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from megastep.agents.distributed.process_group import counts, exchange, joint
+from megastep.agents.distributed.process_group import counts, exchange
 
 
 class Plan(NamedTuple):
@@ -22,7 +22,7 @@ class Plan(NamedTuple):
 def agree(plan: Plan, is_stopped: bool, is_behind: bool) -> Plan:
     """Returns the plan of rank 0, whose clock decides, unless a rank is stopped or behind.
 
-    Waits for the other ranks, also those that train `apart`.
+    Waits for the other ranks, those that train other members of a population included.
 
     Args:
         plan: this rank's plan.
@@ -30,8 +30,7 @@ def agree(plan: Plan, is_stopped: bool, is_behind: bool) -> Plan:
         is_behind: this rank is still writing the last checkpoint, so no rank saves another.
     """
     counts.n_updates += 1
-    with joint():
-        rows = exchange([*plan, is_stopped, is_behind])
+    rows = exchange([*plan, is_stopped, is_behind])
     goes_on, saves, lr_fraction, *_ = rows[0]
     *_, are_stopped, are_behind = zip(*rows, strict=True)
     return Plan(

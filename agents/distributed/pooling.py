@@ -1,9 +1,11 @@
-"""Sums, moments and gradients pooled over all ranks. Never synchronises, so updates can use it.
+"""Sums, moments and gradients pooled over the ranks that train one policy. Never synchronises, so
+updates can use it.
 
 R ranks.
 """
 
-from collections.abc import Iterable, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from typing import cast
 
 import torch
@@ -15,6 +17,24 @@ from megastep.agents.distributed.process_group import communicating, n_ranks, ra
 from megastep.agents.distributed.segments import between_graphs
 from megastep.agents.types import Moments
 
+_is_alone = False
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Pools nothing inside: each rank trains policies of its own, members of a population."""
+    global _is_alone
+    before, _is_alone = _is_alone, True
+    try:
+        yield
+    finally:
+        _is_alone = before
+
+
+def n_pooled() -> int:
+    """Returns R, the ranks that train one policy: 1 in a single process, and `alone`."""
+    return 1 if _is_alone else n_ranks()
+
 
 def all_reduce(tensor: torch.Tensor) -> torch.Tensor:
     """Sums a tensor over the ranks, in place, and returns it."""
@@ -23,14 +43,14 @@ def all_reduce(tensor: torch.Tensor) -> torch.Tensor:
         with communicating():
             distributed.all_reduce(tensor)
 
-    if n_ranks() > 1:
+    if n_pooled() > 1:
         between_graphs(call)
     return tensor
 
 
 def all_gather(tensor: torch.Tensor) -> torch.Tensor:
     """Returns the tensors of all ranks, (R, ...)."""
-    if n_ranks() == 1:
+    if n_pooled() == 1:
         return tensor[None]
     gathered = tensor.new_zeros(n_ranks(), *tensor.shape)
     gathered[rank()] = tensor
@@ -39,7 +59,7 @@ def all_gather(tensor: torch.Tensor) -> torch.Tensor:
 
 def on_all_ranks(condition: torch.Tensor) -> torch.Tensor:
     """Returns () bool, true if the condition, () bool, is true on every rank."""
-    if n_ranks() == 1:
+    if n_pooled() == 1:
         return condition
     return all_reduce((~condition).int()) == 0
 
@@ -55,7 +75,7 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     Returns:
         The moments over the entries of all ranks.
     """
-    if n_ranks() == 1 or not moments:
+    if n_pooled() == 1 or not moments:
         return list(moments)
     own_counts, own_means, own_variances = zip(*moments)
     sizes = [mean.numel() for mean in own_means]
@@ -88,7 +108,7 @@ def pool_with_condition(
     condition: torch.Tensor, *moments: Moments
 ) -> tuple[torch.Tensor, list[Moments]]:
     """Returns `on_all_ranks(condition)` and `pool_moments(*moments)`, in one collective."""
-    if n_ranks() == 1:
+    if n_pooled() == 1:
         return condition, list(moments)
     one = torch.ones_like(condition, dtype=torch.int64)
     is_false = (~condition).float()
@@ -115,7 +135,7 @@ def average_gradients(
         The sum of n_valid over the ranks, and the averaged means.
     """
     means = [value.detach() for value in means]
-    if n_ranks() == 1:
+    if n_pooled() == 1:
         return n_valid, means
     with torch.no_grad():
         held = [(p, p.grad) for p in parameters if p.grad is not None]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import contextvars
 import datetime
 import faulthandler
 import functools
@@ -85,40 +84,6 @@ def waiting() -> Iterator[None]:
         yield
     finally:
         counts.is_waiting = before
-
-
-#: Whether ranks train apart, and whether what is done now is done by all together nonetheless. The
-#: second is a thread's own: threads in the background belong to what is apart.
-_is_apart, _IS_JOINT = False, contextvars.ContextVar("is_joint", default=False)
-
-
-@contextlib.contextmanager
-def apart() -> Iterator[None]:
-    """Makes each rank behave as a single process, but for what is `joint`: they train members of a
-    population, which have nothing in common.
-    """
-    global _is_apart
-    before, _is_apart = _is_apart, True
-    was_joint = _IS_JOINT.set(False)
-    try:
-        yield
-    finally:
-        _IS_JOINT.reset(was_joint)
-        _is_apart = before
-
-
-@contextlib.contextmanager
-def joint() -> Iterator[None]:
-    """Inside `apart`, wraps what all ranks do together."""
-    was_joint = _IS_JOINT.set(True)
-    try:
-        yield
-    finally:
-        _IS_JOINT.reset(was_joint)
-
-
-def _has_others() -> bool:
-    return distributed.is_initialized() and (_IS_JOINT.get() or not _is_apart)
 
 
 def start(seconds: float = START_SECONDS) -> None:
@@ -237,13 +202,13 @@ def stop() -> None:
 
 
 def rank() -> int:
-    """Returns this process's rank, 0 to R - 1; 0 in a single process, and `apart`."""
-    return distributed.get_rank() if _has_others() else 0
+    """Returns this process's rank, 0 to R - 1; 0 in a single process."""
+    return distributed.get_rank() if distributed.is_initialized() else 0
 
 
 def n_ranks() -> int:
-    """Returns R; 1 in a single process, and `apart`."""
-    return distributed.get_world_size() if _has_others() else 1
+    """Returns R; 1 in a single process."""
+    return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
 def local_rank() -> int | None:

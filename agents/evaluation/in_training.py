@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -16,6 +17,9 @@ from megastep.env_state import EnvState
 from megastep.settings import closest
 from megastep.types import Env, optional
 
+if TYPE_CHECKING:
+    from megastep.agents.distributed.ranks import Ranks
+
 
 class Evaluator:
     """Measures a policy in episodes of environments of its own, in unseen homes. Each call plays
@@ -25,16 +29,18 @@ class Evaluator:
         cfg: settings of the run.
         trained_in: the environment of the training, whose wrappers may have learnt something.
         device: where to play.
+        ranks: those that train the policy, which share the episodes.
 
     Raises:
         ConfigErrors: `cfg.stop` names what no evaluation measures.
     """
 
-    def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device):
+    def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: "Ranks"):
+        rank = (0, 1) if ranks.n == 1 else None
         homes = factory.homes(cfg.env, cfg.geometry, "test")
         self.trained_in, self.state, self.start = trained_in, None, None
         with _generators_kept(device):
-            self.stage = arena.Stage(cfg.env, homes, cfg.evaluate_episodes, cfg.seed, device)
+            self.stage = arena.Stage(cfg.env, homes, cfg.evaluate_episodes, cfg.seed, device, rank)
             names = ["return", "length", *self.stage.env.reset().get("metrics", {})]
             if optional(self.stage.env, "resumable"):
                 self.state = EnvState(self.stage.env)

@@ -16,7 +16,7 @@ import torch
 
 from megastep.agents import console, factory, package
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
-from megastep.agents.distributed import process_group
+from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, settings
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
@@ -53,6 +53,7 @@ def make_trainer(
     leader: Trainer | None = None,
     n_members: int = 1,
     homes: list[dict] | None = None,
+    ranks: Ranks | None = None,
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
@@ -67,8 +68,9 @@ def make_trainer(
         leader: the first member of a population, for the others.
         n_members: trainers of a population that memory is to hold from this one on.
         homes: the floor plans to train in, if they are made already.
+        ranks: those that train the policy; None: all that there are.
     """
-    number, n_ranks = process_group.rank(), process_group.n_ranks()
+    number, n_ranks = ranks = world() if ranks is None else ranks
     seed = rank_seed(cfg.seed, number)
     seed_everything(seed)
     if homes is None:
@@ -109,7 +111,7 @@ def make_trainer(
     measured = {}
     if cfg.evaluate_every is not None and make_evaluator is not None:
         measured = dict(
-            evaluator=make_evaluator(cfg, env, device),
+            evaluator=make_evaluator(cfg, env, device, ranks),
             evaluate_every=settings.every(cfg.evaluate_every),
             stop=cfg.stop,
         )
@@ -152,6 +154,7 @@ def make_trainer(
             repeat_hint=functools.partial(repeat.hint, is_resumed=cfg.resume is not None),
             callbacks=[import_object(name)() for name in cfg.callbacks],
             leader=leader,
+            ranks=ranks,
             timetable=populations.schedule(Path(path)) if (path := cfg.population.schedule) else (),
             **measured,
             **writers,

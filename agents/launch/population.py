@@ -5,16 +5,17 @@ import functools
 import gc
 import math
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from megastep import engine
 from megastep.agents import console, factory, package
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import environment, process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
-from megastep.agents.distributed.process_group import joint
+from megastep.agents.distributed.pooling import alone
+from megastep.agents.distributed.ranks import ONE
 from megastep.agents.errors import ConfigErrors, EnvFailed, NonFinite, UserError, memory_problem
 from megastep.agents.evaluation import in_training
 from megastep.agents.factory import env_failures, settings
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
 
     from megastep.agents.training.trainer import Trainer
 
-T = TypeVar("T")
-
 #: Checkpoints that a member keeps at least: while one is being written, and the one before may be
 #: unfinished elsewhere, all members have the one before that.
 KEPT = 3
@@ -46,32 +45,26 @@ def run(cfg: settings.Train, team: rank.Team | None = None) -> Path:
         Interrupted: a signal came; all members were saved.
         UserError: training cannot start or continue.
     """
-    with process_group.apart():
-        return _run(cfg, team)
-
-
-def _run(cfg, team) -> Path:
-    with joint():
-        is_first, n_ranks = process_group.rank() == 0, process_group.n_ranks()
-        device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
-        rank_checks.check_start(cfg)
-        cfg = rank_checks.started_again(cfg, team)
+    is_first, n_ranks = process_group.rank() == 0, process_group.n_ranks()
+    device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
+    rank_checks.check_start(cfg)
+    cfg = rank_checks.started_again(cfg, team)
     if n_ranks > cfg.population.size:
         problem = f"{n_ranks} is more than the members of the population"
         raise ConfigErrors([("ranks", f"{problem}; use population.size={n_ranks} or more")])
     with contextlib.ExitStack() as locks:
         with contextlib.ExitStack() as undo:
-            with signals.deferred(), joint():
+            with signals.deferred():
                 root, checkpoints = from_rank_0(lambda: _open(cfg, locks))
                 if is_first and not checkpoints:
                     undo.callback(shutil.rmtree, root, ignore_errors=True)
-            with joint():
-                rank_checks.check_shared(root)
+            rank_checks.check_shared(root)
             if team:
                 team.set_folder(root)
             told = env_failures.told(cfg.env, root, rank=environment.rank())
             try:
-                population = _together(told(lambda: make(cfg, root, device, checkpoints)))
+                with alone():
+                    population = together(told(lambda: make(cfg, root, device, checkpoints)))
             except EnvFailed:
                 undo.pop_all()  # the folder has the traceback
                 raise
@@ -82,29 +75,23 @@ def _run(cfg, team) -> Path:
                 ranks = f"{n_ranks} x {device.type}" if n_ranks > 1 else device
                 console.say(f"Training {cfg.population.size} members on {ranks} in {root}")
             undo.pop_all()
-        _train(cfg, root, population)
+        with alone():
+            _train(cfg, root, population)
         samples, text = population.samples, table(population, root)
         del population
+        best = from_rank_0(lambda: populations.member(root))
         if is_first:
             console.say(text)
-            best = populations.member(root)
-            with process_group.unhurried():
-                finishing.finish(cfg, best, samples)
+        finishing.finish(cfg, best, samples)
+        if is_first:
             if cfg.rerun:
                 compare.population(root, Path(cfg.rerun))
             console.say(
                 f"Trained {samples:,} samples of each member. The best is in {best}\n"
                 f"To evaluate it: {folders.command_of('evaluate', 'run', root)}"
             )
-        with joint():
-            process_group.exchange([0])  # the others wait for what follows on rank 0
+        process_group.exchange([0])  # the others wait for what follows on rank 0
     return root
-
-
-def _together(function: Callable[[], T]) -> T:
-    """Calls `agreement.together`; the function makes what a rank has for itself."""
-    with joint():
-        return together(process_group.apart()(function))
 
 
 def _open(cfg, locks) -> tuple[Path, list[Path]]:
@@ -158,6 +145,7 @@ def make(
                 leader=trainers[0] if trainers else None,
                 n_members=1 if trainers else len(members),
                 homes=homes,
+                ranks=ONE,
             )
         check_score(chosen.score, trainer)
         trainer.checkpoint_seconds = math.inf
@@ -217,8 +205,7 @@ def _train(cfg, root, population) -> None:
             for trainer in population.trainers:
                 curves.plot_curves(trainer.saver.folder.parent)
     unsaved = next((one.saver.error for one in population.trainers if one.saver.error), None)
-    with joint():
-        ends = process_group.gather_objects((numbers[:1], unsaved))
+    ends = process_group.gather_objects((numbers[:1], unsaved))
     if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
         raise signals.Interrupted(
             signal, f"Stopped after {population.samples:,} samples of each member. {hint()}"

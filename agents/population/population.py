@@ -24,7 +24,6 @@ from megastep.agents.distributed.process_group import (
     exchange,
     from_rank,
     gather_objects,
-    joint,
     n_ranks,
     rank,
     unhurried,
@@ -59,8 +58,7 @@ class Learnt(NamedTuple):
 
 def hosted(size: int) -> range:
     """Returns the numbers of the members that this rank trains: every R-th."""
-    with joint():
-        return range(rank(), size, n_ranks())
+    return range(rank(), size, n_ranks())
 
 
 class Turns:
@@ -174,14 +172,12 @@ class Population:
         self.trainers, self.turns, self.seed, self.every = [*trainers], turns, seed, every
         self.size, self.visitor = size or len(trainers), visitor
         self.members = hosted(self.size)
-        with joint():
-            self.rank, self.n_ranks = rank(), n_ranks()
+        self.rank, self.n_ranks = rank(), n_ranks()
         self.vary, self.exploit, self.explore, self.score = vary, exploit, explore, score
         self.repeated = repeated
         self.checkpoint_seconds, self.saved_at = checkpoint_seconds, time.monotonic()
         self.path = folder / populations.FILE
-        with joint():
-            generations = from_rank_0(self._earlier)
+        generations = from_rank_0(self._earlier)
         self.lines = json_lines.JsonLines(self.path) if self.rank == 0 else None
         self.generation = len(generations) - 1
         self.n_diverged = [0] * self.size
@@ -270,8 +266,7 @@ class Population:
         if self.repeated is not None:  # when a budget was spent, the clock may have decided
             is_due, is_left = self.samples in self.repeated, True
         seconds = time.monotonic() - self.saved_at
-        with joint():
-            rows = exchange([is_left, seconds >= self.checkpoint_seconds])
+        rows = exchange([is_left, seconds >= self.checkpoint_seconds])
         goes_on, saves = rows[0]
         if is_due and goes_on:
             self.take_over()
@@ -339,8 +334,7 @@ class Population:
 
     def gathered(self, values: Sequence[T]) -> list[T]:
         """Returns a value of each member, from those of the members that this rank hosts."""
-        with joint():
-            by_rank = gather_objects([*values])
+        by_rank = gather_objects([*values])
         return [by_rank[n % self.n_ranks][n // self.n_ranks] for n in range(self.size)]
 
     def copy(self, source: int, target: int) -> None:
@@ -375,8 +369,7 @@ class Population:
         if learnt is not None:
             parts = learnt.policy.state_dict(), learnt.learner.state_dict(), learnt.wrappers
             state = tree_map(_on_host, parts)
-        with joint():
-            state = from_rank(source % self.n_ranks, state)
+        state = from_rank(source % self.n_ranks, state)
         if target not in self.members:
             return None
         assert state is not None and self.visitor is not None

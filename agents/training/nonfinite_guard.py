@@ -10,9 +10,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
-from megastep.agents.distributed.agreement import from_rank_0
-from megastep.agents.distributed.process_group import rank, rank_label, unhurried
-from megastep.agents.distributed.reports import gather_if_any
+from megastep.agents.distributed.process_group import rank_label, unhurried
+from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
@@ -35,6 +34,7 @@ class NonFiniteGuard:
         learner: its `check` is read. Without one, only metrics are checked.
         make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,
             such as `repeat.hint`. Called on rank 0.
+        ranks: those that train the policy.
 
     Attributes:
         value: the first NaN or infinity of the run, or None.
@@ -46,7 +46,14 @@ class NonFiniteGuard:
 
     tolerates_divergence = has_diverged = False
 
-    def __init__(self, env: Env, learner: Learner, make_hint: Callable[[NonFiniteValue], str]):
+    def __init__(
+        self,
+        env: Env,
+        learner: Learner,
+        make_hint: Callable[[NonFiniteValue], str],
+        ranks: Ranks = ONE,
+    ):
+        self.ranks = ranks
         self.learner, self.make_hint, self.device = learner, make_hint, env.device
         self.n_agents = optional(env, "n_agents")
         self.nonfinite_check = with_defaults(learner, LearnerOptions).check
@@ -70,14 +77,14 @@ class NonFiniteGuard:
         if value:
             value = value.in_env(_env_lanes(rollout), self.n_agents)
         is_bad = value is not None or n_skipped > 0
-        reports = gather_if_any((n_skipped, value, rank_label()), is_bad, self.device)
+        reports = self.ranks.gather_if_any((n_skipped, value, rank_label()), is_bad, self.device)
         n_skipped = max(report[0] for report in reports)
         _, value, label = next((one for one in reports if one[1]), reports[0])
         text = f"{value}{f' ({label})' * (len(reports) > 1)}"
         if value and self.value is None:
             with unhurried():
-                self.value, self.hint = value, from_rank_0(lambda: self.make_hint(value))
-            if rank() == 0:
+                self.value, self.hint = value, self.ranks.from_first(lambda: self.make_hint(value))
+            if self.ranks.rank == 0:
                 warnings.warn(f"{text}; its rollout was skipped{self.hint}", stacklevel=2)
         self.has_diverged = n_skipped >= MAX_SKIPPED
         if not self.has_diverged:
@@ -101,10 +108,10 @@ class NonFiniteGuard:
             for name, lane in episode_stats.pop_bad_metrics().items()
         }
         of_rank = {name: (lane, rank_label()) for name, lane in bad.items()}
-        reports = gather_if_any(of_rank, bool(bad), self.device)
+        reports = self.ranks.gather_if_any(of_rank, bool(bad), self.device)
         of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
         episode_stats.named |= of_all.keys()
-        for name, (lane, label) in of_all.items() if rank() == 0 else ():
+        for name, (lane, label) in of_all.items() if self.ranks.rank == 0 else ():
             where = f" ({label})" * (len(reports) > 1)
             warnings.warn(
                 f"metrics.{name} of {lane}{where} was not finite at the end of an episode; such "

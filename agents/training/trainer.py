@@ -12,11 +12,10 @@ import torch
 
 from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue
-from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
-from megastep.agents.distributed.process_group import counts, n_ranks, rank, unhurried, waiting
-from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
+from megastep.agents.distributed.process_group import counts, unhurried, waiting
+from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import user_errors
 from megastep.agents.runs.saver import NoSaver
 from megastep.agents.storage.rollout import Rollout
@@ -89,6 +88,7 @@ class Trainer:
             of a population that is asked first.
         timetable: (samples, settings) each, in order: settings by key, such as `learner.lr`, that
             are set after so many samples, see `set_settings`.
+        ranks: those that train this policy together; None: all that there are.
 
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
@@ -137,7 +137,9 @@ class Trainer:
         callbacks: Sequence[object] = (),
         leader: Trainer | None = None,
         timetable: Sequence[tuple[int, Mapping[str, float]]] = (),
+        ranks: Ranks | None = None,
     ):
+        self.ranks = world() if ranks is None else ranks
         self.env, self.policy, self.learner = env, policy, learner
         self.logger = NoLogger() if logger is None else logger
         self.saver = NoSaver() if saver is None else saver
@@ -195,7 +197,9 @@ class Trainer:
         self.run_state = RunState(
             env, policy, learner, self.collect, self.episode_stats, self.curriculum
         )
-        self.nonfinite_guard = NonFiniteGuard(env, learner, lambda value: repeat_hint(self, value))
+        self.nonfinite_guard = NonFiniteGuard(
+            env, learner, lambda value: repeat_hint(self, value), self.ranks
+        )
         self.clock = Stopwatch() if leader is None else leader.clock
         self.timer = PhaseTimer(env.device, counts.finish_phase) if leader is None else None
         self.samples = self.updates = 0
@@ -275,7 +279,7 @@ class Trainer:
                 self.save_what_was_learnt()
             raise
         except Exception:
-            if n_ranks() > 1:  # the others are elsewhere
+            if self.ranks.n > 1:  # the others are elsewhere
                 self.saver.give_up()
                 raise
             with contextlib.suppress(Exception):  # the first error is the one to report
@@ -355,7 +359,7 @@ class Trainer:
         (self.count_episodes if keeps else self._count_episodes)(rollout)
         if self.curriculum is not None:
             self.curriculum.update(rollout)
-        self.samples += rollout.n_steps * rollout.n_lanes * n_ranks()
+        self.samples += rollout.n_steps * rollout.n_lanes * self.ranks.n
         self.updates += 1
         if self.opponents is not None:
             self.opponents.refresh_snapshots(self.policy, self.updates)
@@ -482,28 +486,29 @@ class Trainer:
         """
         self.wait_for_collector()
         optional(self.env, "check")()
-        check_drift(self.policy, self.extra)
+        if self.ranks.n > 1:
+            check_drift(self.policy, self.extra)
         loss_values = [torch.as_tensor(loss, device=self.env.device) for loss in losses.values()]
         loss_values = torch.stack(loss_values).tolist() if losses else []
         loss_values = dict(zip(losses, loss_values, strict=True))
         self.nonfinite_guard.warn_of_metrics(self.episode_stats, self.rollout)
-        stats = self.episode_stats.pop(sum_over_ranks)
+        stats = self.episode_stats.pop(self.ranks.sum)
         if self.opponents is not None:
-            stats |= self.opponents.pop_win_rates(sum_over_ranks)
+            stats |= self.opponents.pop_win_rates(self.ranks.sum)
         of_curriculum = {} if self.curriculum is None else self.curriculum.stats()
         evaluation = {}
-        if self.evaluate_every is None or any_rank(self._evaluation_is_due()):
+        if self.evaluate_every is None or self.ranks.any(self._evaluation_is_due()):
             with unhurried(), self.clock.paused():
                 evaluation = self.evaluator(self.policy)
         evaluation = {f"eval/{name}": value for name, value in evaluation.items()}
-        means = mean_over_ranks({**of_curriculum, **loss_values, **evaluation})
+        means = self.ranks.mean({**of_curriculum, **loss_values, **evaluation})
         if evaluation:
             self.evaluated_at = self.samples
             self.evaluation = {n[5:]: means[n] for n in evaluation if n in means}
         stats |= {name: means[name] for name in of_curriculum if name in means}
         if (n_restarts := optional(self.env, "pop_restarts")()) is not None:
             n_restarts = torch.tensor([n_restarts], device=self.env.device)
-            stats["episode/restarts"] = int(sum_over_ranks(n_restarts))
+            stats["episode/restarts"] = int(self.ranks.sum(n_restarts))
         self.latest_stats.update(stats)
         self.reported_stats = stats
         if self.read_lr:
@@ -556,13 +561,13 @@ class Trainer:
             is_last: no other checkpoint follows.
         """
         self.seconds_at_checkpoint = self.clock.seconds
-        if not any_rank(not self.is_saved or (is_last and self.saver.lacks_replay)):
+        if not self.ranks.any(not self.is_saved or (is_last and self.saver.lacks_replay)):
             return
-        if rank() == 0:
+        if self.ranks.rank == 0:
             self.run_state.warn_of_unreachable()
         state = self.state_dict() if state is None else state
         # a checkpoint must not reach further than what is on disk of the run's files
-        if any_rank(not self._sync_files()) and not is_last:
+        if self.ranks.any(not self._sync_files()) and not is_last:
             return
         score = self.score
         if self.evaluate_every is not None:

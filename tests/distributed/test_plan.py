@@ -2,8 +2,9 @@
 
 import pytest
 
-from megastep.agents.distributed import agreement, plan, reports
+from megastep.agents.distributed import agreement, plan, process_group
 from megastep.agents.distributed.plan import Plan
+from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.errors import UserError
 from megastep.agents.generator import rank_seed
 
@@ -88,10 +89,10 @@ def test_any_rank(others):
 def test_mean_over_ranks_leaves_out_nan(monkeypatch):
     nan = float("nan")
     values = {"a": 1.0, "b": nan, "c": nan}
-    assert reports.mean_over_ranks(values) == {"a": 1}
+    assert ONE.mean(values) == {"a": 1}
     rows = [values, {"a": 3.0, "b": 5.0, "c": nan}]
-    monkeypatch.setattr(reports, "gather_objects", lambda value: rows)
-    assert reports.mean_over_ranks(values) == {"a": 2, "b": 5}
+    monkeypatch.setattr(process_group, "gather_objects", lambda value: rows)
+    assert Ranks(0, 2).mean(values) == {"a": 2, "b": 5}
 
 
 def test_each_rank_has_a_seed_of_its_own():

@@ -8,7 +8,8 @@ import torch
 from megastep.agents.algorithms.masked_stats import pooled_mean, pooled_normalise
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
-from megastep.agents.distributed import pooling, process_group, reports
+from megastep.agents.distributed import pooling, process_group
+from megastep.agents.distributed.ranks import world
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.storage.rollout import Rollout
 from tests.helpers import ranks
@@ -101,9 +102,9 @@ def every(device="cpu"):
         pooled=pooled[0],
         doubles=pooling.pool_moments(several[0], (*third, torch.zeros_like(third[1])))[1],
         nothing=pooling.pool_moments(),
-        total=reports.sum_over_ranks(x[:1]),
-        needed=reports.gather_if_any(rank, rank == 1, device),
-        not_needed=reports.gather_if_any(rank, False, device),
+        total=world().sum(x[:1]),
+        needed=world().gather_if_any(rank, rank == 1, device),
+        not_needed=world().gather_if_any(rank, False, device),
         sum=pooling.all_reduce(x[:1].clone()),
         gathered=pooling.all_gather(x[0]),
         none_true=pooling.on_all_ranks(torch.tensor(rank == 1, device=device)),

@@ -5,8 +5,9 @@ import contextlib
 import pytest
 import torch
 
+from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.runs import json_lines, provenance
-from megastep.agents.training import nonfinite_guard, trainer
+from megastep.agents.training import nonfinite_guard
 from megastep.agents.training.episode_stats import EpisodeStats
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from tests.training.test_trainer import UPDATE, Pairs, always, make_trainer
@@ -22,16 +23,19 @@ def one_by_one(monkeypatch):
     of_rank_1 = []
 
     def act_as(rank):
-        def gather(value, is_needed, device):
-            if rank == 1:
-                assert is_needed, "rank 0 would not be told"
-                of_rank_1.append(value)
-                return [value, value]
-            return [value, of_rank_1.pop(0)]
+        class Made(Ranks):
+            def gather_if_any(self, value, is_needed, device):
+                if rank == 1:
+                    assert is_needed, "rank 0 would not be told"
+                    of_rank_1.append(value)
+                    return [value, value]
+                return [value, of_rank_1.pop(0)]
 
-        monkeypatch.setattr(nonfinite_guard, "gather_if_any", gather)
-        monkeypatch.setattr(nonfinite_guard, "rank", lambda: rank)
+            def from_first(self, function):
+                return function()
+
         monkeypatch.setattr(nonfinite_guard, "rank_label", lambda: LABELS[rank])
+        return Made(rank, 2)
 
     return act_as
 
@@ -50,8 +54,7 @@ def test_means_are_over_the_episodes_of_all_ranks():
 def test_nan_of_another_rank_is_told_by_rank_0(tmp_path, one_by_one, recwarn):
     trainers = []
     for rank, faults in ((1, {("reward", 2, 3): torch.nan}), (0, {})):
-        one_by_one(rank)
-        run = make_trainer(tmp_path, faults)
+        run = make_trainer(tmp_path, faults, ranks=one_by_one(rank))
         run.rollout = run.collect()
         run.update()
         assert not run.nonfinite_guard.check(run.rollout)
@@ -65,8 +68,7 @@ def test_nan_of_another_rank_is_told_by_rank_0(tmp_path, one_by_one, recwarn):
 def test_all_ranks_end_with_the_same_sentence(tmp_path, one_by_one):
     sentences = []
     for rank, faults in ((1, always("reward", 2, torch.nan)), (0, {})):
-        one_by_one(rank)
-        run = make_trainer(tmp_path, faults)
+        run = make_trainer(tmp_path, faults, ranks=one_by_one(rank))
         for _ in range(MAX_SKIPPED):
             run.rollout = run.collect()
             run.update()
@@ -81,8 +83,7 @@ def test_all_ranks_end_with_the_same_sentence(tmp_path, one_by_one):
 
 def test_metric_of_another_rank_is_named_once(tmp_path, one_by_one, recwarn):
     for rank in (1, 0):
-        one_by_one(rank)
-        run = make_trainer(tmp_path, env=Pairs({}))
+        run = make_trainer(tmp_path, env=Pairs({}), ranks=one_by_one(rank))
         run.rollout = run.collect()
         run.episode_stats.bad_lanes[0] = 2 if rank else 6
         run.nonfinite_guard.warn_of_metrics(run.episode_stats, run.rollout)
@@ -91,9 +92,15 @@ def test_metric_of_another_rank_is_named_once(tmp_path, one_by_one, recwarn):
     assert run.episode_stats.named == {"age"}
 
 
-def test_samples_of_all_ranks_are_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr(trainer, "n_ranks", lambda: 3)
-    run = make_trainer(tmp_path, samples=6 * UPDATE)
+class Three(Ranks):
+    """Stands for three ranks of which this one speaks for all."""
+
+    any, mean, sum, from_first = ONE.any, ONE.mean, ONE.sum, ONE.from_first
+    gather_if_any = ONE.gather_if_any
+
+
+def test_samples_of_all_ranks_are_counted(tmp_path):
+    run = make_trainer(tmp_path, samples=6 * UPDATE, ranks=Three(0, 3))
     run.train()
     assert run.updates == 2 and run.samples == 6 * UPDATE
 
