@@ -94,7 +94,7 @@ def train(task, units, seed, words):
     factors = FACTORS.get(task, FACTORS[None]).format(*units)
     with tempfile.TemporaryDirectory() as folder:
         words = [*TASKS[task].split(), *factors.split(), f"seed={seed}", *words]
-        words += [f"folder={folder}/run", "logger={}", "checkpoint_seconds=1e6"]
+        words += [f"folder={folder}/run", "logger={}", "checkpoints.seconds=1e6"]
         with contextlib.redirect_stdout(io.StringIO()):
             assert cli.main(words) == 0
         rows = json_lines.read(Path(folder, "run", "metrics.jsonl"))

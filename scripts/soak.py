@@ -31,8 +31,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from megastep.agents.runs import checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
-WORDS = "device=cpu env.n_envs=4 agent.width=8 learner.n_steps=8 log_every=1"
-WORDS += " checkpoint_seconds=0.05"
+WORDS = "device=cpu env.n_envs=4 agent.width=8 learner.n_steps=8 logging.every=1"
+WORDS += " checkpoints.seconds=0.05"
 MINIMAL = "env=minimal geometry=box env.res=8"
 PONG = "env=pong env.self_play=true opponents.past=0.5 opponents.snapshots=2 opponents.every=10"
 REPLAY = "learner.gradient_steps=2 learner.replay.capacity=400 learner.replay.burn_in=4"

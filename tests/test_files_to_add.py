@@ -140,7 +140,8 @@ def test_one_of_each_is_added_to_a_copy(tmp_path):
 
     assert run("-m", "megastep", "greet", "you") == "hello you\n"
     chosen = "env=count env.limit=4 env.n_envs=8 learner=slow learner.patience=2 agent.core=leaky"
-    chosen += " agent.width=8 logger=memo logger.memo.word=said samples=256 log_every=1 folder=run"
+    chosen += " agent.width=8 logger=memo logger.memo.word=said samples=256 folder=run"
+    chosen += " logging.every=1"
     run("train.py", *chosen.split(), "device=cpu")
     config = json.loads(next((tmp_path / "run").glob("checkpoints/*/config.json")).read_text())
     train = config["train"]

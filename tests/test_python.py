@@ -29,7 +29,7 @@ TINY = dict(
     geometry="box",
     learner={"n_steps": 8, "n_minibatches": 2},
     agent={"width": 8},
-    log_every=4,
+    logging={"every": 4},
     device="cpu",
 )
 

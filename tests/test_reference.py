@@ -45,7 +45,7 @@ def test_settings_say_what_applies():
     rows = {row.key: row for row in reference.settings_of("env", "pettingzoo")}
     assert rows["`env.n_envs`"][2:4] == ("16", "")  # the file that it begins with has 32
     rows = {row.key: row for row in reference.settings_of_script("train")}
-    assert rows["`log_every`"][2:] == ("100", "4", "updates between two lines of metrics")
+    assert rows["`logging.every`"][2:] == ("100", "4", "updates between two lines of metrics")
 
 
 @pytest.mark.parametrize("name", ["deathmatch", "explorer", "keys", "memory", "pointgoal", "pong"])

@@ -51,14 +51,14 @@ The most common words:
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
                                learner.buffer=replay also learns from old experience
-  evaluate_every=60s stop.return=475
-                               evaluate while training, also evaluate_every=1M, and end the run when
-                               an evaluation reaches a return, or stop.success=0.95
+  evaluation.every=60s evaluation.stop.return=475
+                               evaluate while training, also every 1M samples, and end the run when
+                               one reaches this return, or evaluation.stop.success=0.95
   finish.evaluate=true finish.record=true
                                a table and a video at the end
   opponents.past=0.4 opponents.bot=0.1
                                with several agents: fractions of environments against past selves
-                               and a scripted policy; snapshots=8 saves weights for ratings
+                               and a scripted policy; checkpoints.snapshots=8 is for ratings
   curriculum=sfl               draw homes that are won half of the time more often; plr: where
                                values err most
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
@@ -84,10 +84,10 @@ REPEATABLE = (
     "folder",
     "device",
     "trust",
-    "checkpoint_seconds",
-    "keep_checkpoints",
-    "replay_every",
-    "profile",
+    "logging.profile",
+    "checkpoints.seconds",
+    "checkpoints.keep",
+    "checkpoints.replay_every",
     "restarts",
     "dry_run",
     "logger",
@@ -95,7 +95,7 @@ REPEATABLE = (
 )
 #: The keys that may be written with units, and their kind.
 QUANTITIES = {
-    **dict.fromkeys(("seconds", "more_seconds", "checkpoint_seconds"), "seconds"),
+    **dict.fromkeys(("seconds", "more_seconds", "checkpoints.seconds"), "seconds"),
     **dict.fromkeys(("samples", "more_samples", "population.every"), "samples"),
 }
 #: The keys that take a run, each with what is said of a key that cannot go with it.

@@ -257,7 +257,7 @@ class Arena:
         if len(players) < 2:
             raise UserError(
                 f"{folder} has one checkpoint and nothing to compare it with: train with "
-                "snapshots=8, or name others with against="
+                "checkpoints.snapshots=8, or name others with against="
             )
         played = {
             (i, j): self.play(players[i], players[j])

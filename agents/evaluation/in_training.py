@@ -32,7 +32,7 @@ class Evaluator:
         ranks: those that train the policy, which share the episodes.
 
     Raises:
-        ConfigErrors: `cfg.stop` names what no evaluation measures.
+        ConfigErrors: `cfg.evaluation.stop` names what no evaluation measures.
     """
 
     def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: "Ranks"):
@@ -40,15 +40,17 @@ class Evaluator:
         homes = factory.homes(cfg.env, cfg.geometry, "test")
         self.trained_in, self.state, self.start = trained_in, None, None
         with _generators_kept(device):
-            self.stage = arena.Stage(cfg.env, homes, cfg.evaluate_episodes, cfg.seed, device, rank)
+            self.stage = arena.Stage(
+                cfg.env, homes, cfg.evaluation.episodes, cfg.seed, device, rank
+            )
             names = ["return", "length", *self.stage.env.reset().get("metrics", {})]
             if optional(self.stage.env, "resumable"):
                 self.state = EnvState(self.stage.env)
                 self.start = clone(self.state.state_dict())
-        for name in cfg.stop:
+        for name in cfg.evaluation.stop:
             if name not in names:
                 text = f"no evaluation here measures it; {closest(name, names)}"
-                raise ConfigErrors([(f"stop.{name}", text)])
+                raise ConfigErrors([(f"evaluation.stop.{name}", text)])
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """Returns the means of `return`, `length` and each metric of the environment."""

@@ -159,17 +159,24 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
     return f"{f'{group[:-1]} has' if group else 'there are'} {', '.join(sorted(inside))}"
 
 
-#: Keys of earlier versions, and what replaced them.
-GONE = {
-    "preset": "values follow device=cpu or device=cuda, and what you type wins",
-    "nonfinite_replay": "resuming reproduces a NaN; the warning has the command",
+#: Keys of earlier versions, and the new ones.
+MOVED = {
+    "log_every": "logging.every",
+    "profile": "logging.profile",
+    "evaluate_every": "evaluation.every",
+    "evaluate_episodes": "evaluation.episodes",
+    "stop": "evaluation.stop",
+    "checkpoint_seconds": "checkpoints.seconds",
+    "keep_checkpoints": "checkpoints.keep",
+    "replay_every": "checkpoints.replay_every",
+    "snapshots": "checkpoints.snapshots",
 }
 
 
 def _unknown(path: list[str], keys: list[str]) -> str:
     group, leaf = path[0], path[-1]
-    if group in GONE:
-        return f"no such key; {GONE[group]}"
+    if group in MOVED:
+        return f"is now called {MOVED[group]}"
     for member, name in components.members(group).items() if group in settings.IMPORTED else ():
         if path[1:] == [leaf] and leaf in settings.kind_of(group, name).__pydantic_fields__:
             return f"no such key here; {group}={member} has it"

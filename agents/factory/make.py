@@ -20,6 +20,7 @@ from megastep.agents.factory.settings import (
     Geometry,
     Learner,
     Train,
+    Trained,
     changed,
     env_name,
     label,
@@ -50,8 +51,6 @@ PROBE = 65
 LARGE, FEW = 2**28, 4096
 #: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
-#: Stands for a learner of a user's, where it does not learn.
-UNNEEDED = "megastep.agents.algorithms.ppo:PPO"
 #: What the library raises for bad arguments, files and devices, and for too little memory.
 KINDS = (
     ValueError,
@@ -414,14 +413,12 @@ def in_env(bot: PolicyLike, settings: Env, env: types.Env) -> PolicyLike:
     return construct(settings, type(bot), env=env) if takes_env else bot
 
 
-def config_of(loaded: checkpoint.Checkpoint) -> Train:
-    """Returns the settings that a checkpoint was trained with. UserError if they cannot be used."""
-    train = loaded.config["train"] | {"logger": {}, "callbacks": []}
-    # who plays needs no learner and no loggers, and classes of another user's may not be here
-    if not str(train["learner"]["name"]).startswith("megastep."):
-        train["learner"] = {"name": UNNEEDED}
+def config_of(loaded: checkpoint.Checkpoint) -> Trained:
+    """Returns what a checkpoint's agent was trained in. UserError if it cannot be used."""
+    train = loaded.config["train"]
+    tree = {key: train[key] for key in Trained.__dataclass_fields__ if key in train}
     with user_errors(f"{loaded.path} cannot be used: ", (ConfigErrors,)):
-        return check.check(Train, train)
+        return check.check(Trained, tree)
 
 
 def spaces_of(env: types.Env) -> dict[str, str]:

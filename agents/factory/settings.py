@@ -113,7 +113,7 @@ def _every(given: int | float | str) -> int | str:
 
 
 def every(value: float | str) -> tuple[float, str]:
-    """Returns (number, "samples" or "seconds") of `evaluate_every`."""
+    """Returns (number, "samples" or "seconds") of `evaluation.every`."""
     return (float(value[:-1]), "seconds") if isinstance(value, str) else (value, "samples")
 
 
@@ -423,7 +423,7 @@ def population_errors(cfg: "Train") -> dict[str, object]:
                 problem = str(error)
         if problem:
             errors["population.vary"] = f"{key} {problem}"
-    unit = None if cfg.evaluate_every is None else every(cfg.evaluate_every)[1]
+    unit = None if cfg.evaluation.every is None else every(cfg.evaluation.every)[1]
     is_many = chosen.size > 1
     return errors | {
         "population.size": not is_many
@@ -432,7 +432,7 @@ def population_errors(cfg: "Train") -> dict[str, object]:
         "population.score": is_many
         and chosen.score == "evaluated"
         and unit != "samples"
-        and "is evaluated, which needs evaluations every so many samples: evaluate_every=10M",
+        and "is evaluated, which needs evaluations every so many samples: evaluation.every=10M",
         "population.schedule": chosen.schedule is not None
         and (
             (is_many and "is of a single agent, and cannot be combined with population.size")
@@ -491,6 +491,35 @@ class Finish:
 
 
 @frozen
+class Logging:
+    """How often metrics are written, and how many updates are profiled."""
+
+    every: Count = 100
+    profile: Annotated[int, Field(ge=0, le=1000)] = 0
+
+
+@frozen
+class Evaluation:
+    """Evaluations while training."""
+
+    every: Annotated[int | float | str, AfterValidator(_every)] | None = None
+    episodes: Count = 128
+    stop: dict[str, Annotated[float, Field(allow_inf_nan=False)]] = dataclasses.field(
+        default_factory=dict
+    )
+
+
+@frozen
+class Checkpoints:
+    """When checkpoints are saved, and how many are kept."""
+
+    seconds: Above0 = 30.0
+    keep: Annotated[int, Field(ge=2, le=1000)] = 2
+    replay_every: Count = 20
+    snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
+
+
+@frozen
 class Population:
     """Agents that train at once, and take over from each other."""
 
@@ -519,21 +548,13 @@ class Train(Common):
     seconds: Above0 | None
     more_samples: Samples | None = None
     more_seconds: Above0 | None = None
-    log_every: Count
-    evaluate_every: Annotated[int | float | str, AfterValidator(_every)] | None = None
-    evaluate_episodes: Count = 128
-    stop: dict[str, Annotated[float, Field(allow_inf_nan=False)]] = dataclasses.field(
-        default_factory=dict
-    )
-    checkpoint_seconds: Above0
-    keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
-    replay_every: Count = 20
+    logging: Logging = Logging()
+    evaluation: Evaluation = Evaluation()
+    checkpoints: Checkpoints = Checkpoints()
     desync: bool = True
-    profile: Annotated[int, Field(ge=0, le=1000)] = 0
     callbacks: Annotated[
         tuple[Annotated[str, AfterValidator(_callback)], ...], BeforeValidator(_listed)
     ] = ()
-    snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
     restarts: Annotated[int, Field(ge=0, le=1000)] = 0
     dry_run: bool = False
@@ -596,13 +617,26 @@ class Train(Common):
             "member": self.member is not None
             and self.init is None
             and "is of a population whose weights start a run; give init=RUN",
-            "stop": bool(self.stop)
-            and self.evaluate_every is None
-            and "needs evaluations in training to reach it: give evaluate_every=60s, or samples",
-            "snapshots": self.snapshots
+            "evaluation.stop": bool(self.evaluation.stop)
+            and self.evaluation.every is None
+            and "needs evaluations in training to reach it: give evaluation.every=60s, or samples",
+            "checkpoints.snapshots": self.checkpoints.snapshots
             and not (self.samples or self.seconds or self.more_samples or self.more_seconds)
             and "are spread over the budget; give samples= or seconds=",
         }
+
+
+@frozen
+class Trained:
+    """What a trained agent needs to play: it has neither a learner nor loggers, whose classes may
+    not be here.
+    """
+
+    seed: int
+    env: Env
+    geometry: Geometry
+    agent: Agent
+    opponents: Opposition = Opposition()
 
 
 @frozen

@@ -63,7 +63,7 @@ def make_trainer(
     Args:
         token: a name that all ranks of this start have, and no other start.
         on_log: called with the trainer after each report.
-        make_evaluator: returns what measures the policy every `cfg.evaluate_every`, for `cfg`, the
+        make_evaluator: returns what measures the policy in training, for `cfg`, the
             environment of the training and the device, such as `evaluation.in_training.Evaluator`.
         leader: the first member of a population, for the others.
         n_members: trainers of a population that memory is to hold from this one on.
@@ -109,11 +109,11 @@ def make_trainer(
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
             console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     measured = {}
-    if cfg.evaluate_every is not None and make_evaluator is not None:
+    if cfg.evaluation.every is not None and make_evaluator is not None:
         measured = dict(
             evaluator=make_evaluator(cfg, env, device, ranks),
-            evaluate_every=settings.every(cfg.evaluate_every),
-            stop=cfg.stop,
+            evaluate_every=settings.every(cfg.evaluation.every),
+            stop=cfg.evaluation.stop,
         )
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
@@ -133,9 +133,11 @@ def make_trainer(
             snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
             writers = dict(
                 on_log=on_log,
-                snapshot_saver=SnapshotSaver(snapshots, cfg.snapshots),
+                snapshot_saver=SnapshotSaver(snapshots, cfg.checkpoints.snapshots),
                 annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
-                profiler=Profiler(folder, cfg.profile, device) if cfg.profile else None,
+                profiler=Profiler(folder, cfg.logging.profile, device)
+                if cfg.logging.profile
+                else None,
             )
         trainer = Trainer(
             opponents or env,
@@ -143,11 +145,16 @@ def make_trainer(
             learner,
             logger,
             saver.Saver(
-                checkpoints, config, cfg.keep_checkpoints, made_with, cfg.replay_every, rank_files
+                checkpoints,
+                config,
+                cfg.checkpoints.keep,
+                made_with,
+                cfg.checkpoints.replay_every,
+                rank_files,
             ),
             limits,
-            log_every=cfg.log_every,
-            checkpoint_seconds=cfg.checkpoint_seconds,
+            log_every=cfg.logging.every,
+            checkpoint_seconds=cfg.checkpoints.seconds,
             desync=cfg.desync,
             make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
             layout_sources=factory.layout_sources(cfg.env, where["geometries"]),

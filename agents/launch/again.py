@@ -27,16 +27,10 @@ RESUMABLE = (
     "more_seconds",
     "device",
     "trust",
-    "log_every",
-    "evaluate_every",
-    "evaluate_episodes",
-    "stop",
-    "checkpoint_seconds",
-    "keep_checkpoints",
-    "replay_every",
+    "logging",
+    "evaluation",
+    "checkpoints",
     "desync",
-    "profile",
-    "snapshots",
     "ranks",
     "restarts",
     "dry_run",
@@ -109,7 +103,7 @@ def automatic(cfg: settings.Train) -> Start:
     numbers = loaded.numbers
     budgets = {name: getattr(cfg, name) for name in ("samples", "seconds")}
     is_done = any(limit is not None and numbers[name] >= limit for name, limit in budgets.items())
-    is_reached = reaches(evaluation_in(numbers), cfg.stop)
+    is_reached = reaches(evaluation_in(numbers), cfg.evaluation.stop)
     cfg = settings.changed(cfg, resume=str(folder), folder=None, init=None)
     return Start(cfg, folder, is_done or is_reached, is_reached)
 

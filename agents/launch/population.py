@@ -117,7 +117,7 @@ def member_settings(cfg: settings.Train, member: int) -> settings.Train:
         seed=decisions.member_seed(seed, member),
         rerun=rerun,
         population=settings.changed(cfg.population, member=member),
-        keep_checkpoints=max(KEPT, cfg.keep_checkpoints),
+        keep_checkpoints=max(KEPT, cfg.checkpoints.keep),
         folder=None,
     )
 
@@ -163,7 +163,7 @@ def make(
         visitor = Learnt(policy, factory.make_learner(cfg.learner, policy, cfg.seed))
     return Population(
         *(trainers, turns, root, cfg.seed, chosen.every, chosen.vary),
-        *(chosen.exploit, chosen.explore, chosen.score, cfg.checkpoint_seconds),
+        *(chosen.exploit, chosen.explore, chosen.score, cfg.checkpoints.seconds),
         *(chosen.size, visitor, repeated),
     )
 

@@ -192,7 +192,7 @@ def result_of(trainer: Trainer) -> str:
     text = f"Trained {trainer.samples:,} samples in {console.duration(trainer.clock.seconds)}"
     if trainer.is_reached:
         goals = ", ".join(
-            f"{name} {trainer.evaluation[name]:.4g} (stop.{name}={goal:g})"
+            f"{name} {trainer.evaluation[name]:.4g} (evaluation.stop.{name}={goal:g})"
             for name, goal in trainer.stop.items()
         )
         return f"{text}, when an evaluation had {goals}"

@@ -80,7 +80,7 @@ def ranks(
 
 def _curves(device, n_ranks, seeds, *words):
     """Returns the learning curve of a run per seed. Runs on one GPU share the GPUs."""
-    words = "env=explorer", "log_every=5", *words
+    words = "env=explorer", "logging.every=5", *words
     if n_ranks > 1 or device.type == "cpu":
         words += f"ranks={n_ranks}", f"device={device.type}"
         batches = [[(*words, f"seed={seed}")] for seed in seeds]

@@ -79,7 +79,7 @@ def startup(device: torch.device) -> Iterator[dict]:
     seconds = []
     for _ in range(N_PROCESSES + 1):  # the first fills the caches
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "train.py", "geometry=bench", "samples=1", "log_every=1"]
+            command = [sys.executable, "train.py", "geometry=bench", "samples=1", "logging.every=1"]
             command += [f"folder={folder}/run", f"device={device}"]
             start = time.perf_counter()
             with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:

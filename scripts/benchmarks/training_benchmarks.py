@@ -97,7 +97,7 @@ COMPARED = {
 CURRICULA = "none", "plr", "sfl"
 CURRICULUM_RECIPE = "experiment=pointgoal_anywhere", "seconds=null", *NO_FINISH
 EVALUATED_IN = "geometry=suite", "episodes=1024", "baseline=false"
-LEARNABILITY = "env=pointgoal", "geometry.n=4096", "curriculum=sfl", "log_every=4", *NO_FINISH
+LEARNABILITY = "env=pointgoal", "geometry.n=4096", "curriculum=sfl", "logging.every=4", *NO_FINISH
 LEARNABILITY_SECONDS = 10
 N_EPISODES = 10  # in each home: the standard error of a success rate is at most 0.16
 
@@ -156,7 +156,7 @@ def duels(
     in unseen homes, a draw being half, and ratings of its snapshots and of the scripted bot.
     """
     runs = [
-        (*DEATHMATCH, f"samples={samples}", f"seed={seed}", f"snapshots={N_SNAPSHOTS}")
+        (*DEATHMATCH, f"samples={samples}", f"seed={seed}", f"checkpoints.snapshots={N_SNAPSHOTS}")
         for seed in seeds
     ]
     with trained(device, *runs) as folders:
@@ -205,7 +205,7 @@ def learners(
                     continue
                 what = f"{env}, {title}, {budget} s, seed {seed}"
                 overrides = overrides.format(capacity=REPLAY_CAPACITY[device.type])
-                words = f"log_every=10 {env_overrides} {overrides} seconds={budget} seed={seed}"
+                words = f"logging.every=10 {env_overrides} {overrides} seconds={budget} seed={seed}"
                 with trained(device, (*words.split(), *NO_FINISH)) as (run,):
                     curve = learning_curve(run, metric)
                     row = evaluate(run, device)[0]

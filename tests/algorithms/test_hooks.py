@@ -160,9 +160,8 @@ def test_a_run_follows_and_logs_schedules(words, here):
         "learner.warmup=2",
     ]
     assert train.main([*words, *schedules[:2], "samples=9", "learner.lr={from:1,to:-1}"]) == 2
-    assert (
-        train.main([*words, *schedules, f"samples={n_samples}", "log_every=1", "folder=run"]) == 0
-    )
+    words += [*schedules, f"samples={n_samples}", "logging.every=1", "folder=run"]
+    assert train.main(words) == 0
     rows = json_lines.read("run/metrics.jsonl")
     spent = [i / 8 for i in range(8)]
     assert [row["schedule/entropy_coef"] for row in rows] == pytest.approx(
@@ -178,7 +177,7 @@ def test_a_run_follows_and_logs_schedules(words, here):
 
 
 def test_weights_of_rewards_follow_schedules(here):
-    words = [*TINY, "env=pointgoal", "env.cost={from:1,to:0}", "samples=256", "log_every=1"]
+    words = [*TINY, "env=pointgoal", "env.cost={from:1,to:0}", "samples=256", "logging.every=1"]
     assert train.main([*words, "folder=run"]) == 0
     rows = json_lines.read("run/metrics.jsonl")
     assert [row["schedule/cost"] for row in rows] == pytest.approx([1 - i / 8 for i in range(8)])

@@ -351,7 +351,7 @@ RUN = [*TINY_R2D2, "learner=r2d2", "learner.replay.burn_in=2", "learner.replay.c
 
 def test_train_resume_evaluate_and_init(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert train.main([*RUN, f"samples={4 * UPDATE}", "folder=run", "log_every=1"]) == 0
+    assert train.main([*RUN, f"samples={4 * UPDATE}", "folder=run", "logging.every=1"]) == 0
     state = checkpoint.load_latest(tmp_path / "run" / "checkpoints").state
     assert state["learner"]["n_taken"] == 2 * 3 and "output.advantage.weight" in state["policy"]
     assert train.main(["resume=run", f"samples={6 * UPDATE}"]) == 0

@@ -25,7 +25,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 FILES = {"environment": 3, "geometry": 3, "learner": 3, "core": 2, "encoder": 2}
 SMALL = [word for word in tiny.TINY if not word.startswith(("env=", "env.res", "geometry"))]
 MINIMAL = ["env=minimal", "env.res=8", "geometry=box"]
-RUN = [*SMALL, "samples=64", "log_every=1"]
+RUN = [*SMALL, "samples=64", "logging.every=1"]
 
 COUNTER = '''
 from typing import Annotated
@@ -168,7 +168,7 @@ def test_custom_geometry(outside):
             return [toys.box(width + i) for i in range(n)]
         """
     add(outside, "geometry", {"plans.py": source})
-    words = [*MINIMAL, *SMALL, "samples=64", "log_every=1"]
+    words = [*MINIMAL, *SMALL, "samples=64", "logging.every=1"]
     assert train.main([*words, "geometry=plans:rooms", "geometry.width=6"]) == 0
     expected = {"name": "plans:rooms", "n": 3, "seed": 1, "width": 6.0}
     assert saved().config["train"]["geometry"] == expected
@@ -234,7 +234,7 @@ def test_custom_learner(outside, capsys):
     words = ["env=counter:Counter", *(w for w in SMALL if not w.startswith("learner."))]
     learner_words = ["learner=reinforce:Reinforce", "learner.lr=0.1", "learner.length=4"]
     learner_words += ["learner.anneal=never"]
-    assert train.main([*words, *learner_words, "samples=48", "log_every=1"]) == 0
+    assert train.main([*words, *learner_words, "samples=48", "logging.every=1"]) == 0
     config = saved().config["train"]["learner"]
     assert config == {"name": "reinforce:Reinforce", "anneal": "never", "lr": 0.1, "length": 4}
     rows = [json.loads(line) for line in (leftovers()[0] / "metrics.jsonl").open()]

@@ -12,7 +12,7 @@ from megastep.agents.runs import checkpoint
 from megastep.agents.storage.collector import Collector
 from tests.helpers.tiny import TINY, UPDATE
 
-RUN = [*TINY, "log_every=1", f"samples={6 * UPDATE}"]
+RUN = [*TINY, "logging.every=1", f"samples={6 * UPDATE}"]
 AUTO = [*RUN, "folder=run", "resume=auto"]
 
 

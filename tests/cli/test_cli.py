@@ -14,7 +14,7 @@ from megastep.agents.runs import checkpoint, folders
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, ROOT, finished, forked, start, wait_until
 
-TINY = [*tiny.TINY, "checkpoint_seconds=0.2"]
+TINY = [*tiny.TINY, "checkpoints.seconds=0.2"]
 
 
 @pytest.mark.slow
@@ -52,7 +52,7 @@ def test_missing_compiler(tmp_path):
 
 @pytest.mark.slow
 def test_same_seed_in_two_processes(tmp_path):
-    words = [*TINY, *tiny.SHORT_EPISODES, "samples=256", "log_every=2"]
+    words = [*TINY, *tiny.SHORT_EPISODES, "samples=256", "logging.every=2"]
     metrics, weights = [], []
     for n, (begin, seed) in enumerate([(start, 1), (forked, 1), (forked, 2)]):  # hashes differ
         process = begin("train", *words, f"seed={seed}", f"folder=run{n}", cwd=tmp_path)

@@ -214,7 +214,7 @@ def test_values_follow_the_device(monkeypatch):
         ("seconds=1h", 3600),
         ("seconds=1h30min", 5400),
         ("seconds=2.5m", 150),
-        ("checkpoint_seconds=90s", 90),
+        ("checkpoints.seconds=90s", 90),
         ("population.every=20k", 20_000),
     ],
 )
@@ -266,9 +266,9 @@ OUT_OF_RANGE = {
     "seed": [-1],
     "samples": [0, INFINITY],
     "seconds": [0, INFINITY, -INFINITY, NAN],
-    "checkpoint_seconds": [INFINITY, -3],
-    "keep_checkpoints": [1],
-    "log_every": [0],
+    "checkpoints.seconds": [INFINITY, -3],
+    "checkpoints.keep": [1],
+    "logging.every": [0],
     "finish.episodes": [0],
     "finish.record": [1],
     "logger.mode": ["often"],
@@ -359,7 +359,7 @@ def test_contradicting_settings():
         (
             "precision=high",
             "precision",
-            "no such key; there are agent, callbacks, checkpoint_s",
+            "no such key; there are agent, callbacks, checkpoints",
         ),
         ("learner.learning_rate=1", "learner.learning_rate", "no such key; learner has anneal, "),
         ("init=[a]", "init", "expected a word, got ['a']"),
@@ -480,9 +480,9 @@ def jobs(*words):
 
 
 def test_grid_jobs():
-    words = ["env=minimal,explorer", "seed=choice(1,2)", "keep_checkpoints=3"]
+    words = ["env=minimal,explorer", "seed=choice(1,2)", "checkpoints.keep=3"]
     assert jobs(*words) == [
-        [f"env={env}", f"seed={seed}", "keep_checkpoints=3"]
+        [f"env={env}", f"seed={seed}", "checkpoints.keep=3"]
         for env in ("minimal", "explorer")
         for seed in (1, 2)
     ]
@@ -497,15 +497,15 @@ def test_search_is_checked_at_bounds():
     optuna = "hydra/sweeper=optuna"
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     base = compose().learner.lr
-    words = ["learner.lr=interval(1e-4,1e-2)", "keep_checkpoints=2,3", "seed=range(1,4)"]
+    words = ["learner.lr=interval(1e-4,1e-2)", "checkpoints.keep=2,3", "seed=range(1,4)"]
     configs = [compose(*job) for job in jobs(optuna, *words)]
-    tried = [(cfg.learner.lr, cfg.keep_checkpoints, cfg.seed) for cfg in configs]
+    tried = [(cfg.learner.lr, cfg.checkpoints.keep, cfg.seed) for cfg in configs]
     assert tried[0] == (base, 2, 1) and (1e-4, 2, 1) in tried and (1e-2, 2, 1) in tried
     assert (base, 3, 1) in tried and (base, 2, 3) in tried and len(tried) == 7
     for word, problem in (
         ("learner.lr=interval(1e-4,1e9)", "1000000000 is out of range"),
-        ("log_every=interval(1.0,4.0)", "expected an integer"),
-        ("keep_checkpoints=range(1,3)", "1 is out of range"),
+        ("logging.every=interval(1.0,4.0)", "expected an integer"),
+        ("checkpoints.keep=range(1,3)", "1 is out of range"),
         ("agent.core=lstm,lstmm", "lstmm"),
     ):
         with pytest.raises(ConfigErrors, match=re.escape(problem)):
@@ -543,10 +543,10 @@ def test_cfg_prints_composed_config(capsys):
         return capsys.readouterr().out
 
     assert "lr: 0.5" in printed("--cfg", "job", "learner.lr=0.5")
-    tree = yaml.safe_load(printed("--cfg", "job", "log_every=${keep_checkpoints}"))
-    assert tree.pop("log_every") == "${keep_checkpoints}" and "hydra" not in tree
-    tree = yaml.safe_load(printed("--cfg", "job", "--resolve", "log_every=${keep_checkpoints}"))
-    assert tree == as_tree(compose("log_every=2"))
+    tree = yaml.safe_load(printed("--cfg", "job", "logging.every=${checkpoints.keep}"))
+    assert tree["logging"].pop("every") == "${checkpoints.keep}" and "hydra" not in tree
+    tree = yaml.safe_load(printed("--cfg", "job", "--resolve", "logging.every=${checkpoints.keep}"))
+    assert tree == as_tree(compose("logging.every=2"))
     assert set(yaml.safe_load(printed("--cfg", "hydra"))) == {"hydra"}
     assert set(yaml.safe_load(printed("--cfg", "all"))) == {*tree, "hydra"}
     assert yaml.safe_load(printed("--cfg", "job", "-p", "env")) == tree["env"]

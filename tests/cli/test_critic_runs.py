@@ -12,7 +12,7 @@ from tests.helpers import tiny
 from tests.helpers.weights import of_run as weights
 
 pytestmark = pytest.mark.usefixtures("here")
-EXPLORER = ["env=explorer", *tiny.TINY[1:], "env.patience=3", "log_every=1"]
+EXPLORER = ["env=explorer", *tiny.TINY[1:], "env.patience=3", "logging.every=1"]
 UPDATE = tiny.UPDATE
 
 

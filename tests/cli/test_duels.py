@@ -229,7 +229,7 @@ HIGH = "tests.helpers.games:High"
 PONG = [
     *("env=pong", "env.self_play=true", "env.n_envs=8", "agent.width=8"),
     *("agent.core=none", "learner.n_steps=16", "learner.n_minibatches=2", "device=cpu"),
-    "log_every=1",
+    "logging.every=1",
 ]
 UPDATE = 16 * 16
 
@@ -240,7 +240,7 @@ def trained(tmp_path_factory):
     base = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(base)
-        four = [f"samples={4 * UPDATE}", "snapshots=2", "folder=a"]
+        four = [f"samples={4 * UPDATE}", "checkpoints.snapshots=2", "folder=a"]
         train.run(configured(*four, tiny=PONG))
         train.run(configured(f"samples={UPDATE}", "folder=b", "seed=2", tiny=PONG))
         wider = [f"samples={UPDATE}", "folder=pixels", "env.pixels=true"]
@@ -378,7 +378,7 @@ def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
 
 def test_ratings_need_two_checkpoints(here, capsys):
     assert evaluate.main(["run=b", "ratings=true", "device=cpu"]) == 2
-    assert "train with snapshots=8" in capsys.readouterr().err
+    assert "train with checkpoints.snapshots=8" in capsys.readouterr().err
 
 
 MATRIX = ["env=tests.helpers.games:Matrix", "env.n_envs=4", *PONG[3:], "samples=1", "folder=run"]

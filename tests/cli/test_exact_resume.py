@@ -27,7 +27,7 @@ FIGHT = [*("env=deathmatch", "env.n_agents=2", "env.res=8", *SMALL), "learner.n_
 DRAWN = [*SMALL[1:], "geometry=bench", "geometry.n=4", "env.res=8", "learner.n_minibatches=2"]
 PONG = ["env=pong", "env.n_envs=8", "agent.width=8", "learner.n_steps=8", "device=cpu"]
 DATA = pathlib.Path(__file__).parents[1] / "data"
-EVERY_UPDATE = ["checkpoint_seconds=1e-9", "keep_checkpoints=99"]
+EVERY_UPDATE = ["checkpoints.seconds=1e-9", "checkpoints.keep=99"]
 slow = pytest.mark.slow
 CASES = {
     "ppo": [*tiny.TINY, *tiny.SHORT_EPISODES],
@@ -210,7 +210,7 @@ def test_resumed_run_has_the_same_bits(here, case, device):
     if case == "gymnasium":
         pytest.importorskip("gymnasium")
     samples = 512 if "env.n_envs=8" in CASES[case] else 256  # eight updates
-    words = [*CASES[case], f"device={device}", f"samples={samples}", "log_every=2"]
+    words = [*CASES[case], f"device={device}", f"samples={samples}", "logging.every=2"]
     run(*words, "folder=run", *EVERY_UPDATE)
     alone = checkpoint.load_latest("run/checkpoints").state
     metrics = (here / "run/metrics.jsonl").read_bytes()
@@ -241,7 +241,7 @@ def test_interrupted_run_has_the_same_bits(here, monkeypatch):
     """SIGTERM, then Ctrl-C, in rollouts between reports: the reports of the stops are not in the
     file in the end.
     """
-    words = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=320", "log_every=4"]
+    words = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=320", "logging.every=4"]
     run(*words, "folder=left-alone")
     commands = ([*words, "folder=run"], ["resume=run"])
     for command, number in zip(commands, (signal.SIGTERM, signal.SIGINT)):
@@ -307,7 +307,7 @@ def test_processes_side_by_side_have_the_same_bits(here, device):
 @slow
 def test_resume_with_another_number_of_threads(here, capsys):
     """Sums are then rounded in another order, so the bits may differ and the means do not."""
-    words = [*tiny.TINY, *tiny.SHORT_EPISODES, "agent.width=256", "samples=128", "log_every=1"]
+    words = [*tiny.TINY, *tiny.SHORT_EPISODES, "agent.width=256", "samples=128", "logging.every=1"]
     try:
         run(*words, "folder=run", *EVERY_UPDATE)
         alone = json_lines.read("run/metrics.jsonl")
@@ -347,7 +347,7 @@ def test_run_with_other_statistics_is_refused_and_its_weights_are_read(here, cap
 
 def test_run_of_before_a_learner_had_some_settings_resumes_bit_for_bit(here, capsys):
     """Their defaults change nothing, the optimizer's state included."""
-    words = [*tiny.TINY, "samples=128", "log_every=1", "learner.anneal=never"]
+    words = [*tiny.TINY, "samples=128", "logging.every=1", "learner.anneal=never"]
     run(*words, "folder=alone")
     run(*words, "samples=64", "folder=run")
     saved = checkpoint.load_latest("run/checkpoints")
@@ -361,7 +361,7 @@ def test_run_of_before_a_learner_had_some_settings_resumes_bit_for_bit(here, cap
 
 
 def test_inspect(here, capsys):
-    run(*tiny.TINY, "samples=64", "folder=run", "log_every=1")
+    run(*tiny.TINY, "samples=64", "folder=run", "logging.every=1")
     capsys.readouterr()
     assert entry.run_command("inspect", ["rum"]) == 2
     assert "did you mean run?" in capsys.readouterr().err
@@ -378,8 +378,8 @@ def test_inspect(here, capsys):
 
 def test_rerun(here, capsys):
     """A run whose learning rate followed the clock is repeated, though it was interrupted."""
-    words = ["seconds=0.8", "checkpoint_seconds=0.05", "keep_checkpoints=99"]
-    run(*tiny.TINY, *words, "log_every=2", "folder=run")
+    words = ["seconds=0.8", "checkpoints.seconds=0.05", "checkpoints.keep=99"]
+    run(*tiny.TINY, *words, "logging.every=2", "folder=run")
     *reports, _ = (here / "run/metrics.jsonl").read_bytes().splitlines()
     factors = annealing.read("run")
     killed_after = checkpoint.list_checkpoints("run/checkpoints")[0]

@@ -15,7 +15,7 @@ from tests.helpers import tiny
 pytestmark = pytest.mark.nightly
 N = 150  # words of a command, each one run
 #: Words that say what is odd, or have no place in a test: other devices, processes, hours of work.
-LEFT_OUT = ("device", "ranks", "restarts", "profile", "seconds")
+LEFT_OUT = ("device", "ranks", "restarts", "logging.profile", "seconds")
 KEYS = [
     *("env", "geometry", "agent", "learner", "curriculum", "logger", "opponents", "experiment"),
     *("env.kwargs", "env.id", "geometry.parts", "geometry.path", "agent.core", "learner.buffer"),
@@ -80,7 +80,7 @@ FLAGS = [
     "a b",
     "--info",
 ]
-TRAIN = [word for word in tiny.TINY if not word.startswith("log_every")]
+TRAIN = [word for word in tiny.TINY if not word.startswith("logging.every")]
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from tests.helpers.weights import of_run as weights
 
 pytestmark = pytest.mark.cuda
 
-TINY = [*tiny.ON_GPU, "log_every=1"]
+TINY = [*tiny.ON_GPU, "logging.every=1"]
 UPDATE = tiny.UPDATE_ON_GPU
 STOPPED = 6 * UPDATE
 
@@ -142,7 +142,7 @@ def test_non_finite_reward_in_a_cuda_graph(monkeypatch, tmp_path, capsys, traine
 
     monkeypatch.setattr(envs.Explorer, "step", step)
     monkeypatch.chdir(tmp_path)
-    assert train.main([*TINY, "folder=run", "samples=10_000_000", "log_every=10"]) == 1
+    assert train.main([*TINY, "folder=run", "samples=10_000_000", "logging.every=10"]) == 1
     sentence = capsys.readouterr().err.splitlines()[-1]
     assert "The last 20 updates were skipped" in sentence
     assert "reward of lane 5 was nan" in sentence and is_captured(trainers[0])

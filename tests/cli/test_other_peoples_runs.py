@@ -14,7 +14,7 @@ pytest.importorskip("gymnasium")
 pytestmark = pytest.mark.usefixtures("here")
 WORDS = [
     *("env=gymnasium", "device=cpu", "env.n_envs=4", "agent.width=8"),
-    *("learner.n_steps=8", "learner.n_minibatches=2", "log_every=1", "logger=none"),
+    *("learner.n_steps=8", "learner.n_minibatches=2", "logging.every=1", "logger=none"),
 ]
 
 

@@ -26,7 +26,7 @@ PARTS = "geometry.parts={bench: 2, braided: {source: maze, n: 2, braid: 1}}"
 TINY = [
     *("env=deathmatch", "env.n_agents=2", "env.res=16", "env.n_envs=4", "env.limit=20"),
     *("geometry=mixed", PARTS, "device=cpu", "agent.width=8", "seed=1"),
-    *("learner.n_steps=8", "learner.n_minibatches=2", "log_every=4"),
+    *("learner.n_steps=8", "learner.n_minibatches=2", "logging.every=4"),
 ]
 SUITE = ["geometry=suite", PARTS, "episodes=8", "device=cpu"]
 #: The agents of the package.
@@ -39,7 +39,7 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("exported")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert train.main([*TINY, "samples=512", "snapshots=2", "folder=run"]) == 0
+        assert train.main([*TINY, "samples=512", "checkpoints.snapshots=2", "folder=run"]) == 0
         for words in ([], ["against=bot"]):
             assert evaluate.main(["run=run", *SUITE, *words]) == 0
         assert (

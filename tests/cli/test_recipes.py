@@ -1,9 +1,6 @@
 """Recipes: the settings of each on a CPU and on a GPU, and how the blocks of files are merged."""
 
-import functools
-import json
 import textwrap
-from pathlib import Path
 
 import pytest
 
@@ -11,66 +8,13 @@ from megastep.agents.cli import blocks, evaluate, sweeps, train
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.scripts import TRAIN
 from megastep.agents.errors import ConfigErrors
-from megastep.agents.factory.check import as_tree, leaves
 from tests.helpers import tiny
-
-#: {"device words": the settings that differ from those of a row above, or the errors}.
-TABLE = json.loads((Path(__file__).parents[1] / "data/settings.json").read_text())
-#: Keys that are not in it.
-ABSENT = ("nonfinite_replay", "logger.", "profile")
-#: Rows that are compared at every change.
-FEW = ["cpu env=explorer learner=ppo", "cpu experiment=pong learner=ppo"]
-FEW += ["cuda env=explorer learner=ppo", "cuda env=gymnasium learner=ppo"]
-FEW += ["cuda experiment=deathmatch_anywhere learner=vtrace"]
-FEW += ["cuda experiment=pointgoal learner=r2d2"]
-
-
-@functools.cache
-def row(name):
-    """Returns {dotted key: value} of a row."""
-    entry = TABLE[name]
-    base = row(entry["like"]) if "like" in entry else {}
-    return {k: v for k, v in base.items() if k not in entry.get("without", ())} | entry["set"]
 
 
 @pytest.fixture(autouse=True)
 def without_a_gpu(monkeypatch):
     """Has `device=auto` be the CPU."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-
-
-@pytest.fixture
-def on(monkeypatch):
-    """A function that pretends that there is a GPU, or none, and returns the settings of words."""
-
-    def settings(device, *words):
-        monkeypatch.setattr("torch.cuda.is_available", lambda: device == "cuda")
-        return tiny.settings(*words)
-
-    return settings
-
-
-def differences(on, name):
-    """Returns {key: (in the table, composed)} of what differs in a row."""
-    device, *words = name.split()
-    try:
-        found = dict(leaves(as_tree(on(device, *words))))
-        expected = {} if "errors" in TABLE[name] else row(name)
-    except ConfigErrors as error:
-        found, expected = dict(error.errors), dict(TABLE[name].get("errors", ()))
-    pairs = {key: (repr(expected.get(key)), repr(found.get(key))) for key in {*found, *expected}}
-    return {k: pair for k, pair in pairs.items() if pair[0] != pair[1] and not k.startswith(ABSENT)}
-
-
-@pytest.mark.parametrize("name", FEW)
-def test_settings_of_a_few_recipes(on, name):
-    assert differences(on, name) == {}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted({*TABLE} - {*FEW}))
-def test_settings_of_a_recipe(on, name):
-    assert differences(on, name) == {}
 
 
 # ---- Blocks ----

@@ -60,13 +60,13 @@ class Walks:
 
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
-TINY = [f"env={__name__}:Walks", f"env.n_envs={N}", "log_every=4", f"learner.n_steps={T}"]
+TINY = [f"env={__name__}:Walks", f"env.n_envs={N}", "logging.every=4", f"learner.n_steps={T}"]
 TINY += ["agent.width=8", f"samples={12 * UPDATE}", "folder=run"]
 PPO = ["learner.n_minibatches=2"]
 R2D2 = ["learner=r2d2", "learner.gradient_steps=2", "learner.replay.burn_in=4"]
 R2D2 += ["learner.replay.capacity=2000"]
 OPPONENTS = [*PPO, "opponents.past=0.5", "opponents.snapshots=1", "opponents.every=2"]
-EVERY_UPDATE = "checkpoint_seconds=1e-9"
+EVERY_UPDATE = "checkpoints.seconds=1e-9"
 
 
 def met(capsys, *words):

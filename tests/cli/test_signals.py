@@ -21,7 +21,7 @@ from megastep.agents.training import loggers
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, Forked, forked, start, wait_until
 
-TINY = [*tiny.TINY, "log_every=1"]
+TINY = [*tiny.TINY, "logging.every=1"]
 UPDATE = tiny.UPDATE
 WHOLE = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=3"]
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -147,7 +147,7 @@ def test_signals_of_a_cluster_save_and_do_not_quit(here, monkeypatch, numbers):
 @pytest.mark.parametrize("moment, number", pairs([collecting, reporting, saving]))
 def test_signal_while_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
-    words = "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"
+    words = "samples=1e9", "folder=run", "checkpoints.seconds=1e-9"
     assert train.main([*TINY, *words]) == 128 + number
     step = checkpoint.load_latest(here / "run" / "checkpoints").step
     if moment is saving:  # while the second checkpoint is written, any number of updates go by
@@ -225,7 +225,7 @@ sys.exit(train.main(sys.argv[1:]))
 
 @pytest.mark.parametrize("number", ONE_SIGNAL[:2])
 def test_second_signal_quits(here, number):
-    words = [*TINY, "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"]
+    words = [*TINY, "samples=1e9", "folder=run", "checkpoints.seconds=1e-9"]
     (here / "stuck.py").write_text(STUCK)
     environment = {**os.environ, "STUCK_AFTER": str(2 * UPDATE)}
     process = Forked([here / "stuck.py", *words], here, environment)
@@ -292,7 +292,7 @@ def at_any_moment(here, seed):
     """Sends a signal to a run at a random time, and checks what always holds."""
     draw = random.Random(seed)
     number, folder = draw.choice(SIGNALS), here / str(seed)
-    words = f"samples={8 * UPDATE}", "checkpoint_seconds=1e-9", f"folder={folder}", *WHOLE
+    words = f"samples={8 * UPDATE}", "checkpoints.seconds=1e-9", f"folder={folder}", *WHOLE
     process = start("train", *TINY, *words)
     time.sleep(draw.uniform(0.1, 12))
     if draw.random() < 0.5:

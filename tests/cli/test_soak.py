@@ -76,7 +76,7 @@ def test_environment_stepped_for_long(name):
 
 def test_commands_beside_a_run_that_is_training(tmp_path):
     """A checkpoint after each update, so that each is deleted at once."""
-    words = ["checkpoint_seconds=1e-3", "logger=none", "folder=run"]
+    words = ["checkpoints.seconds=1e-3", "logger=none", "folder=run"]
     training = start("train", *tiny.TINY, *words, cwd=tmp_path)
     saved = tmp_path / "run/checkpoints"
     wait_until(lambda: saved.is_dir() and checkpoint.list_checkpoints(saved), training)

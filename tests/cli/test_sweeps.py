@@ -61,7 +61,7 @@ class Payer(Minimal):
         return world
 '''
 UPDATE = tiny.UPDATE
-SMALL = ["env=payer:Payer", *tiny.TINY[1:], "log_every=1"]
+SMALL = ["env=payer:Payer", *tiny.TINY[1:], "logging.every=1"]
 SHORT = [*SMALL, f"samples={2 * UPDATE}"]
 
 
@@ -292,7 +292,7 @@ def test_preempted_submitit_job_continues_its_checkpoint(here):
     job = here / "mine/job"
     words = [*SMALL, "-m", "seed=1", total, "hydra/launcher=submitit_local", "hydra.sweep.dir=mine"]
     words += ["hydra.sweep.subdir=job"]
-    process = start("train", *words, "checkpoint_seconds=0.2", cwd=here)
+    process = start("train", *words, "checkpoints.seconds=0.2", cwd=here)
     wait_until(lambda: [*job.glob("checkpoints/step_*")], process)
     (row,) = (here / "mine/.jobs").glob("*/0.json")
     os.kill(json.loads(row.read_text())["process"], signal.SIGUSR2)
@@ -328,7 +328,7 @@ def children(process):
 @pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
 def test_kill_9(here, victim):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    words = "seconds=8", "checkpoint_seconds=1", "env.mood=slow", "-m", "seed=1,2,3"
+    words = "seconds=8", "checkpoints.seconds=1", "env.mood=slow", "-m", "seed=1,2,3"
     process = start("train", *SMALL, *words, *JOBLIB)
 
     def jobs():

@@ -37,7 +37,7 @@ from tests.helpers.tiny import settings
 from tests.helpers.weights import of_run as weights
 from tests.helpers.weights import same
 
-TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "log_every=1"]
+TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "logging.every=1"]
 UPDATE = tiny.UPDATE
 
 
@@ -106,7 +106,7 @@ def clock_jumps(monkeypatch, seconds):
 
 def test_seconds_and_log_every(here, monkeypatch):
     clock_jumps(monkeypatch, 0)
-    folder = train.run(configured("seconds=0.1", "log_every=2"))
+    folder = train.run(configured("seconds=0.1", "logging.every=2"))
     rows = json_lines.read(folder / "metrics.jsonl")
     *updates, last = [row["updates"] for row in rows]
     assert updates == list(range(2, len(updates) * 2 + 1, 2)) and 0 < last - len(updates) * 2 <= 2
@@ -140,7 +140,7 @@ def test_resume_refuses_changed_settings(here):
 
 
 def test_resume_skips_a_damaged_checkpoint(here):
-    folder = train.run(configured(f"samples={2 * UPDATE}", "checkpoint_seconds=1e-9"))
+    folder = train.run(configured(f"samples={2 * UPDATE}", "checkpoints.seconds=1e-9"))
     os.truncate(folder / "checkpoints" / f"step_{2 * UPDATE}" / "state.pt", 50)
     with pytest.warns(
         UserWarning, match=f"step_{2 * UPDATE} is damaged.*using step_{UPDATE} instead"
@@ -156,7 +156,7 @@ def test_resume_skips_a_damaged_checkpoint(here):
 @pytest.fixture
 def saved_often(here):
     """A run of four updates with a checkpoint after each."""
-    often = "checkpoint_seconds=1e-9", "keep_checkpoints=9"
+    often = "checkpoints.seconds=1e-9", "checkpoints.keep=9"
     return train.run(configured(f"samples={4 * UPDATE}", *often))
 
 
@@ -332,7 +332,7 @@ def test_non_finite_world_exits_with_1(here, monkeypatch, capsys, name, value):
 
 def test_repeated_non_finite_updates_stop(here, monkeypatch, capsys):
     inject(monkeypatch, "reward", step=range(17, 10**6), value=float("nan"))
-    assert train.main([*TINY, "samples=1e9", "folder=run", "log_every=8"]) == 1
+    assert train.main([*TINY, "samples=1e9", "folder=run", "logging.every=8"]) == 1
     _, sentence = capsys.readouterr().err.splitlines()
     assert "The last 22 updates were skipped" in sentence and "reward of lane 2 was nan" in sentence
     loaded = checkpoint.load_latest(here / "run" / "checkpoints")
@@ -343,8 +343,8 @@ def test_repeated_non_finite_updates_stop(here, monkeypatch, capsys):
 
 
 def test_divergence_stops_with_advice(here, capsys):
-    words = ["env=explorer", *tiny.TINY[1:], "log_every=1", "learner.lr=1e3", "samples=1e5"]
-    assert train.main([*words, "checkpoint_seconds=1e-9", "folder=run"]) == 1
+    words = ["env=explorer", *tiny.TINY[1:], "logging.every=1", "learner.lr=1e3", "samples=1e5"]
+    assert train.main([*words, "checkpoints.seconds=1e-9", "folder=run"]) == 1
     sentence = capsys.readouterr().err.splitlines()[-1]
     assert "learning rate smaller than 1000" in sentence
     assert len(json_lines.read(here / "run" / "metrics.jsonl")) < 100
@@ -399,7 +399,9 @@ def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
 
     with full, monkeypatch.context() as patch:
         patch.setattr(Trainer, "log", report)
-        code = train.main([*TINY, f"samples={5 * UPDATE}", "checkpoint_seconds=1e-9", "folder=run"])
+        code = train.main(
+            [*TINY, f"samples={5 * UPDATE}", "checkpoints.seconds=1e-9", "folder=run"]
+        )
     warning, *others, error = capsys.readouterr().err.splitlines()
     assert code == 2 and all("curves.png" in line for line in others)
     assert "at 64 samples could not be saved (File too large)" in warning
@@ -421,7 +423,7 @@ def test_disk_with_space_again(here, monkeypatch):
 
     monkeypatch.setattr(checkpoint, "save", save)
     with pytest.warns(UserWarning, match="tries again"):
-        folder = train.run(configured(f"samples={3 * UPDATE}", "checkpoint_seconds=1e-9"))
+        folder = train.run(configured(f"samples={3 * UPDATE}", "checkpoints.seconds=1e-9"))
     assert checkpoint.load_latest(folder / "checkpoints").step == 3 * UPDATE
 
 
@@ -497,7 +499,7 @@ def test_long_run_leaks_nothing(here, monkeypatch, early, late):
         seen[self.updates] = pages * 4096 / 1e6, len(os.listdir("/proc/self/fd"))
 
     monkeypatch.setattr(Trainer, "log", report)
-    train.run(configured(f"samples={late * UPDATE}", "checkpoint_seconds=0.5"))
+    train.run(configured(f"samples={late * UPDATE}", "checkpoints.seconds=0.5"))
     grown = seen[late][0] - seen[early][0]
     # a checkpoint that is being written has a file open
     files, files_late = (min(seen[i][1] for i in range(n - 50, n)) for n in (early, late))

@@ -151,7 +151,7 @@ gymnasium.register("TypedCap-v0", Cap)
 gymnasium.register("TypedShop-v0", Shop)
 GYMNASIUM = [
     *("env=gymnasium", "device=cpu", "env.n_envs=8", "agent.width=8", "learner.n_steps=32"),
-    *("learner.n_minibatches=2", "log_every=1", "samples=256"),
+    *("learner.n_minibatches=2", "logging.every=1", "samples=256"),
 ]
 
 

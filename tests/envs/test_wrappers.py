@@ -110,7 +110,7 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     and in the file of an agent.
     """
     words = [*PENDULUM, "env.n_envs=2", "env.vectorization=async"]  # a process each
-    words += ["samples=128", "folder=run", "snapshots=1"]
+    words += ["samples=128", "folder=run", "checkpoints.snapshots=1"]
     assert train.main(words) == 0
     saved = checkpoint.load_latest("run/checkpoints")
     learnt = saved.state["wrappers"]
@@ -161,7 +161,7 @@ def test_environments_draw_the_same_from_global_generators_in_any_process():
 
 
 def test_runs_that_draw_from_global_generators_have_the_same_file(here):
-    words = [*SMALL, f"env.id={HELPERS}:Draws-v0", "samples=256", "log_every=1"]
+    words = [*SMALL, f"env.id={HELPERS}:Draws-v0", "samples=256", "logging.every=1"]
     for name in ("sync", "async"):
         assert train.main([*words, f"env.vectorization={name}", f"folder={name}"]) == 0
     files = [(here / name / "metrics.jsonl").read_bytes() for name in ("sync", "async")]

@@ -1,4 +1,4 @@
-"""Evaluations while a run trains: evaluate_every=, stop.return=."""
+"""Evaluations while a run trains: evaluation.every=, evaluation.stop.return=."""
 
 import json
 
@@ -18,7 +18,7 @@ from tests.helpers.tiny import (
 )
 
 WORDS = [*TINY, *SHORT_EPISODES, "learner.anneal=never", "logger=none", "geometry=homes"]
-EVERY = [f"evaluate_every={4 * UPDATE}", "evaluate_episodes=8"]
+EVERY = [f"evaluation.every={4 * UPDATE}", "evaluation.episodes=8"]
 
 
 def lines_of(folder, name="metrics.jsonl"):
@@ -30,7 +30,7 @@ def without_evaluations(rows):
 
 
 def test_evaluations_change_nothing_of_the_training(here):
-    words = [*WORDS, "log_every=2", f"samples={11 * UPDATE}"]
+    words = [*WORDS, "logging.every=2", f"samples={11 * UPDATE}"]
     plain = train.run(settings(*words, "folder=plain"))
     evaluated = train.run(settings(*words, *EVERY, "folder=evaluated"))
     rows = lines_of(evaluated)
@@ -49,7 +49,7 @@ def test_evaluations_change_nothing_of_the_training(here):
 
 
 def test_resumed_run_evaluates_as_the_whole_one(here):
-    words = [*WORDS, *EVERY, "log_every=2"]
+    words = [*WORDS, *EVERY, "logging.every=2"]
     whole = train.run(settings(*words, f"samples={11 * UPDATE}", "folder=whole"))
     half = train.run(settings(*words, f"samples={5 * UPDATE}", "folder=half"))
     train.run(settings(f"resume={half}", f"samples={11 * UPDATE}", "device=cpu"))
@@ -57,29 +57,42 @@ def test_resumed_run_evaluates_as_the_whole_one(here):
 
 
 def test_run_ends_when_an_evaluation_reaches_its_stop(here, capsys):
-    words = [*WORDS, *EVERY, "samples=1e9", "folder=run", "resume=auto", "stop.return=-1000"]
+    words = [
+        *WORDS,
+        *EVERY,
+        "samples=1e9",
+        "folder=run",
+        "resume=auto",
+        "evaluation.stop.return=-1000",
+    ]
     assert train.main(words) == 0
     said = capsys.readouterr().out
     assert f"Trained {4 * UPDATE} samples in " in said
-    assert "when an evaluation had return " in said and "(stop.return=-1000)" in said
+    assert "when an evaluation had return " in said and "(evaluation.stop.return=-1000)" in said
     (row,) = [row for row in lines_of(here / "run", "perf.jsonl") if "perf/seconds_to_stop" in row]
     assert row["samples"] == 4 * UPDATE and row["perf/seconds_to_stop"] == row["perf/seconds"]
     assert train.main(words) == 0
     assert "The run in run has already reached its stop." in capsys.readouterr().out
     higher = [word for word in words if "stop" not in word and "samples" not in word]
-    assert train.main([*higher, "stop.return=1e6", f"samples={6 * UPDATE}"]) == 0
+    assert train.main([*higher, "evaluation.stop.return=1e6", f"samples={6 * UPDATE}"]) == 0
     assert f"Trained {6 * UPDATE} samples" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
     "words, text",
     [
-        (["stop.return=1"], "stop: needs evaluations in training to reach it"),
-        (["evaluate_every=5m"], "may be minutes or millions: write min or M"),
-        (["evaluate_every=often"], "is neither samples, such as 1M, nor a time, such as 60s"),
-        (["evaluate_every=0"], "is neither samples"),
-        ([*EVERY, "stop.returns=1"], "stop.returns: no evaluation here measures it; did you mean"),
-        ([*EVERY, "stop.return=high"], "stop: expected a number, got 'high'"),
+        (
+            ["evaluation.stop.return=1"],
+            "evaluation.stop: needs evaluations in training",
+        ),
+        (["evaluation.every=5m"], "may be minutes or millions: write min or M"),
+        (["evaluation.every=often"], "is neither samples, such as 1M, nor a time, such as 60s"),
+        (["evaluation.every=0"], "is neither samples"),
+        (
+            [*EVERY, "evaluation.stop.returns=1"],
+            "stop.returns: no evaluation here measures it",
+        ),
+        ([*EVERY, "evaluation.stop.return=high"], "evaluation.stop: expected a number, got 'high'"),
     ],
 )
 def test_stop_that_cannot_be(here, capsys, words, text):
@@ -114,9 +127,9 @@ def test_each_evaluation_plays_the_same_episodes():
 
 @pytest.mark.cuda
 def test_evaluations_change_nothing_of_the_training_on_a_gpu(here):
-    words = [*ON_GPU, f"samples={9 * UPDATE_ON_GPU}", "log_every=2", "logger=none"]
+    words = [*ON_GPU, f"samples={9 * UPDATE_ON_GPU}", "logging.every=2", "logger=none"]
     plain = train.run(settings(*words, "folder=plain"))
-    every = [f"evaluate_every={2 * UPDATE_ON_GPU}", "evaluate_episodes=64"]
+    every = [f"evaluation.every={2 * UPDATE_ON_GPU}", "evaluation.episodes=64"]
     evaluated = train.run(settings(*words, *every, "folder=evaluated"))
     rows = lines_of(evaluated)
     assert without_evaluations(rows) == lines_of(plain)

@@ -13,7 +13,7 @@ TINY = [
     "learner.n_steps=8",
     "learner.n_minibatches=2",
     "agent.width=8",
-    "log_every=4",
+    "logging.every=4",
     "device=cpu",
 ]
 #: A small run with what a GPU brings: CUDA graphs, and a host that is updates ahead.

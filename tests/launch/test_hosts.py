@@ -18,7 +18,7 @@ from tests.helpers.processes import HUNG, ROOT, is_running, wait_until
 
 __all__ = ["hosts"]
 pytestmark = pytest.mark.usefixtures("here")
-TINY = [*tiny.TINY, "log_every=1", "folder=run", "checkpoint_seconds=0.5"]
+TINY = [*tiny.TINY, "logging.every=1", "folder=run", "checkpoints.seconds=0.5"]
 UPDATE = 2 * tiny.UPDATE
 CONTINUE = "Its last checkpoint is intact. To continue: python train.py resume=run\n"
 

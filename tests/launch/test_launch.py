@@ -20,7 +20,7 @@ from tests.helpers.processes import Forked, forked, is_running, wait_until
 from tests.helpers.ranks import HUNG, ROOT
 
 pytestmark = pytest.mark.usefixtures("here")
-TINY = [*tiny.TINY, "log_every=1", "folder=run"]
+TINY = [*tiny.TINY, "logging.every=1", "folder=run"]
 UPDATE = 2 * tiny.UPDATE
 ON_GPUS = [*tiny.ON_GPU, "folder=run"]
 UPDATE_ON_GPUS = 2 * tiny.UPDATE_ON_GPU
@@ -276,7 +276,7 @@ def test_error_of_the_ranks_is_told_once(here):
     ids=["SIGINT-cpu", "SIGTERM-cpu", "SIGINT-cuda"],
 )
 def test_signal_saves_once(here, number, is_group, base, update):
-    with started(here, "checkpoint_seconds=1", base=base) as run:
+    with started(here, "checkpoints.seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
         (os.killpg if is_group else os.kill)(run.pid, number)
         code, out, err, _ = wait_for_end(run)
@@ -301,7 +301,7 @@ def test_signal_saves_once(here, number, is_group, base, update):
     ids=["0-cpu", "1-cpu", "0-cuda", "1-cuda"],
 )
 def test_killed_rank(here, rank, base):
-    with started(here, "checkpoint_seconds=1", base=base) as run:
+    with started(here, "checkpoints.seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
         pids = [pid_of(here, n) for n in range(2)]
         os.kill(pids[rank], signal.SIGKILL)
@@ -319,7 +319,7 @@ def test_killed_rank(here, rank, base):
     ids=["cpu", "cuda"],
 )
 def test_stopped_rank(here, base):
-    with started(here, "checkpoint_seconds=1", base=base) as run:
+    with started(here, "checkpoints.seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
         pids = [pid_of(here, n) for n in range(2)]
         os.kill(pids[1], signal.SIGSTOP)
@@ -342,7 +342,7 @@ class Paced(Minimal):
 @pytest.mark.slow
 def test_restart(here):
     (here / "paced.py").write_text(PACED)
-    words = "env=paced:Paced", "checkpoint_seconds=1", "restarts=1", f"samples={100 * UPDATE}"
+    words = "env=paced:Paced", "checkpoints.seconds=1", "restarts=1", f"samples={100 * UPDATE}"
     with started(here, *words) as run:
         wait_for_checkpoint(here, run)
         os.kill(pid_of(here, 1), signal.SIGKILL)
@@ -389,7 +389,7 @@ class Stuck(Minimal):
 )
 def test_rank_that_fails_alone(here, line, code, expected):
     (here / "stuck.py").write_text(STUCK.format(line))
-    with started(here, "env=stuck:Stuck", "checkpoint_seconds=1e-9", "log_every=100") as run:
+    with started(here, "env=stuck:Stuck", "checkpoints.seconds=1e-9", "logging.every=100") as run:
         wait_for_checkpoint(here, run)
         got, _, err, seconds = wait_for_end(run)
     assert got == code and seconds < 35
@@ -460,7 +460,7 @@ class Killed(Minimal):
 @pytest.mark.nightly
 def test_torchrun_goes_on_in_the_folder_that_proves_itself(here):
     (here / "killed.py").write_text(KILLED)
-    words = ["env=killed:Killed", *TINY[1:], "checkpoint_seconds=0.2", f"samples={100 * UPDATE}"]
+    words = ["env=killed:Killed", *TINY[1:], "checkpoints.seconds=0.2", f"samples={100 * UPDATE}"]
     script = str(ROOT / "train.py")
     code, out, err = torchrun(here, "--max-restarts=1", script, *words)
     assert code == 0 and out.count("Training on 2 x cpu in run\n") == 2, (out, err)

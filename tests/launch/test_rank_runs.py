@@ -55,7 +55,7 @@ def run_and_resume():
     """
     results = {}
     for name in LEARNERS:
-        words = [*CASES[name], "samples=512", "log_every=2", f"folder={name}"]
+        words = [*CASES[name], "samples=512", "logging.every=2", f"folder={name}"]
         learnt = trained(*words, *EVERY_UPDATE)
         folder = f"{name}/checkpoints"
         alone = whole(checkpoint.list_checkpoints(folder)[-1])
@@ -101,7 +101,7 @@ def test_ranks_learn_the_same_from_different_samples_and_resume_with_the_same_bi
 @pytest.fixture(scope="module")
 def alone(here):
     """A run of two ranks in processes of their own, with its output."""
-    words = *PPO, "samples=1280", "log_every=2", "folder=alone", "snapshots=2"
+    words = *PPO, "samples=1280", "logging.every=2", "folder=alone", "checkpoints.snapshots=2"
     finish = "finish.evaluate=true", "finish.episodes=9", "finish.record=true", "finish.steps=2"
     return ranks.train(*words, *finish)
 
@@ -124,7 +124,7 @@ def test_rank_0_writes_and_speaks(alone, here):
 
 
 def test_killed_ranks_go_on_bit_for_bit(alone, here):
-    words = *PPO, "samples=1280", "log_every=2", "folder=killed", *EVERY_UPDATE
+    words = *PPO, "samples=1280", "logging.every=2", "folder=killed", *EVERY_UPDATE
     with ranks.started([ranks.ROOT / "train.py", *words]) as processes:
         deadline = time.monotonic() + ranks.HUNG
         while not checkpoint.list_checkpoints("killed/checkpoints"):
@@ -207,7 +207,7 @@ def learning_curves(n_envs):
     """Returns the mean returns of each report of three runs with other seeds."""
     words = ["env=tests.launch.test_rank_runs:Copy", "device=cpu"]
     words += ["agent.width=16", f"env.n_envs={n_envs}", "learner.n_steps=8", "learner.lr=3e-3"]
-    words += ["log_every=5", "samples=10240", "learner.n_minibatches=2", "desync=false"]
+    words += ["logging.every=5", "samples=10240", "learner.n_minibatches=2", "desync=false"]
     curves = []
     for seed in (1, 2, 3):
         folder = f"copy-{n_envs}-{seed}"

@@ -19,7 +19,7 @@ from tests.helpers.processes import HUNG, ROOT
 pytestmark = pytest.mark.nightly
 #: Updates that take long enough to be interrupted.
 N = 100
-WORDS = [*tiny.TINY, "log_every=1", "checkpoint_seconds=0.5"]
+WORDS = [*tiny.TINY, "logging.every=1", "checkpoints.seconds=0.5"]
 SAMPLES = f"samples={2 * N * tiny.UPDATE}"
 #: Seconds before its time limit at which a job gets a signal, or up to a minute earlier.
 EARLY = 60

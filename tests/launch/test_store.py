@@ -93,7 +93,7 @@ def test_a_heartbeat_that_is_none_is_left_out(store, value, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_ranks_of_one_machine_listen_on_loopback_alone(tmp_path):
-    words = [*tiny.TINY, "ranks=2", "folder=run", "log_every=1"]
+    words = [*tiny.TINY, "ranks=2", "folder=run", "logging.every=1"]
     process = start("train", *words, cwd=tmp_path)
     try:
         wait_until(lambda: (tmp_path / "run/metrics.jsonl").exists(), process)

@@ -61,7 +61,7 @@ def killed_once_saved(words, victims, n_saved=3):
 )
 def test_a_population_whose_rank_was_killed_has_the_same_bits(here, left_alone, victims):
     """Resumed by two ranks; killed again, by both at once, and resumed in one process."""
-    codes = killed_once_saved([*WORDS, "checkpoint_seconds=1e-9", "keep_checkpoints=20"], victims)
+    codes = killed_once_saved([*WORDS, "checkpoints.seconds=1e-9", "checkpoints.keep=20"], victims)
     assert codes[victims[0]] == -signal.SIGKILL and codes[1 - victims[0]] > 0
     n_saved = len(checkpoint.list_checkpoints(here / "P/member-2/checkpoints"))
     assert killed_once_saved(["resume=P"], [0, 1], n_saved + 3) == 2 * [-signal.SIGKILL]
@@ -71,7 +71,7 @@ def test_a_population_whose_rank_was_killed_has_the_same_bits(here, left_alone, 
 
 @pytest.mark.nightly
 def test_ctrl_c_saves_the_members_of_all_ranks(here, left_alone):
-    process = start("train", *WORDS, "ranks=2", "checkpoint_seconds=1e-9", OMP_NUM_THREADS="1")
+    process = start("train", *WORDS, "ranks=2", "checkpoints.seconds=1e-9", OMP_NUM_THREADS="1")
     while not checkpoint.list_checkpoints(here / "P/member-2/checkpoints"):
         assert process.poll() is None
         time.sleep(0.01)
@@ -88,7 +88,7 @@ def test_ctrl_c_saves_the_members_of_all_ranks(here, left_alone):
 @pytest.mark.parametrize("victim, n_saved", [(1, 3), (0, 3), (1, 0)])
 def test_restarts_of_a_population_have_the_same_bits(here, left_alone, victim, n_saved):
     (here / "tmp").mkdir()
-    options = "ranks=2", "restarts=1", "checkpoint_seconds=1e-9", "keep_checkpoints=20"
+    options = "ranks=2", "restarts=1", "checkpoints.seconds=1e-9", "checkpoints.keep=20"
     process = start("train", *WORDS, *options, OMP_NUM_THREADS="1", TMPDIR=str(here / "tmp"))
     folder = here / "P/member-2/checkpoints"
     while not folder.exists() or len(checkpoint.list_checkpoints(folder)) < n_saved:

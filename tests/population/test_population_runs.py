@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("here")
 SMALL = [
     "env=tests.cli.test_exact_resume:Steered",
     *tiny.TINY[2:],
-    *("env.n_envs=16", "log_every=2", "logger=none"),
+    *("env.n_envs=16", "logging.every=2", "logger=none"),
 ]
 VARY = (
     "population.vary={learner.lr: {min: 1e-4, max: 3e-2, log: true}, "
@@ -177,12 +177,12 @@ def test_killed_and_interrupted_population_has_the_same_bits(here, monkeypatch, 
 
     for words, owner, name, fault in (
         (
-            [*POPULATION, LONG, "checkpoint_seconds=1e-9"],
+            [*POPULATION, LONG, "checkpoints.seconds=1e-9"],
             GradientLearner,
             "copy_from",
             killed_in_copy,
         ),
-        (["resume=P", "checkpoint_seconds=1e-9"], Population, "save", killed_in_save),
+        (["resume=P", "checkpoints.seconds=1e-9"], Population, "save", killed_in_save),
     ):
         with monkeypatch.context() as patch, pytest.raises(Killed):
             patch.setattr(owner, name, fault)
@@ -213,7 +213,7 @@ def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
         patch.setattr(Population, "take_over", interrupted)
-        train.main(["rerun=latest", "folder=again", "checkpoint_seconds=1e-9"])
+        train.main(["rerun=latest", "folder=again", "checkpoints.seconds=1e-9"])
     capsys.readouterr()
     run("resume=again")
     assert "of all 3 members equal those of P, byte for byte" in capsys.readouterr().out
@@ -334,7 +334,7 @@ BAD = {
     "both": (["population.vary={learner.lr: {min: 1, max: 2, choices: [1]}}"], "one of them"),
     "schedule": (["learner.lr={from:1e-3,to:1e-4}"], "is a schedule"),
     "size": (["population.size=1"], "needs several members"),
-    "evaluated": (["population.score=evaluated"], "evaluate_every"),
+    "evaluated": (["population.score=evaluated"], "evaluation.every"),
     "score": (["population.score=lenght"], "did you mean length"),
     "league": (["population.score=won/league"], "no mean over episodes here"),
     "ranks": (["ranks=4"], "more than population.size=3"),
@@ -416,7 +416,7 @@ def test_members_of_a_league_meet_each_other_and_resume_with_the_same_bits(here,
     words += ["opponents.league=0.5", "opponents.past=0.25", "opponents.snapshots=2"]
     words += ["opponents.every=3", "population.size=3", "population.every=240", "logger=none"]
     words += [VARY, "samples=480", "population.score=won/league"]
-    run(*words, "folder=L", "checkpoint_seconds=1e-9", "keep_checkpoints=99")
+    run(*words, "folder=L", "checkpoints.seconds=1e-9", "checkpoints.keep=99")
     shutil.copytree("L", "left-alone")
     won = [json_lines.read(here / f"L/member-{n}/metrics.jsonl")[-1] for n in range(3)]
     assert any("episode/return/league" in row for row in won)
@@ -452,7 +452,7 @@ def test_population_that_is_killed_at_random_moments_has_the_same_bits(here, n_k
         if is_new:
             shutil.rmtree("P", ignore_errors=True)
         before = set() if is_new else {*checkpoint.list_checkpoints(paths[2])}
-        start = [*words, "checkpoint_seconds=1e-9"] if is_new else ["resume=P"]
+        start = [*words, "checkpoints.seconds=1e-9"] if is_new else ["resume=P"]
         process = forked("train", *start, cwd=here)
         while n_killed % 3 and not {*checkpoint.list_checkpoints(paths[2])} - before:
             if process.poll() is not None:
@@ -493,10 +493,10 @@ def test_copies_of_every_learner_resume_with_the_same_bits(here, monkeypatch, ca
         return random.Random(f"{trainer.samples} {member}").random()
 
     monkeypatch.setattr(Population, "score_of", drawn)
-    words = [*CASES[case], "log_every=2", "logger=none", "samples=384", "folder=P"]
+    words = [*CASES[case], "logging.every=2", "logger=none", "samples=384", "folder=P"]
     words += ["population.size=3", "population.every=96"]
     words += ["population.vary={learner.lr: {min: 1e-4, max: 3e-2, log: true}}"]
-    run(*words, "checkpoint_seconds=1e-9", "keep_checkpoints=99")
+    run(*words, "checkpoints.seconds=1e-9", "checkpoints.keep=99")
     rows = [row for rows in populations.read(here / "P" / populations.FILE) for row in rows]
     assert sum(row["from"] != row["member"] for row in rows) >= 3
     shutil.copytree("P", "left-alone")

@@ -16,7 +16,7 @@ from megastep.agents.reports import homes, runs
 from megastep.agents.runs import json_lines
 from tests.helpers import tiny
 
-WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=800", "log_every=2"]
+WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=800", "logging.every=2"]
 CHROMIUM = shutil.which("chromium")
 
 

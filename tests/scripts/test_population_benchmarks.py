@@ -15,7 +15,7 @@ def tiny_populations(monkeypatch):
         for name, value in values.items():
             monkeypatch.setattr(population_benchmarks, name, value)
 
-    small = ("env.n_envs=16", *tiny.TINY[3:-2], "log_every=1")
+    small = ("env.n_envs=16", *tiny.TINY[3:-2], "logging.every=1")
     pair = {"cpu": (2, 16, 16)}
     set_all(MEMBERS=pair, SMALL_MEMBERS=pair, N_MEMBERS={"cpu": 2}, EVERY={"cpu": 128})
     set_all(EPISODES={"cpu": 8}, RATED=("env=explorer", *small), EXPLORER=("env=explorer", *small))

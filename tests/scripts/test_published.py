@@ -86,7 +86,7 @@ def test_figure_has_a_line_per_seed_and_the_target(tmp_path):
 def test_plain_evaluator_agrees_with_evaluate(tmp_path):
     pytest.importorskip("gymnasium")
     # briefly, so that the policy neither fails at once nor balances until the end
-    words = "env=gymnasium env.id=CartPole-v1 agent.core=none samples=6144 log_every=1"
+    words = "env=gymnasium env.id=CartPole-v1 agent.core=none samples=6144 logging.every=1"
     with training_runs.trained(CPU, tuple(words.split())) as (run,):
         options = "episodes=256", "greedy=true", "baseline=false"
         row = training_runs.evaluate(run, CPU, *options)[0]

@@ -29,7 +29,7 @@ def test_plain_parts_learn_the_same(tmp_path):
     losses = {}
     for word in ("none", "all"):
         command = [sys.executable, ROOT / "scripts" / "train_plain.py", word, *TINY.split()]
-        command += ["samples=4096", "log_every=1", f"folder={tmp_path / word}", "device=cpu"]
+        command += ["samples=4096", "logging.every=1", f"folder={tmp_path / word}", "device=cpu"]
         subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
         (report, *_) = (tmp_path / word / "metrics.jsonl").read_text().splitlines()
         losses[word] = {k: v for k, v in json.loads(report).items() if k.startswith("loss/")}

@@ -44,8 +44,8 @@ def test_failing_run_raises():
 
 @pytest.mark.nightly
 def test_recipes_are_trained_and_evaluated_by_source(monkeypatch):
-    pong = "env=pong samples=8192 env.n_envs=32 log_every=1"
-    pointgoal = "env=pointgoal samples=4096 env.n_envs=32 env.limit=16 env.res=64 log_every=1"
+    pong = "env=pong samples=8192 env.n_envs=32 logging.every=1"
+    pointgoal = "env=pointgoal samples=4096 env.n_envs=32 env.limit=16 env.res=64 logging.every=1"
     parts = "geometry.parts={dense:{source:homes,n:20},box:{n:1}}"
     recipes = {
         "Pong": (pong, "episodes=7"),
@@ -68,7 +68,7 @@ def test_recipes_are_trained_and_evaluated_by_source(monkeypatch):
 
 @pytest.mark.slow
 def test_train_evaluates_in_unseen_homes(monkeypatch):
-    small = "env.n_envs=32", "log_every=1", "finish.episodes=16"
+    small = "env.n_envs=32", "logging.every=1", "finish.episodes=16"
     overrides = *training_benchmarks.EXPLORER, *small
     monkeypatch.setattr(training_benchmarks, "EXPLORER", overrides)
     rows = list(training_benchmarks.train(CPU, seeds=(1,), budgets=(2,)))
@@ -80,7 +80,7 @@ def test_train_evaluates_in_unseen_homes(monkeypatch):
 
 @pytest.mark.nightly
 def test_deathmatch_runs_are_trained_side_by_side_and_duel(monkeypatch):
-    small = "geometry=box", "env.n_envs=16", "log_every=1", "desync=false"
+    small = "geometry=box", "env.n_envs=16", "logging.every=1", "desync=false"
     deathmatch = *training_benchmarks.DEATHMATCH, *small
     monkeypatch.setattr(training_benchmarks, "DEATHMATCH", deathmatch)
     monkeypatch.setattr(training_benchmarks, "ABLATIONS", {"one": "", "other": "env.fov=130"})
@@ -101,7 +101,7 @@ def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
     titles = "PPO", "R2D2", asynchronous
     compared = {title: training_benchmarks.LEARNERS[title] for title in titles}
     monkeypatch.setattr(training_benchmarks, "LEARNERS", compared)
-    overrides = "env=pong agent.core=none env.n_envs=64 log_every=2"
+    overrides = "env=pong agent.core=none env.n_envs=64 logging.every=2"
     monkeypatch.setattr(training_benchmarks, "COMPARED", {"Pong": (overrides, "points_won", 3)})
     rows = list(training_benchmarks.learners(CPU, seeds=(1, 2), envs=("Pong",)))
     assert [row["what"] for row in rows] == [
@@ -119,7 +119,7 @@ def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
 @pytest.mark.nightly
 def test_curricula_are_compared_by_source_and_worst_homes(monkeypatch):
     small = "env=pointgoal", "env.n_envs=32", "env.res=16", "env.subsample=1"
-    homes = "geometry=mixed", "geometry.parts={homes:8,mazes:{source:maze,n:4}}", "log_every=1"
+    homes = "geometry=mixed", "geometry.parts={homes:8,mazes:{source:maze,n:4}}", "logging.every=1"
     recipe = *small, *homes, *training_benchmarks.NO_FINISH
     places = "generated:{source:homes,n:4},dense:{source:homes,n:20,density:2}"
     monkeypatch.setattr(training_benchmarks, "CURRICULUM_RECIPE", recipe)

@@ -94,7 +94,7 @@ def test_init_weights_are_the_first_snapshots(here):
 
 
 def test_snapshot_works_with_init_and_not_with_resume(here, capsys):
-    folder = train.run(configured(f"samples={2 * UPDATE}", "snapshots=1", tiny=PONG))
+    folder = train.run(configured(f"samples={2 * UPDATE}", "checkpoints.snapshots=1", tiny=PONG))
     snapshot = folder / "snapshots" / f"step_{2 * UPDATE}"
     train.run(configured(f"init={snapshot}", f"samples={UPDATE}", tiny=PONG))
     assert train.main([f"resume={snapshot}", "samples=1e6"]) == 2
@@ -104,7 +104,7 @@ def test_snapshot_works_with_init_and_not_with_resume(here, capsys):
 
 def test_snapshots_of_a_resumed_run_are_spaced_over_its_new_budget(here):
     """At the resume after four updates, half of the new budget of seven is spent."""
-    folder = train.run(configured(f"samples={4 * UPDATE}", "snapshots=2", tiny=PONG))
+    folder = train.run(configured(f"samples={4 * UPDATE}", "checkpoints.snapshots=2", tiny=PONG))
     train.run(configured(f"resume={folder}", f"samples={7 * UPDATE}", tiny=[]))
     names = {path.name for path in (folder / "snapshots").iterdir()}
     assert names == {f"step_{n * UPDATE}" for n in (2, 4, 7)}
@@ -126,7 +126,7 @@ class NeedsRgb(Always):
         (["opponents.snapshots=0"], "opponents.snapshots: 0"),
         (["opponents.bot_class=tests.helpers.games:Hihg"], "High"),
         (["opponents.bot_class=test_self_play:NeedsRgb"], "test_self_play:NeedsRgb"),
-        (["samples=null", "snapshots=8"], "snapshots: "),
+        (["samples=null", "checkpoints.snapshots=8"], "snapshots: "),
     ],
 )
 def test_bad_settings_are_named_and_leave_no_folder(here, capsys, words, message):

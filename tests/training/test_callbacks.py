@@ -41,7 +41,7 @@ class Nothing:
 def run(*callbacks):
     names = ",".join(f"{__name__}:{one.__name__}" for one in callbacks)
     return train.main(
-        [*TINY, "samples=192", "checkpoint_seconds=1000", "folder=run", f"callbacks=[{names}]"]
+        [*TINY, "samples=192", "checkpoints.seconds=1000", "folder=run", f"callbacks=[{names}]"]
     )
 
 

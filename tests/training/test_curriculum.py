@@ -19,7 +19,7 @@ from tests.helpers.synchronisation import no_synchronisation
 LEARNER = SimpleNamespace(gamma=0.9, lambda_=0.8)
 SMALL = [
     *("device=cpu", "env.n_envs=4", "env.res=8", "agent.width=8", "learner.n_steps=8"),
-    *("learner.n_minibatches=2", "log_every=1"),
+    *("learner.n_minibatches=2", "logging.every=1"),
 ]
 BENCH = ["geometry=bench", "geometry.n=4", "samples=64"]
 MIX = ["geometry=mixed", "geometry.parts={bench: 2, maze: 2}", "samples=640"]
@@ -290,7 +290,7 @@ def test_run_logs_outcomes_by_source(here):
 )
 def test_run_in_a_mix_logs_episodes_by_source(words, here):
     """Also without a curriculum. Every episode is one of its source's."""
-    assert train.main([*SMALL, *MIX, *words, "log_every=4", "desync=false", "folder=run"]) == 0
+    assert train.main([*SMALL, *MIX, *words, "logging.every=4", "desync=false", "folder=run"]) == 0
     row = json_lines.read("run/metrics.jsonl")[-1]
     names = [f"episode/{{}}/{source}" for source in ("bench", "maze")]
     counts = [row[name.format("count")] for name in names]
@@ -304,7 +304,7 @@ def test_run_in_a_mix_logs_episodes_by_source(words, here):
 
 
 def test_statistics_by_source_are_exact_under_resume(here):
-    words = [*SMALL, *POINTGOAL, *MIX, "log_every=3", "learner.anneal=never"]
+    words = [*SMALL, *POINTGOAL, *MIX, "logging.every=3", "learner.anneal=never"]
     assert train.main([*words, "folder=whole"]) == 0
     assert train.main([*words, "samples=256", "folder=cut"]) == 0
     assert train.main(["resume=cut", "samples=640"]) == 0
@@ -313,7 +313,7 @@ def test_statistics_by_source_are_exact_under_resume(here):
 
 
 def test_without_a_curriculum_nothing_is_stored_or_logged(here, trainers):
-    assert train.main([*SMALL, *BENCH, *POINTGOAL, "log_every=2", "folder=run"]) == 0
+    assert train.main([*SMALL, *BENCH, *POINTGOAL, "logging.every=2", "folder=run"]) == 0
     (made,) = trainers
     assert made.rollout.layouts is None and made.env.spawner.cumulative is None
     (row,) = json_lines.read("run/metrics.jsonl")

@@ -14,7 +14,7 @@ from tests.helpers import ranks, tiny
 
 pytestmark = pytest.mark.usefixtures("here")
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
-WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={12 * tiny.UPDATE}", "log_every=2"]
+WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={12 * tiny.UPDATE}", "logging.every=2"]
 
 
 def table_of(folder):
@@ -32,7 +32,7 @@ def events_of(folder):
 @pytest.mark.parametrize("device", DEVICES)
 def test_profiled_run_has_a_trace_a_table_and_the_same_metrics(device, learner, capsys):
     words = [*WORDS, f"device={device}", f"learner={learner}"]
-    assert train.main([*words, "folder=run", "profile=4"]) == 0
+    assert train.main([*words, "folder=run", "logging.profile=4"]) == 0
     output = capsys.readouterr()
     assert "Profile: run/profile.md" in output.out and not output.err
     assert train.main([*words, "folder=plain"]) == 0
@@ -50,7 +50,12 @@ def test_profiled_run_has_a_trace_a_table_and_the_same_metrics(device, learner, 
 
 
 def test_run_that_ends_early_has_a_profile_of_fewer_updates(capsys):
-    words = [*WORDS, f"samples={(N_SKIPPED + 2) * tiny.UPDATE}", "folder=run", "profile=1000"]
+    words = [
+        *WORDS,
+        f"samples={(N_SKIPPED + 2) * tiny.UPDATE}",
+        "folder=run",
+        "logging.profile=1000",
+    ]
     assert train.main(words) == 0
     assert table_of("run")[0].startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 2} on cpu")
 
@@ -74,7 +79,7 @@ def test_profile_that_cannot_be_made_ends_no_run(method, monkeypatch, capsys):
         raise RuntimeError("CUPTI is in use\nby another")
 
     monkeypatch.setattr(torch.profiler.profile, method, fail)
-    assert train.main([*WORDS, "folder=run", "profile=4"]) == 0
+    assert train.main([*WORDS, "folder=run", "logging.profile=4"]) == 0
     output = capsys.readouterr()
     assert output.err == "warning: The profile could not be made: CUPTI is in use\n"
     assert "Profile" not in output.out and not Path("run/profile.md").exists()
@@ -82,7 +87,7 @@ def test_profile_that_cannot_be_made_ends_no_run(method, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_only_rank_0_is_profiled():
-    for process in ranks.train(*WORDS, "folder=run", "profile=2"):
+    for process in ranks.train(*WORDS, "folder=run", "logging.profile=2"):
         assert not process.stderr.strip()
     assert sorted(path.name for path in Path("run").glob("profile*")) == [
         "profile.json.gz",
