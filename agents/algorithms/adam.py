@@ -84,7 +84,6 @@ class Adam:
                 rows=b"".join(rows),
                 sums=sums,
                 n_rows=len(rows),
-                n_sums=n_sums,
                 first_sum=first_sum,
             )
             first_sum += n_blocks

@@ -1,6 +1,6 @@
 // Adam with decoupled weight decay for many parameters in one launch, the norm of their gradients,
 // and whether a step is taken. A block handles neighbouring numbers of one parameter, a thread a
-// word of four; blocks along y are policies.
+// word of four.
 #include "common/constants.h"
 #include "common/dependent_launch.h"
 #include "constants.h"
@@ -28,9 +28,8 @@ DEVICE WordIndex find_index(const AdamRowParams* rows, int n_rows) {
     }
     const AdamRowParams& its = rows[row];
     unsigned int at = 4 * ((blockIdx.x - its.first_block) * ADAM_THREADS + threadIdx.x);
-    long long of_policy = blockIdx.y * (long long)its.n;
     int n = at < its.n ? (int)min(its.n - at, 4u) : 0;
-    return {row, of_policy + at, n, its.is_aligned && of_policy % 4 == 0 && n == 4};
+    return {row, at, n, its.is_aligned && n == 4};
 }
 
 DEVICE void read(float (&values)[4], const float* array, const WordIndex& index) {
@@ -81,41 +80,39 @@ KERNEL BOUNDS(256) squared_norm(SquaredNormParams p) {
         sum += values[i] * values[i];
     sum = sum_of_block(sum);
     if (!threadIdx.x)
-        p.sums[blockIdx.y * p.n_sums + p.first_sum + blockIdx.x] = sum;
+        p.sums[p.first_sum + blockIdx.x] = sum;
 }
 
 // One block. Decides whether a step is taken, and counts it and its metrics.
 KERNEL BOUNDS(256) judge(JudgeParams p) {
     wait_for_previous();
-    int policy = blockIdx.y, n_totals = p.n_metrics + 3;
+    int n_totals = p.n_metrics + 3;
     float sum = 0.f;
     for (int i = threadIdx.x; i < p.n_sums; i += ADAM_THREADS)
-        sum += p.sums[policy * p.n_sums + i];
+        sum += p.sums[i];
     float grad_norm = sqrtf(sum_of_block(sum));
-    bool is_finite = isfinite(grad_norm) && p.is_finite[policy];
-    bool is_enabled = !p.is_enabled || p.is_enabled[policy];
-    bool is_taken = is_finite && is_enabled && p.n_valid[policy] > 0;
+    bool is_finite = isfinite(grad_norm) && *p.is_finite;
+    bool is_enabled = !p.is_enabled || *p.is_enabled;
+    bool is_taken = is_finite && is_enabled && *p.n_valid > 0;
     for (int i = threadIdx.x; i < n_totals; i += ADAM_THREADS) {
-        float value = i < p.n_metrics ? p.metrics[i].values[policy] : grad_norm;
+        float value = i < p.n_metrics ? *p.metrics[i].values : grad_norm;
         if (i == p.n_metrics + 1)
             value = 1.f;
         value = is_taken ? value : 0.f;
         if (i == p.n_metrics + 2)
             value = !is_finite && is_enabled ? 1.f : 0.f;
-        float* total = p.totals + policy * n_totals + i;
-        *total = p.is_first ? value : *total + value;
+        p.totals[i] = p.is_first ? value : p.totals[i] + value;
     }
     if (threadIdx.x)
         return;
-    p.grad_norm[policy] = grad_norm;
-    p.is_taken[policy] = is_taken;
-    p.n_steps[policy] += is_taken ? 1.f : 0.f;
+    *p.grad_norm = grad_norm;
+    *p.is_taken = is_taken;
+    *p.n_steps += is_taken ? 1.f : 0.f;
 }
 
 KERNEL BOUNDS(256) adam(AdamParams p) {
     wait_for_previous();
-    unsigned int policy = blockIdx.y;
-    if (!p.is_taken[policy])
+    if (!*p.is_taken)
         return;
     WordIndex index = find_index(p.rows, p.n_rows);
     const AdamRowParams& row = p.rows[index.row];
@@ -124,8 +121,8 @@ KERNEL BOUNDS(256) adam(AdamParams p) {
     read(means, row.mean, index);
     read(squares, row.square, index);
     read(parameters, row.parameter, index);
-    float clip = p.grad_norm ? fminf(p.max_norm / (p.grad_norm[policy] + 1e-6f), 1.f) : 1.f;
-    float lr = p.lr[policy] * row.lr_factor, n_steps = p.n_steps[policy];
+    float clip = p.grad_norm ? fminf(p.max_norm / (*p.grad_norm + 1e-6f), 1.f) : 1.f;
+    float lr = *p.lr * row.lr_factor, n_steps = *p.n_steps;
     float step = lr / (1.f - powf(p.beta1, n_steps));
     float scale = 1.f / sqrtf(1.f - powf(p.beta2, n_steps));
 #pragma unroll

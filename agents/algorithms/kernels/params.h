@@ -1,7 +1,6 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
 //
-// T steps, B lanes, P policies. Arrays that belong to weights or to a policy's statistics start
-// with the axis P; whatever is per lane has those of all policies.
+// T steps, B lanes.
 #pragma once
 
 struct GaeParams {
@@ -45,49 +44,49 @@ struct VtraceParams {
 };
 
 struct PpoLossParams {
-    const float* logprobs;       // (P, n_rows), of the actions
-    const float* entropies;      // (P, n_rows)
-    const float* values;         // (P, n_rows)
-    const float* errors;         // (P, n_rows), of the prediction; null: there is none
-    const float* old_logprobs;   // (P, n_rows), when acting
-    const float* old_values;     // (P, n_rows), when acting; null: values are not clipped
-    const float* advantages;     // (P, n_rows)
-    const float* targets;        // (P, n_rows)
-    const unsigned char* valid;  // (P, n_rows)
-    const long long* n_valid;    // (P)
-    const float* value_scale;    // (P)
-    float* d_logprobs;           // (P, n_rows), gradients of the loss
-    float* d_entropies;          // (P, n_rows)
-    float* d_values;             // (P, n_rows)
-    float* d_errors;             // (P, n_rows)
-    // (P, n_blocks, N_SUMS), shares of means: policy, value, entropy, kl, clip_fraction, auxiliary,
+    const float* logprobs;       // (n_rows), of the actions
+    const float* entropies;      // (n_rows)
+    const float* values;         // (n_rows)
+    const float* errors;         // (n_rows), of the prediction; null: there is none
+    const float* old_logprobs;   // (n_rows), when acting
+    const float* old_values;     // (n_rows), when acting; null: values are not clipped
+    const float* advantages;     // (n_rows)
+    const float* targets;        // (n_rows)
+    const unsigned char* valid;  // (n_rows)
+    const long long* n_valid;    // ()
+    const float* value_scale;    // ()
+    float* d_logprobs;           // (n_rows), gradients of the loss
+    float* d_entropies;          // (n_rows)
+    float* d_values;             // (n_rows)
+    float* d_errors;             // (n_rows)
+    // (n_blocks, N_SUMS), shares of means: policy, value, entropy, kl, clip_fraction, auxiliary,
     // loss
     float* sums;
-    const float* clip;            // (P)
-    const float* value_coef;      // (P)
-    const float* entropy_coef;    // (P)
-    const float* auxiliary_coef;  // (P)
+    const float* clip;            // ()
+    const float* value_coef;      // ()
+    const float* entropy_coef;    // ()
+    const float* auxiliary_coef;  // ()
     int n_rows;
     float value_clip;
 };
 
 // M sequences of T steps after the burn-in, A agents per lane, n choices.
 struct TdLossParams {
-    const float* q;                  // (P, T + 1, M, A, n), of the online network
-    const float* target_q;           // (P, T + 1, M, A, n)
-    const long long* actions;        // (P, T, M, A)
-    const float* reward;             // (P, T, M)
-    const unsigned char* terminal;   // (P, T, M)
-    const unsigned char* truncated;  // (P, T, M)
-    const unsigned char* starts;     // (P, T + 1, M)
-    const unsigned char* learns;     // (P, T + 1, M)
-    const float* weight;             // (P, M)
-    const long long* age;            // (P, M)
-    float* values;                   // (P, T + 1, M), written
-    float* d_q;                      // (P, T + 1, M, A, n), of the sum over valid steps
-    float* priorities;               // (P, M)
-    float* sums;         // (P, n_blocks, 7): loss, |error|, q, valid steps; age, weight, weight^2
-    const float* gamma;  // (P)
+    const float* q;                  // (T + 1, M, A, n), of the online network
+    const float* target_q;           // (T + 1, M, A, n)
+    const long long* actions;        // (T, M, A)
+    const float* reward;             // (T, M)
+    const unsigned char* terminal;   // (T, M)
+    const unsigned char* truncated;  // (T, M)
+    const unsigned char* starts;     // (T + 1, M)
+    const unsigned char* learns;     // (T + 1, M)
+    const float* weight;             // (M)
+    const long long* age;            // (M)
+    float* values;                   // (T + 1, M), written
+    float* d_q;                      // (T + 1, M, A, n), of the sum over valid steps
+    float* priorities;               // (M)
+    float* sums;         // (n_blocks, 7): loss, |error|, q, valid steps; age, weight, weight^2
+    const float* gamma;  // ()
     int n_steps;
     int n_sequences;
     int n_agents;
@@ -98,13 +97,13 @@ struct TdLossParams {
 };
 
 struct TdMetricsParams {
-    const float* sums;  // (P, n_blocks, 7)
-    float* metrics;     // (P, 7): those of `td_loss.METRICS`, valid steps, 1 / max(valid steps, 1)
+    const float* sums;  // (n_blocks, 7)
+    float* metrics;     // (7): those of `td_loss.METRICS`, valid steps, 1 / max(valid steps, 1)
     int n_blocks;
     int n_sequences;
 };
 
-// A parameter (P, n) with its gradient and Adam's running means.
+// A parameter (n) with its gradient and Adam's running means.
 struct AdamRowParams {
     float* parameter;
     const float* gradient;
@@ -119,26 +118,25 @@ struct AdamRowParams {
 
 struct SquaredNormParams {
     AdamRowParams rows[48];
-    float* sums;  // (P, n_sums), of this launch's blocks from first_sum on
+    float* sums;  // (n_sums), of this launch's blocks from first_sum on
     int n_rows;
-    int n_sums;
     int first_sum;
 };
 
 struct MetricParams {
-    const float* values;  // (P)
+    const float* values;  // ()
 };
 
 struct JudgeParams {
     MetricParams metrics[32];
-    const float* sums;                // (P, n_sums), of squared gradients
-    const unsigned char* is_finite;   // (P), whether the transitions are
-    const unsigned char* is_enabled;  // (P); null: true
-    const long long* n_valid;         // (P), valid transitions
-    float* n_steps;                   // (P), updated
-    float* grad_norm;                 // (P)
-    unsigned char* is_taken;          // (P)
-    float* totals;  // (P, n_metrics + 3), updated: metrics, the norm and 1 of steps taken; skipped
+    const float* sums;                // (n_sums), of squared gradients
+    const unsigned char* is_finite;   // (), whether the transitions are
+    const unsigned char* is_enabled;  // (); null: true
+    const long long* n_valid;         // (), valid transitions
+    float* n_steps;                   // (), updated
+    float* grad_norm;                 // ()
+    unsigned char* is_taken;          // ()
+    float* totals;  // (n_metrics + 3), updated: metrics, the norm and 1 of steps taken; skipped
     int n_sums;
     int n_metrics;
     int is_first;  // `totals` begin here
@@ -146,10 +144,10 @@ struct JudgeParams {
 
 struct AdamParams {
     AdamRowParams rows[48];
-    const float* lr;                // (P)
-    const float* n_steps;           // (P), this one included
-    const float* grad_norm;         // (P); null: gradients are not clipped
-    const unsigned char* is_taken;  // (P), false: nothing changes
+    const float* lr;                // ()
+    const float* n_steps;           // (), this one included
+    const float* grad_norm;         // (); null: gradients are not clipped
+    const unsigned char* is_taken;  // (), false: nothing changes
     int n_rows;
     float max_norm;
     float beta1;

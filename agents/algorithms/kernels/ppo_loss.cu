@@ -1,5 +1,5 @@
 // PPO's loss, with its gradients and metrics, all means over valid rows. One thread per row; a
-// block adds up its rows in a fixed order, the caller the blocks. Blocks along y are policies.
+// block adds up its rows in a fixed order, the caller the blocks.
 #include "common/constants.h"
 #include "common/dependent_launch.h"
 #include "constants.h"
@@ -7,19 +7,18 @@
 
 KERNEL ppo_loss(PpoLossParams p) {
     wait_for_previous();
-    int of_policy = blockIdx.x * blockDim.x + threadIdx.x;
-    long long policy = blockIdx.y, row = policy * p.n_rows + of_policy;
+    int row = blockIdx.x * blockDim.x + threadIdx.x;
     float sums[N_SUMS] = {};
-    float clip = p.clip[policy], value_coef = p.value_coef[policy];
-    float entropy_coef = p.entropy_coef[policy], auxiliary_coef = p.auxiliary_coef[policy];
-    if (of_policy < p.n_rows) {
-        float weight = p.valid[row] ? 1.f / (float)max(p.n_valid[policy], 1ll) : 0.f;
+    float clip = *p.clip, value_coef = *p.value_coef;
+    float entropy_coef = *p.entropy_coef, auxiliary_coef = *p.auxiliary_coef;
+    if (row < p.n_rows) {
+        float weight = p.valid[row] ? 1.f / (float)max(*p.n_valid, 1ll) : 0.f;
         float d_logprob = 0.f, d_value = 0.f;
         if (p.valid[row]) {
             float log_ratio = p.logprobs[row] - p.old_logprobs[row], ratio = expf(log_ratio);
             float clipped = fminf(fmaxf(ratio, 1.f - clip), 1.f + clip);
             float advantage = p.advantages[row], surrogate = ratio * advantage;
-            float scale = p.value_scale[policy], error = (p.values[row] - p.targets[row]) / scale;
+            float scale = *p.value_scale, error = (p.values[row] - p.targets[row]) / scale;
             // a NaN fails both comparisons and stays
             bool is_clipped = surrogate > clipped * advantage;
             float squared = error * error;
@@ -65,6 +64,6 @@ KERNEL ppo_loss(PpoLossParams p) {
         float total = 0.f;
         for (int warp = 0; warp < BLOCK / WARP; warp++)
             total += of_warps[warp][threadIdx.x];
-        p.sums[(policy * gridDim.x + blockIdx.x) * N_SUMS + threadIdx.x] = total;
+        p.sums[blockIdx.x * N_SUMS + threadIdx.x] = total;
     }
 }

@@ -1,5 +1,5 @@
 // R2D2's loss with its gradient, priorities and metrics. A block handles a few sequences, a thread
-// every N-th step of one of them; the block adds up in a fixed order. Blocks along y are policies.
+// every N-th step of one of them; the block adds up in a fixed order.
 #include "common/constants.h"
 #include "common/dependent_launch.h"
 #include "constants.h"
@@ -22,57 +22,32 @@ DEVICE float inverse_rescale(float y, float eps) {
     return sign(y) * (root * root - 1.f);
 }
 
-// A policy's tensors.
-struct Tensors {
-    const float *q, *target_q, *reward;
-    const long long* actions;
-    const unsigned char *starts, *learns, *terminal, *truncated;
-    float *values, *d_q;
-    float gamma;
-};
-
-DEVICE Tensors of_policy(const TdLossParams& p, long long policy) {
-    long long rows = policy * p.n_steps * p.n_sequences, with_last = rows + policy * p.n_sequences;
-    long long n_outputs = p.n_agents * p.n_choices;
-    return {p.q + with_last * n_outputs,
-            p.target_q + with_last * n_outputs,
-            p.reward + rows,
-            p.actions + rows * p.n_agents,
-            p.starts + with_last,
-            p.learns + with_last,
-            p.terminal + rows,
-            p.truncated + rows,
-            p.values + with_last,
-            p.d_q + with_last * n_outputs,
-            p.gamma[policy]};
-}
-
 // The target network's value of the online network's best actions, in units of reward.
-DEVICE float best_value(const TdLossParams& p, const Tensors& tensors, long long row) {
+DEVICE float best_value(const TdLossParams& p, long long row) {
     float total = 0.f;
     for (int agent = 0; agent < p.n_agents; agent++) {
-        const float* q = tensors.q + (row * p.n_agents + agent) * p.n_choices;
+        const float* q = p.q + (row * p.n_agents + agent) * p.n_choices;
         int best = 0;
         for (int k = 1; k < p.n_choices; k++)
             best = q[k] > q[best] ? k : best;
-        total += tensors.target_q[(row * p.n_agents + agent) * p.n_choices + best];
+        total += p.target_q[(row * p.n_agents + agent) * p.n_choices + best];
     }
     return inverse_rescale(total, p.eps);
 }
 
 // `returns.n_step_returns` of step t
-DEVICE float n_step_return(const TdLossParams& p, const Tensors& tensors, int t, int sequence) {
+DEVICE float n_step_return(const TdLossParams& p, int t, int sequence) {
     float total = 0.f, discount = 1.f;
     for (int s = t; s < p.n_steps; s++) {
         long long row = s * (long long)p.n_sequences + sequence, next = row + p.n_sequences;
-        if (tensors.starts[next])
-            return total + discount * tensors.values[row];
-        total += discount * tensors.reward[row];
-        discount *= tensors.gamma;
-        if (tensors.terminal[row])
+        if (p.starts[next])
+            return total + discount * p.values[row];
+        total += discount * p.reward[row];
+        discount *= *p.gamma;
+        if (p.terminal[row])
             return total;
-        if (tensors.truncated[row] || s + 1 == t + p.n_return_steps || s + 1 == p.n_steps)
-            return total + discount * tensors.values[next];
+        if (p.truncated[row] || s + 1 == t + p.n_return_steps || s + 1 == p.n_steps)
+            return total + discount * p.values[next];
     }
     return total;
 }
@@ -83,30 +58,27 @@ KERNEL td_loss(TdLossParams p) {
     __shared__ float counts[PHASES][TD_SEQUENCES], of_warps[TD_WARPS][N_TD_SUMS];
     int phase = threadIdx.x / TD_SEQUENCES, of_block = threadIdx.x % TD_SEQUENCES;
     int sequence = blockIdx.x * TD_SEQUENCES + of_block, n_outputs = p.n_agents * p.n_choices;
-    long long policy = blockIdx.y, of_sequence = policy * p.n_sequences + sequence;
     bool exists = sequence < p.n_sequences;
-    Tensors tensors = of_policy(p, policy);
     if (exists)
         for (int t = phase; t <= p.n_steps; t += PHASES) {
             long long row = t * (long long)p.n_sequences + sequence;
-            tensors.values[row] = best_value(p, tensors, row);
+            p.values[row] = best_value(p, row);
         }
     __syncthreads();
     float sums[N_TD_SUMS] = {}, size = 0.f;
-    float weight = exists ? p.weight[of_sequence] : 0.f;
+    float weight = exists ? p.weight[sequence] : 0.f;
     if (exists)
         for (int t = phase; t <= p.n_steps; t += PHASES) {
             long long row = t * (long long)p.n_sequences + sequence;
             float d = 0.f;
-            bool is_valid =
-                t < p.n_steps && !tensors.starts[row + p.n_sequences] && tensors.learns[row];
+            bool is_valid = t < p.n_steps && !p.starts[row + p.n_sequences] && p.learns[row];
             if (is_valid) {
                 float taken = 0.f;
                 for (int agent = 0; agent < p.n_agents; agent++) {
                     long long at = row * p.n_agents + agent;
-                    taken += tensors.q[at * p.n_choices + tensors.actions[at]];
+                    taken += p.q[at * p.n_choices + p.actions[at]];
                 }
-                float error = rescale(n_step_return(p, tensors, t, sequence), p.eps) - taken;
+                float error = rescale(n_step_return(p, t, sequence), p.eps) - taken;
                 d = -2.f * weight * error;
                 sums[0] += weight * error * error;
                 sums[1] += fabsf(error);
@@ -116,12 +88,12 @@ KERNEL td_loss(TdLossParams p) {
             }
             for (int k = 0; k < n_outputs; k++) {
                 long long at = row * p.n_agents + k / p.n_choices;
-                bool is_taken = is_valid && tensors.actions[at] == k % p.n_choices;
-                tensors.d_q[row * n_outputs + k] = is_taken ? d : 0.f;
+                bool is_taken = is_valid && p.actions[at] == k % p.n_choices;
+                p.d_q[row * n_outputs + k] = is_taken ? d : 0.f;
             }
         }
     if (exists && !phase) {
-        sums[4] = (float)p.age[of_sequence];
+        sums[4] = (float)p.age[sequence];
         sums[5] = weight;
         sums[6] = weight * weight;
     }
@@ -139,7 +111,7 @@ KERNEL td_loss(TdLossParams p) {
         float total = 0.f;
         for (int warp = 0; warp < TD_WARPS; warp++)
             total += of_warps[warp][threadIdx.x];
-        p.sums[(policy * gridDim.x + blockIdx.x) * N_TD_SUMS + threadIdx.x] = total;
+        p.sums[blockIdx.x * N_TD_SUMS + threadIdx.x] = total;
     }
     if (exists && !phase) {
         float sum = 0.f, count = 0.f;
@@ -149,7 +121,7 @@ KERNEL td_loss(TdLossParams p) {
             count += counts[i][of_block];
         }
         // a NaN is not the largest, but stays in the sum
-        p.priorities[of_sequence] = p.eta * size + (1.f - p.eta) * (sum / fmaxf(count, 1.f));
+        p.priorities[sequence] = p.eta * size + (1.f - p.eta) * (sum / fmaxf(count, 1.f));
     }
 }
 
@@ -158,11 +130,10 @@ KERNEL td_metrics(TdMetricsParams p) {
     wait_for_previous();
     __shared__ float totals[N_TD_SUMS];
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
-    long long policy = blockIdx.y;
     if (warp < N_TD_SUMS) {
         float sum = 0.f;
         for (int block = lane; block < p.n_blocks; block += WARP)
-            sum += p.sums[(policy * p.n_blocks + block) * N_TD_SUMS + warp];
+            sum += p.sums[block * N_TD_SUMS + warp];
         for (int mask = WARP / 2; mask; mask /= 2)
             sum += __shfl_xor_sync(~0u, sum, mask);
         if (!lane)
@@ -171,7 +142,7 @@ KERNEL td_metrics(TdMetricsParams p) {
     __syncthreads();
     if (threadIdx.x)
         return;
-    float* metrics = p.metrics + policy * N_TD_METRICS;
+    float* metrics = p.metrics;
     float weight = 1.f / fmaxf(totals[3], 1.f), n = (float)p.n_sequences;
     metrics[0] = totals[0] * weight;
     metrics[1] = totals[1] * weight;

@@ -1,5 +1,5 @@
 // Rounds weights to bfloat16, many in one launch, with zeros after each. A thread writes a word of
-// eight numbers; blocks along y are policies.
+// eight numbers.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -17,7 +17,7 @@ KERNEL BOUNDS(256) cast(CastParams p) {
     unsigned int at = 8 * ((blockIdx.x - its.first_block) * CAST_THREADS + threadIdx.x);
     if (at >= its.n_padded)
         return;
-    const float* source = its.source + blockIdx.y * (long long)its.n + at;
+    const float* source = its.source + at;
     float values[8];
     if (at + 8 <= its.n && (unsigned long long)source % 16 == 0) {
         uint4 low = *(const uint4*)source, high = *(const uint4*)(source + 4);
@@ -29,5 +29,5 @@ KERNEL BOUNDS(256) cast(CastParams p) {
 #pragma unroll
         for (int i = 0; i < 8; i++)
             values[i] = at + i < its.n ? source[i] : 0.f;
-    write<Bfloat16>(its.target, blockIdx.y * (long long)its.n_padded + at, values);
+    write<Bfloat16>(its.target, at, values);
 }

@@ -56,16 +56,16 @@ template <class T>
 DEVICE void act(const CategoricalActParams& p) {
     int thread = blockIdx.x * blockDim.x + threadIdx.x, part = thread % ACT_THREADS;
     int lane = min(thread / ACT_THREADS, p.n_lanes - 1);  // all threads of a warp shuffle
-    long long policy = blockIdx.y, row = policy * p.n_lanes + lane;
+    long long row = lane;
     bool is_choice = part < p.n_choices;
     float infinity = __int_as_float(0x7f800000), logprob = 0.f;
     for (int agent = 0; agent < p.n_agents; agent++) {
-        long long choice = (policy * p.n_agents + agent) * p.n_choices;
+        int choice = agent * p.n_choices;
         long long at = (row * p.n_agents + agent) * p.n_choices + part;
         float noise = p.noise && is_choice ? p.noise[at] : 1.f;
         float bias = to_float(((const T*)p.bias)[choice + min(part, p.n_choices - 1)]);
         float score = score_of(p, (const T*)p.features + row * p.width,
-                               (const T*)p.weight + choice * p.width, part);
+                               (const T*)p.weight + (long long)choice * p.width, part);
         score = is_choice ? rounded<T>(score + bias) : -infinity;
         float largest = largest_of_lane(score);
         float total = sum_of_lane(is_choice ? expf(score - largest) : 0.f);

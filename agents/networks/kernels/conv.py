@@ -99,7 +99,7 @@ def conv_forward(
 
 
 def forward_kernel(
-    n_channels: int, n_columns: int, *n_blocks: int
+    n_channels: int, n_columns: int, n_blocks: int
 ) -> tuple[str, Blocks, dict[str, int]]:
     """Returns the kernel of `conv_forward`, its blocks and the fields of its struct that are sizes
     in shared memory.
@@ -107,10 +107,10 @@ def forward_kernel(
     Args:
         n_channels: C.
         n_columns: W.
-        n_blocks: per policy, and policies.
+        n_blocks: how many.
     """
     sizes = _forward_sizes(n_channels, n_columns)
-    blocks = Blocks(*n_blocks, threads=_THREADS, shared=_forward_bytes(**sizes))
+    blocks = Blocks(n_blocks, threads=_THREADS, shared=_forward_bytes(**sizes))
     return f"conv_forward_{4 if n_channels <= 4 else 8}", blocks, sizes
 
 
@@ -191,11 +191,11 @@ def conv_backward(
 
 
 def backward_kernel(
-    n_channels: int, n_columns: int, *n_blocks: int
+    n_channels: int, n_columns: int, n_blocks: int
 ) -> tuple[str, Blocks, dict[str, int]]:
     """Returns the kernel of `conv_backward`, as `forward_kernel` does."""
     sizes, n_bytes = _backward_sizes(n_channels, n_columns)
-    blocks = Blocks(*n_blocks, threads=_THREADS, shared=n_bytes)
+    blocks = Blocks(n_blocks, threads=_THREADS, shared=n_bytes)
     return f"conv_backward_{-(-n_channels // 2) * 2}", blocks, sizes
 
 

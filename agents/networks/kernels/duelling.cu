@@ -1,6 +1,6 @@
 // Action values of a duelling network from its hidden layer (features of the value, then those of
 // the advantages), their gradients, and epsilon-greedy actions. An agent's value is the lane's
-// value plus its advantage minus the mean over the choices. Blocks along y: policies.
+// value plus its advantage minus the mean over the choices.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -75,8 +75,8 @@ DEVICE Part find_part(const DuellingParams& p) {
     Part part;
 #pragma unroll
     for (int i = 0; i < ROWS; i++)
-        part.rows[i] = blockIdx.y * (long long)p.n_rows + min(first + i, p.n_rows - 1);
-    part.row = blockIdx.y * (long long)p.n_rows + first + lane / OUTPUTS;
+        part.rows[i] = min(first + i, p.n_rows - 1);
+    part.row = first + lane / OUTPUTS;
     part.part = lane % OUTPUTS;
     part.exists = first + lane / OUTPUTS < p.n_rows && part.part < n_outputs;
     part.agent = min(part.part, n_outputs - 1) / p.n_choices;
@@ -86,13 +86,10 @@ DEVICE Part find_part(const DuellingParams& p) {
 // The value of the thread's choice. Writes it, too.
 DEVICE float value_of(const DuellingParams& p, const Part& me) {
     int n_outputs = p.n_agents * p.n_choices, last = n_outputs - 1;
-    long long agents = blockIdx.y * (long long)p.n_agents;
-    long long outputs = blockIdx.y * (long long)n_outputs;
-    float value = products(p, me.rows, 0, p.value_weight + agents * p.width, p.n_agents);
-    float advantage =
-        products(p, me.rows, p.width, p.advantage_weight + outputs * p.width, n_outputs);
-    advantage += p.advantage_bias[outputs + min(me.part, last)];
-    value = __shfl_sync(~0u, value, me.agent, OUTPUTS) + p.value_bias[agents + me.agent];
+    float value = products(p, me.rows, 0, p.value_weight, p.n_agents);
+    float advantage = products(p, me.rows, p.width, p.advantage_weight, n_outputs);
+    advantage += p.advantage_bias[min(me.part, last)];
+    value = __shfl_sync(~0u, value, me.agent, OUTPUTS) + p.value_bias[me.agent];
     float sum = 0.f;
 #pragma unroll
     for (int k = 0; k < OUTPUTS; k++) {
@@ -128,7 +125,7 @@ KERNEL BOUNDS(64) duelling_act(DuellingParams p) {
     if (p.noise && is_first) {
         long long at = me.row * p.n_agents + agent;
         float epsilon = p.epsilon ? p.epsilon[me.row] : p.usual_epsilon;
-        if (p.noise[gridDim.y * (long long)p.n_rows * p.n_agents + at] < epsilon)
+        if (p.noise[(long long)p.n_rows * p.n_agents + at] < epsilon)
             action = min((int)(p.noise[at] * (float)p.n_choices), p.n_choices - 1);
     }
     if (is_first)
@@ -166,8 +163,7 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
         if (k < n_outputs)
             read<float>(weights[k], weight, (long long)k * p.width + in_half);
     }
-    long long first =
-        blockIdx.y / p.n_parts * (long long)p.n_rows + (long long)blockIdx.x * STRIP_ROWS;
+    long long first = (long long)blockIdx.x * STRIP_ROWS;
     int n_rows = min(STRIP_ROWS, p.n_rows - (int)blockIdx.x * STRIP_ROWS);
     for (int start = 0; start < n_rows; start += AT_ONCE) {
         float hidden[AT_ONCE][2];
@@ -208,14 +204,14 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
 }
 
 // A block handles a strip of rows and up to 2 DUELLING_THREADS columns; blocks along y: the parts
-// of the columns of all policies. A strip's sums are those of the hidden layer's bias, the weights
+// of the columns. A strip's sums are those of the hidden layer's bias, the weights
 // of value and advantages, and their biases, in this order.
 KERNEL BOUNDS(256) duelling_backward(DuellingBackwardParams p) {
     wait_for_previous();
     __shared__ RowGradient gradients[STRIP_ROWS];
     int n_outputs = p.n_agents * p.n_choices, strip = blockIdx.x;
     int n_rows = min(STRIP_ROWS, p.n_rows - strip * STRIP_ROWS);
-    long long policy = blockIdx.y / p.n_parts, first = policy * p.n_rows + strip * STRIP_ROWS;
+    long long first = (long long)strip * STRIP_ROWS;
     for (int i = threadIdx.x; i < STRIP_ROWS; i += DUELLING_THREADS) {
         RowGradient gradient = {};
         if (i < n_rows)
@@ -238,24 +234,22 @@ KERNEL BOUNDS(256) duelling_backward(DuellingBackwardParams p) {
         gradients[i] = gradient;
     }
     __syncthreads();
-    long long agents = policy * p.n_agents, outputs = policy * n_outputs;
-    float* d_bias = p.sums + (policy * gridDim.x + strip) * p.n_sums;
+    float* d_bias = p.sums + (long long)strip * p.n_sums;
     float* d_value_weight = d_bias + 2 * p.width;
     float* d_advantage_weight = d_value_weight + p.n_agents * p.width;
     float* d_biases = d_advantage_weight + n_outputs * p.width;
-    int part = blockIdx.y % p.n_parts, column = 2 * (part * DUELLING_THREADS + threadIdx.x);
+    int part = blockIdx.y, column = 2 * (part * DUELLING_THREADS + threadIdx.x);
     bool is_value = column < p.width;
     if (column < 2 * p.width) {
         if (!is_value)
-            gradient_of_columns<OUTPUTS>(p, gradients, false, column, n_outputs,
-                                         p.advantage_weight + outputs * p.width, d_advantage_weight,
-                                         d_bias);
+            gradient_of_columns<OUTPUTS>(p, gradients, false, column, n_outputs, p.advantage_weight,
+                                         d_advantage_weight, d_bias);
         else if (p.n_agents == 1)
-            gradient_of_columns<1>(p, gradients, true, column, 1, p.value_weight + agents * p.width,
-                                   d_value_weight, d_bias);
+            gradient_of_columns<1>(p, gradients, true, column, 1, p.value_weight, d_value_weight,
+                                   d_bias);
         else
-            gradient_of_columns<OUTPUTS>(p, gradients, true, column, p.n_agents,
-                                         p.value_weight + agents * p.width, d_value_weight, d_bias);
+            gradient_of_columns<OUTPUTS>(p, gradients, true, column, p.n_agents, p.value_weight,
+                                         d_value_weight, d_bias);
     }
     if (!part && threadIdx.x < p.n_agents + n_outputs) {
         float sum = 0.f;

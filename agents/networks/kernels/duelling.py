@@ -116,7 +116,6 @@ def backward(
         width=width,
         n_agents=n_agents,
         n_choices=n_choices,
-        n_parts=n_parts,
         n_sums=sum(sizes),
     )
     d_bias, d_value, d_advantage, d_value_bias, d_advantage_bias = sum_rows(sums).split(sizes)

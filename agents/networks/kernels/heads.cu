@@ -2,7 +2,7 @@
 // log-probability of the actions and the entropy, the value, the error of the auxiliary prediction,
 // and the gradient of that product. A row of the product has the prediction, the scores of the
 // actions, and the critic's hidden layer before its ReLU, each padded to a multiple of 8. Blocks
-// along x are strips of rows; along y, policies.
+// are strips of rows.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -55,12 +55,11 @@ DEVICE float sum_of_eight(float x) {
 // One thread per row for the actions; eight threads per row for the rest.
 KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
     wait_for_previous();
-    long long policy = blockIdx.y, first = policy * p.n_rows;
     int start = (int)blockIdx.x * STRIP;
     int first_score = padded(p.n_predicted);
     int first_hidden = first_score + padded(p.n_agents * p.n_choices);
     int n_columns = first_hidden + p.width;
-    const Bfloat16* product = (const Bfloat16*)p.product + first * n_columns;
+    const Bfloat16* product = (const Bfloat16*)p.product;
 
     int row = start + (int)threadIdx.x;
     if (p.logprobs && threadIdx.x < STRIP && row < p.n_rows) {
@@ -68,17 +67,15 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
         const Bfloat16* scores = product + (long long)row * n_columns + first_score;
         for (int agent = 0; agent < p.n_agents; agent++, scores += p.n_choices) {
             Softmax softmax = softmax_of(scores, p.n_choices);
-            long long action = p.actions[(first + row) * p.n_agents + agent];
+            long long action = p.actions[(long long)row * p.n_agents + agent];
             logprob += logit_of(scores[action], softmax);
             entropy += softmax.entropy;
         }
-        p.logprobs[first + row] = logprob;
-        p.entropies[first + row] = entropy;
+        p.logprobs[row] = logprob;
+        p.entropies[row] = entropy;
     }
 
     int part = threadIdx.x % 8;
-    const float* value_weight = p.value_weight + policy * p.width;
-    const Bfloat16* target = (const Bfloat16*)p.target + first * first_score;
     for (int i = threadIdx.x / 8; i < STRIP; i += STRIP_THREADS / 8) {
         row = min(start + i, p.n_rows - 1);  // all threads of a warp shuffle
         const Bfloat16* columns = product + (long long)row * n_columns;
@@ -87,14 +84,14 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
         for (int column = WORD * part; column < p.width; column += 8 * WORD) {
             float hidden[WORD], weight[WORD];
             read<Bfloat16>(hidden, columns, first_hidden + column);
-            read_word(weight, value_weight + column);
+            read_word(weight, p.value_weight + column);
             for (int n = 0; n < WORD; n++)
                 value += hidden[n] <= 0.f ? 0.f : hidden[n] * weight[n];
         }
         for (int column = WORD * part; column < p.n_predicted; column += 8 * WORD) {
             float predicted[WORD], expected[WORD];
             read<Bfloat16>(predicted, columns, column);
-            read<Bfloat16>(expected, target, (long long)row * first_score + column);
+            read<Bfloat16>(expected, p.target, (long long)row * first_score + column);
             for (int n = 0; n < WORD; n++) {
                 float difference = predicted[n] - expected[n];
                 error += column + n < p.n_predicted ? difference * difference : 0.f;
@@ -104,10 +101,9 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
         error = sum_of_eight(error);
         if (part || start + i >= p.n_rows)
             continue;
-        p.values[first + row] =
-            (value + p.value_bias[policy]) * p.value_scale[policy] + p.value_mean[policy];
+        p.values[row] = (value + *p.value_bias) * *p.value_scale + *p.value_mean;
         if (p.errors)
-            p.errors[first + row] = error / (float)p.n_predicted;
+            p.errors[row] = error / (float)p.n_predicted;
     }
 }
 
@@ -115,7 +111,6 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
 
 // Where a thread reads and writes.
 struct HeadsIndex {
-    long long policy, first;  // row of the policy
     int strip;
     int first_score, first_hidden, n_columns;
     float* sums;  // of this block's strip
@@ -126,14 +121,14 @@ DEVICE void scores_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     int row = index.strip * STRIP + (int)threadIdx.x;
     if (threadIdx.x >= STRIP || row >= p.n_rows)
         return;
-    long long at = (index.first + row) * index.n_columns + index.first_score;
+    long long at = (long long)row * index.n_columns + index.first_score;
     const Bfloat16* scores = (const Bfloat16*)p.product + at;
     Bfloat16* d_scores = (Bfloat16*)p.d_product + at;
-    float d_logprob = p.d_logprobs[index.first + row], d_entropy = p.d_entropies[index.first + row];
+    float d_logprob = p.d_logprobs[row], d_entropy = p.d_entropies[row];
     int n = p.n_choices, n_scores = p.n_agents * n;
     for (int agent = 0; agent < p.n_agents; agent++) {
         Softmax softmax = softmax_of(scores + agent * n, n);
-        long long action = p.actions[(index.first + row) * p.n_agents + agent];
+        long long action = p.actions[(long long)row * p.n_agents + agent];
         for (int k = 0; k < n; k++) {
             float logit = logit_of(scores[agent * n + k], softmax), probability = expf(logit);
             float d = d_logprob * ((action == k ? 1.f : 0.f) - probability) -
@@ -160,7 +155,7 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
             float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
 #pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
-                long long row = index.first + min(start + i * strip.step, strip.end - 1);
+                long long row = min(start + i * strip.step, strip.end - 1);
                 long long at = row * index.n_columns + column;
                 read<Bfloat16>(values[i], is_score ? p.d_product : p.product, at);
                 // a score has no target: reads whatever is in the first columns
@@ -179,7 +174,7 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsIndex& index
                         float d = d_errors[i] * (values[i][n] - expected[i][n]);
                         values[i][n] = column + n < p.n_predicted ? d : 0.f;
                     }
-                    write<Bfloat16>(p.d_product, (index.first + row) * index.n_columns + column,
+                    write<Bfloat16>(p.d_product, (long long)row * index.n_columns + column,
                                     values[i]);
                 }
                 for (int n = 0; n < WORD; n++)
@@ -196,16 +191,16 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
     Strip strip = find_strip(index.strip, min(p.width / WORD - first_word, WARP), p.n_rows);
     int column = WORD * (first_word + strip.word);
     float weight[WORD], sums[WORD], weight_sums[WORD], bias_sum[1];
-    read_word(weight, p.value_weight + index.policy * p.width + column);
+    read_word(weight, p.value_weight + column);
     clear(sums);
     clear(weight_sums);
     clear(bias_sum);
-    float scale = p.value_scale[index.policy];
+    float scale = *p.value_scale;
     for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
         float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
 #pragma unroll
         for (int i = 0; i < AT_ONCE; i++) {
-            long long row = index.first + min(start + i * strip.step, strip.end - 1);
+            long long row = min(start + i * strip.step, strip.end - 1);
             read<Bfloat16>(hidden[i], p.product,
                            row * index.n_columns + index.first_hidden + column);
             d_values[i] = p.d_values[row] * scale;
@@ -223,7 +218,7 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsIndex& inde
                 sums[n] += hidden[i][n];
             }
             write<Bfloat16>(p.d_product,
-                            (index.first + row) * index.n_columns + index.first_hidden + column,
+                            (long long)row * index.n_columns + index.first_hidden + column,
                             hidden[i]);
         }
     }
@@ -239,14 +234,11 @@ KERNEL BOUNDS(256) heads_backward(HeadsBackwardParams p) {
     wait_for_previous();
     int n_parts = 1 + (p.width / WORD + WARP - 1) / WARP, part = blockIdx.x % n_parts;
     HeadsIndex index;
-    index.policy = blockIdx.y;
-    index.first = index.policy * p.n_rows;
     index.strip = blockIdx.x / n_parts;
     index.first_score = padded(p.n_predicted);
     index.first_hidden = index.first_score + padded(p.n_agents * p.n_choices);
     index.n_columns = index.first_hidden + p.width;
-    long long n_strips = gridDim.x / n_parts, n_sums = index.n_columns + p.width + WORD;
-    index.sums = p.sums + (index.policy * n_strips + index.strip) * n_sums;
+    index.sums = p.sums + index.strip * (long long)(index.n_columns + p.width + WORD);
     if (part)
         critic_backward(p, index, part - 1);
     else

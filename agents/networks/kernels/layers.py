@@ -90,7 +90,6 @@ def bias_gradient(
         n_rows=n_rows,
         n_columns=n_columns,
         d_stride=d.stride(0),
-        n_strips=n_strips,
     )
     return d_masked, sum_rows(sums)
 

@@ -90,7 +90,6 @@ def forward(gates, weight, reset, output, cell, needs_backward, residual=None) -
         saved_cells=saved[1],
         n_steps=n_steps,
         n_lanes=n_lanes,
-        n_policies=1,
         n_clusters=n_clusters,
     )
     return outputs, hiddens, after, last_cell, saved
@@ -130,7 +129,6 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell) -> Grad
         d_last_cell=d_last_cell,
         n_steps=n_steps,
         n_lanes=n_lanes,
-        n_policies=1,
         n_clusters=n_clusters,
     )
     return d_gates, sum_rows(d_bias), d_last_output, d_last_cell

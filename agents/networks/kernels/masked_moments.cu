@@ -1,6 +1,5 @@
 // Means and variances of the valid ones of many numbers, such as returns; normalisation by them;
-// and adding those of returns to the critic's (PopArt). Blocks along y: policies, with their
-// arrays.
+// and adding those of returns to the critic's (PopArt). Blocks along y: arrays.
 #include "block_sum.h"
 #include "constants.h"
 #include "lanes.h"
@@ -11,17 +10,14 @@ static_assert(sizeof(MaskedPartsParams::arrays) == MASKED_ARRAYS * sizeof(Masked
 // A block has MASKED_NUMBERS neighbouring numbers of an array per thread.
 KERNEL BOUNDS(256) masked_parts(MaskedPartsParams p) {
     wait_for_previous();
-    int array = blockIdx.y % p.n_arrays;
-    long long policy = blockIdx.y / p.n_arrays;
-    const float* values = p.arrays[array].values + policy * p.n;
-    const unsigned char* valid = p.valid + policy * p.n;
+    const float* values = p.arrays[blockIdx.y].values;
     int first = blockIdx.x * (MASKED_THREADS * MASKED_NUMBERS) + threadIdx.x;
     float numbers[MASKED_NUMBERS], count = 0.f, sum = 0.f, squares = 0.f;
     bool counts[MASKED_NUMBERS];
 #pragma unroll
     for (int i = 0; i < MASKED_NUMBERS; i++) {
         int at = first + i * MASKED_THREADS;
-        counts[i] = at < p.n && valid[at];
+        counts[i] = at < p.n && p.valid[at];
         numbers[i] = at < p.n ? values[at] : 0.f;
     }
 #pragma unroll
@@ -65,45 +61,41 @@ KERNEL BOUNDS(256) masked_moments(MaskedMomentsParams p) {
         return;
     p.moments[2 * blockIdx.y] = (float)mean;
     p.moments[2 * blockIdx.y + 1] = (float)(squares / n);
-    if (blockIdx.y % p.n_arrays == 0)
-        p.n_valid[blockIdx.y / p.n_arrays] = (long long)count;
+    if (!blockIdx.y)
+        *p.n_valid = (long long)count;
 }
 
 KERNEL normalise_masked(NormaliseMaskedParams p) {
     wait_for_previous();
-    int of_policy = blockIdx.x * blockDim.x + threadIdx.x, policy = blockIdx.y;
-    if (of_policy >= p.n)
+    int at = blockIdx.x * blockDim.x + threadIdx.x;
+    if (at >= p.n)
         return;
-    long long at = (long long)policy * p.n + of_policy;
-    float away = p.values[at] - p.mean[policy];
-    p.normalised[at] = p.valid[at] ? __fdiv_rn(away, sqrtf(p.variance[policy]) + 1e-30f) : 0.f;
+    float away = p.values[at] - *p.mean;
+    p.normalised[at] = p.valid[at] ? __fdiv_rn(away, sqrtf(*p.variance) + 1e-30f) : 0.f;
 }
 
 // Changes nothing if no return is valid, if a number is not finite, or if all returns have been 0.
 KERNEL BOUNDS(256) add_returns(AddReturnsParams p) {
     wait_for_previous();
-    int policy = blockIdx.y;
-    float old_mean = p.mean[policy], old_scale = p.scale[policy];
-    float count = p.count[policy] + 1.f;
+    float old_mean = *p.mean, old_scale = *p.scale, count = *p.count + 1.f;
     float rate = fminf(fmaxf(__fdiv_rn(1.f, count), p.min_rate), 1.f);
-    float away = p.new_mean[policy] - old_mean, old_variance = old_scale * old_scale;
-    float variance = old_variance + rate * (p.new_variance[policy] - old_variance) +
-                     rate * (1.f - rate) * away * away;
+    float away = *p.new_mean - old_mean, old_variance = old_scale * old_scale;
+    float variance =
+        old_variance + rate * (*p.new_variance - old_variance) + rate * (1.f - rate) * away * away;
     float mean = old_mean + rate * away, scale = sqrtf(variance);
     bool is_nothing = count == 1.f && scale == 0.f && mean == 0.f;
     float min_scale = fmaxf(p.min_scale, RESOLUTION * fabsf(mean));
     scale = scale < min_scale ? min_scale : scale;  // NaN stays
-    bool is_counted = !p.is_counted || p.is_counted[policy];
-    if (!is_counted || is_nothing || p.n_valid[policy] <= 0 || !isfinite(mean + scale))
+    bool is_counted = !p.is_counted || *p.is_counted;
+    if (!is_counted || is_nothing || *p.n_valid <= 0 || !isfinite(mean + scale))
         return;
-    float* weight = p.weight + (long long)policy * p.width;
     for (int i = threadIdx.x; i < p.width; i += MASKED_THREADS)
-        weight[i] *= __fdiv_rn(old_scale, scale);
+        p.weight[i] *= __fdiv_rn(old_scale, scale);
     __syncthreads();  // all have read the old statistics
     if (threadIdx.x)
         return;
-    p.bias[policy] = __fdiv_rn(p.bias[policy] * old_scale + (old_mean - mean), scale);
-    p.mean[policy] = mean;
-    p.scale[policy] = scale;
-    p.count[policy] = count;
+    *p.bias = __fdiv_rn(*p.bias * old_scale + (old_mean - mean), scale);
+    *p.mean = mean;
+    *p.scale = scale;
+    *p.count = count;
 }

@@ -69,10 +69,10 @@ def forward(
     return outputs, last
 
 
-def blocks(n_lanes: int, width: int, n_policies: int = 1) -> Blocks:
-    """Returns the blocks that step all lanes of each policy."""
+def blocks(n_lanes: int, width: int) -> Blocks:
+    """Returns the blocks that step all lanes."""
     n_blocks = -(-n_lanes // _LANES) * width // _UNITS
-    return Blocks(n_blocks, n_policies, _THREADS, _shared(width))
+    return Blocks(n_blocks, 1, _THREADS, _shared(width))
 
 
 def _shared(width) -> int:

@@ -1,5 +1,5 @@
 // Means and variances of observations over lanes, one block per statistic; and adding them to
-// running statistics, one block per leaf. Blocks along y are policies.
+// running statistics, one block per leaf.
 #include "block_sum.h"
 #include "constants.h"
 #include "half.h"
@@ -24,10 +24,9 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
     bool in_words =
         leaf.is_half && leaf.group % 8 == 0 && (unsigned long long)leaf.values % 16 == 0;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += MOMENTS_THREADS) {
-        long long row = (long long)blockIdx.y * p.n_lanes + lane;
-        if (!p.is_counted[row])
+        if (!p.is_counted[lane])
             continue;
-        long long at = row * leaf.n_features + first;
+        long long at = (long long)lane * leaf.n_features + first;
         if (in_words) {
             const uint4* words = (const uint4*)((const unsigned short*)leaf.values + at);
 #pragma unroll 4
@@ -49,17 +48,17 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
 
 KERNEL BOUNDS(1024) moments(MomentsParams p) {
     wait_for_previous();
-    int statistic = blockIdx.x, leaf = 0, policy = blockIdx.y, n_policies = gridDim.y;
+    int statistic = blockIdx.x, leaf = 0;
     float* results = p.moments;  // of the leaf
     for (; statistic >= p.leaves[leaf].n_features / p.leaves[leaf].group; leaf++) {
         int n_statistics = p.leaves[leaf].n_features / p.leaves[leaf].group;
         statistic -= n_statistics;
-        results += 2 * n_policies * n_statistics;
+        results += 2 * n_statistics;
     }
     IntakeLeafParams chosen = p.leaves[leaf];
     float n_counted = 0.f;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += MOMENTS_THREADS)
-        n_counted += p.is_counted[(long long)policy * p.n_lanes + lane] ? 1.f : 0.f;
+        n_counted += p.is_counted[lane] ? 1.f : 0.f;
     n_counted = sum_of_block<MOMENTS_THREADS>(n_counted);  // exact below 2^24
     float n = fmaxf(n_counted, 1.f) * (float)chosen.group;
     int first = statistic * chosen.group;
@@ -67,24 +66,22 @@ KERNEL BOUNDS(1024) moments(MomentsParams p) {
     float variance = __fdiv_rn(sum_of<true>(p, chosen, first, mean), n);
     if (threadIdx.x)
         return;
-    int n_statistics = chosen.n_features / chosen.group, at = policy * n_statistics + statistic;
-    results[at] = mean;
-    results[n_policies * n_statistics + at] = variance;
+    results[statistic] = mean;
+    results[chosen.n_features / chosen.group + statistic] = variance;
     if (!blockIdx.x)
-        p.n_counted[policy] = (long long)n_counted;
+        *p.n_counted = (long long)n_counted;
 }
 
 // Changes nothing if no lane was counted, if moments do not count, or if a number is not finite.
 KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
     wait_for_previous();
     const RunningNormParams& norm = p.norms[blockIdx.x];
-    int policy = blockIdx.y, first = policy * norm.n;
-    bool is_counted = !p.is_counted || p.is_counted[policy];
-    float count = norm.count[policy] + 1.f, rate = __fdiv_rn(1.f, count);
+    bool is_counted = !p.is_counted || *p.is_counted;
+    float count = *norm.count + 1.f, rate = __fdiv_rn(1.f, count);
     for (int pass = 0; pass < 2; pass++) {  // first only looks
         bool stores = pass == 1;
         bool is_finite = true;
-        for (int i = first + threadIdx.x; i < first + norm.n; i += MOMENTS_THREADS) {
+        for (int i = threadIdx.x; i < norm.n; i += MOMENTS_THREADS) {
             float old_mean = norm.mean[i], old_scale = norm.scale[i];
             float away = norm.new_mean[i] - old_mean;
             float old_variance = old_scale < UNKNOWN_SCALE ? old_scale * old_scale : 0.f;
@@ -99,9 +96,9 @@ KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
                 norm.scale[i] = scale;
             }
         }
-        if (!__syncthreads_and(is_finite) || !is_counted || norm.n_counted[policy] <= 0)
+        if (!__syncthreads_and(is_finite) || !is_counted || *norm.n_counted <= 0)
             return;
     }
     if (!threadIdx.x)
-        norm.count[policy] = count;
+        *norm.count = count;
 }

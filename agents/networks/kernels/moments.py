@@ -108,7 +108,6 @@ def masked_moments(
         valid=valid,
         parts=parts,
         n=n_numbers,
-        n_arrays=len(arrays),
     )
     launch(
         *(LIBRARY, "masked_moments", tensor.device, Blocks(1, len(arrays), _THREADS)),
@@ -116,7 +115,6 @@ def masked_moments(
         moments=moments,
         n_valid=n_valid,
         n_parts=n_parts,
-        n_arrays=len(arrays),
     )
     return n_valid, moments
 

@@ -67,12 +67,11 @@ DEVICE void write_row(const NormaliseParams& p, const Rows& rows, int i, int col
 // Four features of one leaf with one mean and scale, which a word holds.
 template <class Word>
 DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int column,
-                           const Feature& feature, long long policy) {
-    long long statistic = policy * (feature.n_features / feature.group);
+                           const Feature& feature) {
     float means[4], scales[4];
 #pragma unroll
     for (int n = 0; n < 4; n++) {
-        long long at = statistic + (feature.number + n) / feature.group;
+        int at = (feature.number + n) / feature.group;
         means[n] = feature.mean[at];
         scales[n] = feature.scale[at];
     }
@@ -96,14 +95,12 @@ DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int colum
 }
 
 // Any four features, one by one.
-DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int column,
-                               long long policy) {
+DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int column) {
     float values[NORMALISED_ROWS][4];
 #pragma unroll
     for (int n = 0; n < 4; n++) {
         Feature feature = find(p, column + n);
-        int number = max(feature.number, 0);
-        long long at = policy * (feature.n_features / feature.group) + number / feature.group;
+        int number = max(feature.number, 0), at = number / feature.group;
         float mean = feature.mean[at], scale = feature.scale[at];
         const unsigned short* halves = (const unsigned short*)feature.values;
         // a float as two halves, so that no load depends on a branch
@@ -128,7 +125,7 @@ DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int c
         write_row(p, rows, i, column, values[i]);
 }
 
-// Blocks along y: steps of all policies.
+// Blocks along y: steps.
 KERNEL BOUNDS(64) normalise(NormaliseParams p) {
     wait_for_previous();
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_words = p.n_columns / 4;
@@ -144,12 +141,11 @@ KERNEL BOUNDS(64) normalise(NormaliseParams p) {
     unsigned int column = 4 * word;
     if (first >= step)
         return;
-    unsigned int policy = blockIdx.y / p.n_steps;
     Rows rows;
 #pragma unroll
     for (int i = 0; i < NORMALISED_ROWS; i++) {
         unsigned int m = min(first + i * step, n_selected - 1);
-        unsigned int lane = p.lanes ? (unsigned int)p.lanes[policy * n_selected + m] : m;
+        unsigned int lane = p.lanes ? (unsigned int)p.lanes[m] : m;
         rows.exists[i] = first + i * step < n_selected;
         rows.source[i] = blockIdx.y * p.n_lanes + lane;
         rows.target[i] = blockIdx.y * n_selected + m;
@@ -158,9 +154,9 @@ KERNEL BOUNDS(64) normalise(NormaliseParams p) {
     bool is_word = feature.number >= 0 && feature.number % 4 == 0 && feature.n_features % 4 == 0;
     bool is_aligned = (unsigned long long)feature.values % (feature.is_half ? 8 : 16) == 0;
     if (is_word && is_aligned && feature.is_half)
-        normalise_word<uint2>(p, rows, column, feature, policy);
+        normalise_word<uint2>(p, rows, column, feature);
     else if (is_word && is_aligned)
-        normalise_word<uint4>(p, rows, column, feature, policy);
+        normalise_word<uint4>(p, rows, column, feature);
     else
-        normalise_features(p, rows, column, policy);
+        normalise_features(p, rows, column);
 }

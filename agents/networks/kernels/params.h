@@ -105,14 +105,12 @@ struct MingruBackwardParams {
 };
 
 // ---- Layers ----
-//
-// P policies, each with its own weights, statistics and rows: every array starts with the axis P.
 
 // One leaf of an observation. Mean and scale belong to `group` neighbouring features.
 struct IntakeLeafParams {
-    const void* values;  // (P, T, B, n_features) float16 or float32
-    const float* mean;   // (P, n_features / group)
-    const float* scale;  // (P, n_features / group)
+    const void* values;  // (T, B, n_features) float16 or float32
+    const float* mean;   // (n_features / group)
+    const float* scale;  // (n_features / group)
     int n_features;      // 0: there is no such leaf
     int group;
     int is_half;
@@ -120,8 +118,8 @@ struct IntakeLeafParams {
 
 struct NormaliseParams {
     IntakeLeafParams leaves[8];
-    const long long* lanes;  // (P, M), the lanes to read; null: all, M = B
-    void* features;          // (P, T, M, n_columns) bfloat16
+    const long long* lanes;  // (M), the lanes to read; null: all, M = B
+    void* features;          // (T, M, n_columns) bfloat16
     int n_steps;
     int n_lanes;        // B
     int n_selected;     // M
@@ -131,33 +129,33 @@ struct NormaliseParams {
 };
 
 struct MomentsParams {
-    IntakeLeafParams leaves[8];       // (P, B, n_features), without mean and scale
-    const unsigned char* is_counted;  // (P, B)
-    float* moments;        // of each leaf (2, P, n_features / group): means, then variances
-    long long* n_counted;  // (P)
+    IntakeLeafParams leaves[8];       // (B, n_features), without mean and scale
+    const unsigned char* is_counted;  // (B)
+    float* moments;                   // of each leaf (2, n_features / group): means, then variances
+    long long* n_counted;             // ()
     int n_lanes;
 };
 
 // A leaf's running statistics, and the moments to add to them.
 struct RunningNormParams {
-    float* mean;                 // (P, n)
-    float* scale;                // (P, n)
-    float* count;                // (P)
-    const float* new_mean;       // (P, n)
-    const float* new_variance;   // (P, n)
-    const long long* n_counted;  // (P)
+    float* mean;                 // (n)
+    float* scale;                // (n)
+    float* count;                // ()
+    const float* new_mean;       // (n)
+    const float* new_variance;   // (n)
+    const long long* n_counted;  // ()
     int n;
 };
 
 struct AddMomentsParams {
     RunningNormParams norms[8];
-    const unsigned char* is_counted;  // (P), false: nothing changes; null: true
+    const unsigned char* is_counted;  // (), false: nothing changes; null: true
 };
 
 // A weight, and where it is rounded to.
 struct CastRowParams {
-    const float* source;  // (P, n)
-    void* target;         // (P, n_padded) bfloat16, at a multiple of 16 bytes
+    const float* source;  // (n)
+    void* target;         // (n_padded) bfloat16, at a multiple of 16 bytes
     unsigned int n;
     unsigned int n_padded;     // a multiple of 8
     unsigned int first_block;  // of the launch that handles it
@@ -170,76 +168,73 @@ struct CastParams {
 
 // Numbers of which some are valid; the others may be anything.
 struct MaskedArrayParams {
-    const float* values;  // (P, n)
+    const float* values;  // (n)
 };
 
 struct MaskedPartsParams {
     MaskedArrayParams arrays[4];
-    const unsigned char* valid;  // (P, n), of all arrays
-    float* parts;  // (P, n_arrays, n_blocks, 3): count, mean, sum of squared distances from it
+    const unsigned char* valid;  // (n), of all arrays
+    float* parts;  // (n_arrays, n_blocks, 3): count, mean, sum of squared distances from it
     int n;
-    int n_arrays;
 };
 
 struct MaskedMomentsParams {
-    const float* parts;  // (P, n_arrays, n_parts, 3)
-    float* moments;      // (P, n_arrays, 2), means and variances
-    long long* n_valid;  // (P)
+    const float* parts;  // (n_arrays, n_parts, 3)
+    float* moments;      // (n_arrays, 2), means and variances
+    long long* n_valid;  // ()
     int n_parts;
-    int n_arrays;
 };
 
 struct NormaliseMaskedParams {
-    const float* values;         // (P, n)
-    const unsigned char* valid;  // (P, n)
-    const float* mean;           // (P)
-    const float* variance;       // (P)
-    float* normalised;           // (P, n), 0 where invalid
+    const float* values;         // (n)
+    const unsigned char* valid;  // (n)
+    const float* mean;           // ()
+    const float* variance;       // ()
+    float* normalised;           // (n), 0 where invalid
     int n;
 };
 
 // The critic's last layer, and the statistics of returns that it predicts in.
 struct AddReturnsParams {
-    float* weight;                    // (P, W)
-    float* bias;                      // (P)
-    float* mean;                      // (P)
-    float* scale;                     // (P)
-    float* count;                     // (P)
-    const float* new_mean;            // (P)
-    const float* new_variance;        // (P)
-    const long long* n_valid;         // (P)
-    const unsigned char* is_counted;  // (P), false: nothing changes; null: true
+    float* weight;                    // (W)
+    float* bias;                      // ()
+    float* mean;                      // ()
+    float* scale;                     // ()
+    float* count;                     // ()
+    const float* new_mean;            // ()
+    const float* new_variance;        // ()
+    const long long* n_valid;         // ()
+    const unsigned char* is_counted;  // (), false: nothing changes; null: true
     int width;
     float min_rate;
     float min_scale;
 };
 
 struct BiasGradientParams {
-    const void* d;          // (P, n_rows, n_columns) bfloat16, a row every d_stride numbers
-    const void* activated;  // (P, n_rows, n_columns), as d_masked; null: no activation
+    const void* d;          // (n_rows, n_columns) bfloat16, a row every d_stride numbers
+    const void* activated;  // (n_rows, n_columns), as d_masked; null: no activation
     void* d_masked;  // d, 0 where `activated` is not above 0 (NaN counts as above); null without
-    float* sums;     // (P, n_strips, n_columns), over STRIP rows each
+    float* sums;     // (n_strips, n_columns), over STRIP rows each
     int n_rows;      // at most 2^31 - STRIP
     int n_columns;   // a multiple of 8
     int d_stride;    // a multiple of 8
-    int n_strips;
 };
 
 struct SumRowsParams {
-    const float* rows;  // (P, n_rows, n_columns)
-    float* sums;        // (P, n_columns)
+    const float* rows;  // (n_rows, n_columns)
+    float* sums;        // (n_columns)
     int n_rows;
     int n_columns;
 };
 
 struct CategoricalActParams {
-    const void* features;  // (P, B, W) compute
-    const void* weight;    // (P, A n, W) compute
-    const void* bias;      // (P, A n) compute
-    const float* noise;    // (P, B, A, n), exponentially distributed; null: the most likely
-    float* logits;         // (P, B, A, n), log-probabilities
-    long long* actions;    // (P, B, A)
-    float* logprobs;       // (P, B), of the joint actions
+    const void* features;  // (B, W) compute
+    const void* weight;    // (A n, W) compute
+    const void* bias;      // (A n) compute
+    const float* noise;    // (B, A, n), exponentially distributed; null: the most likely
+    float* logits;         // (B, A, n), log-probabilities
+    long long* actions;    // (B, A)
+    float* logprobs;       // (B), of the joint actions
     int n_lanes;
     int width;  // a multiple of 8
     int n_agents;
@@ -270,17 +265,17 @@ struct CategoricalTermsBackwardParams {
 // The heads of an update. A row of their product has the prediction, the actions' scores, and the
 // critic's hidden layer of W units before its ReLU, each padded to a multiple of 8.
 struct HeadsForwardParams {
-    const void* product;        // (P, n_rows, n_columns) bfloat16
-    const void* target;         // (P, n_rows, n_predicted, padded) bfloat16, of the prediction
-    const long long* actions;   // (P, n_rows, A)
-    const float* value_weight;  // (P, W)
-    const float* value_bias;    // (P)
-    const float* value_scale;   // (P)
-    const float* value_mean;    // (P)
-    float* logprobs;            // (P, n_rows), of the joint actions; null: not wanted
-    float* entropies;           // (P, n_rows)
-    float* errors;              // (P, n_rows), of the prediction; null: not wanted
-    float* values;              // (P, n_rows)
+    const void* product;        // (n_rows, n_columns) bfloat16
+    const void* target;         // (n_rows, n_predicted, padded) bfloat16, of the prediction
+    const long long* actions;   // (n_rows, A)
+    const float* value_weight;  // (W)
+    const float* value_bias;    // ()
+    const float* value_scale;   // ()
+    const float* value_mean;    // ()
+    float* logprobs;            // (n_rows), of the joint actions; null: not wanted
+    float* entropies;           // (n_rows)
+    float* errors;              // (n_rows), of the prediction; null: not wanted
+    float* values;              // (n_rows)
     int n_rows;                 // at most 2^31 - STRIP
     int n_predicted;
     int n_agents;
@@ -294,12 +289,12 @@ struct HeadsBackwardParams {
     const long long* actions;
     const float* value_weight;
     const float* value_scale;
-    const float* d_logprobs;   // (P, n_rows)
-    const float* d_entropies;  // (P, n_rows)
-    const float* d_errors;     // (P, n_rows)
-    const float* d_values;     // (P, n_rows)
-    void* d_product;           // (P, n_rows, n_columns) bfloat16
-    float* sums;               // (P, n_strips, n_columns + W + 8), of d_product, and the gradients
+    const float* d_logprobs;   // (n_rows)
+    const float* d_entropies;  // (n_rows)
+    const float* d_errors;     // (n_rows)
+    const float* d_values;     // (n_rows)
+    void* d_product;           // (n_rows, n_columns) bfloat16
+    float* sums;               // (n_strips, n_columns + W + 8), of d_product, and the gradients
                                // of the value's weight and bias, over STRIP rows each
     int n_rows;
     int n_predicted;
@@ -309,16 +304,16 @@ struct HeadsBackwardParams {
 };
 
 struct DuellingParams {
-    const void* hidden;             // (P, n_rows, 2 W) bfloat16
-    const float* value_weight;      // (P, A, W)
-    const float* value_bias;        // (P, A)
-    const float* advantage_weight;  // (P, A n, W)
-    const float* advantage_bias;    // (P, A n)
-    const float* noise;             // (2, P, n_rows, A) from 0 to 1; null: no random actions
-    const float* epsilon;           // (P, n_rows); null: `usual_epsilon`
-    float* values;                  // (P, n_rows, A, n)
-    long long* actions;             // (P, n_rows, A); null unless acting, like `logprobs`
-    float* logprobs;                // (P, n_rows), of the joint actions with `usual_epsilon`
+    const void* hidden;             // (n_rows, 2 W) bfloat16
+    const float* value_weight;      // (A, W)
+    const float* value_bias;        // (A)
+    const float* advantage_weight;  // (A n, W)
+    const float* advantage_bias;    // (A n)
+    const float* noise;             // (2, n_rows, A) from 0 to 1; null: no random actions
+    const float* epsilon;           // (n_rows); null: `usual_epsilon`
+    float* values;                  // (n_rows, A, n)
+    long long* actions;             // (n_rows, A); null unless acting, like `logprobs`
+    float* logprobs;                // (n_rows), of the joint actions with `usual_epsilon`
     int n_rows;
     int width;      // a multiple of 8
     int n_agents;   // A
@@ -327,18 +322,17 @@ struct DuellingParams {
 };
 
 struct DuellingBackwardParams {
-    const void* hidden;             // (P, n_rows, 2 W) bfloat16, after the ReLU
-    const float* value_weight;      // (P, A, W)
-    const float* advantage_weight;  // (P, A n, W)
-    const float* d_values;          // (P, n_rows, A, n)
-    void* d_hidden;                 // (P, n_rows, 2 W) bfloat16, before the ReLU
-    float* sums;                    // (P, n_strips, n_sums); see the kernel
+    const void* hidden;             // (n_rows, 2 W) bfloat16, after the ReLU
+    const float* value_weight;      // (A, W)
+    const float* advantage_weight;  // (A n, W)
+    const float* d_values;          // (n_rows, A, n)
+    void* d_hidden;                 // (n_rows, 2 W) bfloat16, before the ReLU
+    float* sums;                    // (n_strips, n_sums); see the kernel
     int n_rows;
     int width;
     int n_agents;
     int n_choices;
-    int n_parts;  // blocks for the columns of a row
-    int n_sums;   // (2 + A + A n) W + A + A n
+    int n_sums;  // (2 + A + A n) W + A + A n
 };
 
 // The LSTM over a whole sequence, on the CPU. Everything is float32, W is a multiple of 16.

@@ -82,9 +82,8 @@ DEVICE void multiply(float (&sums)[TILES][C][4], const unsigned int (&left)[TILE
 }
 
 // The number of the block whose saved numbers of step t these are.
-DEVICE long long saved_block(long long policy, int t, int n_steps, int cluster, int n_clusters,
-                             int n_ranks, int rank) {
-    return ((policy * n_steps + t) * n_clusters + cluster) * n_ranks + rank;
+DEVICE long long saved_block(int t, int cluster, int n_clusters, int n_ranks, int rank) {
+    return ((long long)t * n_clusters + cluster) * n_ranks + rank;
 }
 
 // One bit per lane of the cluster, for each step: whether the lane is reset before it.
@@ -147,14 +146,12 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
     int n_steps = p.n_steps, n_lanes = p.n_lanes, last_lane = n_lanes - 1;
-    long long policy = blockIdx.y, lanes = policy * n_lanes;
     int unit = rank * UNITS + me.unit;
-    const Bits* gates = (const Bits*)p.gates + policy * n_steps * n_lanes * (4 * W);
-    const unsigned char* reset = p.reset + policy * n_steps * n_lanes;
-    const Bits* residual =
-        p.residual ? (const Bits*)p.residual + policy * n_steps * n_lanes * W : nullptr;
-    Bits* outputs = (Bits*)p.outputs + policy * n_steps * n_lanes * W;
-    Bits* hiddens = (Bits*)p.hiddens + policy * n_steps * n_lanes * W;
+    const Bits* gates = (const Bits*)p.gates;
+    const unsigned char* reset = p.reset;
+    const Bits* residual = (const Bits*)p.residual;
+    Bits* outputs = (Bits*)p.outputs;
+    Bits* hiddens = (Bits*)p.hiddens;
 
     auto begin_gates = [&](int t) {
         if (t < n_steps) {
@@ -181,7 +178,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
 
     // Rows of tile 0: input gates, then forget gates; of tile 1: candidates, then output gates
     unsigned int weights[2][W / 16][4];
-    const Bits* weight = (const Bits*)p.weight + policy * (4 * W) * W;
+    const Bits* weight = (const Bits*)p.weight;
 #pragma unroll
     for (int tile = 0; tile < 2; tile++)
 #pragma unroll
@@ -197,7 +194,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     for (int i = me.index; i < LANES * W / 2; i += THREADS) {
         int lane = i / (W / 2), column = 2 * (i % (W / 2));
         int from = min(first_lane + lane, last_lane);
-        float2 pair = *(const float2*)(p.last_output + (lanes + from) * W + column);
+        float2 pair = *(const float2*)(p.last_output + (long long)from * W + column);
         unsigned int bits = reset[from] ? 0u : pack_bfloat16(pair.x, pair.y);
         *(unsigned int*)&memory.hidden[0][column / UNITS][lane][column % UNITS] = bits;
         if (column / UNITS == rank && first_lane + lane < n_lanes)
@@ -209,7 +206,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = min(first_lane + 8 * j + 2 * me.q + e, last_lane);
-            cells[j][e] = reset[lane] ? 0.f : p.last_cell[(lanes + lane) * W + unit];
+            cells[j][e] = reset[lane] ? 0.f : p.last_cell[(long long)lane * W + unit];
         }
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
     if (!me.index) {
@@ -259,8 +256,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             }
         if (p.saved_gates) {
             long long first =
-                COLUMNS * saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank) +
-                G::FIRST_COLUMN;
+                COLUMNS * saved_block(t, cluster, p.n_clusters, RANKS, rank) + G::FIRST_COLUMN;
 #pragma unroll
             for (int j = 0; j < C; j++) {
                 long long at = (first + j) * THREADS + me.index;
@@ -310,8 +306,8 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             } else if (!sends && exists) {
                 uint4 value = *(const uint4*)&memory.output[t & 1][lane][part];
                 if (is_last)
-                    write_floats(p.output + (lanes + first_lane + lane) * W + rank * UNITS + part,
-                                 value);
+                    write_floats(
+                        p.output + ((long long)first_lane + lane) * W + rank * UNITS + part, value);
                 if (residual)
                     value = add(value,
                                 *(const uint4*)&memory.residual[t % RESIDUAL_STAGES][lane][part]);
@@ -330,7 +326,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             if (lane < n_lanes)
-                p.cell[(lanes + lane) * W + unit] = cells[j][e];
+                p.cell[(long long)lane * W + unit] = cells[j][e];
         }
     cluster_barrier();  // no block ends while another sends to it
 }
@@ -362,11 +358,10 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
     int n_steps = p.n_steps, n_lanes = p.n_lanes, last_lane = n_lanes - 1;
-    long long policy = blockIdx.y, lanes = policy * n_lanes;
     int unit = rank * UNITS + me.unit;
-    const unsigned char* reset = p.reset + policy * n_steps * n_lanes;
-    const Bits* d_outputs = (const Bits*)p.d_outputs + policy * n_steps * n_lanes * W;
-    Bits* d_gates = (Bits*)p.d_gates + policy * n_steps * n_lanes * (4 * W);
+    const unsigned char* reset = p.reset;
+    const Bits* d_outputs = (const Bits*)p.d_outputs;
+    Bits* d_gates = (Bits*)p.d_gates;
 
     auto begin_d_output = [&](int t) {
         if (t >= 0)
@@ -382,7 +377,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 
     // Rows: the units whose outputs fed the gates, ROWS per warp. Columns: this block's gates.
     unsigned int weights[TILES][GATES / 16][4];
-    const Bits* weight = (const Bits*)p.weight + policy * W * (4 * W);
+    const Bits* weight = (const Bits*)p.weight;
 #pragma unroll
     for (int tile = 0; tile < TILES; tile++)
 #pragma unroll
@@ -402,7 +397,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             bool exists = p.d_cell && lane < n_lanes;
-            d_cells[j][e] = exists ? p.d_cell[(lanes + lane) * W + unit] : 0.f;
+            d_cells[j][e] = exists ? p.d_cell[(long long)lane * W + unit] : 0.f;
         }
     // What was saved of the next step to go back through
     uint4 gates[COLUMNS];
@@ -411,8 +406,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         typedef decltype(group) G;
         if (t < 0)
             return;
-        long long first =
-            COLUMNS * saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank);
+        long long first = COLUMNS * saved_block(t, cluster, p.n_clusters, RANKS, rank);
 #pragma unroll
         for (int j = G::FIRST_COLUMN; j < G::FIRST_COLUMN + G::COLUMNS; j++) {
             long long at = (first + j) * THREADS + me.index;
@@ -547,7 +541,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
                 int lane = G::FIRST_LANE + 8 * j + 2 * me.q + e;
                 if (first_lane + lane < n_lanes) {
                     bool cut = memory.resets[0] >> lane & 1;
-                    long long at = (lanes + first_lane + lane) * W + unit;
+                    long long at = ((long long)first_lane + lane) * W + unit;
                     p.d_last_output[at] = cut ? 0.f : d_hiddens[j][e];
                     p.d_last_cell[at] = cut ? 0.f : d_cells[G::FIRST_COLUMN + j][e];
                 }
@@ -561,7 +555,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         sum += __shfl_xor_sync(~0u, sum, 1);
         sum += __shfl_xor_sync(~0u, sum, 2);
         if (!me.q)
-            p.d_bias[(policy * p.n_clusters + cluster) * (4 * W) + gate * W + unit] = sum;
+            p.d_bias[cluster * (4 * W) + gate * W + unit] = sum;
     }
     cluster_barrier();  // no block ends while another sends to it
 }

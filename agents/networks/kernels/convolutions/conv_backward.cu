@@ -92,10 +92,9 @@ struct BackwardWeights {
 
 template <int R>
 DEVICE void load(BackwardWeights<R>& weights, const ConvBackwardParams& p, const Thread& me) {
-    long long policy = blockIdx.y;
-    const Bits* first = (const Bits*)p.first_weight + policy * CONV_CHANNELS * p.n_channels * 8;
-    const Bits* second = (const Bits*)p.second_weight + policy * CONV_CHANNELS * CONV_CHANNELS * 4;
-    const Bits* first_bias = (const Bits*)p.first_bias + policy * CONV_CHANNELS;
+    const Bits* first = (const Bits*)p.first_weight;
+    const Bits* second = (const Bits*)p.second_weight;
+    const Bits* first_bias = (const Bits*)p.first_bias;
 #pragma unroll
     for (int part = 0; part < 4; part++) {
         int hidden = 16 * me.half + me.g + 8 * (part & 1);
@@ -156,7 +155,7 @@ DEVICE void expect_tile(const Tile& tile, int first_row, int n_features,
 template <int R>
 DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_features,
                        const ConvBackwardParams& p, const Thread& me) {
-    long long first = (long long)blockIdx.y * p.n_rows + first_row;
+    long long first = first_row;
     int n_rows = min(p.n_rows - first_row, ROWS);
     if (me.lane < 2 * ROWS / WARPS) {  // a row of one of two arrays
         int row = me.warp + WARPS * (me.lane >> 1);
@@ -462,7 +461,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
         return;
     for_each(sums, [&](float& sum, int n) { sum += of_threads[32 * HALVES * n]; });
     int n_sums = CONV_CHANNELS * (p.n_channels * 8 + 1 + CONV_CHANNELS * TAPS + 1);
-    long long block = (long long)blockIdx.y * gridDim.x + blockIdx.x;
+    long long block = blockIdx.x;
     write(sums, p.sums + block * n_sums, p.n_channels, me);
 }
 

@@ -67,11 +67,10 @@ struct ForwardWeights {
 
 template <int N>
 DEVICE void load(ForwardWeights<N>& weights, const ConvForwardParams& p, int g, int q) {
-    long long policy = blockIdx.y;
-    const Bits* first = (const Bits*)p.first_weight + policy * CONV_CHANNELS * p.n_channels * 8;
-    const Bits* second = (const Bits*)p.second_weight + policy * CONV_CHANNELS * CONV_CHANNELS * 4;
-    const Bits* first_bias = (const Bits*)p.first_bias + policy * CONV_CHANNELS;
-    const Bits* second_bias = (const Bits*)p.second_bias + policy * CONV_CHANNELS;
+    const Bits* first = (const Bits*)p.first_weight;
+    const Bits* second = (const Bits*)p.second_weight;
+    const Bits* first_bias = (const Bits*)p.first_bias;
+    const Bits* second_bias = (const Bits*)p.second_bias;
 #pragma unroll
     for (int j = 0; j < TILES; j++) {
         int feature = 8 * j + g;
@@ -156,9 +155,8 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
     int warp = threadIdx.x >> 5, g = (threadIdx.x & 31) >> 2, q = threadIdx.x & 3;
     int n_hidden = p.n_columns / 4 + 1, n_outputs = n_hidden / 2 + 1;
     int n_tiles = (p.n_rows + ROWS - 1) / ROWS, n_features = CONV_CHANNELS * n_outputs;
-    long long policy = blockIdx.y;
-    const Bits* rows = (const Bits*)p.rows + policy * p.n_rows * p.row_stride;
-    Bits* features = (Bits*)p.features + policy * p.n_rows * p.feature_stride;
+    const Bits* rows = (const Bits*)p.rows;
+    Bits* features = (Bits*)p.features;
     bool is_aligned =
         !((unsigned long long)rows % 16) && !(p.row_stride % WORD) && !(p.n_columns % WORD);
     Bits* staged = (Bits*)shared_memory;  // a tile of rows, and the next one

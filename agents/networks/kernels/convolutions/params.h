@@ -1,17 +1,16 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
 //
-// P policies, each with its own weights and its own N rows of C channels and W columns, with F = 32
-// features in each of W' columns. Every array starts with the axis P. Arrays are bfloat16 unless
-// their type says otherwise. Sizes count numbers.
+// N rows of C channels and W columns, with F = 32 features in each of W' columns. Arrays are
+// bfloat16 unless their type says otherwise. Sizes count numbers.
 #pragma once
 
 struct ConvForwardParams {
-    const void* rows;           // (P, N, C, W)
-    const void* first_weight;   // (P, F, C, 8)
-    const void* first_bias;     // (P, F)
-    const void* second_weight;  // (P, F, F, 4)
-    const void* second_bias;    // (P, F)
-    void* features;             // (P, N, F, W')
+    const void* rows;           // (N, C, W)
+    const void* first_weight;   // (F, C, 8)
+    const void* first_bias;     // (F)
+    const void* second_weight;  // (F, F, 4)
+    const void* second_bias;    // (F)
+    void* features;             // (N, F, W')
     int n_rows;
     int n_channels;
     int n_columns;
@@ -23,13 +22,13 @@ struct ConvForwardParams {
 };
 
 struct ConvBackwardParams {
-    const void* d_features;     // (P, N, F, W')
-    const void* features;       // (P, N, F, W')
-    const void* rows;           // (P, N, C, W)
-    const void* first_weight;   // (P, F, C, 8)
-    const void* first_bias;     // (P, F)
-    const void* second_weight;  // (P, F, F, 4)
-    float* sums;  // (P, n_blocks, 8 F C + F + 4 F F + F): each block's gradients of the first
+    const void* d_features;     // (N, F, W')
+    const void* features;       // (N, F, W')
+    const void* rows;           // (N, C, W)
+    const void* first_weight;   // (F, C, 8)
+    const void* first_bias;     // (F)
+    const void* second_weight;  // (F, F, 4)
+    float* sums;  // (n_blocks, 8 F C + F + 4 F F + F): each block's gradients of the first
                   // weight, the first bias, the second weight and the second bias
     int n_rows;
     int n_channels;
