@@ -17,6 +17,7 @@ import math
 import operator
 import pkgutil
 import re
+import sys
 import textwrap
 import types
 import typing
@@ -569,6 +570,15 @@ def _environments_per_gb():
     return table(["training", "environments per GB"], rows)
 
 
+def _benchmarks():
+    sys.path.append(str(Path(__file__).parent / "benchmarks"))
+    import paths
+    import records
+    import report
+
+    return report.page(records.read(paths.RECORDS))
+
+
 #: What the words of a generated block make.
 PAGES: dict[str, Callable[..., str]] = {
     "api": api,
@@ -576,6 +586,7 @@ PAGES: dict[str, Callable[..., str]] = {
     "settings": _settings_page,
     "cores": _cores,
     "environments-per-gb": _environments_per_gb,
+    "benchmarks": _benchmarks,
     "recipes": _recipes,
     "metrics": _metrics_page,
     "exit-codes": _exit_codes,

@@ -1,11 +1,10 @@
-"""Measures the numbers in docs/lab/benchmarks.md and docs/lab/benchmark-table.md.
+"""Measures the numbers in docs/lab/benchmarks.md.
 
     python scripts/benchmarks/benchmark.py step kernels --json docs/lab/benchmarks.jsonl
     python scripts/benchmarks/benchmark.py report
 
 The first prints a table and appends a line per measurement to a file of JSON lines. The second
-turns docs/lab/benchmarks.jsonl into docs/lab/benchmark-table.md and its figures, and writes the
-numbers that README.md and docs/ quote from it (docs/lab/quoted.yaml).
+draws the figures of docs/lab from these records. The site has a table of all of them.
 
 A measurement is the median of its samples, with their 10th and 90th percentiles as its spread. A
 sample is the mean over as many calls as fill 50 ms, after a warm-up, timed by CUDA events on a GPU
@@ -26,7 +25,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # idle threads of PyTorch m
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # this checkout comes first
 
 import paths
-import quoted
 import records
 import report
 import torch
@@ -127,8 +125,6 @@ def main(argv: list[str] | None = None) -> int:
 def run(arguments: argparse.Namespace) -> None:
     if arguments.benchmarks == ["report"]:
         report.write(arguments.json or paths.RECORDS)
-        if arguments.json in (None, paths.RECORDS):
-            quoted.write()
         return
     check_names(arguments.benchmarks)
     device = engine.device(arguments.device)

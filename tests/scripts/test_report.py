@@ -1,12 +1,14 @@
-"""The page and the figures that are written from the benchmarks' records."""
+"""The figures that are drawn from the benchmarks' records, and the tables that state them."""
 
 import json
+import re
 
 import benchmark
 import figures
+import numpy as np
 import paths
+import pytest
 import records
-import report
 
 
 def record(what, value, **fields):
@@ -24,37 +26,29 @@ def write_records(folder, *rows):
     return path
 
 
-def test_report_writes_page_and_plot_reproducibly(tmp_path):
+def test_report_draws_the_same_figure_again(tmp_path):
     path = write_records(
         tmp_path,
         record("explorer, `env.step`, 1,024 environments", 12.5, lower=12.0, upper=13.0, n=15),
         record("explorer, `env.step`, 1,024 environments, as trained, in a rollout", 7.5),
-        record("minimal, `env.step`, 8,192 environments", 70.0),
     )
-    written = []
+    plots = []
     for _ in range(2):
         assert benchmark.main(["report", "--json", str(path)]) == 0
-        names = "benchmark-table.md", "benchmark-table.svg"
-        written.append([(tmp_path / name).read_text() for name in names])
-    (page, plot), second = written
-    assert [page, plot] == second
-    assert "<svg" in plot and "explorer, NVIDIA H200" in plot
-    assert "explorer, as trained, NVIDIA H200" in plot
-    cells = "12.5 M/s | 12 to 13 | 15 | NVIDIA H200 | abc | 2026-01-01 |"
-    assert f"| `step` | explorer, `env.step`, 1,024 environments | {cells}" in page
+        plots.append((tmp_path / "frames.svg").read_text())
+    assert plots[0] == plots[1]
+    assert "explorer, as trained, NVIDIA H200" in plots[0]
 
 
 def test_plot_has_one_point_per_size_of_the_plain_environment(tmp_path):
-    """That of a step per graph, though the page has both."""
+    """That of a step per graph, though there are records of both."""
     rows = [record(f"explorer, `env.step`, {n} environments", 12.5) for n in ("1,024", "4,096")]
     other = record("explorer, `env.step`, 4,096 environments, in a rollout", 99.0)
     plots = []
-    for records_of in (rows, [*rows, other]):
-        path = write_records(tmp_path, *records_of)
-        assert benchmark.main(["report", "--json", str(path)]) == 0
-        plots.append((tmp_path / "benchmark-table.svg").read_text())
+    for rows_of in (rows, [*rows, other]):
+        figures.plot_frames_per_second(rows_of, tmp_path / "frames.svg")
+        plots.append((tmp_path / "frames.svg").read_text())
     assert plots[0] == plots[1]
-    assert "in a rollout | 99 M/s" in (tmp_path / "benchmark-table.md").read_text()
 
 
 def test_newest_record_per_machine_in_order_of_size():
@@ -80,11 +74,52 @@ def test_names_that_differ_in_counts_are_one_measurement():
     assert [row["value"] for row in records.newest(rows)] == [4.0, 5.0, 3.0]
 
 
-def test_committed_page_matches_committed_records():
-    """If this fails: python scripts/benchmarks/benchmark.py report."""
-    page = paths.RECORDS.with_name("benchmark-table.md").read_text()
-    assert report.page(records.read(paths.RECORDS), "benchmark-table.svg") == page
-    assert paths.RECORDS.with_name("benchmark-table.svg").exists()
+# ---- The two tables of headline figures ----
+
+STEP = "explorer, `env.step`, {} environments"
+TRAINED = "training, {} s, seed \\d, return in unseen homes"
+#: README's figures: text in the table, form, and the records, whose median, or range, it is.
+HEADLINES = [
+    ("178.6 M", "{:.1f} M", STEP.format("1,048,576")),
+    ("72 M", "{:.0f} M", STEP.format("4,096") + ", as trained, in a rollout"),
+    ("19.2 M", "{:.1f} M", "training, 30 s, seed \\d, median rate"),
+    ("2.0 M", "{:.1f} M", "Explorer, LSTM-256, pufferlib 3.0.0, float32"),
+    ("52 to 55", "{:.0f} to {:.0f}", TRAINED.format(6)),
+    ("59.4 to 59.8", "{:.1f} to {:.1f}", TRAINED.format(30)),
+]
+
+
+def tables_of(page):
+    return [line.split(" | ") for line in (paths.ROOT / page).read_text().splitlines()]
+
+
+def values_of(what):
+    """Returns the newest records on an H200 whose names match a regular expression."""
+    rows = records.newest(records.read(paths.RECORDS))
+    found = [r for r in rows if re.fullmatch(what, r["what"]) and r["on"] == "NVIDIA H200"]
+    return sorted(r["value"] for r in found)
+
+
+@pytest.mark.parametrize("text, form, what", HEADLINES)
+def test_readme_states_what_the_records_say(text, form, what):
+    values = values_of(what)
+    is_range = form.count("{") == 2
+    stated = form.format(*values[:: len(values) - 1] if is_range else [np.median(values)])
+    assert stated == text
+    assert any(text in cell for row in tables_of("README.md")[2:] for cell in row)
+
+
+def test_benchmarks_states_what_the_records_say():
+    rows = [row for row in tables_of("docs/lab/benchmarks.md") if row[0][:3] in ("| 1", "| 4")]
+    ends = "", ", in a rollout", ", as trained, in a rollout"
+    checked = 0
+    for n, *cells in rows:
+        for cell, end in zip(cells, ends):
+            if (number := cell.strip(" |").split(" M")[0]) and values_of(STEP.format(n[2:]) + end):
+                (value,) = values_of(STEP.format(n[2:]) + end)
+                assert f"{value:.1f}" == number, (n, end)
+                checked += 1
+    assert checked
 
 
 def test_learning_curves_are_mean_and_range_of_seeds(tmp_path):
