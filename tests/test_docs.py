@@ -1,6 +1,5 @@
-"""README and docs/: links, images and tests exist, commands compose, environments have sections."""
+"""README and docs/: links and images exist, commands compose, environments have sections."""
 
-import ast
 import functools
 import re
 import shlex
@@ -68,44 +67,3 @@ def test_links_and_images_exist(page):
 def test_every_environment_has_a_section():
     titles = re.findall(r"^## (\w+)$", (DOCS / "environments.md").read_text(), re.M)
     assert set(envs.ENVS) <= {title.lower() for title in titles}
-
-
-def test_every_decision_is_a_short_page_of_the_index():
-    index, *pages = sorted((DOCS / "decisions").glob("*.md"))  # README.md is the first
-    rows = re.findall(r"^\| \[(.+)\]\((.+)\) \|", index.read_text(), re.M)
-    texts = {page.name: page.read_text() for page in pages}
-    assert sorted(rows) == sorted((text.splitlines()[0][2:], name) for name, text in texts.items())
-    for name, text in texts.items():
-        parts = re.findall(r"^\*\*(\w+)\.\*\*", text, re.M)
-        assert parts == ["Context", "Decision", "Consequence"], name
-        assert text.count("\n") <= 25, name
-
-
-@functools.cache
-def tiers(path):
-    """Returns {test: (its marks among slow, nightly and cuda, decorators)} of a file of tests."""
-    functions, of_all = {}, set()
-    for node in ast.parse((ROOT / "tests" / path).read_text()).body:
-        if isinstance(node, ast.FunctionDef):
-            functions[node.name] = {ast.unparse(mark) for mark in node.decorator_list}
-        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "pytestmark":
-            of_all.add(ast.unparse(node.value))
-    known = {"slow", "nightly", "cuda"}
-    return {
-        name: ({mark.rpartition(".")[2] for mark in marks | of_all} & known, str(marks))
-        for name, marks in functions.items()
-    }
-
-
-def test_tests_of_all_faults_exist():
-    rows = re.findall(r"^\| (?!fault|---).*", (DOCS / "lab" / "faults.md").read_text(), re.M)
-    for row in rows:
-        fault, _, tests = row.strip("| ").split(" | ")
-        named = re.findall(r"`([\w/]+\.py)::(\w+)`(?: \((\w+)\))?", tests)
-        assert named and len(named) == tests.count("::"), fault
-        for path, name, tier in named:
-            marks, decorators = tiers(path).get(name, ({"absent"}, ""))
-            # every case of a test may have a mark of its own
-            is_of_tier = marks == {tier} - {""} or not marks and f"mark.{tier}" in decorators
-            assert is_of_tier, (fault, path, name)
-    assert len(rows) == 94
