@@ -1,6 +1,6 @@
 """Prints what CHANGELOG.md says of a release, for its page on GitHub.
 
-    python scripts/release_notes.py v0.2.0
+    python scripts/release_notes.py v0.3.0
 
 Exits with one sentence if the tag is not the version that the files state.
 """
