@@ -110,7 +110,7 @@ class Adam:
             rows = [(p, p.grad, *moments) for p, *moments in members if p.grad is not None]
             if rows:
                 lr = self.lr if factor == 1 else self.lr * factor
-                torch._fused_adamw_(
+                torch._fused_adamw_(  # pyright: ignore[reportPrivateImportUsage]
                     *map(list, zip(*rows)),
                     max_exp_avg_sqs=[],
                     state_steps=[self.n_steps] * len(rows),

@@ -138,5 +138,5 @@ class _FusedLoss(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_loss, d_metrics) -> tuple[torch.Tensor | None, ...]:
         # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
-        gradients = torch._foreach_mul(ctx.saved_tensors, d_loss)
+        gradients = torch._foreach_mul(ctx.saved_tensors, d_loss)  # pyright: ignore[reportPrivateImportUsage]
         return *gradients, *[None] * (7 - len(gradients))

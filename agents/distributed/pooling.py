@@ -152,7 +152,7 @@ def average_gradients(
         bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)
         *parts, pooled = bucket.split([*sizes, len(numbers)])
         parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
-        torch._foreach_copy_([*parts, *pooled.unbind()], [*gradients, *numbers])
+        torch._foreach_copy_([*parts, *pooled.unbind()], [*gradients, *numbers])  # pyright: ignore[reportPrivateImportUsage]
         all_reduce(bucket.mul_(n_valid))
         n = pooled[-1].clone()
         bucket /= n.clamp(min=1)

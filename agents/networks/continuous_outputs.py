@@ -141,7 +141,7 @@ class BetaOutput(_BoundedOutput):
         self, logits: torch.Tensor, generator: torch.Generator | None = None
     ) -> torch.Tensor:
         """Samples actions."""
-        alpha, beta = torch._standard_gamma(logits, generator).chunk(2, -1)
+        alpha, beta = torch._standard_gamma(logits, generator).chunk(2, -1)  # pyright: ignore[reportPrivateImportUsage]
         return self._actions(2 * alpha / (alpha + beta) - 1)
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:

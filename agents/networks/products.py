@@ -25,7 +25,7 @@ def layer(
     if few_rows.is_supported(rows, weight) and not len(weight) % 8 and bias.is_contiguous():
         outputs = few_rows.layer(rows, weight, bias, has_relu)
     elif has_relu:
-        outputs = torch._addmm_activation(bias, rows, weight.T)
+        outputs = torch._addmm_activation(bias, rows, weight.T)  # pyright: ignore[reportPrivateImportUsage]
     else:
         outputs = torch.addmm(bias, rows, weight.T)
     return outputs.unflatten(0, x.shape[:-1])

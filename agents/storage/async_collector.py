@@ -38,7 +38,7 @@ class _Slot:
         self.end = None
 
     def copy_weights(self) -> None:
-        torch._foreach_copy_([*self.weights.values()], self.sources)
+        torch._foreach_copy_([*self.weights.values()], self.sources)  # pyright: ignore[reportPrivateImportUsage]
 
 
 class AsyncCollector:
