@@ -59,6 +59,12 @@ def rank() -> int:
     return info.rank if info else 0
 
 
+def is_first_here() -> bool:
+    """Returns whether this is the first rank of its machine."""
+    info = rank_info()
+    return info is not None and info.local_rank == 0
+
+
 def hostname() -> str:
     return socket.gethostname()
 

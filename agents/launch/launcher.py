@@ -1,43 +1,39 @@
-"""Starts the ranks of `ranks=2` on this machine with torchrun's library and waits for them.
+"""Starts the ranks of `ranks=2` on this machine and waits for them.
 
-This process composes and checks the settings once and writes them to a temporary *job folder*.
-Each rank reads them there, and leaves its process id and its ending in the same folder. Only this
-process prints errors and forwards signals; its exit code is that of a run in one process.
-
-torchrun's agent runs in a thread, where it cannot handle signals itself: it would kill ranks that
-take more than 30 s to save.
+This process composes and checks the settings once and writes them to a temporary *job folder*. Each
+rank reads them there, and writes there how it ended. Only this process prints errors and forwards
+signals; its exit code is that of a run in one process. It also keeps the store through which ranks
+find each other, at an address that only this machine reaches.
 """
 
 import contextlib
-import logging
+import datetime
+import json
 import os
 import shutil
 import signal
+import socket
+import subprocess
 import sys
 import tempfile
-import threading
+import time
 import uuid
 from pathlib import Path
 
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
-from megastep.agents.errors import ConfigErrors, shortened
+from megastep.agents.errors import ConfigErrors, user_errors
 from megastep.agents.factory import check, settings
-from megastep.agents.launch import gpu, signals
-from megastep.agents.launch.endings import Ending
-from megastep.agents.runs import checkpoint, folders, populations, typed_json
+from megastep.agents.launch import gpu, rank, signals
+from megastep.agents.runs import typed_json
 
-#: Environment variable with the job folder, set for ranks that this module started.
-JOB = "MEGASTEP_JOB"
-#: Files of the job folder: settings; a mark that the user stopped the job; the run folder's path.
-SETTINGS, STOPPED, RUN = "settings.json", "stopped", "run"
-#: Exit code if a rank was killed, hangs or cannot be reached.
-LOST = 3
+ADDRESS = "127.0.0.1"
 #: Code that runs a rank. Modules in the current folder must not shadow Python's own.
-RANK = """import sys
+CODE = """import signal, sys
+signal.signal(signal.SIGINT, signal.SIG_DFL)
 sys.path[:] = filter(None, sys.path)
-from megastep.agents.launch import rank_process
-sys.exit(rank_process.main())"""
+from megastep.agents.launch import rank
+sys.exit(rank.main())"""
 
 
 def n_ranks(cfg: settings.Train) -> int:
@@ -78,16 +74,13 @@ def run(cfg: settings.Train) -> Path:
         UserError, Interrupted: as for training in this process.
     """
     cfg = settings.changed(cfg, ranks=n_ranks(cfg))
-    with contextlib.ExitStack() as stack:
-        job = Job(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="megastep-"))), cfg)
-        stack.enter_context(environment.variables(variables(job.folder, int(cfg.ranks))))
-        agent = threading.Thread(target=job.run_agent, daemon=True)
-        with signals.handled(job.stop, job.quit) as numbers:
-            agent.start()
-            while agent.is_alive():
-                agent.join(0.2)
-                job.poll()
-        ending = job.ending()
+    with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+        job = Job(Path(folder), cfg)
+        with (
+            signals.handled(job.stop, job.quit) as numbers,
+            user_errors("The ranks cannot be started: ", (OSError,)),
+        ):
+            ending = job.run()
     if numbers:
         by_signal = ending.code == 128 + numbers[0]
         name = signal.Signals(numbers[0]).name
@@ -103,17 +96,11 @@ class Job:
     Args:
         folder: the job folder, a temporary one.
         cfg: settings; `ranks` is a number.
-
-    Attributes:
-        attempt: how often torchrun has restarted the ranks.
-        cleared: attempts whose remaining ranks were killed after a loss.
-        error: the error of torchrun's agent, if any.
     """
 
     def __init__(self, folder: Path, cfg: settings.Train):
-        self.folder, self.cfg = folder, cfg
-        self.attempt, self.error = 0, None
-        self.cleared: set[int] = set()
+        self.folder, self.cfg, self.is_stopped = folder, cfg, False
+        self.processes: list[subprocess.Popen] = []
         facts = dict(
             settings=check.as_tree(cfg),
             argv=sys.argv,
@@ -121,19 +108,59 @@ class Job:
             prefix=console.prefix,
             parent=os.getpid(),
         )
-        (folder / SETTINGS).write_text(typed_json.dumps(facts))
+        (folder / rank.SETTINGS).write_text(typed_json.dumps(facts))
 
-    def run_agent(self) -> None:
-        """Runs torchrun's agent until all ranks have ended."""
-        try:
-            launch_ranks(int(self.cfg.ranks), self.cfg.restarts)
-        except BaseException as error:
-            self.error = error
+    def run(self) -> signals.Ending:
+        """Runs the ranks, again after a loss or a crash if `restarts` allows. Returns how they
+        ended.
+        """
+        listener = socket.create_server((ADDRESS, 0))
+        shared = variables(self.folder, int(self.cfg.ranks))
+        shared |= dict(
+            MASTER_PORT=f"{listener.getsockname()[1]}", TORCHELASTIC_RUN_ID=uuid.uuid4().hex
+        )
+        store = None
+        for attempt in range(self.cfg.restarts + 1):
+            (self.folder / rank.ENDING).unlink(missing_ok=True)
+            with signals.deferred():
+                self.start(shared | {"TORCHELASTIC_RESTART_COUNT": f"{attempt}"})
+            store = store or opened_store(listener)  # while the ranks import modules
+            failure = self.wait()
+            ending = self.ending(failure)
+            if failure is None or self.is_stopped or attempt == self.cfg.restarts:
+                break
+            problem = ending.text.partition(" To continue: ")[0].rstrip(".")
+            again = f"Restarting, {attempt + 1} of restarts={self.cfg.restarts}."
+            console.warn(f"{problem}. {again}")
+        return ending
+
+    def start(self, shared: dict[str, str]) -> None:
+        """Starts the ranks in sessions of their own, as this process forwards signals."""
+        self.processes = []
+        for number in map(str, range(int(self.cfg.ranks))):
+            own = os.environ | shared | dict(RANK=number, LOCAL_RANK=number)
+            command = [sys.executable, "-c", CODE]
+            self.processes.append(subprocess.Popen(command, env=own, start_new_session=True))
+
+    def wait(self) -> tuple[int, int] | None:
+        """Waits for the ranks; once one has failed, kills the others, unless they are saving.
+
+        Returns:
+            The first rank that failed and its exit code; None if all have ended for good.
+        """
+        failure = None
+        while True:
+            codes = [process.poll() for process in self.processes]
+            failure = failure or next(((n, code) for n, code in enumerate(codes) if code), None)
+            if None not in codes:
+                return failure
+            if failure and not self.is_stopped:
+                self.send(signal.SIGKILL)
+            time.sleep(0.1)
 
     def stop(self, number: int) -> None:
-        """Forwards a signal to the ranks. Ranks that start later exit at once."""
-        (self.folder / STOPPED).touch()
-        self.poll()
+        """Forwards a signal to the ranks."""
+        self.is_stopped = True
         self.send(number)
 
     def quit(self, number: int) -> None:
@@ -142,103 +169,46 @@ class Job:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def send(self, number: int) -> None:
-        for path in self.folder.glob(f"pid-{self.attempt}-*"):
-            with contextlib.suppress(OSError, ValueError):  # it has ended, or is writing its id
-                os.kill(int(path.read_text()), number)
+        for process in self.processes:
+            process.send_signal(number)
 
-    def poll(self) -> None:
-        """Once a rank is lost, kills the others at once (torchrun would give them 30 s). Warns when
-        torchrun restarts the ranks.
-        """
-        ending = self.ending_of(self.attempt)
-        if ending and ending.code == LOST and self.attempt not in self.cleared:
-            self.cleared.add(self.attempt)
-            self.send(signal.SIGKILL)
-        if [*self.folder.glob(f"pid-{self.attempt + 1}-*")]:
-            ending = self.ending_of(self.attempt)
-            if ending is None or ending.code > 128:  # torchrun's signal to the remaining ranks
-                problem = "A rank was killed or ended without a message"
-            else:
-                problem = ending.text.partition(" To continue: ")[0]
-            self.attempt += 1
-            again = f"Restarting, {self.attempt} of restarts={self.cfg.restarts}."
-            console.warn(f"{problem.rstrip('.')}. {again}")
-
-    def ending(self) -> Ending:
-        """Returns how the ranks ended."""
-        ending, failures = self.ending_of(self.attempt), getattr(self.error, "failures", None)
-        is_stopped = (self.folder / STOPPED).exists()
-        if ending and ending.code > 128 and failures and not is_stopped:
-            ending = None  # it reports torchrun's signal to the remaining ranks, not the failure
-        return ending or self.unknown_ending()
-
-    def ending_of(self, attempt: int) -> Ending | None:
-        path = self.folder / f"ending-{attempt}"
-        return Ending.read(path) if path.exists() else None
-
-    def unknown_ending(self) -> Ending:
-        """Returns the ending of ranks that wrote none, from the exit codes that torchrun saw."""
-        failures = getattr(self.error, "failures", {})
-        for rank, failure in failures.items():
-            if failure.exitcode < 0:
-                name = signal.Signals(-failure.exitcode).name
-                text = f"was killed by {name}" + ", perhaps out of memory" * (name == "SIGKILL")
-            else:
-                text = f"ended with exit code {failure.exitcode}"
-            label = f"rank {rank} on {environment.hostname()}"
-            return Ending(LOST, f"{label} {text}. {hint(self.run_folder())}")
-        reason = shortened(self.error or "they ended without a message", 400)
-        return Ending(2, f"The ranks cannot be started: {reason}")
-
-    def run_folder(self) -> Path | None:
-        path = self.folder / RUN
-        return Path(path.read_text()) if path.exists() else None
+    def ending(self, failure: tuple[int, int] | None) -> signals.Ending:
+        """Returns what a rank wrote about its ending, otherwise what its exit code says."""
+        with contextlib.suppress(FileNotFoundError):
+            return signals.Ending(*json.loads((self.folder / rank.ENDING).read_text()))
+        number, code = failure or (0, 0)
+        text = f"ended with exit code {code}"
+        if code < 0:
+            name = signal.Signals(-code).name
+            text = f"was killed by {name}" + ", perhaps out of memory" * (name == "SIGKILL")
+        path = self.folder / rank.RUN
+        hint = rank.hint(Path(path.read_text()) if path.exists() else None)
+        label = f"rank {number} on {environment.hostname()}"
+        return signals.Ending(rank.LOST, f"{label} {text}. {hint}")
 
 
-def hint(folder: Path | None) -> str:
-    """Returns how to continue a run whose ranks were lost in the middle of an update."""
-    runs = () if folder is None else populations.members(folder) or [folder]
-    if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
-        return "Nothing was saved yet"
-    return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
+def opened_store(listener: socket.socket) -> object:
+    """Returns the ranks' key-value store, which answers at a socket as long as it lives."""
+    from torch import distributed
 
-
-def launch_ranks(n_ranks: int, n_restarts: int) -> None:
-    """Runs torchrun's agent until all ranks have ended.
-
-    Args:
-        n_ranks: processes to start.
-        n_restarts: how often all ranks are restarted after a failure.
-
-    Raises:
-        torch.distributed.elastic.multiprocessing.errors.ChildFailedError: a rank failed.
-    """
-    from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs
-    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
-
-    from megastep.agents.launch import loopback
-
-    loopback.register()
-    # its messages repeat the ranks' errors, which are reported in one sentence
-    logger = logging.getLogger("torch.distributed")
-    logger.handlers, logger.propagate = [logging.NullHandler()], False
-    config = LaunchConfig(
-        min_nodes=1,
-        max_nodes=1,
-        nproc_per_node=n_ranks,
-        run_id=uuid.uuid4().hex,
-        rdzv_backend=loopback.BACKEND,
-        local_addr=loopback.ADDRESS,
-        max_restarts=n_restarts,
-        monitor_interval=0.1,
-        logs_specs=DefaultLogsSpecs(log_dir=os.devnull),
+    return distributed.TCPStore(  # pyright: ignore[reportPrivateImportUsage]
+        *listener.getsockname(),
+        is_master=True,
+        timeout=datetime.timedelta(seconds=300),
+        wait_for_workers=False,
+        master_listen_fd=listener.detach(),
     )
-    elastic_launch(config, sys.executable)("-c", RANK)
 
 
 def variables(job: Path, n_ranks: int) -> dict[str, str]:
-    """Returns the environment variables for ranks on this machine."""
-    changes = {JOB: str(job)}
+    """Returns the environment variables that all ranks on this machine have beside its own."""
+    changes = {
+        rank.JOB: str(job),
+        "WORLD_SIZE": str(n_ranks),
+        "LOCAL_WORLD_SIZE": str(n_ranks),
+        "MASTER_ADDR": ADDRESS,
+        "TORCHELASTIC_USE_AGENT_STORE": "True",
+    }
     if (package.ROOT / "train.py").exists():  # a checkout, which may not be installed
         paths = filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
         changes["PYTHONPATH"] = os.pathsep.join(paths)

@@ -3,19 +3,38 @@ with them. Only one rank reports an error.
 """
 
 import contextlib
+import hmac
+import json
 import math
 import os
 import sys
+import threading
 import time
+import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import TYPE_CHECKING, NoReturn, TypeVar
 
+from megastep import workers
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
-from megastep.agents.errors import UserError, user_errors
-from megastep.agents.launch import endings, launcher, signals, started
+from megastep.agents.errors import UserError, shortened, user_errors
+from megastep.agents.launch import signals
+from megastep.agents.runs import checkpoint, folders, populations, strange_files, typed_json
+from megastep.agents.runs.atomic_files import write_atomically
 
+if TYPE_CHECKING:
+    from torch.distributed import Store  # pyright: ignore[reportPrivateImportUsage]
+
+#: Environment variable with the job folder, set for ranks that `launcher` started.
+JOB = "MEGASTEP_JOB"
+#: Files of the job folder: settings; how the ranks ended; the run folder's path.
+SETTINGS, ENDING, RUN = "settings.json", "ending.json", "run"
+#: The file of a run folder with the token of its start, and the store's key with folder and token.
+STARTED, KEY = ".started", "run"
+#: Exit code if a rank was killed, hangs or cannot be reached.
+LOST = 3
 #: Seconds that a rank waits for rank 0 to end: after an error; and after a signal, as rank 0 saves.
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
 #: Seconds after which ranks that have not started yet are named.
@@ -25,12 +44,57 @@ _team = None
 T = TypeVar("T")
 
 
+def main() -> int:
+    """Trains as one of the ranks that `launcher` started.
+
+    Returns:
+        The exit code: 0 if this rank's ending is final, otherwise the ranks may be restarted.
+    """
+    facts = typed_json.loads(Path(os.environ[JOB], SETTINGS).read_text())
+    sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
+    workers.end_with_parent(facts["parent"])
+    console.open_streams()
+    console.prefix = facts["prefix"]
+    threading.excepthook = console.warn_of_thread
+    warnings.showwarning = console.warn
+    from megastep.agents.factory import check, settings
+    from megastep.agents.launch import train
+
+    folder = None
+
+    def work() -> None:
+        nonlocal folder
+        folder = train.run(check.check(settings.Train, facts["settings"]))
+
+    try:
+        ending, code = signals.ending_of(work)._replace(folder=folder and str(folder)), 0
+    except Exception as error:
+        traceback.print_exc()
+        ending = signals.Ending(1, f"{type(error).__name__}: {shortened(error, 400)}")
+        code = 1
+    if ending.text or ending.folder:
+        report_ending(ending)
+    return code
+
+
+def report_ending(ending: signals.Ending) -> None:
+    """Reports the ranks' ending to the process that launched them, or on stderr under torchrun."""
+    info = environment.rank_info()
+    if JOB in os.environ:
+        assert info is not None
+        if info.rank > 0 and ending.code != LOST:
+            name = f"rank {info.rank} on {environment.hostname()}: "
+            ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
+        path = Path(os.environ[JOB], ENDING)
+        if not path.exists():
+            write_atomically(path, json.dumps(ending).encode())
+    elif ending.text:
+        console.say(f"{package.command('train')}: {ending.text}", sys.stderr)
+
+
 def announce(number: int) -> None:
-    """Announces on rank 0 that training stops, unless torchrun sent the signal in tear-down."""
-    job = os.environ.get(launcher.JOB)
-    if environment.rank() == 0 and (
-        job is None or os.path.exists(os.path.join(job, launcher.STOPPED))
-    ):
+    """Announces on rank 0 that training stops."""
+    if environment.rank() == 0:
         signals.announce(number)
 
 
@@ -40,25 +104,12 @@ def refuse(problem: str) -> None:
         raise UserError(problem) if environment.rank() == 0 else SystemExit(UserError.code)
 
 
-def report_ending(ending: endings.Ending) -> None:
-    """Reports the ranks' ending to the process that launched them, or on stderr under torchrun."""
-    info = environment.rank_info()
-    if launcher.JOB in os.environ:
-        assert info is not None
-        if info.rank > 0 and ending.code != launcher.LOST:
-            name = f"rank {info.rank} on {environment.hostname()}: "
-            ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
-        path = Path(os.environ[launcher.JOB], f"ending-{info.attempt}")
-        if not path.exists():
-            ending.write(path)
-    elif ending.text:
-        console.say(f"{package.command('train')}: {ending.text}", sys.stderr)
-
-
-def is_first_here() -> bool:
-    """Returns whether this is the first rank of its machine."""
-    info = environment.rank_info()
-    return info is not None and info.local_rank == 0
+def hint(folder: Path | None) -> str:
+    """Returns how to continue a run whose ranks were lost in the middle of an update."""
+    runs = () if folder is None else populations.members(folder) or [folder]
+    if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
+        return "Nothing was saved yet"
+    return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
 
 
 class Team:
@@ -76,9 +127,7 @@ class Team:
         self.folder = None
         self.store = process_group.store("job")
         # where `launcher` is, which Ctrl-Z suspends
-        is_ours = launcher.JOB in os.environ
-        self.watch = watch.Watch(self.end, self.end_in_silence, may_be_silent=is_ours)
-        self.watch.start()
+        self.watch = watch.Watch(self.end, may_be_silent=JOB in os.environ)
 
     def await_all(self) -> None:
         """Waits until all ranks have started. Raises UserError if some have not in time."""
@@ -92,30 +141,26 @@ class Team:
             seconds = time.monotonic() - began
             if seconds > process_group.START_SECONDS:
                 raise UserError(f"{problem.format(process_group.START_SECONDS)}; {cure}")
-            if seconds > warns_at and is_first_here():
+            if seconds > warns_at and environment.is_first_here():
                 console.warn(f"{problem.format(warns_at)}; {cure}. Waiting on")
                 warns_at = math.inf
             time.sleep(0.1)
 
     def set_folder(self, folder: Path) -> None:
-        """Publishes the run folder to the launcher and to restarted ranks."""
+        """Publishes the run folder, which holds the token of this start, to restarted ranks and to
+        the launcher.
+        """
         self.folder = folder
         if environment.rank() == 0:
-            if launcher.JOB in os.environ:
-                Path(os.environ[launcher.JOB], launcher.RUN).write_text(str(folder))
-            else:
-                started.leave_proof(self.store, folder)
+            with contextlib.suppress(OSError):  # without a token, a restart begins another run
+                token = (folder / STARTED).read_text()
+                self.store.set(KEY, json.dumps([str(folder), token]))
+            if JOB in os.environ:
+                Path(os.environ[JOB], RUN).write_text(str(folder))
 
     def earlier_folder(self) -> Path | None:
-        """Returns the run folder of the previous attempt if torchrun restarted the ranks."""
-        if launcher.JOB in os.environ:  # the job folder, to which only this user can write
-            info = environment.rank_info()
-            assert info is not None
-            if info.attempt == 0:
-                return None
-            path = Path(os.environ[launcher.JOB], launcher.RUN)
-            return Path(path.read_text()) if path.exists() else None
-        return started.proven_folder(self.store)
+        """Returns the run folder of an earlier attempt, if the ranks were restarted."""
+        return proven_folder(self.store)
 
     def end(self, problem: str | None) -> NoReturn:
         """Exits at once, because a rank was lost.
@@ -128,38 +173,33 @@ class Team:
         # a folder on a machine that is gone blocks whoever reads it, and so may a pipe
         if problem:
             unknown = "Its run folder does not answer, so what is saved is not known"
-            hint = within(CALL_SECONDS, lambda: launcher.hint(self.folder), unknown)
-            ending = endings.Ending(launcher.LOST, f"{problem}. {hint}")
+            advice = within(CALL_SECONDS, lambda: hint(self.folder), unknown)
+            ending = signals.Ending(LOST, f"{problem}. {advice}")
             within(CALL_SECONDS, lambda: report_ending(ending), None)
         within(CALL_SECONDS, console.restore, None)
-        is_ours = launcher.JOB in os.environ
-        os._exit(launcher.LOST if problem or not is_ours else 0)
-
-    def end_in_silence(self, seconds: float | None = None) -> NoReturn:
-        """Exits at once, because the store has not answered for so many seconds, or has closed the
-        connection. One rank of this machine reports it, as the others may be out of reach.
-        """
-        silence = (
-            "closed the connection" if seconds is None else f"not answered for {seconds:.0f} s"
-        )
-        problem = (
-            f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, has "
-            f"{silence}: torchrun has ended there, or that machine or the network is down"
-        )
-        self.end(problem if is_first_here() else None)
-
-    def leave(self, seconds: float = 0.0) -> None:
-        """Leaves the team; the other ranks no longer expect heartbeats from this one.
-
-        Args:
-            seconds: how long to wait for rank 0 to leave, too.
-        """
-        self.watch.leave(seconds)
+        os._exit(0 if problem is None and JOB in os.environ else LOST)
 
     def finish(self) -> None:
-        """Removes the proof by which restarted ranks would find the run, which is done."""
+        """Removes the token by which restarted ranks would find the run, which is done."""
         if environment.rank() == 0 and self.folder is not None:
-            started.remove_proof(self.folder)
+            with contextlib.suppress(OSError):
+                (self.folder / STARTED).unlink()
+
+
+def proven_folder(store: "Store") -> Path | None:
+    """Returns the run folder in the ranks' store if it is this user's and holds the token that is
+    beside it there, else None: anyone who reaches the store can write another path.
+    """
+    if not store.check([KEY]):
+        return None
+    with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
+        folder, token = json.loads(store.get(KEY))
+        path = Path(folder) / STARTED
+        content = strange_files.read_bytes(path, 1024)
+        is_ours = {os.stat(one).st_uid for one in (folder, path)} == {os.geteuid()}
+        if is_ours and hmac.compare_digest(content, token.encode()) and len(token) == 64:
+            return Path(folder)
+    return None
 
 
 @contextlib.contextmanager
@@ -176,7 +216,8 @@ def joined() -> Iterator[Team | None]:
     global _team
     with user_errors():
         info = environment.rank_info()
-    if info is None or info.n_ranks == 1 or _team is not None:
+    is_alone = info is None or (info.n_ranks == 1 and JOB not in os.environ)
+    if is_alone or _team is not None:
         yield _team
         return
     from megastep.agents.distributed import process_group
@@ -202,12 +243,10 @@ def joined() -> Iterator[Team | None]:
         if loss := _cause(error, process_group.RankLost):
             with signals.handled(lambda number: None):  # ignores torchrun's SIGTERM
                 team.watch.await_verdict()  # which ends this process
-            if team.watch.is_gone:
-                team.end_in_silence()
             team.end(f"A rank is lost: {loss}" if team.watch.claim() else None)
         is_signal = isinstance(error, signals.Interrupted)
         reports = info.rank == 0 and team.watch.claim()
-        team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
+        team.watch.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
         if reports or team.watch.claim():
             raise
         code = 128 + error.args[0] if is_signal else getattr(error, "code", 1)
@@ -215,7 +254,7 @@ def joined() -> Iterator[Team | None]:
     finally:
         _team = None
     team.finish()
-    team.leave()
+    team.watch.leave()
     if has_joined:
         process_group.stop()
 

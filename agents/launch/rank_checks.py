@@ -17,13 +17,14 @@ import numpy as np
 import torch
 
 from megastep.agents import factory, package
-from megastep.agents.distributed import process_group
+from megastep.agents.distributed import environment, process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
 from megastep.agents.distributed.drift import first_difference, first_differing_fact
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import check, settings
-from megastep.agents.launch.rank import Team
+from megastep.agents.launch.rank import STARTED, Team
 from megastep.agents.runs import checkpoint, folders, populations, provenance
+from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
 
 #: Seconds within which a file of rank 0 must be visible on the other machines.
@@ -74,22 +75,25 @@ def digest(homes: Iterable[dict]) -> str:
 
 
 def check_shared(folder: Path) -> str:
-    """Checks that all ranks see the run folder of rank 0.
+    """Checks that all ranks see the run folder of rank 0, by a file with a random token.
 
     Returns:
-        A random name of this launch, the same on all ranks.
+        The token of this start, the same on all ranks.
 
     Raises:
         UserError: on all ranks, if one of them does not see the folder.
     """
-    name = from_rank_0(secrets.token_hex)
-    if process_group.n_ranks() == 1:
-        return name
-    token = f".ranks-{name}"
+    token, path = from_rank_0(secrets.token_hex), folder / STARTED
+    if environment.rank_info() is None:
+        return token
+
+    def is_seen() -> bool:
+        # a network file system looks for new files once it lists their folder
+        return folder.is_dir() and STARTED in os.listdir(folder) and path.read_text() == token
 
     def wait_for_token() -> None:
         deadline = time.monotonic() + SHARED_SECONDS
-        while not (folder.is_dir() and token in os.listdir(folder)):
+        while not is_seen():
             if time.monotonic() > deadline:
                 raise UserError(
                     f"The run folder {folder.absolute()} of rank 0 is not here; start all ranks "
@@ -98,14 +102,9 @@ def check_shared(folder: Path) -> str:
             time.sleep(0.1)
 
     with user_errors(folders.CANNOT.format(folder)):
-        from_rank_0((folder / token).touch)
-    try:
+        from_rank_0(lambda: write_atomically(path, token.encode()))
         together(wait_for_token)
-    finally:
-        if process_group.rank() == 0:
-            with contextlib.suppress(OSError):
-                (folder / token).unlink()
-    return name
+    return token
 
 
 def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:

@@ -1,12 +1,12 @@
 """Detects ranks that were killed or hang, in a thread of each rank, and ends the others.
 
-Every rank writes a heartbeat to torchrun's key-value store. Each rank monitors one neighbour, the
-next rank; the first to detect a loss tells all others through the store.
+Every rank writes a heartbeat to torchrun's key-value store and reads those of all. The first to
+detect a loss tells the others through the store.
 
 A rank is lost if its heartbeat stops (it was killed or suspended, or is cut off), or if it hangs:
-its neighbour has waited too long for it in a collective operation. If all wait for each other in
-the same operation, they cannot reach each other. A second thread, which never touches the store,
-ends a rank that the store no longer answers, whatever its other threads are blocked in.
+others have waited too long for it in a collective operation. If all wait for each other in the same
+operation, they cannot reach each other. A second thread, which never touches the store, ends a rank
+that the store no longer answers, whatever its other threads are blocked in.
 """
 
 from __future__ import annotations
@@ -19,25 +19,21 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeVar
-
-from pydantic import TypeAdapter
 
 from megastep.agents.distributed import environment, process_group
 
 #: Seconds between heartbeats.
 PERIOD = 2.0
-#: A rank is lost after this many seconds without a heartbeat, or while its neighbour waits for it.
-LOST_SECONDS = 20.0
-#: The same for heartbeats, once a connection has broken.
-BROKEN_SECONDS = 5.0
-#: Seconds to wait for a rank in the first two updates, which compile kernels and graphs.
-FIRST_SECONDS = 300.0
+#: A rank is lost after this many seconds without a heartbeat; and once a connection has broken.
+LOST_SECONDS, BROKEN_SECONDS = 20.0, 5.0
+#: A rank hangs if the others have waited this many seconds for it; and in the first two updates,
+#: which compile kernels and graphs.
+HUNG_SECONDS, FIRST_SECONDS = 30.0, 300.0
 #: A wait may last this many times the longest earlier wait, if that is more.
 PATIENCE = 5
-#: Seconds that all ranks may wait for each other in the same operation.
-STALLED_SECONDS = 40.0
 #: Seconds without an answer of the store after which a rank ends. Together with the seconds of its
 #: last words, below a minute.
 SILENT_SECONDS = 45.0
@@ -74,57 +70,63 @@ class Heartbeat(NamedTuple):
     host: str
 
 
-HEARTBEAT = TypeAdapter(Heartbeat)
-
-
 class LossDetector:
-    """Decides whether the neighbouring rank is lost, from its heartbeats and this rank's.
+    """Decides from the heartbeats of all ranks whether one is lost.
 
     Time is counted in polls, so no rank is lost when a machine wakes up after an hour of sleep.
     """
 
     def __init__(self) -> None:
-        self.last = None
-        self.n_silent = self.n_ahead = self.n_stalled = self.longest = 0
+        self.before: Mapping[int, Heartbeat] = {}
+        self.n_silent: Counter[int] = Counter()
+        self.n_stuck = self.longest = 0
 
-    def poll(self, ours: Heartbeat, theirs: Heartbeat, is_broken: bool) -> str | None:
-        """Compares two heartbeats, once every `PERIOD` seconds.
+    def poll(self, rows: Mapping[int, Heartbeat], is_broken: bool = False) -> str | None:
+        """Compares heartbeats with those before, once every `PERIOD` seconds.
 
         Args:
-            ours: heartbeat of this rank.
-            theirs: heartbeat of the monitored rank.
-            is_broken: a connection to any rank has broken.
+            rows: the heartbeats, by rank.
+            is_broken: a connection to a rank has broken.
 
         Returns:
-            What happened to the other rank, as the rest of a sentence; None if it is not lost.
+            What has happened, a sentence without a full stop; None if no rank is lost.
         """
-        before, self.last = self.last, theirs
-        if theirs.has_left or before is None:
-            return None
-        self.n_silent = self.n_silent + 1 if theirs == before else 0
-        if self.n_silent * PERIOD > (BROKEN_SECONDS if is_broken else LOST_SECONDS):
-            return (
-                "does not answer: it was killed or suspended, the system ran out of memory, or its "
-                "network is down"
-            )
-        is_stalled = ours.is_waiting and theirs.is_waiting and before.is_waiting
-        is_stalled &= ours.n_operations == theirs.n_operations == before.n_operations
-        is_stalled &= theirs.n_phases == before.n_phases
-        self.n_stalled = self.n_stalled + 1 if is_stalled else 0
-        is_ahead = ours.n_operations > theirs.n_operations and not theirs.is_exempt
-        if is_ahead and theirs.n_operations == before.n_operations:
-            self.n_ahead += 1
+        before, self.before = self.before, rows
+        rows = {rank: row for rank, row in rows.items() if not row.has_left and rank in before}
+        for rank, row in rows.items():
+            self.n_silent[rank] = self.n_silent[rank] + 1 if row == before[rank] else 0
+            if self.n_silent[rank] * PERIOD > (BROKEN_SECONDS if is_broken else LOST_SECONDS):
+                return (
+                    f"rank {rank} on {row.host} does not answer: it was killed or suspended, the "
+                    "system ran out of memory, or its network is down"
+                )
+        n_done = min((row.n_operations for row in rows.values()), default=0)
+        late = {rank: row for rank, row in rows.items() if row.n_operations == n_done}
+        is_stuck = bool(rows) and not any(
+            (row.n_operations, row.n_phases) != (before[rank].n_operations, before[rank].n_phases)
+            for rank, row in late.items()
+        )
+        if len(late) < len(rows):
+            is_stuck &= not any(row.is_exempt for row in late.values())
         else:
-            if min(ours.n_updates, theirs.n_updates) > 2:
-                self.longest = max(self.longest, self.n_ahead)
-            self.n_ahead = 0
-        seconds = max(LOST_SECONDS, PATIENCE * self.longest * PERIOD)
-        if min(ours.n_updates, theirs.n_updates) <= 2:
-            seconds = FIRST_SECONDS
-        if self.n_ahead * PERIOD > seconds:
-            waited = round(self.n_ahead * PERIOD)
-            return f"hangs: the others have waited for it for {waited} s"
-        return None
+            is_stuck &= all(row.is_waiting for row in rows.values())
+        has_compiled = min((row.n_updates for row in rows.values()), default=0) > 2
+        if not is_stuck:
+            self.longest = max(self.longest, self.n_stuck * has_compiled)
+        self.n_stuck = self.n_stuck + 1 if is_stuck else 0
+        seconds = self.n_stuck * PERIOD
+        limit = max(HUNG_SECONDS, PATIENCE * self.longest * PERIOD)
+        if seconds <= (limit if has_compiled else FIRST_SECONDS):
+            return None
+        if len(late) < len(rows):
+            rank, row = next(iter(late.items()))
+            return f"rank {rank} on {row.host} hangs: others have waited for it for {seconds:.0f} s"
+        return (
+            f"The ranks on {', '.join(dict.fromkeys(row.host for row in rows.values()))} reach "
+            f"torchrun's store, but not each other, and have waited for {seconds:.0f} s: a network "
+            "is down, or NCCL_SOCKET_IFNAME and GLOO_SOCKET_IFNAME name another interface than the "
+            "one that connects them"
+        )
 
 
 def within(seconds: float, function: Callable[[], T], default: T) -> T:
@@ -145,34 +147,27 @@ def within(seconds: float, function: Callable[[], T], default: T) -> T:
 
 
 class Watch:
-    """Monitors the ranks of this job, from `start` to `leave`.
+    """Monitors the ranks of this job until `leave`. Ends this rank if the store falls silent; the
+    others are monitored once they start.
 
     Args:
         on_lost: called in a thread of the watch when a rank is lost; must end this process. Its
             argument is `rank 1 on node-7 hangs: ...` on the rank that reports the loss, None on the
             others.
-        on_silence: called, as `on_lost`, when the store has not answered for so many seconds.
         may_be_silent: the process with the store may be suspended, but ends this one if it is gone.
     """
 
-    def __init__(
-        self,
-        on_lost: Callable[[str | None], None],
-        on_silence: Callable[[float], None] = lambda seconds: None,
-        may_be_silent: bool = False,
-    ):
+    def __init__(self, on_lost: Callable[[str | None], None], may_be_silent: bool = False):
         info = environment.rank_info()
         assert info is not None
-        self.on_lost, self.on_silence, self.may_be_silent = on_lost, on_silence, may_be_silent
+        self.on_lost, self.may_be_silent = on_lost, may_be_silent
         self.is_broken = self.is_gone = self.has_left = False
         self.rank, self.n_ranks = info.rank, info.n_ranks
+        self.keys = [f"heartbeat {rank}" for rank in range(info.n_ranks)]
         self.number = self.n_answers = 0
         self._leaves_by = math.inf
         self._wakes = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def start(self) -> None:
-        """Ends this rank if the store falls silent. The others are monitored once they start."""
         threading.Thread(target=self._guard, daemon=True).start()
 
     def missing(self) -> list[int]:
@@ -185,10 +180,7 @@ class Watch:
             self.store = process_group.store(f"watch {name} {next(NUMBERS)}")
             self._beat()
             self._thread.start()
-        ranks = range(self.n_ranks)
-        if self.store.check([_key(rank) for rank in ranks]):
-            return []
-        return [rank for rank in ranks if not self.store.check([_key(rank)])]
+        return [rank for rank, key in enumerate(self.keys) if not self.store.check([key])]
 
     def claim(self) -> bool:
         """Returns True on the first rank that calls this: it reports the error, the others end."""
@@ -202,8 +194,9 @@ class Watch:
     def await_verdict(self) -> None:
         """Waits after a broken connection until the lost rank is found, which ends this process."""
         self.is_broken = True
-        within(CALL_SECONDS, lambda: self.store.set("broken", "1"), None)
         self._thread.join(LOST_SECONDS + 2 * PERIOD)
+        if self.is_gone:
+            self._end_in_silence("closed the connection")
 
     def leave(self, seconds: float = 0.0) -> None:
         """Stops the watch; this rank no longer counts as lost.
@@ -218,25 +211,20 @@ class Watch:
             self._thread.join(seconds + CALL_SECONDS)
 
     def _run(self) -> None:
-        detector, other = LossDetector(), (self.rank + 1) % self.n_ranks
+        detector = LossDetector()
         try:
             while not self._wakes.wait(PERIOD):
-                ours = self._beat()
+                self._beat()
                 if self.store.check(["end"]):
                     return self.on_lost(None)
-                self.is_broken |= self.store.check(["broken"])
-                theirs = self._heartbeat_of(other)
-                problem = detector.poll(ours, theirs, self.is_broken) if theirs else None
-                if theirs and problem and not self.has_left:
-                    label = f"rank {other} on {theirs.host}"
-                    return self._end(f"{label} {problem}")
-                if detector.n_stalled * PERIOD > STALLED_SECONDS and self.rank == 0:
-                    if problem := self._stall(ours):
+                if self.store.check(self.keys):
+                    problem = detector.poll(dict(enumerate(self._heartbeats())), self.is_broken)
+                    if problem and not self.has_left:
                         return self._end(problem)
                 self.n_answers += 1
             self._beat()
             while self.rank > 0 and time.monotonic() < self._leaves_by:
-                if (first := self._heartbeat_of(0)) is None or first.has_left:
+                if not self.store.check(self.keys) or self._heartbeats()[0].has_left:
                     break
                 time.sleep(0.1)
         except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
@@ -261,45 +249,30 @@ class Watch:
             n_silent = n_silent + 1 if self.n_answers == n_answers and not may_be_silent else 0
             n_answers = self.n_answers
             if n_silent * PERIOD > SILENT_SECONDS:
-                return self.on_silence(n_silent * PERIOD)
+                return self._end_in_silence(f"not answered for {n_silent * PERIOD:.0f} s")
 
-    def _stall(self, ours: Heartbeat) -> str | None:
-        """Returns what is wrong if all ranks wait in the same operation; None otherwise."""
-        hosts = {}
-        for rank in range(self.n_ranks):
-            theirs = self._heartbeat_of(rank)
-            if not (theirs and theirs.is_waiting and theirs.n_operations == ours.n_operations):
-                return None
-            hosts[theirs.host] = None
-        return (
-            f"The ranks on {', '.join(hosts)} reach torchrun's store, but not each other, and have "
-            f"waited for {STALLED_SECONDS:.0f} s: a network is down, or NCCL_SOCKET_IFNAME and "
-            "GLOO_SOCKET_IFNAME name another interface than the one that connects them"
+    def _end_in_silence(self, silence: str) -> None:
+        """Ends this rank. One of this machine reports it, as the others may be out of reach."""
+        problem = (
+            f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, has "
+            f"{silence}: torchrun has ended there, or that machine or the network is down"
         )
+        self.on_lost(problem if environment.is_first_here() else None)
 
-    def _beat(self) -> Heartbeat:
+    def _beat(self) -> None:
         self.number += 1
+        counts = process_group.counts
         heartbeat = Heartbeat(
             self.number,
-            process_group.counts.n_operations,
-            process_group.counts.n_updates,
-            process_group.counts.n_phases,
-            process_group.counts.is_exempt,
-            process_group.counts.is_waiting,
+            counts.n_operations,
+            counts.n_updates,
+            counts.n_phases,
+            counts.is_exempt,
+            counts.is_waiting,
             self.has_left,
-            process_group.hostname(),
+            environment.hostname(),
         )
-        self.store.set(_key(self.rank), json.dumps(heartbeat))
-        return heartbeat
+        self.store.set(self.keys[self.rank], json.dumps(heartbeat))
 
-    def _heartbeat_of(self, rank) -> Heartbeat | None:
-        if not self.store.check([_key(rank)]):
-            return None
-        try:
-            return HEARTBEAT.validate_json(self.store.get(_key(rank)))
-        except ValueError:  # written by something other than a rank
-            return None
-
-
-def _key(rank) -> str:
-    return f"heartbeat {rank}"
+    def _heartbeats(self) -> list[Heartbeat]:
+        return [Heartbeat(*json.loads(text)) for text in self.store.multi_get(self.keys)]

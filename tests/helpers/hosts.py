@@ -206,13 +206,17 @@ def hosts():
         yield hosts
 
 
-def descendants(pid):
-    """Returns the numbers of all processes below a process."""
+def children(pid):
+    """Returns the numbers of the processes that a process's main thread started, in order."""
     try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        return [*map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
     except (FileNotFoundError, ProcessLookupError):
         return []
-    return [int(child) for one in children for child in [one, *descendants(one)]]
+
+
+def descendants(pid):
+    """Returns the numbers of all processes below a process."""
+    return [child for one in children(pid) for child in [one, *descendants(one)]]
 
 
 @contextlib.contextmanager

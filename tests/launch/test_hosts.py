@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from megastep.agents.launch import launcher
+from megastep.agents.launch.rank import LOST
 from megastep.agents.runs import checkpoint, json_lines
 from tests.cli.test_exact_resume import differences
 from tests.helpers import tiny
@@ -108,7 +108,7 @@ def test_both_sides_of_a_cut_cable_end(here, hosts):
         code = wait_for_ranks(pids, 60)
         first.wait(timeout=HUNG)
         errors = first.written(1), second.written(1)
-        assert second.poll() is not None or code == launcher.LOST
+        assert second.poll() is not None or code == LOST
     lost = f"train.py: rank 1 on {NAMES[1]} does not answer: "
     silent = f"rank 1 on {NAMES[1]}: train.py: {NAMES[0]}, where torchrun keeps the ranks' store, "
     for error, words in zip(errors, (lost, f"{silent}has not answered for ")):

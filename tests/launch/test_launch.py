@@ -12,10 +12,11 @@ import torch
 from megastep.agents.cli import train
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.launch import gpu, launcher
-from megastep.agents.launch.endings import Ending
-from megastep.agents.launch.signals import Interrupted
+from megastep.agents.launch.rank import LOST
+from megastep.agents.launch.signals import Ending, Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from tests.helpers import tiny
+from tests.helpers.hosts import children
 from tests.helpers.processes import Forked, forked, is_running, wait_until
 from tests.helpers.ranks import HUNG, ROOT
 
@@ -137,71 +138,63 @@ def test_dry_run_counts_lanes_that_learn(here, capsys):
 # ---- What the ranks' endings mean for the process that launched them ----
 
 
-def launched(monkeypatch, *attempts, failure=None):
-    """Trains with ranks that end as given, and returns the run's folder."""
+#: Two ranks, of which the second writes an ending and ends; the first ends for good as well.
+ENDS = """
+import json, os, signal, sys, time
+from megastep.agents.launch import rank
 
-    def run_agent(n_ranks, n_restarts):
-        folder = launcher.Path(os.environ[launcher.JOB])
-        for attempt, ending in enumerate(attempts):
-            (folder / f"pid-{attempt}-0").write_text("999999999")
-            if ending:
-                ending.write(folder / f"ending-{attempt}")
-            time.sleep(0.4 * (len(attempts) > 1))  # more than the launching process sleeps
-        if failure:
-            raise failure
-
-    monkeypatch.setattr(launcher, "launch_ranks", run_agent)
-    return train.run(tiny.settings(*TINY, "ranks=2", "restarts=1"))
+ending, code = {}[int(os.environ["TORCHELASTIC_RESTART_COUNT"])]
+if os.environ["RANK"] == "1":
+    if ending:
+        path = rank.Path(os.environ[rank.JOB], rank.ENDING)
+        rank.write_atomically(path, json.dumps(ending).encode())
+    os.kill(os.getpid(), 9) if code < 0 else os._exit(code)
+time.sleep(60 * bool(code))
+"""
 
 
-def test_folder_of_launched_run(monkeypatch):
-    assert str(launched(monkeypatch, Ending(folder="run"))) == "run"
-    assert launcher.JOB not in os.environ
+def launched(monkeypatch, *attempts, restarts=1):
+    """Trains with ranks that end as given, by (ending, exit code). Returns the run folder."""
+    attempts = [(ending and tuple(ending), code) for ending, code in attempts]
+    monkeypatch.setattr(launcher, "CODE", ENDS.format(attempts))
+    return train.run(tiny.settings(*TINY, "ranks=2", f"restarts={restarts}"))
 
 
-def test_errors_of_launched_run(monkeypatch):
+def test_launched_run_ends_as_its_ranks_do(monkeypatch):
+    assert str(launched(monkeypatch, (Ending(folder="run"), 0))) == "run"
     with pytest.raises(UserError, match="too small") as error:
-        launched(monkeypatch, Ending(2, "too small"))
-    assert error.value.code == 2
+        launched(monkeypatch, (Ending(1, "too small"), 0))
+    assert error.value.code == 1
     with pytest.raises(Interrupted) as error:
-        launched(monkeypatch, Ending(143, "Stopped after 3 samples"))
+        launched(monkeypatch, (Ending(143, "Stopped after 3 samples"), 0))
     assert error.value.args == (143 - 128, "Stopped after 3 samples")
+    with pytest.raises(
+        UserError, match="rank 1 on .* SIGKILL, perhaps .*Nothing was saved"
+    ) as error:
+        launched(monkeypatch, (None, -9), restarts=0)
+    assert error.value.code == LOST
+
+
+HANGS = Ending(LOST, "rank 1 hangs. Its last checkpoint is intact. To continue: t")
 
 
 @pytest.mark.parametrize(
-    "ending, text",
+    "ending, code, text",
     [
+        (HANGS, LOST, "rank 1 hangs. Its last checkpoint is intact"),
+        (Ending(1, "KeyError: 3"), 1, "KeyError: 3"),
         (
-            Ending(launcher.LOST, "rank 1 hangs. Its last checkpoint is intact. To continue: t"),
-            "rank 1 hangs. Its last checkpoint is intact",
+            None,
+            -9,
+            f"rank 1 on {socket.gethostname()} was killed by SIGKILL, perhaps out of memory",
         ),
-        (
-            Ending(launcher.LOST, "rank 1 hangs. Nothing was saved"),
-            "rank 1 hangs. Nothing was saved",
-        ),
-        (Ending(143, "stopped by SIGTERM"), "A rank was killed or ended without a message"),
-        (None, "A rank was killed or ended without a message"),
     ],
 )
-def test_restart_is_announced(monkeypatch, capsys, ending, text):
-    assert launched(monkeypatch, ending, Ending(folder="run"))
-    assert capsys.readouterr().err == f"warning: {text}. Restarting, 1 of restarts=1.\n"
-
-
-class Failed(Exception):
-    def __init__(self, exitcode):
-        self.exitcode = exitcode
-        self.failures = {1: self}
-
-
-def test_rank_that_said_nothing(monkeypatch):
-    with pytest.raises(UserError, match="rank 1 on .* SIGKILL.*Nothing was saved yet") as error:
-        launched(monkeypatch, None, failure=Failed(-signal.SIGKILL))
-    assert error.value.code == launcher.LOST
-    with pytest.raises(UserError, match="rank 1 on .* SIGKILL"):  # and torchrun stopped rank 0
-        launched(monkeypatch, Ending(143, "stopped"), failure=Failed(-signal.SIGKILL))
-    with pytest.raises(UserError, match="cannot be started: no address"):
-        launched(monkeypatch, failure=OSError("no address"))
+def test_restart_is_announced(monkeypatch, capsys, ending, code, text):
+    assert launched(monkeypatch, (ending, code), (Ending(folder="run"), 0))
+    error = capsys.readouterr().err
+    assert error.startswith(f"warning: {text}") and error.count("\n") == 1
+    assert error.endswith(". Restarting, 1 of restarts=1.\n")
 
 
 def test_ranks_share_the_cores_that_they_may_use(here, monkeypatch):
@@ -227,11 +220,6 @@ def started(here, *words, base=TINY, **env):
     finally:
         process.kill()
         process.communicate()
-
-
-def pid_of(here, rank, attempt=0):
-    (path,) = (here / "tmp").glob(f"megastep-*/pid-{attempt}-{rank}")
-    return int(path.read_text())
 
 
 def wait_for_checkpoint(here, process):
@@ -303,10 +291,10 @@ def test_signal_saves_once(here, number, is_group, base, update):
 def test_killed_rank(here, rank, base):
     with started(here, "checkpoints.seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
-        pids = [pid_of(here, n) for n in range(2)]
+        pids = children(run.pid)
         os.kill(pids[rank], signal.SIGKILL)
         code, out, err, seconds = wait_for_end(run)
-    assert code == launcher.LOST and seconds < 30
+    assert code == LOST and seconds < 30
     assert err.startswith(f"train.py: rank {rank} on ") and err.count("\n") == 1
     assert "killed" in err and err.endswith("To continue: python train.py resume=run\n")
     assert "Stopping" not in out and not any(map(is_running, pids))
@@ -321,10 +309,10 @@ def test_killed_rank(here, rank, base):
 def test_stopped_rank(here, base):
     with started(here, "checkpoints.seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
-        pids = [pid_of(here, n) for n in range(2)]
+        pids = children(run.pid)
         os.kill(pids[1], signal.SIGSTOP)
         code, _, err, seconds = wait_for_end(run)
-    assert code == launcher.LOST and seconds < 30
+    assert code == LOST and seconds < 30
     assert err.startswith("train.py: rank 1 on ") and not any(map(is_running, pids))
 
 
@@ -345,7 +333,7 @@ def test_restart(here):
     words = "env=paced:Paced", "checkpoints.seconds=1", "restarts=1", f"samples={100 * UPDATE}"
     with started(here, *words) as run:
         wait_for_checkpoint(here, run)
-        os.kill(pid_of(here, 1), signal.SIGKILL)
+        os.kill(children(run.pid)[1], signal.SIGKILL)
         code, out, err, _ = wait_for_end(run)
     assert code == 0 and out.count("Training on 2 x cpu in run") == 2
     assert err.startswith("warning: rank 1 on ") and "Restarting, 1 of restarts=1" in err
@@ -358,7 +346,7 @@ def test_ranks_end_with_the_process_that_launched_them(here):
     with started(here) as run:
         wait_until(lambda: (here / "run" / "metrics.jsonl").exists(), run)
         time.sleep(1)
-        pids = [pid_of(here, n) for n in range(2)]
+        pids = children(run.pid)
         run.kill()
         deadline = time.monotonic() + 30
         while any(map(is_running, pids)) and time.monotonic() < deadline:
@@ -385,7 +373,7 @@ class Stuck(Minimal):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "line, code, expected",
-    [("time.sleep(0.1)", launcher.LOST, "hangs: "), ("raise MemoryError", 2, "Out of memory")],
+    [("time.sleep(0.1)", LOST, "hangs: "), ("raise MemoryError", 2, "Out of memory")],
 )
 def test_rank_that_fails_alone(here, line, code, expected):
     (here / "stuck.py").write_text(STUCK.format(line))
