@@ -32,8 +32,8 @@ ADDRESS = "127.0.0.1"
 CODE = """import signal, sys
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 sys.path[:] = filter(None, sys.path)
-from megastep.agents.launch import rank
-sys.exit(rank.main())"""
+from megastep.agents.launch import rank_process
+sys.exit(rank_process.main())"""
 
 
 def n_ranks(cfg: settings.Train) -> int:

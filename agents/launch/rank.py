@@ -8,20 +8,16 @@ import json
 import math
 import os
 import sys
-import threading
 import time
-import traceback
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
-from megastep import workers
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
-from megastep.agents.errors import UserError, shortened, user_errors
+from megastep.agents.errors import UserError, user_errors
 from megastep.agents.launch import signals
-from megastep.agents.runs import checkpoint, folders, populations, strange_files, typed_json
+from megastep.agents.runs import checkpoint, folders, populations, strange_files
 from megastep.agents.runs.atomic_files import write_atomically
 
 if TYPE_CHECKING:
@@ -42,39 +38,6 @@ NOTICE_SECONDS = 30.0
 #: The team that this process has joined.
 _team = None
 T = TypeVar("T")
-
-
-def main() -> int:
-    """Trains as one of the ranks that `launcher` started.
-
-    Returns:
-        The exit code: 0 if this rank's ending is final, otherwise the ranks may be restarted.
-    """
-    facts = typed_json.loads(Path(os.environ[JOB], SETTINGS).read_text())
-    sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
-    workers.end_with_parent(facts["parent"])
-    console.open_streams()
-    console.prefix = facts["prefix"]
-    threading.excepthook = console.warn_of_thread
-    warnings.showwarning = console.warn
-    from megastep.agents.factory import check, settings
-    from megastep.agents.launch import train
-
-    folder = None
-
-    def work() -> None:
-        nonlocal folder
-        folder = train.run(check.check(settings.Train, facts["settings"]))
-
-    try:
-        ending, code = signals.ending_of(work)._replace(folder=folder and str(folder)), 0
-    except Exception as error:
-        traceback.print_exc()
-        ending = signals.Ending(1, f"{type(error).__name__}: {shortened(error, 400)}")
-        code = 1
-    if ending.text or ending.folder:
-        report_ending(ending)
-    return code
 
 
 def report_ending(ending: signals.Ending) -> None:
