@@ -25,8 +25,6 @@ from megastep.geometries import homes
 from megastep.geometries.homes import database, plan
 from scripts import check_homes
 
-NEAR = 0.3  # metres; side of the cells in which the walls of two homes are compared
-
 # Of real homes, from CubiCasa5k and Raster-to-Vector: (statistic, percentile, min, max).
 BANDS = [
     ("walls", 5, 30, 55),
@@ -95,34 +93,6 @@ def fingerprint(g):
     return hashlib.sha1(min(images)).hexdigest()
 
 
-def similarity(plans):
-    """Returns, for each home, the largest Jaccard index of its wall cells with those of another,
-    over the 8 symmetries.
-    """
-    side = int(np.ceil(max(np.ptp(g.walls, axis=(0, 1)).max() for g in plans) / NEAR)) + 2
-    cells = np.zeros((8, len(plans), side * side), np.float32)
-    for k, g in enumerate(plans):
-        middle = (g.walls.max((0, 1)) + g.walls.min((0, 1))) / 2
-        steps = np.linspace(0, 1, 2 * side)[:, None, None]  # along each wall, closer than cells
-        points = (g.walls[:, 0] + (g.walls[:, 1] - g.walls[:, 0]) * steps - middle) / NEAR
-        for s, image in enumerate(symmetries(points.reshape(-1, 2))):
-            x, y = np.floor(image + side / 2).astype(int).T
-            cells[s, k, y * side + x] = 1
-    sizes = cells[0].sum(-1)
-    best = np.zeros(len(plans))
-    for image in cells:
-        common = image @ cells[0].T
-        index = common / (sizes[:, None] + sizes - common)
-        np.fill_diagonal(index, 0)
-        best = np.maximum(best, index.max(1))
-    return best
-
-
-def adjacency(g):
-    """Returns a summary of a home's topology: the sorted kinds of rooms and the number of gaps."""
-    return tuple(sorted(g.rooms)), len(g.doors) + len(g.openings)
-
-
 def generate(seed, density=1, clutter=0):
     """Returns (the home of a seed, its errors, the seconds that it took)."""
     start = time.process_time()
@@ -177,15 +147,7 @@ def main(argv=None):
         "  rooms per home  ",
         ", ".join(f"{kind} {n / len(plans):.2f}" for kind, n in kinds.most_common()),
     )
-    nearest = similarity(plans[:1_000])
-    print(
-        f"  similarity to the nearest other of {len(nearest)}: median {np.median(nearest):.2f}, "
-        f"maximum {nearest.max():.2f}"
-    )
-    print(
-        f"  {len({fingerprint(g) for g in plans})} different plans, "
-        f"{len({adjacency(g) for g in plans})} programmes"
-    )
+    print(f"  {len({fingerprint(g) for g in plans})} different plans")
     passed = "  all checks passed"
     if args.density == 1 and args.clutter == 0:
         messages += outside(values, BANDS)

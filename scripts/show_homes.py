@@ -20,22 +20,10 @@ from megastep import geometry
 from megastep.geometries import homes, mazes
 
 BRAIDS = (0.0, 0.5, 1.0)
-LABELS = {
-    "living": "living",
-    "bath": "bath",
-    "entry": "entry",
-    "bedroom": "bed",
-    "kitchen": "kitchen",
-    "lobby": "lob",
-    "closet": "clo",
-    "storage": "sto",
-    "utility": "util",
-    "room": "room",
-}
 
 
 def sheet(plans, titles, columns):
-    """Returns a figure with floor plans at one scale, and the names of the rooms of homes."""
+    """Returns a figure with floor plans at one scale."""
     rows = -(-len(plans) // columns)
     figure, axes = plt.subplots(
         rows, columns, figsize=(4 * columns, 4 * rows), squeeze=False, layout="constrained"
@@ -47,8 +35,6 @@ def sheet(plans, titles, columns):
         geometry.display(g, ax)
         ax.set(xlim=(0.5, side + 0.5), ylim=(0.5, side + 0.5))
         ax.set_title(title, fontsize=9)
-        for kind, (x, y), area in zip(g.get("rooms", ()), g.lights, g.get("areas", ())):
-            ax.text(x, y - 0.2, LABELS[kind], ha="center", va="top", fontsize=5 + 2 * (area > 4))
     return figure
 
 

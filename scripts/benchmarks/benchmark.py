@@ -29,8 +29,6 @@ import records
 import report
 import torch
 from catalogue import BENCHMARKS
-from published import TASKS
-from training_benchmarks import COMPARED
 
 from megastep import engine
 
@@ -42,8 +40,7 @@ def measure(
     options = options or {}
     device = torch.device("cpu") if name == "cpu" else device
     provenance = records.provenance(device, commit)
-    repeated = {key: value for key, value in options.items() if key != "folder"}
-    command = command_line(name, device, repeated)
+    command = command_line(name, device, options)
     for measurement in BENCHMARKS[name](device, **options):
         numbers = {key: rounded(measurement[key]) for key in ("value", "lower", "upper")}
         yield dict(benchmark=name) | measurement | numbers | provenance | dict(command=command)
@@ -85,28 +82,10 @@ def main(argv: list[str] | None = None) -> int:
         help=f"{', '.join(BENCHMARKS)}; or report alone",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument("--seeds", nargs="+", type=int, metavar="SEED", help="for those that train")
-    parser.add_argument(
-        "--budgets", nargs="+", type=int, metavar="SECONDS", help="for train and learners"
-    )
-    parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds, learners, scaling")
-    parser.add_argument(
-        "--samples",
-        type=int,
-        metavar="N",
-        help="samples per run, for duels, ablation, curricula, published",
-    )
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, metavar="TASK", help="for published")
-    parser.add_argument(
-        "--seconds", type=int, metavar="S", help="of a run, for published, populations"
-    )
-    parser.add_argument("--jobs", type=int, metavar="N", help="runs side by side, for published")
-    parser.add_argument(
-        "--folder",
-        type=Path,
-        help="keeps run folders and measures those in it, for published, search, league; "
-        "has cubicasa/ and houseexpo/, for plans",
-    )
+    parser.add_argument("--seeds", nargs="+", type=int, help="for train and ranks")
+    parser.add_argument("--budgets", nargs="+", type=int, help="seconds, for train and ranks")
+    parser.add_argument("--envs", nargs="+", metavar="ENV", help="for scaling")
+    parser.add_argument("--seconds", type=int, metavar="S", help="of a run, for members")
     parser.add_argument("--commit", help="the commit to record, if git is not available")
     parser.add_argument(
         "--json",

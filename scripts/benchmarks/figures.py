@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from records import newest
-from training_benchmarks import COMPARED, LEARNERS, curve_metric
 
 #: Environments and frames per second of the original megastep's Explorer, on one H200.
 ORIGINAL_MEGASTEP = 16_384, 0.86e6
 #: Explorer's mean return in test homes for seeing all that is visible from 128 points.
 NEARLY_ALL_SEEN = 59.1
 ENV_COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange", "pointgoal": "tab:purple"}
-CORE_ORDER = "none", "lstm", "gru", "mingru"
 BUDGET_COLOURS = "tab:green", "tab:blue", "tab:red"
 
 
@@ -40,10 +38,6 @@ def finish(ax, path, ticks=None, legend="best"):
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8, loc=legend)
     save(ax.figure, path)
-
-
-def metric_name(metric: str) -> str:
-    return "SPL" if metric == "spl" else metric.replace("_", " ")
 
 
 def is_cpu(record: dict) -> bool:
@@ -132,109 +126,6 @@ def plot_training(records: list[dict], path: Path) -> None:
     finish(ax, path, ticks=[1, *curves], legend="lower right")
 
 
-def plot_recipes(records: list[dict], path: Path) -> None:
-    """Plots each environment's metric over seconds of training, from `worlds`."""
-    curves = {
-        record["what"].removesuffix(", median rate"): record["curve"]
-        for record in newest(records)
-        if record["benchmark"] == "worlds" and "curve" in record
-    }
-    # in self-play each side wins half of the points
-    curves = {title: curve for title, curve in curves.items() if "self-play" not in title}
-    if not curves:
-        return
-    ax = subplots(7.5, 4.2)
-    for title, curve in curves.items():
-        seconds, _, values = zip(*curve)
-        ax.plot(seconds, values, label=f"{title}: {metric_name(curve_metric(title))}")
-    ax.set(xscale="log", xlabel="seconds of training", ylabel="metric in training", ylim=(0, 1))
-    finish(ax, path, ticks=[1, 3, 10, 30, 60], legend="lower right")
-
-
-def plot_learners(records: list[dict], path: Path) -> None:
-    """Plots each environment's metric over samples and over seconds, from `learners`.
-
-    A row of plots per environment and machine, a colour per learner, a line per seed. Only the runs
-    with the longest budget are drawn.
-    """
-    runs = {}
-    for record in newest(records):
-        if record["benchmark"] == "learners" and "curve" in record:
-            env, learner = record["what"].rsplit(", ", 3)[0].split(", ", 1)
-            runs.setdefault((env, record["on"].split(",")[0]), []).append((learner, record))
-    if not runs:
-        return
-    grid = subplots(9, 2.9 * len(runs), len(runs), 2, squeeze=False, sharey="row")
-    learners = list(LEARNERS)
-    panels = sorted(runs, key=lambda panel: (panel[1] == "CPU", list(COMPARED).index(panel[0])))
-    for (env, machine), (by_samples, by_seconds) in zip(panels, grid):
-        panel_runs = sorted(runs[env, machine], key=lambda run: learners.index(run[0]))
-        longest = max(record["curve"][-1][0] for _, record in panel_runs)
-        for learner, record in panel_runs:
-            seconds, samples, values = zip(*record["curve"])
-            if seconds[-1] < 0.75 * longest:
-                continue
-            style = dict(color=f"C{learners.index(learner)}", linewidth=1.2)
-            label = learner if ", seed 1," in record["what"] else None
-            by_samples.plot([n / 1e6 for n in samples], values, **style)
-            by_seconds.plot(seconds, values, label=label, **style)
-        metric = metric_name(COMPARED[env][1])
-        by_samples.set(xlabel="million samples", ylabel=f"{metric} in training")
-        by_samples.set(xscale="log", ylim=(0, None))
-        by_seconds.set(xlabel="seconds of training")
-        for ax in (by_samples, by_seconds):
-            ax.set(title=f"{env}, {machine}")
-            ax.grid(alpha=0.3)
-    grid[0, 1].legend(fontsize=8)
-    save(grid[0, 0].figure, path)
-
-
-def plot_published(records: list[dict], path: Path) -> None:
-    """Plots the return in training over samples of each task of `published`, beside its target.
-
-    A plot per task, a colour per recurrent core, a line per seed.
-    """
-    by_task = {}
-    for record in newest(records):
-        has_curve = any("curve" in run for run in record.get("seeds", ()))
-        if record["benchmark"] == "published" and has_curve:
-            task, core = record["what"].partition(":")[0].rsplit(", ", 1)
-            by_task.setdefault(task, {})[core] = record
-    if not by_task:
-        return
-    n_rows = -(-len(by_task) // 3)
-    grid = subplots(10, 2.7 * n_rows, n_rows, 3, squeeze=False)
-    for ax in grid.flat[len(by_task) :]:
-        ax.set_axis_off()
-    for (task, by_core), ax in zip(by_task.items(), grid.flat):
-        for core, record in by_core.items():
-            for i, run in enumerate(run for run in record["seeds"] if "curve" in run):
-                _, samples, values = zip(*run["curve"])
-                style = dict(color=f"C{CORE_ORDER.index(core)}", linewidth=1.1)
-                ax.plot([n / 1e6 for n in samples], values, label=core * (i == 0), **style)
-        if record["target"] is not None:
-            ax.axhline(record["target"], color="grey", linewidth=1, linestyle="--")
-        ax.set(title=task.removeprefix("popgym-"), xlabel="million samples")
-        ax.grid(alpha=0.3)
-        ax.legend(fontsize=8, loc="lower right")
-    for ax in grid[:, 0]:
-        ax.set(ylabel="return in training")
-    save(grid[0, 0].figure, path)
-
-
-def plot_memory(records: list[dict], path: Path) -> None:
-    """Plots what cores find in Memory over the seconds of their training, from memory.jsonl."""
-    ax = subplots(7, 4)
-    cores = [record for record in records if record["budget"] == 120 and not record["variant"]]
-    styles = {1: "-", 3: "--"}
-    colours = dict(zip(CORE_ORDER, ("tab:grey", "tab:blue", "tab:orange", "tab:green")))
-    for record in sorted(cores, key=lambda record: -record["found"][-1]):
-        style = dict(color=colours[record["core"]], linestyle=styles[record["layers"]])
-        ax.plot(record["seconds"], record["found"], label=record["name"], **style)
-    ax.set(xlabel="seconds on one H200", ylabel="objects found per episode, 9 x 9 mazes", ylim=0)
-    finish(ax, path)
-
-
 def plot_scaling(records: list[dict], path: Path) -> None:
     """Plots samples per second over the number of GPUs, from `scaling`, beside linear scaling: of
     the commit and on the machine that were measured last.
@@ -256,31 +147,3 @@ def plot_scaling(records: list[dict], path: Path) -> None:
         ax.plot(counts, linear, color=colour, linestyle=":", label=f"{env}, linear")
     ax.set(xlabel="GPUs", ylabel="million samples per second", xlim=(0, None), ylim=(0, None))
     finish(ax, path, ticks=sorted({n for by_count in series.values() for n in by_count}))
-
-
-def plot_ratings(records: list[dict], path: Path) -> None:
-    """Plots the ratings of each run's snapshots, and of the scripted bot, over samples."""
-    ratings_by_seed = {}
-    for record in newest(records):
-        match = re.fullmatch(r"deathmatch, .*, seed (\d+), rating of (.*)", record["what"])
-        if match:
-            rating = match[2], record["value"], record["upper"]
-            ratings_by_seed.setdefault(match[1], []).append(rating)
-    if not ratings_by_seed:
-        return
-    ax = subplots(7.5, 4.2)
-    for i, (seed, ratings) in enumerate(ratings_by_seed.items()):
-        snapshots = [
-            (float(player.split()[0].replace(",", "")) / 1e6, value, upper - value)
-            for player, value, upper in ratings
-            if player.endswith(" samples")
-        ]
-        samples, values, spreads = zip(*sorted(snapshots))
-        style = dict(color=f"C{i}", marker="o", markersize=4, capsize=3)
-        ax.errorbar(samples, values, spreads, label=f"seed {seed}", **style)
-        for player, value, _ in ratings:
-            if player.lower() == "bot":
-                label = "the scripted bot, in each run's ratings" if i == 0 else None
-                ax.axhline(value, color=f"C{i}", linestyle="--", linewidth=1, label=label)
-    ax.set(xlabel="million samples", ylabel="rating ± two standard deviations")
-    finish(ax, path, legend="upper left")

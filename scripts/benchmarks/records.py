@@ -11,7 +11,6 @@ from datetime import date
 from pathlib import Path
 
 import torch
-from catalogue import BENCHMARKS
 from paths import ROOT
 
 
@@ -24,7 +23,7 @@ def newest(records: list[dict]) -> list[dict]:
     """Returns the newest record of each measurement per GPU model, and on any CPU.
 
     They are in order of benchmark, machine and name. Two names are the same measurement if they
-    differ only in the duels won, or in the last six digits of a number of samples.
+    differ only in the last six digits of a number of samples, or in what they count in brackets.
     """
     newest_records = {}
     for record in sorted(records, key=lambda record: record["date"]):
@@ -37,8 +36,7 @@ def newest(records: list[dict]) -> list[dict]:
         benchmark, machine, what = key
         parts = re.split(r"(\d[\d,]*)", what)
         numbers = [int(part.replace(",", "")) for part in parts[1::2]]
-        rank = list(BENCHMARKS).index(benchmark)
-        return rank, machine == "CPU", machine, parts[::2], numbers
+        return benchmark, machine == "CPU", machine, parts[::2], numbers
 
     return [newest_records[key] for key in sorted(newest_records, key=order)]
 

@@ -47,10 +47,4 @@ def write(path: Path) -> None:
     rows = records.read(path)
     figures.plot_frames_per_second(rows, path.with_name("frames.svg"))
     figures.plot_training(rows, path.with_name("results.svg"))
-    figures.plot_recipes(rows, path.with_name("worlds.svg"))
-    figures.plot_ratings(rows, path.with_name("ratings.svg"))
     figures.plot_scaling(rows, path.with_name("scaling.svg"))
-    figures.plot_learners(rows, path.with_name("learners.svg"))
-    figures.plot_published(rows, path.with_name("published.svg"))
-    if (curves := path.with_name("memory.jsonl")).exists():
-        figures.plot_memory(records.read(curves), path.with_name("memory.svg"))

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from paths import ROOT
 from timing import measurement
-from training_runs import learning_curve, rates, trained
+from training import learning_curve, rates, trained
 
 N_ROUNDS = 3
 #: What trains long enough for a steady rate; about 8 s on a GPU.

@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import shutil
 import subprocess
 import sys
 
@@ -12,17 +11,14 @@ import engine_operations
 import env_steps
 import nsight_counters
 import paths
-import plan_statistics
 import pytest
 import random_walks
 import records
-import replay_buffer
 import startup_times
 import timing
 import torch
 
 from megastep import arrdict
-from megastep.geometries import sample
 
 RECORD_KEYS = {
     *("benchmark", "what", "value", "unit", "lower", "upper", "n"),
@@ -39,9 +35,6 @@ def tiny_benchmarks(monkeypatch):
         (env_steps, "N_ARENAS", (8,)),
         (engine_operations, "N_AGENTS", (8,)),
         (engine_operations, "N_ARENAS", 8),
-        (replay_buffer, "N_LANES", 8),
-        (replay_buffer, "N_ROLLOUTS", 2),
-        (replay_buffer, "N_SAMPLED", 4),
     ):
         monkeypatch.setattr(module, name, {"cuda": value, "cpu": value})
     monkeypatch.setattr(random_walks, "N_HOMES", 2)
@@ -87,7 +80,7 @@ def test_benchmark_is_documented_generator(name):
     ("name", "n_records"),
     [
         *(("step", 5), ("kernels", 8), ("observe", 2), ("agents", 1), ("deathmatch", 2)),
-        *(("memory", 1), ("replay", 9), ("pong", 2)),
+        *(("memory", 1), ("pong", 2)),
     ],
 )
 def test_benchmark_appends_json_lines(name, n_records, device, tiny_benchmarks, tmp_path, capsys):
@@ -109,26 +102,6 @@ def test_benchmarks_start_without_what_only_importing_floor_plans_needs():
     code = "import sys; sys.modules.update(shapely=None, svgelements=None); import catalogue"
     folder = paths.ROOT / "scripts" / "benchmarks"
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
-
-
-def test_plans_benchmark_measures_imported_and_generated_homes(tmp_path, monkeypatch):
-    imports = pytest.importorskip("megastep.geometries.plans.imports", exc_type=ImportError)
-    for source, name in ("cubicasa", "ok_two_rooms.svg"), ("houseexpo", "houseexpo_ok.json"):
-        (tmp_path / source).mkdir()
-        shutil.copy(paths.ROOT / "tests/data/hostile" / name, tmp_path / source)
-    monkeypatch.setattr(plan_statistics, "N_BENCH", 2)
-    monkeypatch.setattr(plan_statistics, "DENSE", {"bench": ("bench", {})})
-    monkeypatch.setattr(plan_statistics, "N_DENSE", 1)
-    monkeypatch.setattr(imports, "generated_homes", lambda: sample("homes", 3, "all"))
-    rows = [*catalogue.BENCHMARKS["plans"](torch.device("cpu"), tmp_path)]
-    values = {row["what"]: row["value"] for row in rows}
-    assert len(values) == len(rows) == 9 + 9 + 11 + 10 + 3
-    assert values["CubiCasa5k, rooms"] == 2
-    assert (
-        0.9 < values["bench, room width"] < 2 * values["bench, longest of a home's shortest paths"]
-    )
-    assert values["HouseExpo, rooms that an agent can reach"] == 100
-    assert values["bench, homes that do not pass"] == 0
 
 
 def test_step_benchmark_measures_explorer_as_trained(tiny_benchmarks, monkeypatch):
@@ -178,23 +151,23 @@ def test_cpu_benchmark_restores_number_of_threads(tiny_benchmarks):
 
 
 def test_record_contains_command_that_repeats_it(monkeypatch):
-    def duels(device, seeds=(1, 2, 3), samples=10):
+    def trained(device, seeds=(1, 2, 3), budgets=(6,)):
         yield dict(what="a", value=1.0, unit="", lower=None, upper=None, n=None)
 
-    monkeypatch.setitem(catalogue.BENCHMARKS, "duels", duels)
-    options = dict(seeds=[3, 4], samples=5)
-    (row,) = benchmark.measure("duels", torch.device("cpu"), "abc", options)
-    command = "python scripts/benchmarks/benchmark.py duels --seeds 3 4 --samples 5 --device cpu"
+    monkeypatch.setitem(catalogue.BENCHMARKS, "train", trained)
+    options = dict(seeds=[3, 4], budgets=[5])
+    (row,) = benchmark.measure("train", torch.device("cpu"), "abc", options)
+    command = "python scripts/benchmarks/benchmark.py train --seeds 3 4 --budgets 5 --device cpu"
     assert row["command"] == command
 
 
 def test_options_reach_benchmark(monkeypatch, capsys):
-    def learners(device, seeds=(1, 2, 3), envs=("Explorer",)):
+    def scaled(device, seeds=(1, 2, 3), envs=("Explorer",)):
         what = json.dumps([list(seeds), list(envs)])
         yield dict(what=what, value=1.0, unit="", lower=None, upper=None, n=None)
 
-    monkeypatch.setitem(catalogue.BENCHMARKS, "learners", learners)
-    arguments = ["learners", "--seeds", "2", "--envs", "Pong", "--samples", "5", "--device", "cpu"]
+    monkeypatch.setitem(catalogue.BENCHMARKS, "scaling", scaled)
+    arguments = ["scaling", "--seeds", "2", "--envs", "Pong", "--budgets", "5", "--device", "cpu"]
     assert benchmark.main(arguments) == 0
     assert '[[2], ["Pong"]]' in capsys.readouterr().out
 
