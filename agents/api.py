@@ -231,7 +231,7 @@ def record(
         UserError: there is no such run, or it cannot be filmed so.
     """
     from megastep import recording
-    from megastep.agents.evaluation import record as filming  # with PyTorch
+    from megastep.agents.evaluation import filming  # with PyTorch
 
     if _is_policy(run):
         options = cast(dict, settings)

@@ -568,8 +568,9 @@ def _moments_of(player, worlds, steps, trail) -> Iterator[_Moment]:
         yield _Moment(state, _returns(returns))
     if player.expected is not None and not np.isclose(returns[agent], player.expected, rtol=1e-4):
         raise ValueError(
-            f"its return is {returns[agent]:.6g} and not {player.expected:.6g}: the environment "
-            "has changed since, or draws what no seed decides"
+            f"its return is {returns[agent]:.6g} and not {player.expected:.6g}: film it on the "
+            "device that it was evaluated on (device=); or the environment has changed since, or "
+            "draws what no seed decides"
         )
 
 

@@ -12,6 +12,6 @@ main = functools.partial(command.run_command, scripts.RECORD)
 
 def run(cfg: settings.Record) -> Path:
     """Films an agent; see `megastep.agents.evaluation.record.run`."""
-    from megastep.agents.evaluation import record  # with PyTorch
+    from megastep.agents.evaluation import filming  # with PyTorch
 
-    return record.run(cfg)
+    return filming.run(cfg)

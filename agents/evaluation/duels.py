@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from megastep.agents import factory
+from megastep.agents.evaluation import players, tables
+from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.evaluation.playing import step_until
-from megastep.agents.evaluation.statistics import interval, lanes_by_source, worst_homes
+from megastep.agents.evaluation.statistics import TAIL, interval, lanes_by_source, worst_homes
+from megastep.agents.factory import settings
 from megastep.agents.generator import SeededGenerator
+from megastep.agents.runs import checkpoint
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.arrdict import arrdict
@@ -96,6 +101,67 @@ def play(
     step_until(is_over, step, world, state, env, (policy, opponent), changed, max_steps)
     optional(env, "check")()
     return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)
+
+
+class Duels:
+    """The agent of a run against others, in unseen homes.
+
+    Two agents play, or as many as the environment has if their number is fixed. Each home is played
+    in from every agent's slot, equally often, in up to `cfg.episodes` duels.
+
+    Attributes:
+        agent, others: who plays: the run's agent, and each of `cfg.against`.
+        where: the environment.
+    """
+
+    def __init__(
+        self,
+        cfg: settings.Evaluate,
+        run: checkpoint.Checkpoint,
+        env: settings.Env,
+        homes: list,
+        device: torch.device,
+    ):
+        self.cfg, self.run = cfg, run
+        self.where = EvalEnv(env, homes, cfg.episodes, cfg.seed, device, is_duel=True)
+        self.env, self.sample = self.where.env, self.where.sample
+        self.agent = players.load_player(run, self.sample, run)
+        factory.load_wrappers(self.env, run)
+        self.others = [self.player(name) for name in cfg.against or ()]
+        shard = self.where.shard
+        slots = rotating_slots(shard.n_envs, optional(self.env, "n_agents"), self.env.device)
+        self.slots = slots[[*shard.envs]]
+        self.where.warn_without_layout()
+
+    def player(self, name: str) -> players.Player:
+        """Returns who plays in the environment, see `find_player`."""
+        where, trust = self.where.settings, self.cfg.trust
+        player = players.find_player(name, self.run, where, self.sample, trust)
+        return player._replace(policy=factory.in_env(player.policy, where, self.env))
+
+    def play(self, player: players.Player, opponent: players.Player) -> arrdict:
+        """Returns the duels of two players, those of all ranks."""
+        with factory.errors():
+            played = play(
+                *(self.env, player.policy, opponent.policy, self.where.seed, self.cfg.greedy),
+                max_steps=self.cfg.max_steps or MAX_STEPS,
+                slots=self.slots,
+            )
+        return self.where.shard.with_others(played)
+
+    def rows(self, source: str | None = None) -> "list[Row]":
+        """Plays the run's agent against each of `cfg.against`, in homes of a `source` or of
+        several. Returns the table rows.
+        """
+        sources = None if source else factory.sources_of(self.where.homes)
+        roles, rows = optional(self.env, "roles"), []
+        for opponent in self.others:
+            played = self.play(self.agent, opponent)
+            found = summaries(played, roles, sources)
+            if source == tables.DENSE and "homes" in played:
+                found.append({"tail": TAIL, **worst_summary(played)})
+            rows += [{"against": opponent.name, **row} for row in found]
+        return rows
 
 
 def summaries(

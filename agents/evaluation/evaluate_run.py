@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.evaluation import arena, episodes, playing, replay, statistics, suite, tables
+from megastep.agents.evaluation import players, playing, ratings, statistics, tables
+from megastep.agents.evaluation.duels import Duels
+from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import checkpoint, folders
 from megastep.env_state import EnvState
@@ -28,11 +30,11 @@ def run(cfg: settings.Evaluate) -> Path:
     With several ranks, each plays some of the environments. Rank 0 writes; the others return the
     run's folder.
 
-    Writes .json, .md, .csv, which has a row per episode, and .npz, from which `record.py worst=3`
-    plays episodes again, into the run's folder `evaluations`, one of each per source of geometries
-    (per environment where it has none), split and checkpoint. Of `geometry=suite` plays as many
-    episodes in each source, and adds the worst source and the worst dense homes. With `cfg.against`
-    plays duels instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
+    Writes .json, .md and .csv, which has a row per episode, into the run's folder `evaluations`,
+    one of each per source of geometries (per environment where it has none), split and checkpoint.
+    Of `geometry=suite` plays as many episodes in each source, and adds the worst source and the
+    worst dense homes. With `cfg.against` plays duels instead; with `cfg.ratings` writes ratings.csv
+    and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
@@ -42,7 +44,11 @@ def run(cfg: settings.Evaluate) -> Path:
     homes = factory.homes(env_settings, geometry, cfg.split)
     folder, rank = folders.folder_of(loaded.path), process_group.rank()
     with env_failures.told(env_settings, folder, rank=rank):
-        path = measure(cfg, loaded, env_settings, geometry, homes, device)
+        if cfg.ratings:
+            duels = Duels(cfg, loaded, env_settings, homes, device)
+            path = ratings.write(duels, tables.labels(duels.where, geometry, cfg.split))
+        else:
+            path = measure(cfg, loaded, env_settings, geometry, homes, device)
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
 
@@ -55,42 +61,36 @@ def measure(
     homes: list,
     device: "torch.device",
 ) -> Path:
-    """Does what `run` does, with what its settings name."""
-    if cfg.ratings:
-        path = arena.Arena(cfg, loaded, env_settings, geometry, homes, device).rate()
-    elif cfg.against is not None:
-        path = duel(cfg, loaded, env_settings, geometry, homes, device)
-    else:
-        rows, single, actions = [], [], []
-        numbers = {id(home): number for number, home in enumerate(homes)}
-        for source, part in suite.parts_of(geometry, homes):
-            table, each, taken = play(cfg, loaded, env_settings, part, device, source)
-            actions.append(taken)
-            rows += suite.of_source(source, table)
+    """Plays episodes, or with `cfg.against` duels, of a suite in each source. Prints and writes a
+    table, and returns the path of its .json.
+    """
+    rows, single = [], []
+    numbers = {id(home): number for number, home in enumerate(homes)}
+    for source, part in tables.parts_of(geometry, homes):
+        if cfg.against is not None:
+            duels = Duels(cfg, loaded, env_settings, part, device)
+            where, of_part = duels.where, duels.rows(source)
+        else:
+            where, of_part, each = play(cfg, loaded, env_settings, part, device, source)
             if source:  # the number among all homes, not among those of the source
-                where = [numbers[id(home)] for home in part]
-                each = [
-                    row | {"home": where[row["home"]]} if "home" in row else row for row in each
-                ]
+                for row in each:
+                    if "home" in row:
+                        row["home"] = numbers[id(part[row["home"]])]
             single += each
-        if process_group.rank() > 0:
-            return folders.folder_of(loaded.path)
-        labels = tables.labels(env_settings, geometry, homes, cfg.split)
-        what = f"{rows[0]['lanes']:,} episodes{suite.each_source(geometry)}"
-        n_homes = suite.count_homes(rows)
-        rows = suite.with_worst_source(rows, "agent") if suite.is_suite(geometry) else rows
-        path = tables.write_table(
-            cfg,
-            loaded,
-            [labels.source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
-            f"{labels.title(what, n_homes)}, after {loaded.step:,} samples "
-            f"({loaded.path.name}), seed {cfg.seed}",
-            rows,
-            [*map(tables.cells, rows)],
-            single,
-            replay.as_bytes(actions),
-        )
-    return path
+        rows += [row | ({"source": source} if source else {}) for row in of_part]
+    if process_group.rank() > 0:
+        return folders.folder_of(loaded.path)
+    labels = tables.labels(where, geometry, cfg.split)
+    title, rows = tables.title_of(labels, geometry, rows, "duels" if cfg.against else "lanes")
+    if cfg.against is not None:
+        names = ["duels", labels.source, cfg.split, str(loaded.step), "against", *cfg.against]
+        title, cells = f"{duels.agent.name}, in {title}, seed {cfg.seed}", tables.duel_cells
+    else:
+        names = [labels.source, "env" if cfg.env else "", cfg.split, str(loaded.step)]
+        title += f", after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}"
+        cells = tables.cells
+    n_ranks = where.shard.n_ranks
+    return tables.write_table(cfg, loaded, names, title, rows, [*map(cells, rows)], single, n_ranks)
 
 
 def play(
@@ -100,60 +100,52 @@ def play(
     homes: list,
     device: "torch.device",
     source: str | None = None,
-) -> "tuple[list[Row], list[Row], playing.Actions | None]":
-    """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the rows of the
-    table, those of the episodes, and the actions of the run's agent.
+) -> "tuple[EvalEnv, list[Row], list[Row]]":
+    """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns where, the rows of
+    the table, and those of the episodes.
     """
-    stage = arena.Stage(env_settings, homes, cfg.episodes, cfg.seed, device)
-    env, roles = stage.env, optional(stage.env, "roles")
-    sources = factory.sources_of(stage.homes)
-    rows, single, recorder = [], [], playing.Recorder()
-    players = players_of(cfg, loaded, stage)
-    all_played = play_all(stage, players, cfg.max_steps, recorder)
-    for (player, _), played in zip(players, all_played, strict=True):
+    where = EvalEnv(env_settings, homes, cfg.episodes, cfg.seed, device)
+    env, roles, sources = where.env, optional(where.env, "roles"), factory.sources_of(where.homes)
+    rows, single, is_first = [], [], process_group.rank() == 0
+    playing_ones = players_of(cfg, loaded, where)
+    for (player, _), played in zip(playing_ones, play_all(cfg, where, playing_ones), strict=True):
         n_cut = int((~played["done"]).sum())
-        if n_cut and process_group.rank() == 0:
+        if n_cut and is_first:
             limit = cfg.max_steps or optional(env, "max_episode_steps")
             console.warn(
                 f"{player.name}: {n_cut:,} of {len(played['done']):,} episodes had not ended after "
                 f"{limit:,} steps and are counted as truncated there; max_steps= sets the limit"
             )
         summaries = statistics.summaries(played, roles, None if source else sources)
-        if source == suite.DENSE and "homes" in played:
+        if source == tables.DENSE and "homes" in played:
             summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(played)})
         rows += [{"agent": player.name, **row} for row in summaries]
-        each = episodes.rows_of(played, cfg.seed, stage.numbers, sources, roles)
+        each = statistics.rows_of(played, cfg.seed, where.numbers, sources, roles)
         single += [{"agent": player.name, **row} for row in each]
-    if process_group.rank() == 0:
-        arena.warn_without_layout(env, stage.homes)
-    return rows, single, stage.actions(recorder)
+    if is_first:
+        where.warn_without_layout()
+    return where, rows, single
 
 
 def play_all(
-    stage: arena.Stage,
-    players: list[tuple[arena.Player, bool]],
-    max_steps: int | None,
-    recorder: playing.Recorder,
+    cfg: settings.Evaluate, where: EvalEnv, playing_ones: list[tuple[players.Player, bool]]
 ) -> "list[arrdict]":
-    """Returns the first episodes of each player, see `playing.first_episodes`.
+    """Returns the first episodes of each player on all ranks, see `playing.first_episodes`.
 
     If the bot `oracle` is among them, all play the same episodes, and have a further metric,
     `oracle_fraction`: what they found divided by what the oracle found in the same episode.
-
-    Args:
-        recorder: of the first player, as the environment's generators are where its seed puts them.
     """
-    names = [player.name for player, _ in players]
+    names = [player.name for player, _ in playing_ones]
     has_oracle = ORACLE in names
     # a copy, as the state's tensors are the environment's own
-    state = EnvState(stage.env) if has_oracle else None
+    state = EnvState(where.env) if has_oracle else None
     first = copy.deepcopy(state.state_dict()) if state is not None else {}
     all_played = []
-    for number, (player, greedy) in enumerate(players):
+    for player, greedy in playing_ones:
         if state is not None:
             state.load_state_dict(first)
-        own = None if number else recorder
-        all_played.append(stage.play(player.policy, greedy, max_steps, own))
+        settings_of = where.env, player.policy, where.seed, greedy, cfg.max_steps
+        all_played.append(where.shard.with_others(playing.first_episodes(*settings_of)))
     if has_oracle:
         found = all_played[names.index(ORACLE)]["metrics"]["found"]
         for played in all_played:
@@ -162,46 +154,15 @@ def play_all(
 
 
 def players_of(
-    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, stage: arena.Stage
-) -> list[tuple[arena.Player, bool]]:
+    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, where: EvalEnv
+) -> list[tuple[players.Player, bool]]:
     """Returns who plays, the run's agent and each of `cfg.baseline`, and whether it is greedy."""
-    policy = factory.make_policy(factory.config_of(loaded).agent, stage.env)
-    policy = factory.load_weights(policy, stage.env, loaded)
-    factory.load_wrappers(stage.env, loaded)
-    players = [(arena.Player("trained, greedy" if cfg.greedy else "trained", policy), cfg.greedy)]
+    policy = factory.make_policy(factory.config_of(loaded).agent, where.env)
+    policy = factory.load_weights(policy, where.env, loaded)
+    factory.load_wrappers(where.env, loaded)
+    every = [(players.Player("trained, greedy" if cfg.greedy else "trained", policy), cfg.greedy)]
     for name in cfg.baseline:
-        player = arena.find_player(name, loaded, stage.settings, stage.sample, cfg.trust)
-        own = factory.in_env(player.policy, stage.settings, stage.env)
-        players.append((player._replace(policy=own), cfg.greedy and player.step is not None))
-    return players
-
-
-def duel(
-    cfg: settings.Evaluate,
-    run: checkpoint.Checkpoint,
-    env: settings.Env,
-    geometry: settings.Geometry,
-    homes: list,
-    device: "torch.device",
-) -> Path:
-    """Plays the run's agent against each of `cfg.against`, of a suite in each source. Prints and
-    writes a table, and returns the path of its .json.
-    """
-    rows = []
-    for source, part in suite.parts_of(geometry, homes):
-        meeting = arena.Arena(cfg, run, env, geometry, part, device)
-        rows += suite.of_source(source, meeting.duel(source))
-    if process_group.rank() > 0:
-        return folders.folder_of(run.path)
-    labels = tables.labels(meeting.env_settings, geometry, homes, cfg.split)
-    what = f"{rows[0]['duels']:,} duels{suite.each_source(geometry)}"
-    title = labels.title(what, suite.count_homes(rows))
-    rows = suite.with_worst_source(rows, "against") if suite.is_suite(geometry) else rows
-    return tables.write_table(
-        cfg,
-        run,
-        ["duels", labels.source, cfg.split, str(run.step), "against", *(cfg.against or ())],
-        f"{meeting.agent.name}, in {title}, seed {cfg.seed}",
-        rows,
-        [*map(tables.duel_cells, rows)],
-    )
+        player = players.find_player(name, loaded, where.settings, where.sample, cfg.trust)
+        own = factory.in_env(player.policy, where.settings, where.env)
+        every.append((player._replace(policy=own), cfg.greedy and player.step is not None))
+    return every

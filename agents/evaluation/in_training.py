@@ -9,7 +9,8 @@ import torch
 from megastep import global_generators
 from megastep.agents import factory
 from megastep.agents.errors import ConfigErrors
-from megastep.agents.evaluation import arena, playing
+from megastep.agents.evaluation import playing
+from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import clone
@@ -40,12 +41,10 @@ class Evaluator:
         homes = factory.homes(cfg.env, cfg.geometry, "test")
         self.trained_in, self.state, self.start = trained_in, None, None
         with _generators_kept(device):
-            self.stage = arena.Stage(
-                cfg.env, homes, cfg.evaluation.episodes, cfg.seed, device, rank
-            )
-            names = ["return", "length", *self.stage.env.reset().get("metrics", {})]
-            if optional(self.stage.env, "resumable"):
-                self.state = EnvState(self.stage.env)
+            self.where = EvalEnv(cfg.env, homes, cfg.evaluation.episodes, cfg.seed, device, rank)
+            names = ["return", "length", *self.where.env.reset().get("metrics", {})]
+            if optional(self.where.env, "resumable"):
+                self.state = EnvState(self.where.env)
                 self.start = clone(self.state.state_dict())
         for name in cfg.evaluation.stop:
             if name not in names:
@@ -54,13 +53,13 @@ class Evaluator:
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """Returns the means of `return`, `length` and each metric of the environment."""
-        env = self.stage.env
-        with _generators_kept(self.stage.env.device):
+        env = self.where.env
+        with _generators_kept(env.device):
             if self.state is not None:
                 self.state.load_state_dict(clone(self.start))
             if learnt := optional(self.trained_in, "wrapper_state")():
                 optional(env, "load_wrapper_state")(learnt, True)
-            played = playing.first_episodes(env, policy.actor(), self.stage.seed)
+            played = playing.first_episodes(env, policy.actor(), self.where.seed)
         return means(played)
 
 

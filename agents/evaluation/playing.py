@@ -1,13 +1,10 @@
 """Plays episodes with a policy."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch.utils import _pytree
 
-from megastep import spaces
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.storage.collector import capture_with
 from megastep.arrdict import arrdict
@@ -16,10 +13,6 @@ from megastep.types import Env, PolicyLike, Tree, World, n_lanes, optional
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
 #: costs more than a few superfluous steps.
 CHECK_EVERY = 64
-
-
-#: Most bytes of actions that a `Recorder` keeps, and the name of its count.
-MAX_BYTES, COUNT = 2**28, "#"
 
 
 #: Steps of a CUDA graph, a divisor of `CHECK_EVERY`.
@@ -35,7 +28,6 @@ def step_until(
     policies: tuple[PolicyLike, ...],
     roots: tuple,
     max_steps: int,
-    after: Callable[[int], None] = lambda n_steps: None,
 ) -> None:
     """Calls `world, state = step(world, state)` until all of `is_over` is true, or `max_steps`
     times. On a GPU, in CUDA graphs after the first `CHECK_EVERY` steps, where libraries initialise
@@ -50,7 +42,6 @@ def step_until(
         policies: the policies that act.
         roots: what else `step` changes, see `megastep.capture.capture`.
         max_steps: maximum number of steps.
-        after: called, outside of graphs, after each `STEPS_PER_GRAPH` steps or fewer.
     """
 
     def several(world, state, n_steps=STEPS_PER_GRAPH) -> tuple[World, Tree]:
@@ -72,7 +63,6 @@ def step_until(
             world, state = play(world, state)
         else:
             several(world, state, max_steps - start)
-        after(min(STEPS_PER_GRAPH, max_steps - start))
 
 
 def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
@@ -92,72 +82,6 @@ def _has_fixed_form(before, after) -> bool:
     return spec == other and all(isinstance(leaf, torch.Tensor) for leaf in leaves)
 
 
-class Actions(NamedTuple):
-    """The actions of all lanes of an environment.
-
-    Attributes:
-        leaves: (T, B, ...) per leaf of the action space, by name.
-        n_ranks: number of ranks that played, each with a seed of its own.
-    """
-
-    leaves: dict[str, np.ndarray]
-    n_ranks: int = 1
-
-
-class Recorder:
-    """Keeps the actions of all lanes, on the host, for a film of some of the episodes.
-
-    Attributes:
-        latest: those since the last `keep`, (STEPS_PER_GRAPH, B, ...) per leaf of the action space,
-            by name, and how many there are.
-    """
-
-    def __init__(self) -> None:
-        self.latest: dict[str, torch.Tensor] = {}
-        self._parts: list[dict[str, np.ndarray]] | None = []
-        self._n_bytes = 0
-
-    def add(self, actions: Tree) -> None:
-        """Notes the actions of a step. Does not synchronise."""
-        leaves = spaces.leaves(actions)
-        if not self.latest:
-            like = next(iter(leaves.values()))
-            self.latest[COUNT] = torch.zeros(1, dtype=torch.int64, device=like.device)
-            for name, leaf in leaves.items():
-                self.latest[name] = leaf.new_zeros(STEPS_PER_GRAPH, *leaf.shape)
-        for name, leaf in leaves.items():
-            self.latest[name].index_copy_(0, self.latest[COUNT], leaf[None])
-        self.latest[COUNT].add_(1).remainder_(STEPS_PER_GRAPH)
-
-    def keep(self, n_steps: int) -> None:
-        """Copies the actions of the latest steps to the host."""
-        self.latest[COUNT].zero_()
-        if self._parts is None:
-            return
-        part = {
-            name: narrow(steps[:n_steps].cpu().numpy())
-            for name, steps in self.latest.items()
-            if name != COUNT
-        }
-        self._parts.append(part)
-        self._n_bytes += sum(steps.nbytes for steps in part.values())
-        if self._n_bytes > MAX_BYTES:
-            self._parts = None
-
-    def actions(self) -> dict[str, np.ndarray] | None:
-        """Returns (T, B, ...) per leaf; None if these are more than `MAX_BYTES`."""
-        if not self._parts:
-            return None
-        return {name: np.concatenate([p[name] for p in self._parts]) for name in self._parts[0]}
-
-
-def narrow(values: np.ndarray) -> np.ndarray:
-    """Returns integers in the smallest dtype that holds them."""
-    if not np.issubdtype(values.dtype, np.integer) or not values.size:
-        return values.copy()
-    return values.astype(np.result_type(*map(np.min_scalar_type, (values.min(), values.max()))))
-
-
 @torch.no_grad()
 def first_episodes(
     env: Env,
@@ -165,7 +89,6 @@ def first_episodes(
     seed: int = 1,
     greedy: bool = False,
     max_steps: int | None = None,
-    recorder: "Recorder | None" = None,
 ) -> arrdict:
     """Plays the first episode of each lane that learns, or of all lanes if none does.
 
@@ -174,7 +97,6 @@ def first_episodes(
         greedy: takes the most likely actions instead of sampling.
         max_steps: maximum number of steps, by default the environment's `max_episode_steps`;
             unfinished episodes have `done` False.
-        recorder: keeps the actions, if not None.
 
     Returns:
         An arrdict on the environment's device:
@@ -209,8 +131,6 @@ def first_episodes(
 
     def step(world, state) -> tuple[World, Tree]:
         decision, state = policy(world, state, sample=not greedy, generator=draws.on(done.device))
-        if recorder is not None:
-            recorder.add(decision["actions"])
         world = env.step(decision)
         returns.add_(torch.where(done, 0.0, world.reward))
         lengths.add_(~done)
@@ -222,10 +142,8 @@ def first_episodes(
         return world, state
 
     changed = draws, returns, lengths, metrics, terminal
-    after = (lambda n_steps: None) if recorder is None else recorder.keep
-    changed += () if recorder is None else (recorder.latest,)
     most: int = optional(env, "max_episode_steps") if max_steps is None else max_steps
-    step_until(done, step, world, state, env, (policy,), changed, most, after)
+    step_until(done, step, world, state, env, (policy,), changed, most)
     return arrdict(
         returns=returns,
         lengths=lengths,

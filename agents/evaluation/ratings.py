@@ -5,14 +5,20 @@ a mean, which starts at 25, and a standard deviation for its uncertainty. A play
 wins 73 % of the duels, a player rated 1 higher 54 %.
 """
 
-import csv
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from megastep.agents import console
+from megastep.agents.distributed import process_group
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.evaluation import tables
+from megastep.agents.evaluation.duels import Duels
+from megastep.agents.runs import checkpoint, folders
 from megastep.agents.runs.atomic_files import write_atomically
 
 if TYPE_CHECKING:
@@ -23,6 +29,51 @@ N_ORDERS = 10
 
 #: Scores of player i in duels with player j, by (i, j): 1 won, 0 lost, 0.5 a draw.
 Scores = Mapping[tuple[int, int], Sequence[float]]
+
+
+def write(duels: Duels, labels: tables.Labels) -> Path:
+    """Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels of
+    each with each. Prints a table, writes ratings.csv and ratings.svg into the run's folder, and
+    returns the path of the first.
+    """
+    folder, players = folders.folder_of(duels.run.path), []
+    for path in (
+        checkpoint.list_checkpoints(folder / "snapshots")
+        or checkpoint.list_checkpoints(folder / "checkpoints")
+        or [duels.run.path]  # the file of an agent
+    ):
+        try:
+            player = duels.player(str(path))
+        except UserError:
+            if path.exists():
+                raise
+            continue  # its run, which is training, has deleted it
+        players.append(player._replace(name=f"{player.step:,} samples"))
+    players += duels.others
+    if len(players) < 2:
+        raise UserError(
+            f"{folder} has one checkpoint and nothing to compare it with: train with "
+            "checkpoints.snapshots=8, or name others with against="
+        )
+    played = {
+        (i, j): duels.play(players[i], players[j])
+        for i, j in itertools.combinations(range(len(players)), 2)
+    }
+    if process_group.rank() > 0:
+        return folder
+    scores = {pair: one["score"].tolist() for pair, one in played.items()}
+    table = rows([(player.name, player.step) for player in players], scores, duels.cfg.seed)
+    layouts, what = played[0, 1].get("homes"), f"{duels.where.shard.n_envs:,} duels of each pair"
+    n_homes = None if layouts is None else len(layouts.unique())
+    title = f"Ratings in {labels.title(what, n_homes)}, seed {duels.cfg.seed}"
+    cells = [[form.format_map(row) for form in tables.RATINGS.values()] for row in table]
+    console.say(f"{title}\n{console.table([*tables.RATINGS], cells)}")
+    with user_errors(f"{folder} cannot be written: "):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / "ratings.csv", tables.as_csv(table, [*table[0]]).encode())
+        write_atomically(folder / "ratings.svg", _plot(table, title))
+    console.say(f"Plot: {folder / 'ratings.svg'}")
+    return folder / "ratings.csv"
 
 
 def rate(n_players: int, scores: Scores, seed: int = 1) -> list[tuple[float, float]]:
@@ -74,21 +125,10 @@ def rows(players: Sequence[tuple[str, int | None]], scores: Scores, seed: int = 
     return table
 
 
-def write(folder: Path, table: "Sequence[Row]", title: str) -> None:
-    """Writes `ratings.csv` and `ratings.svg` into a folder, each atomically.
-
-    The plot shows rating against samples with two standard deviations. Players without samples are
-    horizontal lines.
-    """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    write_atomically(folder / "ratings.csv", text.getvalue().encode())
-    write_atomically(folder / "ratings.svg", _plot(table, title))
-
-
 def _plot(table, title) -> bytes:
+    """Returns an SVG of ratings over samples with two standard deviations. Players without samples
+    are horizontal lines.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")

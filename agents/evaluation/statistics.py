@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:
@@ -57,6 +58,9 @@ def lanes_by_source(
     return {source: played for source, played in lanes.items() if played.any()}
 
 
+#: How an episode ended: terminal or truncated, as the environment said, or cut off at the limit of
+#: steps.
+ENDS = "cut off", "truncated", "terminal"
 #: What tells how well an episode went, the first that there is; homes of all sizes compare by it.
 SCORES = "success", "coverage", "won", "return"
 
@@ -219,3 +223,50 @@ def _metric(values, groups) -> dict[str, float | None]:
     values, groups = values[is_finite], groups[is_finite]
     numbers = interval(values, groups) if len(values) else (None,) * 3
     return dict(zip(("mean", "lower", "upper"), numbers, strict=True))
+
+
+def rows_of(
+    played: Mapping,
+    seed: int,
+    numbers: Sequence[int] | None = None,
+    sources: Sequence[str] | None = None,
+    roles: Sequence[str] | None = None,
+) -> "list[Row]":
+    """Returns a dict per episode for the result of `playing.first_episodes`.
+
+    Only lanes that learn have one, or all lanes if none learns, as in `summaries`. Keys,
+    those of what is known:
+
+    - episode: the number of the lane; seed: of the evaluation
+    - home, source: its number in the split, and the source it is from
+    - role: of the agent
+    - start_x, start_y, start_angle: where the agent was put, metres and degrees
+    - return, length (steps), and each metric by its name, None if it is not finite
+    - ended: terminal, truncated, or cut off at the limit of steps
+
+    Args:
+        numbers: the number of each home in the split; by default its index.
+        sources: the source of each home.
+        roles: the role of each agent slot, repeated over environments.
+    """
+    arrays = {k: v.cpu().numpy() for k, v in played.items() if isinstance(v, torch.Tensor)}
+    learns = arrays["learns"]
+    lanes = np.flatnonzero(learns if learns.any() else ~learns)
+    columns = {"episode": lanes.tolist(), "seed": [seed] * len(lanes)}
+    if (homes := arrays.get("homes")) is not None:
+        known = homes[lanes].tolist()
+        columns["home"] = [home if numbers is None else numbers[home] for home in known]
+        columns |= {"source": [sources[home] for home in known]} if sources else {}
+    if roles:
+        columns["role"] = [roles[lane % len(roles)] for lane in lanes]
+    if (starts := arrays.get("starts")) is not None:
+        names = "start_x", "start_y", "start_angle"
+        columns |= dict(zip(names, starts[lanes].T.tolist(), strict=True))
+    columns["return"] = arrays["returns"][lanes].tolist()
+    columns["length"] = arrays["lengths"][lanes].astype(int).tolist()
+    ended = arrays["done"][lanes].astype(int) + arrays["terminal"][lanes]
+    columns["ended"] = [ENDS[how] for how in ended]
+    for name, values in played["metrics"].items():
+        finite = [x if np.isfinite(x) else None for x in values.cpu().numpy()[lanes].tolist()]
+        columns[name + "_" * (name in columns)] = finite
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

@@ -9,14 +9,19 @@ from typing import NamedTuple
 
 from megastep.agents import console
 from megastep.agents.errors import user_errors
+from megastep.agents.evaluation.eval_env import EvalEnv
+from megastep.agents.evaluation.statistics import score_of
+from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree
-from megastep.agents.factory.settings import Env, Evaluate, Geometry, env_name, label
+from megastep.agents.factory.settings import Evaluate, Geometry, env_name, label
 from megastep.agents.runs import checkpoint
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.folders import folder_of, for_file
 from megastep.agents.runs.typed_json import encoded
 
 INTERVAL = "95 % interval"
+#: The source of a suite of which the worst homes have a row of their own.
+DENSE = "dense"
 
 
 class Labels(NamedTuple):
@@ -43,9 +48,10 @@ class Labels(NamedTuple):
         return f"{self.env}: {what}{homes}{self.choice}"
 
 
-def labels(env: Env, geometry: Geometry, homes: list, split: str) -> Labels:
+def labels(where: EvalEnv, geometry: Geometry, split: str) -> Labels:
     """Returns how tables name an environment and its homes."""
-    if not homes:
+    env = where.settings
+    if not where.homes:
         return Labels(env_name(env), env_name(env), "")
     path = Path(getattr(geometry, "path", None) or "")
     is_ours = geometry.name.startswith("megastep.")
@@ -62,14 +68,14 @@ def write_table(
     rows: list,
     cells: list[dict],
     episodes: Sequence[Mapping] = (),
-    actions: bytes | None = None,
+    n_ranks: int = 1,
 ) -> Path:
     """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
     and `rows` for programs, .json. Returns the latter's path.
 
     Args:
         episodes: a row per episode, for the .csv and, by column, the .json.
-        actions: content of the .npz, None for none.
+        n_ranks: number of ranks that played them.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
     folder, name = folder_of(loaded.path) / "evaluations", for_file("-".join(names))
@@ -79,6 +85,7 @@ def write_table(
         checkpoint=str(loaded.path),
         step=loaded.step,
         evaluation=encoded(as_tree(cfg)),
+        ranks=n_ranks,
         rows=rows,
     )
     text = json.dumps(result, indent=2)
@@ -93,10 +100,6 @@ def write_table(
         )
         if columns:
             write_atomically(folder / f"{name[:200]}.csv", as_csv(episodes, [*columns]).encode())
-        if actions:
-            write_atomically(folder / f"{name[:200]}.npz", actions)
-        else:
-            (folder / f"{name[:200]}.npz").unlink(missing_ok=True)
         write_atomically(folder / f"{name[:200]}.json", text.encode())
     return folder / f"{name[:200]}.json"
 
@@ -167,3 +170,46 @@ def duel_cells(row: dict) -> dict[str, str]:
     against = f"{row['against']}{part_of(row).replace(': ', ', as ')}"
     row = row | {"against": against, "homes": row["homes"] or "none"}
     return {key: form.format_map(row) for key, form in DUELS.items()}
+
+
+# ---- Suites: geometries of several sources, which are evaluated one by one ----
+
+
+def is_suite(geometry: Geometry) -> bool:
+    """Returns whether the homes are evaluated by source."""
+    return geometry.name == components.SUITE
+
+
+def parts_of(geometry: Geometry, homes: list) -> list[tuple[str | None, list]]:
+    """Returns [(source, its homes)] of a suite, and [(None, homes)] of all other geometries."""
+    if not is_suite(geometry):
+        return [(None, homes)]
+    parts = {}
+    for home in homes:
+        parts.setdefault(home["source"], []).append(home)
+    return [*parts.items()]
+
+
+def title_of(
+    labels: Labels, geometry: Geometry, rows: list[dict], what: str
+) -> tuple[str, list[dict]]:
+    """Returns the title of a table, and its rows: of a suite with the worst source of each agent or
+    opponent once more at its end.
+
+    Args:
+        what: the key of the number of episodes, `lanes` or `duels`.
+    """
+    who, name = ("agent", "episodes") if what == "lanes" else ("against", what)
+    text = f"{rows[0][what]:,} {name}{' in each source' * is_suite(geometry)}"
+    by_source = {}
+    for row in rows:
+        by_source.setdefault(row.get("source"), row["homes"] or 0)
+    title = labels.title(text, by_source.get(None) or sum(by_source.values()))
+    if not is_suite(geometry):
+        return title, rows
+    ordered = []
+    for one in dict.fromkeys(row[who] for row in rows):
+        of_one = [row for row in rows if row[who] == one]
+        whole = [row for row in of_one if not {"role", "tail"} & row.keys()]
+        ordered += [*of_one, {**min(whole, key=score_of), "is_worst": True}]
+    return title, ordered

@@ -5,7 +5,7 @@ from typing import cast
 
 from megastep.agents import factory
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import arena
+from megastep.agents.evaluation import eval_env, players
 from megastep.agents.export.launches import add_policy
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
@@ -42,7 +42,7 @@ def make(
     found = factory.homes(trained.env, trained.geometry, "test")
     chosen = _homes(found, homes)
     changes = dict(n_envs=1, resample=True, self_play=True)
-    changes |= {} if against is None else {**arena.FOR_TWO, "resample": True}
+    changes |= {} if against is None else {**eval_env.FOR_TWO, "resample": True}
     env_settings = settings.changed(trained.env, **changes)
     where = dict(geometries=chosen, seed=seed, device="cpu")
     env = cast(Env, factory.construct(env_settings, **where))
@@ -50,8 +50,8 @@ def make(
     factory.load_wrappers(env, loaded)
     lanes, names = n_lanes(env), {0: (name, policy)}
     if against is not None:
-        arena.check_duels(env)
-        player = arena.find_player(against, loaded, trained.env, env, False)
+        eval_env.check_duels(env)
+        player = players.find_player(against, loaded, trained.env, env, False)
         if not isinstance(player.policy, Policy):
             raise UserError(f"against={against} is scripted, and a page has trained agents alone")
         names[1] = player.name.partition(",")[0], player.policy

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
-from megastep.agents.evaluation import evaluate_run, record, tables
+from megastep.agents.evaluation import evaluate_run, filming, tables
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_loggers
 from megastep.agents.runs import scores
@@ -28,7 +28,7 @@ def finish(cfg: settings.Train, folder: Path, samples: int) -> None:
             )
     if cfg.finish.record and is_first:
         with console.warned():
-            film = record.run(
+            film = filming.run(
                 settings.Record(steps=cfg.finish.steps, home=None, file=None, **common)
             )
     if cfg.finish.report and is_first:

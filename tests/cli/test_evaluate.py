@@ -15,10 +15,9 @@ from megastep import envs, scene, spaces
 from megastep.agents import factory
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
-from megastep.agents.evaluation import evaluate as evaluate_episodes
 from megastep.agents.evaluation import evaluate_run as evaluation
 from megastep.agents.evaluation import playing, statistics, tables
-from megastep.agents.runs import checkpoint, folders, scores
+from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from megastep.geometries import files, sample
@@ -334,7 +333,7 @@ def test_evaluate_is_reproducible(trained):
     evaluate.run(configured(run=str(trained), split="training", baseline=False))
     names = {path.name for path in (trained / "evaluations").iterdir()}
     tables = "box-test-32", "box-training-32", "bench-test-32-greedy"
-    assert names == {f"{name}.{kind}" for name in tables for kind in ("json", "md", "csv", "npz")}
+    assert names == {f"{name}.{kind}" for name in tables for kind in ("json", "md", "csv")}
 
 
 def test_evaluate_in_homes_from_a_file(trained, tmp_path):
@@ -567,24 +566,6 @@ def test_episodes_are_written_one_by_one(explorer):
     columns = result["episodes"]
     assert columns["return"] == [float(row["return"]) for row in rows]
     assert columns["source"] == ["homes"] * 24 if "source" in columns else True
-
-
-def test_episodes_from_python(explorer):
-    """Of settings as many in each home; of an environment one per lane; equal to the command's."""
-    loaded = folders.load_checkpoint(folders.find(str(explorer)), False, "cpu")
-    cfg = factory.config_of(loaded)
-    homes = sample("bench", 3)
-    env = factory.construct(factory.settings.changed(cfg.env, n_envs=6), geometries=homes)
-    policy = factory.load_weights(factory.make_policy(cfg.agent, env), env, loaded)
-    result = evaluate_episodes(policy, cfg.env, 6, homes)
-    assert [row["home"] for row in result.rows] == [0, 1, 2] * 2
-    (summary,) = result.summary
-    assert summary["return"] == pytest.approx(np.mean([row["return"] for row in result.rows]))
-    assert len(evaluate_episodes(policy, cfg.env, geometries=homes).rows) == 3
-    assert len(evaluate_episodes(policy, env, max_steps=2).rows) == 6
-    assert {row["ended"] for row in evaluate_episodes(policy, env, max_steps=2).rows} == {"cut off"}
-    with pytest.raises(ValueError, match="as many episodes as lanes"):
-        evaluate_episodes(policy, env, 3)
 
 
 def test_duels_need_two_agents(explorer, capsys):

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from megastep.agents.cli import train
+from megastep.agents.distributed.ranks import ONE
 from megastep.agents.evaluation import in_training
 from megastep.agents.factory import settings as settings_module
 from megastep.agents.runs import checkpoint, checkpoint_format
@@ -119,7 +120,7 @@ def test_each_evaluation_plays_the_same_episodes():
     sample = in_training.factory.make_sample(
         cfg.env, in_training.factory.homes(cfg.env, cfg.geometry, "test"), seed=1, device="cpu"
     )
-    evaluator = in_training.Evaluator(cfg, sample, sample.device)
+    evaluator = in_training.Evaluator(cfg, sample, sample.device, ONE)
     policy = in_training.factory.make_policy(cfg.agent, sample)
     first = evaluator(policy)
     assert evaluator(policy) == first and first.keys() >= {"return", "length"}

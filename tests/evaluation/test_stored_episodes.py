@@ -5,14 +5,13 @@ import json
 import os
 import shutil
 
-import numpy as np
 import pytest
 import torch
 
 from megastep import recording
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.evaluation import arena, playing, replay
-from megastep.agents.selfplay.bots.random import RandomActions
+from megastep.agents.evaluation import playing, replay
+from megastep.agents.evaluation.eval_env import EvalEnv
 from tests.helpers import tiny
 from tests.helpers.tiny import settings
 
@@ -90,8 +89,7 @@ def test_episode_that_is_none(evaluated, here, capsys, words, text):
 
 def test_no_evaluation_yet(evaluated, tmp_path, capsys):
     copy = shutil.copytree(evaluated, tmp_path / "copy")
-    for path in (copy / "evaluations").glob("*.npz"):
-        path.unlink()
+    shutil.rmtree(copy / "evaluations")
     assert record.main([f"run={copy}", "worst=1", "device=cpu"]) == 2
     error = capsys.readouterr().err
     assert "has no evaluation yet with episodes to film; first " in error
@@ -107,57 +105,25 @@ def test_another_episode_is_refused(evaluated, tmp_path, capsys):
     words = [f"run={copy}", "episode=0", "dpi=30", "device=cpu"]
     assert record.main(words) == 2
     assert "its return is" in capsys.readouterr().err and not [*copy.glob("video*")]
-    path.with_suffix(".npz").write_bytes(b"PK")
+    path.write_text("{")
     assert record.main(words) == 2
-    assert ".npz cannot be used: " in capsys.readouterr().err
+    assert "cannot be used: " in capsys.readouterr().err
 
 
-def test_actions_of_several_ranks(evaluated, monkeypatch):
-    cfg = settings(*WORDS, "geometry=homes", "env.res=16")
-    homes = [*replay.factory.homes(cfg.env, cfg.geometry, "test")][:8]
-    stages = [arena.Stage(cfg.env, homes, 8, rank=(number, 2)) for number in range(2)]
-    played, recorders = [], [playing.Recorder(), playing.Recorder()]
-    for number, (stage, recorder) in enumerate(zip(stages, recorders, strict=True)):
-        policy = RandomActions(stage.env.action_space)
-        steps = 4 + 2 * number  # the ranks end after as many steps as their episodes take
-        arguments = stage.seed, False, steps, recorder
-        played.append(playing.first_episodes(stage.env, policy, *arguments))
-
-    def of_both(value):
-        if isinstance(value, int):
-            return [4, 6]
-        other = recorders[1].actions()[""]
-        return [value, {"": torch.as_tensor(other).long().transpose(0, 1)}]
-
-    monkeypatch.setattr("megastep.agents.distributed.process_group.gather_objects", of_both)
-    monkeypatch.setattr("megastep.agents.distributed.shard.gather_objects", of_both)
-    actions = stages[0].actions(recorders[0])
-    assert actions.n_ranks == 2 and actions.leaves[""].shape[:2] == (6, 8)
-    for number, stage in enumerate(stages):
-        own = {"": actions.leaves[""][:, [*stage.shard.envs]]}
-        again = arena.Stage(cfg.env, homes, 8, rank=(number, 2))
-        steps = 4 + 2 * number
-        same = playing.first_episodes(again.env, replay.Replay(again.env, own), 1, False, steps)
-        assert (same.returns == played[number].returns).all()
-        assert (same.starts == played[number].starts).all()
-
-
-def test_too_many_actions_are_not_kept(monkeypatch):
-    recorder = playing.Recorder()
-    monkeypatch.setattr(playing, "MAX_BYTES", 100)
-    for number in range(20):
-        recorder.add({"move": torch.full((4, 1), 300), "turn": torch.full((4, 1), number)})
-        if number == 15:
-            recorder.keep(16)
-    assert recorder.actions() is None and replay.as_bytes([None]) is None
-    assert playing.narrow(np.array([0, 300])).dtype == np.uint16
-
-
-@pytest.mark.cuda
-def test_an_episode_on_a_gpu_is_the_same_on_a_cpu(evaluated, tmp_path):
-    copy = shutil.copytree(evaluated, tmp_path / "copy")
-    shutil.rmtree(copy / "evaluations")
-    words = ["episodes=256", "device=cuda", "baseline=none"]
-    assert evaluate.main([f"run={copy}", *words]) == 0
-    film = [f"run={copy}", "worst=3", "dpi=30", "device=cpu", f"file={tmp_path / 'a.png'}"]
-    assert record.main(film) == 0
+def test_an_episode_of_several_ranks_is_the_same_again(evaluated, device="cpu"):
+    loaded = replay.folders.load_checkpoint(replay.folders.find(str(evaluated)), False, device)
+    trained = replay.factory.config_of(loaded)
+    homes = replay.factory.homes(trained.env, trained.geometry, "test")
+    rank = EvalEnv(trained.env, homes[:8], 8, rank=(1, 2))
+    policy = replay.factory.make_policy(trained.agent, rank.env)
+    policy = replay.factory.load_weights(policy, rank.env, loaded)
+    played = playing.first_episodes(rank.env, policy, rank.seed)
+    cfg = settings(f"run={evaluated}", "episodes=8", script="evaluate")
+    table = replay.Table(evaluated, "", "", cfg, trained.env, trained.geometry, [], 2)
+    rows = [{"episode": 1}, {"episode": 5}]  # environments 0 and 2 of the second rank
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replay.factory, "homes", lambda *_: homes[:8])
+        shown = [*table.plays(rows, loaded, torch.device(device))]
+    assert [lane for *_, lane in shown] == [0, 2] and shown[0][1] is shown[1][1]
+    again = playing.first_episodes(shown[0][1], shown[0][2], seed=12345)
+    assert (again.returns == played.returns).all() and (again.starts == played.starts).all()

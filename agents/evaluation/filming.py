@@ -11,7 +11,7 @@ import torch
 from megastep import recording
 from megastep.agents import console, factory
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import arena, duels, replay
+from megastep.agents.evaluation import duels, eval_env, players, replay
 from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.runs import folders
 from megastep.agents.runs.atomic_files import make_folders, remove_folders
@@ -35,11 +35,11 @@ def run(cfg: settings.Record) -> Path:
         geometry = factory.typed_or(trained.geometry, geometry, env_settings)
         folder = folders.folder_of(runs[0].path)
     if cfg.against is not None:
-        env_settings = settings.changed(env_settings, **arena.FOR_TWO)
+        env_settings = settings.changed(env_settings, **eval_env.FOR_TWO)
     geometry = geometry or settings.kind_of("geometry", components.HOMES)(name=components.HOMES)
     homes = factory.homes(env_settings, geometry, cfg.split)
     env_settings = settings.changed(env_settings, n_envs=1)
-    players = []
+    shown = []
     for home in (cfg.home or 0,) if cfg.homes is None else cfg.homes:
         for loaded in runs or [None]:
             home_alone = _home(homes, home, cfg.split)
@@ -52,8 +52,8 @@ def run(cfg: settings.Record) -> Path:
             elif loaded is not None and len(runs) > 1:
                 name = folders.name_of(loaded.path)
                 title = name if title is None else f"{title}, {name}"
-            players.append(recording.Player(env, policy, title))
-    path = film(cfg, players, folder, cast("settings.Env", env_settings))
+            shown.append(recording.Player(env, policy, title))
+    path = film(cfg, shown, folder, cast("settings.Env", env_settings))
     console.say(f"Filmed {cfg.steps} steps: {path}")
     return path
 
@@ -67,15 +67,15 @@ def film_stored(cfg: settings.Record, device: torch.device) -> Path:
     rows = table.chosen(cfg.worst, cfg.episode, cfg.home)
     if (evaluated := folder / "checkpoints" / table.checkpoint).exists():
         loaded = folders.load_checkpoint(evaluated, cfg.trust, device)
-    players = []
+    shown = []
     for row, env, policy, lane in table.plays(rows, loaded, device):
         title = f"{cfg.title}, " if cfg.title else ""
         title += f"episode {row['episode']}" + (f", home {row['home']}" if "home" in row else "")
         title += f": return {row['return']:.4g}, {row['ended']}"
         frames = int(row["length"]) + 1
-        players.append(recording.Player(env, policy, title, lane, frames, row["return"]))
-    path = film(cfg, players, folder, table.env)
-    lines = "\n".join(str(player.title) for player in players)
+        shown.append(recording.Player(env, policy, title, lane, frames, row["return"]))
+    path = film(cfg, shown, folder, table.env)
+    lines = "\n".join(str(player.title) for player in shown)
     console.say(f"{table.title}\n{lines}\nFilmed: {path}")
     return path
 
@@ -128,12 +128,12 @@ def _player(cfg, loaded, runs, env_settings, env) -> PolicyLike:
     """Returns what plays: the agent of `loaded`, the duel with `cfg.against`, or random actions."""
     if loaded is None:
         return RandomActions(env.action_space)
-    policy = arena.load_player(loaded, env, runs[0]).policy
+    policy = players.load_player(loaded, env, runs[0]).policy
     factory.load_wrappers(env, loaded)
     if cfg.against is None:
         return policy
-    arena.check_duels(env)
-    opponent = arena.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
+    eval_env.check_duels(env)
+    opponent = players.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
     console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
     seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
     return duels.duel_policy(policy, opponent.policy, seat, optional(env, "n_agents"))
