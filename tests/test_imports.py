@@ -110,9 +110,6 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.workers",
     "megastep.wrappers",
 }
-# Rooms whose subject ranks are, and how many files elsewhere may know of them.
-ROOMS_WITH_RANKS = ("distributed", "storage", "algorithms", "launch")
-MOST_FILES_WITH_RANKS = 9
 # The files that may import these modules of ours, as glob patterns.
 OWN_USERS = {
     "megastep.kernels.build.launch": (
@@ -368,17 +365,6 @@ def agents_is_imported_as_megastep_agents(graph):
             yield f"{name} must not import agents: the name is megastep.agents"
 
 
-def few_files_know_of_ranks(graph):
-    of_ranks = "megastep.agents.distributed"
-    names = {
-        name
-        for name, target in edges(graph, is_agents)
-        if is_below(target, of_ranks) and part_of(name, "megastep.agents") not in ROOMS_WITH_RANKS
-    }
-    if len(names) > MOST_FILES_WITH_RANKS:
-        yield f"more than {MOST_FILES_WITH_RANKS} files import {of_ranks}: {sorted(names)}"
-
-
 def no_import_cycles(graph):
     below = {
         name: {
@@ -407,7 +393,6 @@ RULES = (
     modules_stay_with_their_users,
     outside_packages_stay_with_their_users,
     agents_is_imported_as_megastep_agents,
-    few_files_know_of_ranks,
     no_import_cycles,
 )
 
@@ -426,43 +411,16 @@ def test_tests_and_scripts_import_megastep_agents():
 
 
 PLANTED = [
-    (simulator_rows, "megastep.engine.rendering", "megastep.modules"),
-    (simulator_rows, "megastep.plotting", "megastep.engine.scenery"),
-    (simulator_rows, "megastep.kernels.build.compile", "megastep.engine"),
     (simulator_rows, "megastep.engine.views", "megastep.geometries.toys"),
-    (simulator_rows, "megastep.engine.rendering", "megastep.envs.pong.step"),
     (engine_rows, "megastep.engine.checks", "megastep.engine.agents"),
-    (engine_rows, "megastep.engine.scenery", "megastep.engine.rendering"),
     (agents_rows, "megastep.agents.networks.policy", "megastep.agents.storage.rollout"),
-    (agents_rows, "megastep.agents.storage.rollout", "megastep.agents.algorithms.ppo"),
-    (agents_rows, "megastep.agents.algorithms.ppo", "megastep.agents.training.trainer"),
-    (agents_rows, "megastep.agents.training.trainer", "megastep.agents.evaluation.duels"),
-    (agents_rows, "megastep.agents.storage.rollout", "megastep.agents.factory.settings"),
     (simulator_knows_no_learner, "megastep.envs.minimal", "megastep.agents.networks.heads"),
-    (simulator_knows_no_learner, "megastep.core", "train"),
     (environments_are_independent, "megastep.envs.minimal", "megastep.envs.explorer"),
-    (environments_are_independent, "megastep.envs.pong.env", "megastep.envs.deathmatch.step"),
     (learner_knows_trees_and_spaces_only, "megastep.agents.algorithms.ppo", "megastep.engine"),
-    (learner_knows_trees_and_spaces_only, "megastep.agents.networks.policy", "megastep.envs"),
-    (
-        learner_knows_trees_and_spaces_only,
-        "megastep.agents.training.trainer",
-        "megastep.kernels.build.compile",
-    ),
-    (learner_knows_trees_and_spaces_only, "megastep.agents.training.loggers", "train"),
-    (learner_knows_trees_and_spaces_only, "megastep.agents.cli.sweeps", "train"),
-    (learner_knows_trees_and_spaces_only, "megastep.agents.factory.make", "megastep.envs.pong"),
     (entry_scripts_only_start_the_command_line, "train", "torch"),
-    (entry_scripts_only_start_the_command_line, "record", "megastep.agents.cli.train"),
-    (modules_stay_with_their_users, "megastep.modules.sensors", "megastep.kernels.build.launch"),
     (modules_stay_with_their_users, "megastep.envs.minimal", "megastep.kernels.build.launch"),
     (outside_packages_stay_with_their_users, "megastep.agents.algorithms.ppo", "hydra.core"),
-    (outside_packages_stay_with_their_users, "megastep.agents.cli.train", "wandb"),
-    (outside_packages_stay_with_their_users, "megastep.core", "loky"),
-    (outside_packages_stay_with_their_users, "megastep.core", "rich.progress"),
-    (agents_is_imported_as_megastep_agents, "megastep.agents.cli.train", "agents.cli"),
     (agents_is_imported_as_megastep_agents, "train", "agents"),
-    (few_files_know_of_ranks, "megastep.agents.runs.saver", "megastep.agents.distributed"),
 ]
 
 
