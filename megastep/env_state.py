@@ -26,14 +26,13 @@ from megastep.types import Env
 
 __all__ = ["EnvState"]
 
-#: A part of the state by name, such as the arrays, by path.
-State = dict[str, dict[str, Any]]
 _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
 _NUMBERS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
 _CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque)
 #: Bytes of a tensor that is left out if it has not changed.
 _LARGE = 2**20
+_UNEQUAL = object()
 _CHUNK, _FACTOR = 2**20, 0x9E3779B1  # an odd number without a pattern
 #: Types without attributes that hold nothing that changes.
 _CONSTANT = (
@@ -71,87 +70,91 @@ class EnvState:
             generators["cuda"] = torch.cuda.default_generators[index]
         generators |= dict(numpy=np.random.mtrand._rand, python=random.seed.__self__)
         self.root = python_types.SimpleNamespace(env=env, bot=bot, generators=generators)
-        self._first_values = {path: _encoded(node) for path, node in self._plain_values()}
-        leaves = {} if host_only else walk(self.root, torch.Tensor)
-        leaves = leaves.items()
-        self._first_digests = {
-            path: _digest(leaf)
-            for path, (_, _, leaf) in leaves
-            if leaf.nbytes >= _LARGE and not isinstance(leaf, ReadOnlyTensor)
-        }
-        nodes = self._nodes_of_user()
-        self._first_constants = {path: node for path, node in nodes if isinstance(node, _CONSTANT)}
+        self._first_values, self._first_digests, self._first_constants = {}, {}, {}
+        for path, node, is_users in self._nodes():
+            if isinstance(node, torch.Tensor) and not isinstance(node, ReadOnlyTensor):
+                if not host_only and node.nbytes >= _LARGE:
+                    self._first_digests[path] = _digest(node)
+            elif is_users and _is_plain(node):
+                self._first_values[path] = "value", _encoded(node)
+            elif is_users and isinstance(node, _CONSTANT):
+                self._first_constants[path] = node
 
     # ---- Saving ----
 
-    def state_dict(self) -> State:
-        """Returns the state by path. Tensors share their memory with the environment; all else is
-        a copy, in types that `torch.load(weights_only=True)` reads.
+    def state_dict(self) -> dict[str, dict[str, Any]]:
+        """Returns the state. Tensors share their memory with the environment; all else is a copy,
+        in types that `torch.load(weights_only=True)` reads.
         """
-        arrays, kinds, generators = {}, {}, {}
-        for path, (_, _, leaf) in walk(self.root, _STATEFUL).items():
-            if isinstance(leaf, _GENERATORS):
-                generators[path] = _generator_state(leaf)
-            elif isinstance(leaf, np.ndarray):
-                if _is_savable(leaf):
-                    arrays[path], kinds[path] = _copied(leaf)
-            elif not isinstance(leaf, ReadOnlyTensor):
-                arrays[path], kinds[path] = leaf.detach(), leaf.device.type
-        values = {path: _encoded(node) for path, node in self._plain_values()}
-        first, missing = self._first_values, object()
-        values = {path: now for path, now in values.items() if first.get(path, missing) != now}
-        state = dict(kinds=kinds, generators=generators, values=values, **self._members())
-        aliases, first = self._aliases(arrays), self._first_digests
-        unchanged = {
-            path: first[path]
-            for path in first
-            if path in arrays and _digest(arrays[path]) == first[path]
-        }
-        arrays = {path: leaf for path, leaf in arrays.items() if path not in unchanged}
+        records, first_values = self._records(), self._first_values
+        records = {p: one for p, one in records.items() if one != first_values.get(p, _UNEQUAL)}
         worlds = {
             path: spaces.leaves(resets.last)
             for path, resets in self._resets()
             if resets.is_used and resets.last is not None
         }
-        return state | dict(arrays=arrays, aliases=aliases, unchanged=unchanged, worlds=worlds)
+        return dict(records=records, worlds=worlds)
+
+    def _records(self) -> dict[str, tuple]:
+        """Returns {path: record} of everything, parents before children. A record is the kind of a
+        node and what `_load` needs to have it again.
+        """
+        records, first_paths = {}, {}
+        for path, node, is_users in self._nodes():
+            if isinstance(node, torch.Tensor) and not isinstance(node, ReadOnlyTensor):
+                first = first_paths.setdefault(_identity(node), path) if node.numel() else path
+                digest = self._first_digests.get(path)
+                if first != path:
+                    records[path] = "same", first
+                elif digest is not None and _digest(node) == digest:
+                    records[path] = "unchanged", digest
+                else:
+                    records[path] = "tensor", node.detach(), node.device.type
+            elif record := _record(node, is_users):
+                records[path] = record
+        return records
 
     def _resets(self) -> Iterator[tuple[str, Resets]]:
         return ((path, leaf) for path, (_, _, leaf) in walk(self.root, Resets).items())
 
-    def host_state(self) -> State:
-        """Returns the part of the state that is not in tensors, for `restore_host`."""
-        arrays, kinds, generators, frozen = {}, {}, {}, {}
+    def host_state(self) -> dict[str, tuple]:
+        """Returns the part of the state that no CUDA graph repeats, for `restore_host`: what is not
+        in tensors, and tensors and generators on the CPU where the environment is on a GPU.
+        """
+        records = {}
         is_on_gpu = torch.device(self.env.device).type == "cuda"
-        for path, (_, _, leaf) in walk(self.root, _STATEFUL).items():
-            is_frozen = is_on_gpu and getattr(leaf, "device", None) == torch.device("cpu")
-            with contextlib.suppress(TypeError, ValueError, RuntimeError):  # of rare kinds of both
-                if isinstance(leaf, _GENERATORS):
-                    generators[path] = state = _generator_state(leaf)
-                    frozen |= {path: _bytes(state)} if is_frozen else {}
-                elif isinstance(leaf, np.ndarray):
-                    if _is_savable(leaf):
-                        arrays[path], kinds[path] = _copied(leaf)
-                elif is_frozen and leaf.nbytes < _LARGE and not isinstance(leaf, ReadOnlyTensor):
-                    frozen[path] = _bytes(leaf)
-        state = dict(kinds=kinds, arrays=arrays, generators=generators)
-        state["values"] = {path: _encoded(node) for path, node in self._plain_values()}
-        state |= dict(n_items=self._members()["lengths"], frozen=frozen)
-        none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
-        return state | none
+        for path, node, is_users in self._nodes():
+            is_frozen = is_on_gpu and getattr(node, "device", None) == torch.device("cpu")
+            with contextlib.suppress(TypeError, ValueError, RuntimeError):  # of rare kinds
+                if isinstance(node, torch.Generator):
+                    records[path] = "generator", node.get_state(), is_frozen
+                elif not isinstance(node, torch.Tensor):
+                    records[path] = _record(node, is_users)
+                elif is_frozen and node.nbytes < _LARGE and not isinstance(node, ReadOnlyTensor):
+                    records[path] = "frozen", _bytes(node)
+        return records
 
-    def restore_host(self, state: State) -> None:
-        """Restores a `host_state` in the same process: of plain values, those that have changed."""
-        now = {path: repr(_encoded(node)) for path, node in self._plain_values()}
-        values = {k: value for k, value in state["values"].items() if now.get(k) != repr(value)}
-        self._load(state | {"values": values})
+    def restore_host(self, state: dict[str, tuple]) -> None:
+        """Restores a `host_state` in the same process, but for the lengths of lists and what is
+        frozen. Of plain values, those that have changed.
+        """
+        now, kinds = self.host_state(), ("value", "array", "generator")
+        records = {path: record for path, record in state.items() if record and record[0] in kinds}
+        self._load(
+            {
+                path: record
+                for path, record in records.items()
+                if record[0] != "value" or repr(now.get(path)) != repr(record)
+            }
+        )
 
-    def changed_on_host(self, before: State) -> str | None:
+    def changed_on_host(self, before: dict[str, tuple]) -> str | None:
         """Returns the name of something that has changed since an earlier `host_state` and that no
         CUDA graph repeats: a plain value, an array, the length of a list, a generator of NumPy or
         Python, and a tensor or a generator on the CPU where the environment is on a GPU. None if
         there is none, or all objects are megastep's own.
         """
-        if not any(True for _ in self._nodes_of_user()):
+        if not any(is_users for *_, is_users in self._nodes()):
             return None
         was, now = _comparable(before), _comparable(self.host_state())
         changed = sorted(path for path in {*was, *now} if was.get(path) != now.get(path))
@@ -160,41 +163,23 @@ class EnvState:
         is_global = re.match(r"\.generators\['(\w+)'\]", changed[0])
         return f"the global generator of {is_global[1]}" if is_global else _name(changed[0])
 
-    def _members(self) -> State:
-        """Returns the classes of objects, the lengths of lists and the keys of dicts that hold
-        tensors or objects.
-        """
-        nodes = [(path, node) for path, node in self._nodes_of_user() if not _is_plain(node)]
-        objects = [pair for pair in nodes if _is_object(pair[1])]
-        return dict(
-            classes={path: type(node).__qualname__ for path, node in objects},
-            lengths={path: len(node) for path, node in nodes if _is_list(node)},
-            keys={path: _encoded([*node]) for path, node in nodes if _is_dict(node)},
-        )
-
-    def _aliases(self, arrays) -> dict[str, str]:
-        """Returns {path: an earlier path} of tensors that are the same."""
-        first, aliases = {}, {}
-        for path, leaf in arrays.items():
-            key = _identity(leaf)
-            if leaf.numel() and first.setdefault(key, path) != path:
-                aliases[path] = first[key]
-        return aliases
-
     # ---- Restoring ----
 
-    def load_state_dict(self, state: State) -> None:
+    def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:
         """Restores a `state_dict`, whose tensors may be on any device. Tensors change in place, so
         that whatever refers to them sees it.
 
         Raises:
             ValueError: it does not fit this environment. Nothing has changed.
         """
-        before = self.state_dict()
-        before["arrays"] = {path: leaf.clone() for path, leaf in before["arrays"].items()}
-        before["values"] = {path: _encoded(node) for path, node in self._plain_values()}
+        before = {
+            path: (record[0], record[1].clone(), *record[2:]) if record[0] == "tensor" else record
+            for path, record in self._records().items()
+        }
         try:
-            self._load(state)
+            if "records" not in state:
+                raise ValueError("it is of another version of megastep")
+            self._load(state["records"])
         except Exception as error:
             self._load(before)
             raise ValueError(
@@ -206,54 +191,45 @@ class EnvState:
             resets.last = leaves and _tree({k: v.to(device, copy=True) for k, v in leaves.items()})
 
     @torch.no_grad()
-    def _load(self, state) -> None:
-        for path, length in state["lengths"].items():
-            if not _is_list(node_at(self.root, path)):
-                self._replace(path, [])
-            while len(node_at(self.root, path)) > length:
-                node_at(self.root, path).pop()
-        for path, keys in state["keys"].items():
-            if not isinstance(node_at(self.root, path), dict):
-                self._replace(path, {})
-            node = node_at(self.root, path)
-            for key in [key for key in node if key not in _decoded(keys)]:
-                del node[key]
-        for path, value in state["values"].items():
-            self._set_value(path, value)
-        leaves = {path: leaf for path, (_, _, leaf) in walk(self.root, _STATEFUL).items()}
-        for path, digest in state["unchanged"].items():
-            if path not in leaves or _digest(leaves[path]) != digest:
-                raise ValueError(
-                    f"{_name(path)} is not that of the run; have its homes or its class changed?"
+    def _load(self, records) -> None:
+        written = set()
+        for path, (kind, value, *more) in records.items():
+            now = node_at(self.root, path)
+            if kind == "list":
+                now = now if _is_list(now) else self._replace(path, [])
+                while len(now) > value:
+                    now.pop()
+            elif kind == "dict":
+                now, keys = (
+                    now if isinstance(now, dict) else self._replace(path, {}),
+                    _decoded(value),
                 )
-        for path, name in state.get("classes", {}).items():  # absent in older checkpoints
-            if (now := type(node_at(self.root, path)).__qualname__) != name:
-                raise ValueError(f"{_name(path)} was a {name} and is a {now}")
-        for path, value in state["arrays"].items():
-            now, owner = leaves.get(path), node_at(self.root, _parent(path))
-            is_fixed = _is_ours(owner) and not _is_dict(owner)
-            # of another version of megastep
-            if isinstance(now, torch.Tensor) and is_fixed and now.shape != value.shape:
-                shapes = f"was {tuple(value.shape)} and is {tuple(now.shape)}"
-                raise ValueError(f"the shape of {_name(path)} {shapes}")
-        for path, value in state["generators"].items():
-            is_of_another_device = path.startswith(".generators") and path not in leaves
-            if not is_of_another_device and not _set_generator_state(leaves.get(path), value):
-                raise ValueError(f"{_name(path)} is no longer the kind of generator that was saved")
-        fits = {path for path, value in state["arrays"].items() if _fits(leaves.get(path), value)}
-        for path in fits:
-            _as_tensor(leaves[path]).copy_(state["arrays"][path])
-        for path, value in state["arrays"].items():
-            # what has no such tensor yet, or began as one tensor with another
-            if path not in fits or not _equal(leaves[path], value):
-                self._replace(path, _as_kind(value, state["kinds"][path]))
-        for path, first in state["aliases"].items():
-            same, now = node_at(self.root, first), node_at(self.root, path)
-            if _identity(same) != _identity(now):
-                self._replace(path, same)
+                for key in [key for key in now if key not in keys]:
+                    del now[key]
+            elif kind == "object":
+                if now is None:
+                    raise ValueError(f"it has no {_name(path)}")
+                if type(now).__qualname__ != value:
+                    found = type(now).__qualname__
+                    raise ValueError(f"{_name(path)} was a {value} and is a {found}")
+            elif kind == "value":
+                self._set_value(path, now, _decoded(value))
+            elif kind == "generator":
+                is_of_another_device = path.startswith(".generators") and now is None
+                if not is_of_another_device and not _set_generator_state(now, value):
+                    raise ValueError(f"{_name(path)} is no longer the kind of generator it was")
+            elif kind == "unchanged":
+                if not isinstance(now, torch.Tensor) or _digest(now) != value:
+                    raise ValueError(
+                        f"{_name(path)} is not that of the run; did its homes or class change?"
+                    )
+            elif kind == "same":
+                if _identity(now) != _identity(same := node_at(self.root, value)):
+                    self._replace(path, same)
+            else:
+                self._set_array(path, now, value, more[0], written)
 
-    def _set_value(self, path, value) -> None:
-        now, value = node_at(self.root, path), _decoded(value)
+    def _set_value(self, path, now, value) -> None:
         if isinstance(now, enum.Enum):
             self._replace(path, type(now)[value])
         elif isinstance(now, (list, collections.deque)) and type(now) is type(value):
@@ -265,7 +241,22 @@ class EnvState:
         else:
             self._replace(path, value)
 
-    def _replace(self, path, value) -> None:
+    def _set_array(self, path, now, value, kind, written) -> None:
+        """Writes into a tensor or an array, or replaces what has no such one yet, or began as one
+        with another, whose number is in `written`.
+        """
+        if _fits(now, value) and (_identity(now) not in written or _equal(now, value)):
+            _as_tensor(now).copy_(value)
+            written.add(_identity(now))
+            return
+        owner = node_at(self.root, _parent(path))
+        is_fixed = isinstance(now, torch.Tensor) and _is_ours(owner) and not _is_dict(owner)
+        if is_fixed and now.shape != value.shape:  # of another version of megastep
+            shapes = f"was {tuple(value.shape)} and is {tuple(now.shape)}"
+            raise ValueError(f"the shape of {_name(path)} {shapes}")
+        self._replace(path, _as_kind(value, kind))
+
+    def _replace(self, path, value) -> Any:
         parent, step = node_at(self.root, _parent(path)), path[len(_parent(path)) :]
         if parent is None:
             raise ValueError(f"it has no {_name(path)}")
@@ -275,6 +266,7 @@ class EnvState:
             parent.append(value)
         else:
             rebind(parent, step, value)
+        return value
 
     # ---- What there is ----
 
@@ -282,8 +274,8 @@ class EnvState:
         """Returns what may change and cannot be saved, as `name (type)`."""
         return [
             f"{_name(path)} ({type(node).__name__})"
-            for path, node in self._nodes_of_user()
-            if not self._is_reached(path, node)
+            for path, node, is_users in self._nodes()
+            if is_users and not self._is_reached(path, node)
         ]
 
     def _is_reached(self, path, node) -> bool:
@@ -296,19 +288,14 @@ class EnvState:
         )
         return is_known or _is_plain(node) or hasattr(node, "__dict__")
 
-    def _plain_values(self) -> Iterator[tuple[str, Any]]:
-        """Yields (path, value) of plain values but those of megastep's own objects, which never
-        change or are addresses.
+    def _nodes(self) -> Iterator[tuple[str, Any, bool]]:
+        """Yields (path, node, whether it is below an object of a class that is not megastep's).
+        Plain values of megastep's own objects never change, or are addresses.
         """
-        return ((path, node) for path, node in self._nodes_of_user() if _is_plain(node))
-
-    def _nodes_of_user(self) -> Iterator[tuple[str, Any]]:
-        """Yields (path, node) of what is below objects of a class that is not megastep's."""
         visited, stack = set(), [("", self.root, False)]
         while stack:
             path, node, is_users = stack.pop()
-            if is_users:
-                yield path, node
+            yield path, node, is_users
             is_leaf = isinstance(node, (*_NUMBERS, *_CONSTANT, *_STATEFUL))
             if is_leaf or id(node) in visited or (is_users and _is_plain(node)):
                 continue
@@ -316,6 +303,23 @@ class EnvState:
             if hasattr(node, "__dict__"):
                 is_users = node is not self.root and not _is_ours(node)
             stack += [(path + step, child, is_users) for step, child in reversed(children(node))]
+
+
+def _record(node, is_users) -> tuple | None:
+    """Returns the record of a node that is no tensor, None if it has none."""
+    if isinstance(node, _GENERATORS):
+        return "generator", _generator_state(node)
+    if isinstance(node, np.ndarray):
+        return ("array", *_copied(node)) if _is_savable(node) else None
+    if not is_users or isinstance(node, torch.Tensor):
+        return None
+    if _is_plain(node):
+        return "value", _encoded(node)
+    if _is_list(node):
+        return "list", len(node)
+    if _is_dict(node):
+        return "dict", _encoded([*node])
+    return ("object", type(node).__qualname__) if _is_object(node) else None
 
 
 def _tree(leaves) -> arrdict:
@@ -332,12 +336,19 @@ def _tree(leaves) -> arrdict:
 
 def _comparable(host_state) -> dict[str, object]:
     """Returns {path: what is equal for equal values}."""
-    same = {path: repr(value) for path, value in host_state["values"].items()}
-    same |= {path: array.numpy().tobytes() for path, array in host_state["arrays"].items()}
-    same |= {f"{path} (its length)": n for path, n in host_state["n_items"].items()}
-    generators = host_state["generators"].items()
-    same |= {k: repr(v) for k, v in generators if not isinstance(v, torch.Tensor)}
-    return same | host_state["frozen"]
+    same = {}
+    for path, record in host_state.items():
+        kind = record and record[0]
+        if kind == "array":
+            same[path] = record[1].numpy().tobytes()
+        elif kind == "list":
+            same[f"{path} (its length)"] = record[1]
+        elif kind == "generator" and isinstance(record[1], torch.Tensor):
+            if record[2]:
+                same[path] = _bytes(record[1])
+        elif kind in ("value", "generator", "frozen"):
+            same[path] = repr(record[1])
+    return same
 
 
 def _bytes(tensor) -> bytes:
@@ -345,7 +356,9 @@ def _bytes(tensor) -> bytes:
 
 
 def _is_ours(node) -> bool:
-    return type(node).__module__.startswith(("megastep.", "torch."))
+    kind = type(node)
+    is_ours = kind.__module__.startswith(("megastep.", "torch."))
+    return is_ours and not getattr(kind, "HAS_PLAIN_STATE", False)
 
 
 def _is_state(root, parent, step, value) -> bool:

@@ -18,16 +18,7 @@ import numpy as np
 if TYPE_CHECKING:
     import torch
 
-__all__ = [
-    "KINDS",
-    "GlobalGenerators",
-    "Held",
-    "changed_kinds",
-    "kept",
-    "restore",
-    "seed_all",
-    "states",
-]
+__all__ = ["KINDS", "GlobalGenerators", "Held", "kept"]
 
 KINDS = "numpy", "python", "torch"
 _NUMPY: Any = np.random  # whose types leave out the functions that exchange its bit generator
@@ -53,6 +44,12 @@ class GlobalGenerators:
         for kind in kinds:
             setattr(self, kind, None)
 
+    def states(self) -> dict[str, object]:
+        """Returns the states by kind, equal where nothing was drawn in between."""
+        of_torch = self.torch and self.torch.get_state().tolist()
+        states = repr(self.numpy.bit_generator.state), self.python.getstate(), of_torch
+        return dict(zip(KINDS, states))
+
     @contextlib.contextmanager
     def installed(self, kinds: Collection[str]) -> Iterator[None]:
         """Draws inside come from these generators, of some of `KINDS`. Others stay as they are."""
@@ -74,44 +71,22 @@ class GlobalGenerators:
             yield
 
 
-def seed_all(seed: int) -> None:
-    """Seeds the global generators."""
-    np.random.seed(seed)
-    random.seed(seed)
-    if torch := sys.modules.get("torch"):
-        torch.manual_seed(seed)
-
-
-def states() -> dict[str, tuple]:
-    """Returns the states of the global generators by kind."""
-    torch = sys.modules.get("torch")
-    found = {"numpy": np.random.get_state(), "python": random.getstate()}
-    return found | ({"torch": torch.get_rng_state()} if torch else {})
-
-
-def changed_kinds(before: dict[str, tuple]) -> tuple[str, ...]:
-    """Returns the kinds of generators from which was drawn since their `states`."""
-    return tuple(
-        kind
-        for kind, state in states().items()
-        if repr(_plain(state)) != repr(_plain(before.get(kind)))
-    )
-
-
-def _plain(state) -> list | None:
-    if isinstance(state, tuple):
-        return [part.tolist() if isinstance(part, np.ndarray) else part for part in state]
-    return None if state is None else state.tolist()
-
-
 @contextlib.contextmanager
 def kept() -> Iterator[None]:
     """Draws inside leave the global generators as they were."""
-    before = states()
+    torch = sys.modules.get("torch")
+    numpy, python, of_torch = (
+        np.random.get_state(),
+        random.getstate(),
+        torch and torch.get_rng_state(),
+    )
     try:
         yield
     finally:
-        restore(before)
+        np.random.set_state(numpy)
+        random.setstate(python)
+        if torch:
+            torch.set_rng_state(of_torch)
 
 
 class Held(NamedTuple):
@@ -139,11 +114,3 @@ class Held(NamedTuple):
         random.setstate(self.python)
         if self.torch is not None:
             sys.modules["torch"].set_rng_state(self.torch)
-
-
-def restore(before: dict[str, tuple]) -> None:
-    """Brings the global generators back to their `states`."""
-    random.setstate(before["python"])
-    np.random.set_state(before["numpy"])
-    if "torch" in before:
-        sys.modules["torch"].set_rng_state(before["torch"])

@@ -136,9 +136,10 @@ def test_plain_values_that_never_change_are_not_saved():
     """They may be addresses, or differ between machines."""
     env = Env()
     state = EnvState(env)
-    assert state.state_dict()["values"] == {}
+    kinds = [record[0] for record in state.state_dict()["records"].values()]
+    assert "tensor" in kinds and "value" not in kinds
     env.n = 3
-    assert state.state_dict()["values"] == {".env.n": 3}
+    assert state.state_dict()["records"][".env.n"] == ("value", 3)
 
 
 def test_another_environment_is_refused_and_unchanged():
@@ -180,7 +181,7 @@ def test_state_of_another_version_is_refused_and_changes_nothing():
     env_state = EnvState(env)
     state = env_state.state_dict()
     before = env.tally.clone()
-    state["arrays"] = state["arrays"] | {".env.tally": before[:3] + 1}
+    state["records"][".env.tally"] = "tensor", before[:3] + 1, "cpu"
     with pytest.raises(ValueError, match=r"the shape of tally was \(3, 8\) and is \(4, 8\)"):
         env_state.load_state_dict(state)
     assert torch.equal(env.tally, before)
@@ -198,11 +199,9 @@ def test_what_is_no_state_is_never_set(path, value, monkeypatch):
     env.helper = env.draw
     env_state, before = EnvState(env), str(facts(env))
     saved, attributes = env_state.state_dict(), vars(env).copy()
-    kind = (
-        {"values": {path: 5}} if value == 5 else {"arrays": {path: value}, "kinds": {path: "cpu"}}
-    )
+    saved["records"][path] = ("value", 5) if value == 5 else ("tensor", value, "cpu")
     with pytest.raises(ValueError, match=r"is not state of the environment|it has no"):
-        env_state.load_state_dict(saved | kind)
+        env_state.load_state_dict(saved)
     assert str(facts(env)) == before and vars(env).keys() == attributes.keys()
     assert type(env) is Env and env.helper == env.draw and env.step() is not None
 
@@ -213,13 +212,15 @@ def test_no_plain_value_of_megasteps_own_objects_is_set():
     env_state = EnvState(env)
     for name in ("step", "limit", "n_envs", "n_agents", "unheard_of"):
         with pytest.raises(ValueError, match=f"{name} is not state"):
-            env_state.load_state_dict(env_state.state_dict() | {"values": {f".env.{name}": 5}})
+            saved = env_state.state_dict()
+            saved["records"][f".env.{name}"] = "value", 5
+            env_state.load_state_dict(saved)
 
 
 def test_state_of_a_gpu_is_restored_without_one():
     env = Env()
     saved = EnvState(env).state_dict()
-    saved["generators"][".generators['cuda']"] = torch.zeros(16, dtype=torch.uint8)
+    saved["records"][".generators['cuda']"] = "generator", torch.zeros(16, dtype=torch.uint8)
     EnvState(Env()).load_state_dict(saved)
 
 
@@ -241,10 +242,12 @@ def test_large_tensors_are_saved_only_if_they_have_changed():
     state, restored = EnvState(env), EnvState(target)
     env.places[7] = 1
     saved = state.state_dict()
-    assert ".env.plans" not in saved["arrays"] and ".env.places" in saved["arrays"]
+    assert saved["records"][".env.plans"][0] == "unchanged"
+    assert saved["records"][".env.places"][0] == "tensor"
     restored.load_state_dict(saved)
     assert torch.equal(target.places, env.places)
-    assert ".env.places" in restored.state_dict()["arrays"], "not what a new environment has"
+    kind = restored.state_dict()["records"][".env.places"][0]
+    assert kind == "tensor", "not what a new environment has"
     other.plans[[3, 2**18]] = other.plans[[2**18, 3]]
     with pytest.raises(ValueError, match="plans is not that of the run"):
         EnvState(other).load_state_dict(saved)

@@ -17,23 +17,22 @@ SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
     ("types",),
-    ("env_values", "global_generators", "wrapper_state"),
+    ("global_generators",),
     (
         "cache",
         "colour",
         "dotdict",
         "read_only",
         "settings",
-        "sync_envs",
         "video",
         "workers",
     ),
-    ("env_probe",),
-    ("arrdict", "geometry", "imports", "kernels", "plotting", "ragged", "vector_processes"),
+    ("arrdict", "geometry", "imports", "kernels", "plotting", "ragged"),
     ("schedules",),
     ("coefficients",),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "env_state", "geometries", "scene"),
+    ("hosting",),
     ("core", "cubicasa", "toys"),
     ("cuda", "modules"),
     ("compat", "envs", "web", "wrappers"),
@@ -102,7 +101,7 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.global_generators",
     "megastep.recording",
     "megastep.scene",
-    "megastep.sync_envs",
+    "megastep.hosting.errors",
     "megastep.web.page",
     "megastep.web.program",
     "megastep.web.recording",
@@ -141,13 +140,9 @@ OUTSIDE_USERS = {
     "cuda": ("megastep/kernels/build/compile.py",),
     "gymnasium": (
         "megastep/adapters/*.py",
-        "megastep/envs/gymnasium/*.py",
-        "megastep/envs/on_host/*.py",
-        "megastep/env_values.py",
+        "megastep/envs/gymnasium.py",
         "megastep/envs/pettingzoo.py",
-        "megastep/sync_envs.py",
-        "megastep/vector_processes.py",
-        "megastep/wrapper_state.py",
+        "megastep/hosting/*.py",
     ),
     "defusedxml": ("megastep/geometries/plans/safe.py",),
     "hydra": ("agents/api.py", "agents/cli/*.py"),
@@ -156,12 +151,12 @@ OUTSIDE_USERS = {
         "megastep/geometries/homes/database.py",
         "megastep/geometries/plans/imports.py",
         "megastep/recording.py",
-        "megastep/vector_processes.py",
+        "megastep/hosting/processes.py",
         "megastep/workers.py",
     ),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/evaluation/ratings.py",),
-    "pettingzoo": ("megastep/adapters/pettingzoo.py", "megastep/envs/pettingzoo.py"),
+    "pettingzoo": ("megastep/adapters/pettingzoo.py", "megastep/hosting/parallel.py"),
     "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
     "rsl_rl": ("megastep/adapters/rsl_rl.py",),
     "shapely": ("megastep/geometries/plans/*.py",),
@@ -315,10 +310,10 @@ def simulator_knows_no_learner(graph):
 
 
 def environments_are_independent(graph):
-    """An environment is a file, or a folder with its own operation. All share envs.common alone,
-    and those of other packages envs.on_host.
+    """An environment is a file, or a folder with its own operation. All share envs.common
+    alone.
     """
-    envs, shared = "megastep.envs", ("common", "on_host")
+    envs, shared = "megastep.envs", ("common",)
     for name, target in edges(graph, lambda name: name.startswith(f"{envs}.")):
         if is_below(target, envs) and part_of(target, envs) not in (part_of(name, envs), *shared):
             yield f"{name} must not import {target}"

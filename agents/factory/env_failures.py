@@ -10,8 +10,8 @@ from pathlib import Path
 from megastep import engine
 from megastep.agents.errors import EnvFailed, UserError, memory_problem
 from megastep.agents.factory.settings import Env
+from megastep.hosting.errors import BadValue, EnvError, one_line
 from megastep.imports import import_object
-from megastep.sync_envs import BadValue, EnvError, one_line
 
 #: Has the traceback, in the run's folder.
 FILE = "env_error.txt"

@@ -1,4 +1,4 @@
-"""megastep's environments in other libraries, and a checker of vector environments.
+"""megastep's environments in other libraries.
 
 Each adapter is imported at its first use, and needs the extra of its name, such as
 ``pip install 'megastep-flatland[sb3]'``. Importing this package registers the environments with
@@ -9,6 +9,8 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING
 
+from megastep.envs import ENVS
+
 if TYPE_CHECKING:
     from megastep.adapters.gymnasium import SingleEnv as SingleEnv
     from megastep.adapters.gymnasium import VectorEnv as VectorEnv
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
     from megastep.adapters.rsl_rl import RslRlVecEnv as RslRlVecEnv
     from megastep.adapters.sb3 import SB3VecEnv as SB3VecEnv
     from megastep.adapters.torchrl import TorchRLEnv as TorchRLEnv
-    from megastep.adapters.vector_checks import check_vector_env as check_vector_env
 
 #: The module of each name, which is its extra too, with hyphens: older pips find no other.
 _MODULES = {
@@ -26,7 +27,12 @@ _MODULES = {
     "RslRlVecEnv": "rsl_rl",
     "SB3VecEnv": "sb3",
     "TorchRLEnv": "torchrl",
-    "check_vector_env": "vector_checks",
+}
+#: The environments by their ids in Gymnasium; those of other packages have ids already.
+IDS = {
+    f"megastep/{kind.__name__}-v0": kind.__name__
+    for kind in ENVS.values()
+    if getattr(kind, "capturable", True)
 }
 
 
@@ -39,16 +45,22 @@ def __getattr__(name) -> object:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("megastep"):
             raise
-        extra = "gymnasium" if module == "vector_checks" else module.replace("_", "-")
         raise ImportError(
             f"megastep.adapters.{name} needs {error.name}, which is not installed: pip install "
-            f"'megastep-flatland[{extra}]'"
+            f"'megastep-flatland[{module.replace('_', '-')}]'"
         ) from None
 
 
 __all__ = []
 if importlib.util.find_spec("gymnasium"):
-    __all__ += ["SingleEnv", "VectorEnv", "check_vector_env"]
-    from megastep.adapters.registration import register
+    import gymnasium
 
-    register()
+    __all__ += ["SingleEnv", "VectorEnv"]
+    for _id, _name in IDS.items():
+        if _id not in gymnasium.registry:
+            gymnasium.register(
+                _id,
+                entry_point="megastep.adapters.gymnasium:make_single",
+                vector_entry_point="megastep.adapters.gymnasium:make_vector",
+                kwargs=dict(name=_name),
+            )

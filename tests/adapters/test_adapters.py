@@ -18,7 +18,6 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from megastep import adapters, arrdict, contract, envs, geometries
-from megastep.adapters import registration
 from tests.helpers.made_up import Numbers
 from tests.helpers.synchronisation import no_synchronisation
 
@@ -43,7 +42,7 @@ def moves(env, n_steps, seed=1):
 # ---- Gymnasium ----
 
 
-@pytest.mark.parametrize("full_name", sorted({*registration.IDS} - {"megastep/Deathmatch-v0"}))
+@pytest.mark.parametrize("full_name", sorted({*adapters.IDS} - {"megastep/Deathmatch-v0"}))
 def test_gymnasium_makes_one(full_name):
     env = gymnasium.make(full_name, render_mode="rgb_array", seed=3)
     with warnings.catch_warnings():
@@ -61,7 +60,7 @@ def test_gymnasium_makes_one(full_name):
 def test_ids_are_those_of_all_environments():
     foreign = {"Gymnasium", "PettingZoo"}
     names = {kind.__name__ for kind in envs.ENVS.values()} - foreign
-    assert {*registration.IDS.values()} == names
+    assert {*adapters.IDS.values()} == names
     assert all(f"{name}".lower() in envs.ENVS for name in names)
     env = gymnasium.make_vec(
         "megastep.adapters:megastep/Deathmatch-v0", 2, n_agents=3, device="cpu"
@@ -69,10 +68,8 @@ def test_ids_are_those_of_all_environments():
     assert env.num_envs == 6 and env.spec.id == "megastep/Deathmatch-v0"
 
 
-def test_registering_and_processes_of_environments_import_no_torch():
-    code = "import gymnasium, sys, megastep.vector_processes;"
-    code += "from megastep.adapters.registration import register; register();"
-    code += "assert 'torch' not in sys.modules and 'megastep/Pong-v0' in gymnasium.registry"
+def test_processes_of_environments_import_no_torch():
+    code = "import sys, megastep.hosting.processes; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 

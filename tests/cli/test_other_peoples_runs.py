@@ -45,7 +45,7 @@ def test_failed_environment_ends_the_run_with_all_saved(here, vectorization, cap
     assert f"All {n_samples} samples are saved. To continue: python train.py resume=run" in line
     trace = (here / "run/env_error.txt").read_text()
     assert trace.startswith("Traceback") and "odd_envs.py" in trace
-    assert "sync_envs" not in trace and trace.endswith("OSError: simulator does not answer\n")
+    assert "hosting" not in trace and trace.endswith("OSError: simulator does not answer\n")
     words = ["resume=run", "samples=640", "env.restart_failed=50"]
     assert train.main(words) == 0
     rows = json_lines.read(here / "run/metrics.jsonl")

@@ -16,7 +16,7 @@ from megastep.agents.storage.collector import Collector
 from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
 from megastep.envs import Gymnasium
-from megastep.sync_envs import EnvError
+from megastep.hosting.errors import EnvError
 
 gymnasium = pytest.importorskip("gymnasium")
 VECTORIZATIONS = "sync", "async", "own"
@@ -205,7 +205,7 @@ def test_error_of_an_environment_is_named_with_its_traceback(vectorization):
         EnvError, match=f"^CartPole-v1: {name} failed: AssertionError: .*invalid"
     ) as error:
         env.step(arrdict(actions=torch.full((4, 1), 7)))
-    assert "cartpole.py" in error.value.trace and "sync_envs" not in error.value.trace
+    assert "cartpole.py" in error.value.trace and "hosting" not in error.value.trace
     env.close()
 
 

@@ -11,7 +11,7 @@ from megastep.dotdict import dotdict, leaves
 gym = pytest.importorskip("gymnasium.spaces")
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate  # noqa: E402
 
-from megastep.envs.on_host.spaces import actions, observation  # noqa: E402
+from megastep.hosting.conversions import actions, observation  # noqa: E402
 
 N = 5
 vector, image, discrete = spaces.MultiVector, spaces.MultiImage, spaces.MultiDiscrete

@@ -12,10 +12,11 @@ from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
 
 gymnasium = pytest.importorskip("gymnasium")
-from megastep.env_probe import probe  # noqa: E402
 from megastep.envs import Gymnasium  # noqa: E402
-from megastep.envs.on_host.frames import as_frame  # noqa: E402
-from megastep.sync_envs import EnvError, SyncEnvs  # noqa: E402
+from megastep.hosting.errors import EnvError  # noqa: E402
+from megastep.hosting.guard import HostedEnvs  # noqa: E402
+from megastep.hosting.probe import probe  # noqa: E402
+from megastep.hosting.vectorized import _as_frame as as_frame  # noqa: E402
 from tests.helpers import odd_envs  # noqa: E402
 
 
@@ -38,15 +39,15 @@ class FailsAt(odd_envs.Odd):
 
 
 def test_failed_environment_is_made_anew_and_its_episode_truncated():
-    vector = SyncEnvs(FailsAt, 1, restart_failed=2)
+    vector = HostedEnvs(FailsAt, 1, restart_failed=2)
     vector.reset(seed=[5])
-    first, n_failures = vector.envs[0], 0
+    first, n_failures = vector.envs[0].env, 0
     for expected in [(1, 1), (2, 1), (2, 0), (0, 0), (1, 1), (2, 1), (2, 0), (0, 0), (1, 1)]:
-        obs, reward, terminated, truncated, news = vector.step(np.zeros(1, int))
+        obs, reward, terminated, truncated, infos = vector.step(np.zeros(1, int))
         assert (obs.item(), reward.item()) == expected and not terminated
-        assert truncated == (expected == (2, 0)) == ("failures" in news)
-        n_failures += len(news.get("failures", ()))
-    assert n_failures == vector.restarts[0] == 2 and vector.envs[0] is not first
+        assert truncated == (expected == (2, 0)) == ("failure" in infos)
+        n_failures += int(infos.get("restarts", np.zeros(1)).sum())
+    assert n_failures == 2 and vector.envs[0].env is not first
     vector.step(np.zeros(1, int))
     with pytest.raises(EnvError, match="^environment 0 failed: ValueError: no$") as error:
         vector.step(np.zeros(1, int))

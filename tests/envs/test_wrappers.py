@@ -13,7 +13,7 @@ from megastep.agents.runs import agent_file, checkpoint
 
 gymnasium = pytest.importorskip("gymnasium")
 from megastep.envs import Gymnasium  # noqa: E402
-from megastep.envs.on_host.env import VectorizedEnv  # noqa: E402
+from megastep.hosting.vectorized import VectorizedEnv  # noqa: E402
 
 HELPERS = "tests.helpers.learning_wrappers"
 NORMALIZE = "gymnasium.wrappers:NormalizeObservation"
@@ -70,7 +70,7 @@ def test_environment_in_other_wrappers_is_refused():
 
 def test_wrappers_that_only_know_the_episode_have_learnt_nothing():
     env = make(id="CartPole-v1")  # with a time limit
-    assert env.wrapper_state() == {} and not env.vector.kinds and not env.vector.frozen
+    assert env.wrapper_state() == {} and not env.vector.found.generators
 
 
 def test_returns_before_wrappers_change_rewards_are_a_metric():

@@ -1,44 +1,45 @@
 """What the wrappers around an environment of Gymnasium or PettingZoo keep in their attributes, such
 as running statistics: to read it, and to put it into other wrappers of the same classes. Workers
-import it.
+import it, so without PyTorch.
 """
 
 import collections
 import copy
 import numbers
 import types
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
+from typing import Any
 
+import gymnasium
 import numpy as np
 
 from megastep.types import Tree
 
-__all__ = ["WrappedEnvs", "freeze", "load_wrapper_state", "wrapper_state"]
+__all__ = ["give_state", "load_wrapper_state", "wrapper_state"]
 
 #: Attributes of a wrapper that are no state of its own.
 SKIPPED = "env", "metadata", "spec", "_np_random", "recorded_reward"
 SEQUENCES = list, tuple, collections.deque
 
 
-def wrapper_state(env, paths: Collection[str] | None = None) -> Tree:
+def wrapper_state(env: Any, paths: Collection[str] | None = None) -> Tree:
     """Returns copies of the numbers, the arrays and the lists of numbers in wrappers by path, such
     as `0.NormalizeObservation.obs_rms.mean`; wrapper 0 is the outermost.
 
     Args:
         paths: those wanted. None: all.
     """
-    state, visited = {}, set()
-    for place, wrapper in _wrappers(env):
-        state |= {
-            path: copy.deepcopy(value)
-            for path, value in _values(place, wrapper, visited)
-            if paths is None or path in paths
-        }
-    return state
+    visited = set()
+    return {
+        path: copy.deepcopy(value)
+        for place, wrapper in _wrappers(env)
+        for path, value in _values(place, wrapper, visited)
+        if paths is None or path in paths
+    }
 
 
-def load_wrapper_state(env, state: Tree) -> None:
-    """Puts a `wrapper_state` into the wrappers of another environment.
+def load_wrapper_state(env: Any, state: Tree) -> None:
+    """Puts a `wrapper_state`, which may be a stranger's, into the wrappers of another environment.
 
     Raises:
         ValueError: it is not in such wrappers.
@@ -69,64 +70,28 @@ def load_wrapper_state(env, state: Tree) -> None:
             setattr(holder, last, value)
 
 
-def _is_safe(path, value) -> bool:
-    """Returns whether a part of a state, which may be a stranger's, is numbers for an attribute
-    that is not special.
+def give_state(env: Any, state: Tree, is_frozen: bool) -> Tree:
+    """Puts a `wrapper_state` into the wrappers of an environment. With `is_frozen`, stops the
+    running statistics of Gymnasium's own, and returns the state, to be put there after each step.
     """
+    load_wrapper_state(env, state)
+    for _, wrapper in _wrappers(env) if is_frozen else ():
+        if hasattr(type(wrapper), "update_running_mean"):
+            wrapper.update_running_mean = False
+    return state if is_frozen else None
+
+
+def _is_safe(path, value) -> bool:
+    """Returns whether a part of a state is numbers for an attribute that is not special."""
     _, *names = str(path).split(".")
-    is_named = len(names) > 1 and all(name.isidentifier() for name in names)
     is_special = any(name.startswith("__") or name in SKIPPED for name in names)
+    is_named = len(names) > 1 and all(name.isidentifier() for name in names)
     return is_named and not is_special and _are_numbers(value)
 
 
 def _are_numbers(value) -> bool:
     is_nested = isinstance(value, SEQUENCES)  # as arrays are in the files of agents
     return all(map(_are_numbers, value)) if is_nested else _is_value(value)
-
-
-def freeze(env) -> None:
-    """Stops the running statistics of Gymnasium's own wrappers."""
-    for _, wrapper in _wrappers(env):
-        if hasattr(type(wrapper), "update_running_mean"):
-            wrapper.update_running_mean = False
-
-
-class WrappedEnvs:
-    """Environments in wrappers that may have learnt something.
-
-    Attributes:
-        envs: environments in equal wrappers.
-        learnt: paths of what the wrappers have learnt.
-        frozen: what stays as it is, None if nothing does.
-    """
-
-    envs: list
-    learnt: Sequence[str] = ()
-    frozen: Tree = None
-
-    def wrapper_state(self) -> Tree:
-        """Returns what the wrappers of the first environment have learnt, by path."""
-        return wrapper_state(self.envs[0], self.learnt) if self.learnt else {}
-
-    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what others have learnt.
-
-        Args:
-            is_frozen: it stays as it is from now on.
-
-        Raises:
-            ValueError: the environments are not in such wrappers.
-        """
-        for env in self.envs:
-            load_wrapper_state(env, state)
-            if is_frozen:
-                freeze(env)
-        self.frozen = state if is_frozen else None
-
-    def _keep_frozen(self, env) -> None:
-        """Called after each step and reset of an environment."""
-        if self.frozen:
-            load_wrapper_state(env, self.frozen)
 
 
 def _wrappers(env) -> Iterator[tuple]:
@@ -165,12 +130,8 @@ def _is_value(value) -> bool:
 
 def _has_values(value) -> bool:
     """Returns whether a value may be a wrapper's own object: no environment, space or function."""
-    import gymnasium
-
     others = gymnasium.Env, gymnasium.Space, types.ModuleType, type
-    is_object = hasattr(value, "__dict__") and not callable(value)
-    is_object = is_object and not hasattr(value, "possible_agents")
+    is_other = isinstance(value, others) or callable(value) or hasattr(value, "possible_agents")
     is_gymnasiums = type(value).__module__.startswith("gymnasium.envs")
-    return isinstance(value, dict) or (
-        is_object and not isinstance(value, others) and not is_gymnasiums
-    )
+    is_object = hasattr(value, "__dict__") and not is_other and not is_gymnasiums
+    return isinstance(value, dict) or is_object

@@ -1,29 +1,33 @@
-"""An episode of random actions in an environment of Gymnasium or PettingZoo, which tells what
+"""An episode of random actions in an environment of Gymnasium or PettingZoo, which finds what
 cannot be asked of it. Workers import it, so without PyTorch.
 """
 
 import contextlib
 import copy
 import itertools
+import numbers
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 
-from megastep import global_generators
-from megastep.env_values import masked_actions
-from megastep.sync_envs import TRUE_RETURN, RewardRecorder, numbers_of
-from megastep.wrapper_state import wrapper_state
+from megastep.global_generators import KINDS, GlobalGenerators, kept
+from megastep.hosting.values import masked_actions
+from megastep.hosting.wrapper_state import wrapper_state
+from megastep.types import Tree
 
-__all__ = ["Probe", "play", "play_parallel", "probe"]
+__all__ = ["TRUE_RETURN", "Probe", "RewardRecorder", "numbers_of", "play_parallel", "probe"]
 
+#: Name of the sum of an episode's rewards before wrappers change them.
+TRUE_RETURN = "true_return"
 #: Steps and seconds of the episode.
 MAX_STEPS, MAX_SECONDS = 1000, 5.0
 
 
 class Probe(NamedTuple):
-    """What an episode has told.
+    """What an episode has shown.
 
     Attributes:
         names: keys of the numbers in its last ``info``, `is_success` first; before them
@@ -39,7 +43,37 @@ class Probe(NamedTuple):
     n_masked: int = 0
 
 
-def play(env, seed: int) -> Iterator[tuple]:
+class RewardRecorder(gymnasium.Wrapper):
+    """Keeps the last reward of an environment, which wrappers around it may change."""
+
+    recorded_reward = 0.0
+
+    def step(self, action: Tree) -> tuple:
+        result = super().step(action)
+        self.recorded_reward = result[1]
+        return result
+
+    @classmethod
+    def inside(cls, env: Any) -> "RewardRecorder | None":
+        """Returns the recorder inside other wrappers, None if there is none."""
+        while env is not None and not isinstance(env, cls):
+            env = vars(env).get("env")
+        return env
+
+
+def numbers_of(info: object) -> dict[str, float]:
+    """Returns the numbers of an `info` by key, without those in dicts and arrays of several."""
+    values = {}
+    for key, value in info.items() if isinstance(info, Mapping) else ():
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.reshape(())[()]
+        if isinstance(key, str) and isinstance(value, (numbers.Real, np.bool_)):
+            with contextlib.suppress(OverflowError):
+                values[key] = float(value)
+    return values
+
+
+def play(env: Any, seed: int) -> Iterator[tuple]:
     """Takes random actions in an environment of Gymnasium. Yields reward, whether the episode is
     over, and info, for each step.
     """
@@ -50,7 +84,7 @@ def play(env, seed: int) -> Iterator[tuple]:
         yield reward, terminated or truncated, info
 
 
-def play_parallel(env, seed: int) -> Iterator[tuple]:
+def play_parallel(env: Any, seed: int) -> Iterator[tuple]:
     """As `play`, in a parallel environment of PettingZoo, without rewards and info."""
     spaces = {agent: copy.deepcopy(env.action_space(agent)) for agent in env.possible_agents}
     for space in spaces.values():
@@ -65,17 +99,16 @@ def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
     """Makes an environment, plays an episode of at most `MAX_STEPS` and `MAX_SECONDS`, and closes
     it. Leaves the global generators as they were.
 
-    An error ends the episode: the same one comes in training, which tells of it.
+    An error ends the episode: the same one comes in training, which names it.
 
     Args:
         play: takes random actions, as `play` does.
     """
     names, first, last, is_changed, n_masked = (), {}, {}, False, 0
-    with global_generators.kept():
+    with kept():
         env = make()
-        global_generators.seed_all(seed)
-        before = global_generators.states()
-        with contextlib.suppress(Exception):
+        drawn, fresh = GlobalGenerators([seed]), GlobalGenerators([seed])
+        with contextlib.suppress(Exception), drawn.installed(KINDS):
             n_masked = masked_actions(env.action_space, env.reset(seed=seed)[1])
             first, end = wrapper_state(env), time.monotonic() + MAX_SECONDS
             recorder = RewardRecorder.inside(env)
@@ -84,9 +117,10 @@ def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
                 names = sorted(numbers_of(info), key=lambda name: name != "is_success")
                 if is_over or time.monotonic() > end:
                     break
-        generators = global_generators.changed_kinds(before)
-        with contextlib.suppress(Exception):
-            global_generators.seed_all(seed)  # so that what a new episode draws is the same
+        before = fresh.states()
+        generators = tuple(kind for kind, state in drawn.states().items() if state != before[kind])
+        # what a new episode draws is the same
+        with contextlib.suppress(Exception), fresh.installed(KINDS):
             env.reset(seed=seed)
             last = wrapper_state(env)
         with contextlib.suppress(Exception):

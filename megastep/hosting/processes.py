@@ -6,21 +6,23 @@ Workers import Gymnasium and what the environments need, but not PyTorch.
 import contextlib
 import multiprocessing
 import os
+import random
 import signal
-import sys
 import time
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.vector.utils import create_empty_array
 
-from megastep import global_generators, workers
-from megastep.env_probe import Probe, probe
-from megastep.sync_envs import EnvError, SyncEnvs
+from megastep import workers
+from megastep.hosting.errors import EnvError
+from megastep.hosting.guard import HostedEnvs, start_rendering
+from megastep.hosting.probe import Probe, probe
 from megastep.types import Tree
 
-__all__ = ["VectorProcesses", "start_rendering"]
+__all__ = ["VectorProcesses"]
 
 #: Seconds in which a worker that is to end may finish what it does.
 PATIENCE = 5
@@ -34,90 +36,85 @@ class VectorProcesses:
     killed.
 
     Args:
-        make: ``make(n_envs=n, first=i)`` returns :class:`~megastep.sync_envs.SyncEnvs`. It is sent
-            to the workers.
+        make: makes one environment. It is sent to the workers.
         n_envs: number of environments, N.
-        n_processes: number of processes. Default: one per core, shared among the ranks of a host.
+        seed: of what the environments draw from global generators.
+        settings: others of :class:`~megastep.hosting.guard.HostedEnvs`.
     """
 
     max_episode_steps: int | None = None
 
-    def __init__(self, make: Callable[..., SyncEnvs], n_envs: int, n_processes: int | None = None):
+    def __init__(self, make: Callable, n_envs: int, seed: int = 0, **settings: Any):
         import loky
-        from gymnasium.vector.utils import create_empty_array
         from loky.backend import get_context
 
-        if n_processes is None:
-            n_processes = loky.cpu_count() // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
-        example = make(n_envs=1)
-        self.metadata, self.render_mode = example.metadata, example.render_mode
-        self.single_observation_space = example.single_observation_space
-        self.single_action_space = example.single_action_space
-        self.restart_failed = example.restart_failed
-        with contextlib.suppress(Exception):
-            example.close()
+        self.restart_failed = settings.get("restart_failed", 0)
+        # one per core, shared among the ranks of a host
+        n_processes = loky.cpu_count() // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         edges = np.linspace(0, n_envs, min(max(n_processes, 1), n_envs) + 1).astype(int).tolist()
         self.rows = [slice(*pair) for pair in zip(edges, edges[1:])]
-        self.observations = create_empty_array(self.single_observation_space, n_envs)
-        self.results = np.zeros(n_envs), np.zeros(n_envs, bool), np.zeros(n_envs, bool)
         self.pipes, self.processes = [], []
         self._finalizer = weakref.finalize(self, _end, self.pipes, self.processes)
         context = get_context("loky")  # a new interpreter: a fork would share locks and threads
         with workers.terminal_signals_blocked():
             for rows in self.rows:
                 pipe, far_end = multiprocessing.Pipe()
+                worker = _Worker(make, rows, dict(seed=seed, **settings))
                 process = context.Process(  # pyright: ignore[reportAttributeAccessIssue]
-                    target=_serve,
-                    args=(far_end, make, rows),
-                    daemon=True,
-                    env=workers.WORKER_ENV,
+                    target=worker.serve, args=(far_end,), daemon=True, env=workers.WORKER_ENV
                 )
                 process.start()
                 far_end.close()
                 self.pipes.append(pipe)
                 self.processes.append(process)
-        self.pipes[0].send(("probe", None))
-        found = self._receive(0)
-        found = Probe() if isinstance(found, Exception) else found
-        self.names, self.learnt, self.latest_state = found.names, found.learnt, {}
-        self.n_masked = found.n_masked
-        self._ask("use", [found for _ in self.pipes])
+        # in a worker, since a fault may end the process that it happens in
+        self.pipes[0].send(("probe", ()))
+        self.found = self._receive(0)
+        self.found = Probe() if isinstance(self.found, Exception) else self.found
+        (example, *_) = self._ask("begin", [(self.found,) for _ in self.rows])
+        self.metadata, self.render_mode, spaces = example
+        self.single_observation_space, self.single_action_space = spaces
+        self.observations = create_empty_array(self.single_observation_space, n_envs)
+        self.results = np.zeros(n_envs), np.zeros(n_envs, bool), np.zeros(n_envs, bool)
+        self.latest_state: Tree = {}
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
-        """Resets every environment. Returns (observations, news), see `step`."""
-        answers = self._ask("reset", [seed and list(seed[rows]) for rows in self.rows])
+        """Resets every environment. Returns (observations, infos), see `step`."""
+        seeds = [(seed and list(seed[rows]),) for rows in self.rows]
+        answers = self._ask("reset", seeds)
         for rows, (obs, _) in zip(self.rows, answers):
             _write(self.observations, rows, obs)
-        return self.observations, self._news([news for _, news in answers])
+        return self.observations, self._merged([infos for _, infos in answers])
 
     def step(self, actions: Tree) -> tuple:
-        """Takes one step. Returns (observations, rewards, terminated, truncated, news), which are
-        valid until the next call. News are those of :class:`~megastep.sync_envs.SyncEnvs`.
+        """Takes one step. Returns (observations, rewards, terminated, truncated, infos), which are
+        valid until the next call.
         """
-        answers = self._ask("step", [_read(actions, rows) for rows in self.rows])
+        answers = self._ask("step", [(_read(actions, rows),) for rows in self.rows])
         for rows, (obs, *results, _) in zip(self.rows, answers):
             _write(self.observations, rows, obs)
             _write(self.results, rows, results)
-        return self.observations, *self.results, self._news([news for *_, news in answers])
+        return self.observations, *self.results, self._merged([infos for *_, infos in answers])
 
     def render(self) -> list:
         """Returns a frame of every environment."""
-        return [frame for frames in self._ask("render", self.rows) for frame in frames]
+        answers = self._ask("render", [() for _ in self.rows])
+        return [frame for frames in answers for frame in frames]
 
     def wrapper_state(self) -> Tree:
         """Returns what the wrappers of the first environment have learnt, by path; of a process
         that has ended, what it was at the last call.
         """
-        if self.learnt:
+        if self.found.learnt:
             with contextlib.suppress(OSError, EnvError, MemoryError):
-                self.pipes[0].send(("wrapper_state", None))
+                self.pipes[0].send(("wrapper_state", ()))
                 answer = self._receive(0)
                 if not isinstance(answer, Exception):
                     self.latest_state = answer
         return self.latest_state
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """As :meth:`SyncEnvs.load_wrapper_state`."""
+        """As :meth:`~megastep.hosting.guard.HostedEnvs.load_wrapper_state`."""
         self._ask("load_wrapper_state", [(state, is_frozen) for _ in self.pipes])
 
     def close(self) -> None:
@@ -129,7 +126,7 @@ class VectorProcesses:
         answers, pipes = [], [*self.pipes]
         for pipe in pipes:
             with contextlib.suppress(EOFError, OSError):  # it has ended
-                pipe.send(("close", None))
+                pipe.send(("close", ()))
         end = time.monotonic() + PATIENCE
         for pipe in pipes:
             with contextlib.suppress(EOFError, OSError):
@@ -144,9 +141,9 @@ class VectorProcesses:
 
     def _ask(self, command, arguments) -> list:
         """Returns the answer of each process to a command."""
-        for pipe, argument in zip(self.pipes, arguments, strict=True):
-            with contextlib.suppress(OSError):  # of a process that has ended, as its answer tells
-                pipe.send((command, argument))
+        for pipe, own in zip(self.pipes, arguments, strict=True):
+            with contextlib.suppress(OSError):  # of a process that has ended, as its answer says
+                pipe.send((command, own))
         answers = [self._receive(number) for number in range(len(self.pipes))]
         for error in answers:
             if isinstance(error, Exception):
@@ -175,80 +172,72 @@ class VectorProcesses:
             f"the process that steps environments {rows.start} to {rows.stop - 1} was ended {how}"
         )
 
-    def _news(self, of_processes) -> dict:
-        """Returns the news of all environments."""
-        news: dict = {
-            "failures": [one for part in of_processes for one in part.get("failures", ())]
-        }
-        if any("numbers" in part for part in of_processes):
-            n_envs = self.rows[-1].stop
-            news["numbers"] = {name: np.full(n_envs, np.nan) for name in self.names}
-            for rows, part in zip(self.rows, of_processes):
-                for name, values in part.get("numbers", {}).items():
-                    news["numbers"][name][rows] = values
-        news = {key: value for key, value in news.items() if value}
-        if self.n_masked > 0:
-            news["masks"] = np.concatenate([part["masks"] for part in of_processes])
-        return news
+    def _merged(self, infos) -> dict[str, np.ndarray]:
+        """Returns the infos of all environments."""
+        merged = {}
+        for rows, own in zip(self.rows, infos):
+            for key, values in own.items():
+                if key not in merged:
+                    shape = self.rows[-1].stop, *values.shape[1:]
+                    merged[key] = np.zeros(shape, values.dtype)
+                merged[key][rows] = values
+        return merged
 
 
-def start_rendering(vector) -> None:
-    """Sets the render mode of environments to rgb_array, if they have it and no other was chosen.
-
-    Called before the first frame and not earlier: with a render mode, LunarLander simulates the
-    particles of its exhaust and steps at a third of the speed.
+class _Worker:
+    """What a process does: it answers commands until the pipe is closed, which it is when the other
+    process ends.
     """
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame complains of no display
-    if vector.render_mode is None and "rgb_array" in vector.metadata.get("render_modes", ()):
-        for env in getattr(vector, "envs", ()):
-            env.unwrapped.render_mode = "rgb_array"
-        vector.render_mode = "rgb_array"
+
+    def __init__(self, make, rows, settings) -> None:
+        self.make, self.rows, self.settings = make, rows, settings
+
+    def serve(self, pipe) -> None:
+        seeds = np.random.SeedSequence([self.settings["seed"], self.rows.start])
+        seed = int(seeds.generate_state(1)[0])
+        np.random.seed(seed)  # for what draws too rarely to be found by a probe
+        random.seed(seed)
+        command = None
+        with contextlib.suppress(EOFError, OSError):
+            while command != "close":
+                command, arguments = pipe.recv()
+                pipe.send(_attempt(getattr(self, command), *arguments))
+        if command != "close":
+            _attempt(self.close)
+
+    def probe(self) -> Probe:
+        return probe(self.make)
+
+    def begin(self, found) -> tuple:
+        n_envs, first = self.rows.stop - self.rows.start, self.rows.start
+        self.envs = envs = HostedEnvs(self.make, n_envs, first, found, **self.settings)
+        spaces = envs.single_observation_space, envs.single_action_space
+        return envs.metadata, envs.render_mode, spaces
+
+    def reset(self, seed) -> tuple:
+        return self.envs.reset(seed=seed)
+
+    def step(self, actions) -> tuple:
+        return self.envs.step(actions)
+
+    def render(self) -> object:
+        start_rendering(self.envs)
+        return self.envs.render()
+
+    def wrapper_state(self) -> Tree:
+        return self.envs.wrapper_state()
+
+    def load_wrapper_state(self, state, is_frozen) -> None:
+        self.envs.load_wrapper_state(state, is_frozen)
+
+    def close(self) -> None:
+        self.envs.close()
 
 
-def _serve(pipe, make, rows) -> None:
-    """Answers commands until the pipe is closed, which it is when the other process ends."""
-    envs = _attempt(make, n_envs=rows.stop - rows.start, first=rows.start)
-    if not isinstance(envs, Exception):  # for what draws too rarely to be found by a probe
-        seeds = np.random.SeedSequence([envs.seed, envs.first])
-        global_generators.seed_all(int(seeds.generate_state(1)[0]))
-    with contextlib.suppress(EOFError, OSError):
-        while True:
-            command, argument = pipe.recv()
-            if isinstance(envs, Exception):
-                pipe.send(envs)
-            else:
-                pipe.send(_attempt(_answer, envs, command, argument))
-            if command == "close":
-                return
-    with contextlib.suppress(Exception):
-        if not isinstance(envs, Exception):
-            envs.close()
-
-
-def _answer(envs, command, argument) -> object:
-    if command == "reset":
-        return envs.reset(seed=argument)
-    if command == "step":
-        return envs.step(argument)
-    if command == "probe":
-        return probe(envs.make)
-    if command == "use":
-        return envs.use(*argument)
-    if command == "wrapper_state":
-        return envs.wrapper_state()
-    if command == "load_wrapper_state":
-        return envs.load_wrapper_state(*argument)
-    if command == "close":
-        return envs.close()
-    start_rendering(envs)
-    return envs.render()
-
-
-def _attempt(function, *arguments, **more) -> Any:
+def _attempt(function, *arguments) -> Any:
     """Returns what a function returns, or its error, in a form that can be sent."""
     try:
-        return function(*arguments, **more)
+        return function(*arguments)
     except (EnvError, MemoryError) as error:
         return error if isinstance(error, EnvError) else MemoryError(*map(str, error.args))
     except Exception as error:

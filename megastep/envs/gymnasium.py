@@ -1,0 +1,215 @@
+"""Gymnasium: N copies of any environment of Gymnasium, one agent each, so B = N lanes.
+
+They step on the CPU, even if the learner is on a GPU.
+"""
+
+import contextlib
+import difflib
+import functools
+import importlib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from megastep import global_generators
+from megastep.hosting.vectorized import VectorizedEnv
+from megastep.imports import import_object, search_current_folder
+from megastep.settings import checked
+
+if TYPE_CHECKING:
+    from gymnasium.envs.registration import EnvSpec
+
+__all__ = ["Gymnasium"]
+
+INSTALL = "pip install 'megastep-flatland[gymnasium]'"
+#: Environments that step on the host are counted in hundreds; more is a typing error.
+MAX_ENVS = 2**16
+
+
+class Gymnasium(VectorizedEnv):
+    """Any environment of Gymnasium, or of a package that registers its own with it.
+
+    They step on the CPU: one after the other in this process (sync), in worker processes, one per
+    core (async), or together, by the environment's own vector class (own).
+    With a learner on a GPU, observations and actions cross through pinned memory.
+
+    Observation:
+        Box: (B, 1, n) float32, flattened, or an image (B, 1, C, H, W), uint8 or float32, if it has
+        8 rows and columns or more and up to 4 channels. Discrete: (B, 1) integers from 0.
+        MultiDiscrete: (B, k) integers, or a dict of its numbers if their ranges differ.
+        MultiBinary: (B, 1, n) float32. Tuple and Dict: a dict.
+
+    Actions:
+        Discrete: (B, 1) integers from 0. MultiDiscrete: (B, k), or a dict if the ranges differ.
+        MultiBinary: (B, k), 0 or 1. Box with bounds: (B, 1, n) float32 within them. Tuple and Dict:
+        a dict. A mask in ``info["action_mask"]``, a number per action of a Discrete space, becomes
+        ``world.mask``: actions with 0 are not taken.
+
+    Reward:
+        The environment's own.
+
+    Episode end:
+        Terminal and truncated as the environment says. If it says both, terminal.
+
+    Metrics:
+        The numbers in the last ``info`` of an episode, such as ``is_success``, at most 16.
+
+    Args:
+        n_envs: number of environments, N.
+        id: name of the environment, such as CartPole-v1; with a colon, ``package:Name-v0``, of a
+            package that is imported first.
+        kwargs: arguments of the environment's constructor.
+        wrappers: import paths of Gymnasium's wrappers, ``package.module:Wrapper``, put around every
+            environment in this order.
+        vectorization: how environments are stepped: sync, one after the other in this process;
+            async, divided among processes, one per core; own, the environment's own vector
+            environment.
+        restart_failed: how often each environment is made anew after an error of its own. The
+            episode is then truncated. Not with own.
+        seed: each environment is reset with a seed of its own, which derives from this one.
+        films: renders images from the start, if it can. Some environments make their renderer in
+            the constructor, and some step more slowly with it.
+        check: refuses, in the first steps of each environment, observations that are not in their
+            space and results of another form than Gymnasium's, and at any time actions that are
+            not finite. Numbers beyond the bounds of a Box are a warning.
+        device: where worlds and actions are. Default: a GPU if there is one.
+    """
+
+    @checked
+    def __init__(
+        self,
+        n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 32,
+        *,
+        id: str | None = None,
+        kwargs: dict[str, Any] | None = None,
+        wrappers: tuple[str, ...] = (),
+        vectorization: Literal["sync", "async", "own"] = "sync",
+        restart_failed: Annotated[int, Field(ge=0, le=1_000_000)] = 0,
+        seed: int = 1,
+        films: bool = False,
+        check: bool = True,
+        device: torch.device | str | None = None,
+    ):
+        spec, kwargs = _spec(id), kwargs or {}
+        try:
+            functions = [import_object(name) for name in wrappers]
+        except ValueError as error:
+            raise ValueError(f"env.wrappers: {error}") from None
+        settings = dict(seed=seed, restart_failed=restart_failed, check=check)
+        with _one_sentence(id, kwargs):
+            if vectorization == "own":
+                vector = _own(spec, n_envs, kwargs, bool(wrappers), restart_failed)
+            else:
+                vector = _hosted(spec, n_envs, kwargs, functions, vectorization, films, settings)
+        # one seed for each, or one for all
+        seeds = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
+        seeds = seeds[0] if vectorization == "own" else seeds
+        super().__init__(id, vector, n_envs, 1, seeds, device, check)
+
+
+def _spec(id) -> "EnvSpec":
+    """Returns the specification of an environment, whose package is imported if it names one."""
+    try:
+        import gymnasium
+    except ImportError:
+        raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
+    if id is None:
+        raise ValueError("env.id is missing; name an environment, such as env.id=CartPole-v1")
+    package, _, name = id.rpartition(":")
+    if package:
+        search_current_folder()
+        try:
+            importlib.import_module(package)
+        except Exception as error:
+            raise ValueError(
+                f"env.id={id} needs the package {package}, which cannot be imported "
+                f"({_line(error)}); install the one that has it"
+            ) from None
+    if name not in gymnasium.registry:
+        near = difflib.get_close_matches(name, gymnasium.registry, 1)
+        raise ValueError(
+            f"Gymnasium has no environment {name!r}"
+            + (f"; did you mean {near[0]}? " if near else ". ")
+            + "Those of other packages are package:id, such as minigrid:MiniGrid-MemoryS7-v0"
+        )
+    return gymnasium.registry[name]
+
+
+def _own(spec, n_envs, kwargs, has_wrappers, restart_failed) -> Any:
+    """Returns the environment's own vector environment."""
+    import gymnasium
+
+    if restart_failed:
+        raise ValueError(
+            "env.restart_failed makes single environments anew, which its own vector environment "
+            "has not; use env.vectorization=sync or async"
+        )
+    if has_wrappers:
+        raise ValueError(
+            "env.wrappers go around single environments, which its own vector environment has "
+            "not; use env.vectorization=sync or async"
+        )
+    if spec.vector_entry_point is None:
+        raise ValueError("it has no vector environment of its own; use env.vectorization=sync")
+    vector: Any = gymnasium.make_vec(
+        spec, num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs
+    )
+    mode = vector.metadata.get("autoreset_mode")
+    if mode != gymnasium.vector.AutoresetMode.NEXT_STEP:
+        vector.close()
+        raise ValueError(
+            f"its own vector environment resets by {mode}, which loses the last observation of an "
+            "episode or leaves the reset to others; use env.vectorization=sync"
+        )
+    return vector
+
+
+def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, settings) -> Any:
+    """Returns single environments as a vector environment, in this process or in others."""
+    from megastep.hosting.guard import HostedEnvs, make_env
+    from megastep.hosting.probe import probe
+    from megastep.hosting.processes import VectorProcesses
+
+    # Gymnasium's checker warns of an environment's faults once per environment
+    kwargs = {"disable_env_checker": True, **kwargs}
+    with global_generators.kept():
+        example = make_env(spec, wrappers, kwargs)
+    max_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
+    if films and "rgb_array" in (example.metadata.get("render_modes") or ()):
+        kwargs = {"render_mode": "rgb_array", **kwargs}
+    with contextlib.suppress(Exception):
+        example.close()
+    make = functools.partial(make_env, spec, wrappers, kwargs)
+    if vectorization == "sync":
+        vector = HostedEnvs(make, n_envs, found=probe(make), **settings)
+    else:
+        vector = VectorProcesses(make, n_envs, **settings)
+    vector.max_episode_steps = max_steps
+    return vector
+
+
+@contextlib.contextmanager
+def _one_sentence(id, kwargs) -> Iterator[None]:
+    """Raises what goes wrong inside as a ValueError, with the likely cure."""
+    import gymnasium
+
+    try:
+        yield
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise ValueError(f"{id} needs a package that is missing: {_line(error)}") from None
+    except ValueError as error:
+        raise ValueError(f"{id} cannot be made: {_line(error)}") from None
+    except Exception as error:
+        cause = f" with env.kwargs={kwargs}" if kwargs else ""
+        raise ValueError(
+            f"{id} cannot be made{cause}: {type(error).__name__}: {_line(error)}"
+        ) from error
+
+
+def _line(error) -> str:
+    """Returns the first line of an error, without what Gymnasium adds to it."""
+    line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return line.partition(" was raised from the environment creator")[0]

@@ -1,1 +1,0 @@
-"""Shared by the environments of other packages, which step on the host."""

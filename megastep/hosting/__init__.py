@@ -1,0 +1,1 @@
+"""Environments of other packages, N of them as one environment of ours, stepped on the host."""

@@ -1,0 +1,204 @@
+"""N parallel environments of PettingZoo, whose agents are lanes."""
+
+import copy
+import importlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+
+from megastep.hosting.errors import BadValue
+from megastep.hosting.guard import close_all
+from megastep.hosting.probe import Probe, play_parallel, probe
+from megastep.hosting.values import CHECKED_STEPS, allowed_actions, masked_actions, problem
+from megastep.hosting.wrapper_state import give_state, load_wrapper_state, wrapper_state
+from megastep.types import Tree
+
+__all__ = ["ParallelEnvs"]
+
+
+class ParallelEnvs:
+    """N parallel environments as one of Gymnasium's vector environments, with a row per agent.
+
+    Args:
+        make: returns a parallel environment, or a turn-based one that PettingZoo can convert.
+        n_envs: number of environments, N.
+        kwargs: arguments of ``make``.
+        check: checks the form of what the environments return in their first steps.
+        wrappers: put around each, in this order.
+
+    Attributes:
+        found: what is found about them, as of :class:`~megastep.hosting.guard.HostedEnvs`.
+        present: (N, A) bool, agents that act in the next step. An agent is not if the reset left it
+            out or its episode has ended, until it is among the environment's agents again.
+
+    Raises:
+        ValueError: it is turn-based, or the spaces of two agents differ.
+    """
+
+    HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
+
+    def __init__(
+        self,
+        make: Callable,
+        n_envs: int,
+        kwargs: dict[str, object],
+        check: bool = True,
+        wrappers: Sequence[Callable] = (),
+    ):
+        parameters = inspect.signature(make).parameters
+        if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            kwargs = {"render_mode": "rgb_array", **kwargs}
+
+        def make_one() -> Any:
+            env = _parallel(make(**kwargs))
+            for wrapper in wrappers:
+                env = wrapper(env)
+            return env
+
+        self.envs = [make_one() for _ in range(n_envs)]
+        self.render_mode, env = kwargs.get("render_mode"), self.envs[0]
+        self.agents, self.metadata = list(env.possible_agents), env.metadata
+        first = env.reset()
+        self.single_observation_space = self._common(env.observation_space)
+        self.single_action_space = self._common(env.action_space)
+        n_lanes = n_envs * len(self.agents)
+        self.actions = batch_space(self.single_action_space, n_lanes)
+        self.batch = create_empty_array(self.single_observation_space, n_lanes)
+        lanes = batch_space(self.single_observation_space, n_lanes)
+        self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]  # observations
+        masks = _masks(*first) if isinstance(first, tuple) and len(first) == 2 else {}
+        sizes = [masked_actions(self.single_action_space, one) for one in masks.values()]
+        learnt = ()
+        if wrapper_state(env):
+            learnt = probe(make_one, play=play_parallel).learnt
+        self.found = Probe(learnt=learnt, n_masked=min(sizes, default=0))
+        self.masks = np.ones((n_lanes, max(0, self.found.n_masked)), bool)
+        shape = n_envs, len(self.agents)
+        self.reward, self.present = np.zeros(shape), np.zeros(shape, bool)
+        self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
+        self.n_to_check = [CHECKED_STEPS if check else 0] * n_envs
+        self.frozen: Tree = None
+
+    def _common(self, space_of) -> gymnasium.Space:
+        first, *others = self.agents
+        for agent in others:
+            if space_of(agent) != space_of(first):
+                raise ValueError(
+                    f"the spaces of {first} and {agent} differ, but one policy acts for all agents"
+                )
+        return space_of(first)
+
+    def reset(self, *, seed: list[int] | None = None) -> tuple[Tree, dict]:
+        for e in range(len(self.envs)):
+            self._begin(e, seed and seed[e])
+        return self._observations(), self._infos()
+
+    def step(self, actions: Tree) -> tuple:
+        rows = iterate(self.actions, actions)
+        for e, env in enumerate(self.envs):
+            chosen = dict(zip(self.agents, rows))
+            if self.present[e].any():
+                self._step(e, {agent: chosen[agent] for agent in env.agents})
+            else:
+                self._begin(e)
+        flags = self.terminated.ravel(), self.truncated.ravel()
+        return self._observations(), self.reward.ravel(), *flags, self._infos()
+
+    def render(self) -> list[np.ndarray]:
+        return [env.render() for env in self.envs]
+
+    def close(self) -> None:
+        close_all(self.envs)
+
+    def wrapper_state(self) -> Tree:
+        """Returns what the wrappers of the first environment have learnt, by path."""
+        return wrapper_state(self.envs[0], self.found.learnt) if self.found.learnt else {}
+
+    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
+        """Gives the wrappers of all environments what others have learnt.
+
+        Args:
+            is_frozen: it stays as it is from now on.
+        """
+        for env in self.envs:
+            self.frozen = give_state(env, state, is_frozen)
+
+    def _begin(self, e, seed=None) -> None:
+        observed, infos = self._checked(e, "reset", self.envs[e].reset(seed=seed))
+        self._observe(e, observed, infos)
+        for flags in (self.reward, self.terminated, self.truncated):
+            flags[e] = 0
+        agents = self.envs[e].agents
+        self.present[e] = [agent in agents and agent in observed for agent in self.agents]
+
+    def _step(self, e, actions) -> None:
+        env = self.envs[e]
+        result = self._checked(e, "step", env.step(actions))
+        observed, rewards, terminated, truncated, infos = result
+        self._observe(e, observed, infos)
+        for a, agent in enumerate(self.agents):
+            was_present = self.present[e, a]
+            ends, cut = (
+                bool(flags.get(agent, False) or flags.get("__all__", False))
+                for flags in (terminated, truncated)
+            )
+            is_here = agent in env.agents and agent in observed and not (ends or cut)
+            self.reward[e, a] = rewards.get(agent, 0.0) if was_present else 0.0
+            self.terminated[e, a] = was_present and ends
+            self.truncated[e, a] = was_present and not ends and not is_here
+            self.present[e, a] = is_here
+
+    def _checked(self, e, method, result) -> tuple:
+        """Returns the result of `reset` or `step`. Raises BadValue if its form is wrong."""
+        if self.frozen:
+            load_wrapper_state(self.envs[e], self.frozen)
+        if self.n_to_check[e] > 0:
+            self.n_to_check[e] -= 1
+            space = self.single_observation_space
+            if clause := problem(method, result, space, self.agents):
+                raise BadValue.of(clause, f"environment {e}")
+        return result
+
+    def _observe(self, e, observed, infos) -> None:
+        n_masked = self.masks.shape[1]
+        masks = _masks(observed, infos) if n_masked else {}
+        for a, agent in enumerate(self.agents, e * len(self.agents)):
+            if agent in observed:
+                self.latest[a] = observed[agent]
+            if n_masked:
+                place = f"environment {e}, {agent}"
+                self.masks[a] = allowed_actions(masks.get(agent, {}), n_masked, place)
+
+    def _infos(self) -> dict[str, np.ndarray]:
+        return {"present": self.present.ravel(), "action_mask": self.masks.copy()}
+
+    def _observations(self) -> np.ndarray | dict | tuple:
+        return concatenate(self.single_observation_space, self.latest, self.batch)
+
+
+def _masks(observed, infos) -> dict[str, Mapping]:
+    """Returns what has the action mask of each agent that has one: its info or its observation."""
+    found = {}
+    for part in (observed, infos):
+        for agent, one in part.items() if isinstance(part, Mapping) else ():
+            if isinstance(one, Mapping) and "action_mask" in one:
+                found[agent] = one
+    return found
+
+
+def _parallel(env) -> Any:
+    """Returns an environment in which agents act together."""
+    if not hasattr(env, "agent_iter"):
+        return env
+    if getattr(env, "metadata", {}).get("is_parallelizable"):
+        conversions = importlib.import_module("pettingzoo.utils.conversions")
+        return conversions.aec_to_parallel(env)
+    raise ValueError(
+        "it is turn-based, and agents have to act together; name the function that makes its "
+        "parallel form, such as env.id=package.module:parallel_env, or one whose metadata has "
+        "is_parallelizable"
+    )

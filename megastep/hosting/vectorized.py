@@ -1,0 +1,389 @@
+"""VectorizedEnv: a vector environment that steps on the host, with the interface learners use.
+
+N environments of A agents each, B = N A lanes.
+"""
+
+import contextlib
+import functools
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from megastep import engine, spaces
+from megastep.arrdict import arrdict
+from megastep.contract import FLAGS, RESERVED
+from megastep.dotdict import leaves
+from megastep.env_state import EnvState
+from megastep.hosting.conversions import RESERVED as RESERVED_KEYS
+from megastep.hosting.conversions import actions, identifiers, observation
+from megastep.hosting.errors import BadValue, EnvError
+from megastep.types import Space, Tree
+
+__all__ = ["VectorizedEnv"]
+
+#: The most numbers of an ``info`` that become metrics.
+MAX_NUMBERS = 16
+#: Steps of an episode in an evaluation, of environments whose specification names no limit.
+MAX_EPISODE_STEPS = 10_000
+#: A float frame with a larger number counts from 0 to 255; rounding may exceed 1 a little.
+MAX_FRACTION = 1.5
+
+
+class VectorizedEnv:
+    """Wraps a vector environment that resets a lane in the step after its episode's end.
+
+    Args:
+        id: name of the environments in messages.
+        vector: has ``single_observation_space``, ``single_action_space``, ``metadata``,
+            ``render_mode``, ``reset(seed=)``, ``step(actions)``, ``render()`` and ``close()``, as
+            Gymnasium's vector environments do, with a row per lane. If it has ``found``, a
+            :class:`~megastep.hosting.probe.Probe`, its infos are those of
+            :class:`~megastep.hosting.guard.GuardedEnv`; if it has ``present``, they have
+            ``present``, (B,) bool, the lanes whose next action is used.
+        n_envs: number of environments, N.
+        n_agents: lanes per environment, A.
+        seeds: passed to the first ``vector.reset``, one per environment or one for all.
+        device: where worlds and actions are. Default: a GPU if there is one.
+        check: refuses actions that are not finite, and in the first `CHECKED_STEPS` observations
+            that are not in their space; warns of those beyond the bounds of a Box.
+
+    Raises:
+        ValueError: if a space has no conversion, with its name and the cure.
+    """
+
+    capturable = False
+    HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
+    _has_warned = False  # of an environment that was made anew
+
+    def __init__(
+        self,
+        id: str | None,
+        vector: Any,
+        n_envs: int,
+        n_agents: int,
+        seeds: list[int] | int,
+        device: torch.device | str | None,
+        check: bool = True,
+    ):
+        from megastep.hosting.probe import Probe
+        from megastep.hosting.values import CHECKED_STEPS
+
+        self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
+        self.device = engine.device("auto" if device is None else device)
+        self._checks, self._seeds = check, seeds
+        self.fps = float(vector.metadata.get("render_fps") or 10)
+        self.max_episode_steps = getattr(vector, "max_episode_steps", None) or MAX_EPISODE_STEPS
+        try:
+            self.obs_space, self._read = observation(vector.single_observation_space)
+            self.action_space, self._write = actions(vector.single_action_space)
+        except ValueError as error:
+            with contextlib.suppress(EnvError):
+                self.close()
+            raise ValueError(f"{id}: {error}") from None
+        n_lanes, found = n_envs * n_agents, getattr(vector, "found", Probe())
+        names = found.names[:MAX_NUMBERS]
+        if left_out := found.names[MAX_NUMBERS:]:
+            warnings.warn(
+                f"{id}: the last info of an episode has {len(found.names)} numbers; {MAX_NUMBERS} "
+                f"become metrics, and {', '.join(left_out)} do not",
+                stacklevel=3,
+            )
+        if found.n_masked < 0:
+            warnings.warn(
+                f"{id}: info['action_mask'] is not used: it must be a number per action of a "
+                "Discrete space",
+                stacklevel=3,
+            )
+        reserved = {*RESERVED_KEYS, *RESERVED, "restarts"}
+        self._metrics = {n: np.zeros(n_lanes, np.float32) for n in identifiers(names, reserved)}
+        self._n_masked, self._has_present = max(0, found.n_masked), hasattr(vector, "present")
+        self._buffers = HostBuffers(
+            *(n_lanes, self.obs_space, self.action_space, self.device, [*self._metrics]),
+            flags=(*FLAGS, *["learns"] * self._has_present),
+            n_masked=self._n_masked,
+        )
+        self._ended = np.ones(n_lanes, bool)
+        self._n_restarts, self._n_to_check = 0, CHECKED_STEPS if check else 0
+
+    def reset(self) -> arrdict:
+        """Starts a new episode in every lane. Returns the first world.
+
+        Raises:
+            EnvError: an environment failed.
+        """
+        obs, infos = self._call(self.vector.reset, seed=self._seeds)
+        self._read_infos(infos, self._ended)
+        self._seeds = None
+        self._ended[:] = True
+        return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended, infos)
+
+    def step(self, decision: Mapping) -> arrdict:
+        """Takes one step by ``decision["actions"]``. Returns a world.
+
+        Raises:
+            EnvError: an environment failed.
+        """
+        actions = self._buffers.receive(decision["actions"])
+        for path, leaf in spaces.leaves(actions, "the action").items() if self._checks else ():
+            if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
+                lane = int(np.argwhere(~np.isfinite(leaf))[0][0])
+                raise BadValue.of(
+                    f"{path} for lane {lane} is not finite, so the policy's weights or "
+                    "observations are not",
+                    str(self.id),
+                )
+        actions = self._write(actions)
+        obs, reward, terminated, truncated, infos = self._call(self.vector.step, actions)
+        self._read_infos(infos, terminated | truncated)
+        return self._world(obs, reward, terminated, truncated, infos)
+
+    def wrapper_state(self) -> Tree:
+        """Returns what the wrappers of an environment have learnt, such as running statistics, as
+        tensors and numbers by path.
+        """
+        state = getattr(self.vector, "wrapper_state", dict)()
+        return {path: _plain(value) for path, value in state.items()}
+
+    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
+        """Gives the wrappers of all environments what those of others have learnt.
+
+        Args:
+            state: of `wrapper_state`, on any device.
+            is_frozen: it stays as it is from now on.
+
+        Raises:
+            ValueError: the environments are not in such wrappers.
+        """
+        state = {
+            path: value.cpu().numpy() if isinstance(value, torch.Tensor) else value
+            for path, value in state.items()
+        }
+        if not hasattr(self.vector, "load_wrapper_state"):
+            raise ValueError(f"{self.id} is in no wrappers, as in the training of the agent")
+        self.vector.load_wrapper_state(state, is_frozen)
+
+    def pop_restarts(self) -> int | None:
+        """Returns how many environments were made anew after an error since the last call, None if
+        none ever is.
+        """
+        if not getattr(self.vector, "restart_failed", 0):
+            return None
+        n_restarts, self._n_restarts = self._n_restarts, 0
+        return n_restarts
+
+    @functools.cached_property
+    def resumable(self) -> bool:
+        """False if checkpoints cannot hold the environments: those in other processes, and those
+        whose state is not in Python, such as Box2D's.
+        """
+        return not hasattr(self.vector, "processes") and not EnvState(self).unreachable()
+
+    def close(self) -> None:
+        """Closes the environments, and ends their processes.
+
+        Raises:
+            EnvError: an environment failed at it.
+        """
+        self._call(self.vector.close)
+
+    def state(self, e: int = 0) -> arrdict:
+        """Returns the frame of environment ``e``, (H, W, 3) uint8, as the environment renders it.
+
+        Raises:
+            ValueError: if it renders no images.
+            EnvError: if it fails.
+        """
+        from megastep.hosting.guard import start_rendering
+
+        start_rendering(self.vector)
+        if self.vector.render_mode != "rgb_array":
+            raise ValueError(
+                f"{self.id} renders no images: it has no render mode rgb_array, or env.kwargs "
+                "chooses another"
+            )
+        frame = self._call(self.vector.render)[e]
+        try:
+            return arrdict(frame=torch.from_numpy(_as_frame(frame)))
+        except ValueError as error:
+            raise ValueError(f"{self.id}: {error}") from None
+
+    @staticmethod
+    def plot_state(state: arrdict) -> np.ndarray:
+        """Returns the frame of a numpyified :meth:`state`."""
+        return state.frame
+
+    def _call(self, function, *arguments, **more) -> Any:
+        """Calls a method of the environments. Raises EnvError for their errors."""
+        try:
+            return function(*arguments, **more)
+        except EnvError as error:
+            raise type(error)(f"{self.id}: {error}", error.trace) from error
+        except MemoryError:
+            raise
+        except Exception as error:
+            raise EnvError.of(error, f"{self.id}: an environment") from error
+
+    def _read_infos(self, infos, ended) -> None:
+        """Keeps the numbers of episodes that ended, and counts environments that were made anew."""
+        if self._metrics and "numbers" in infos:
+            for column, values in enumerate(self._metrics.values()):
+                np.copyto(values, infos["numbers"][:, column], "unsafe", where=ended)
+        if getattr(self.vector, "restart_failed", 0) and "restarts" in infos:
+            self._n_restarts += int(infos["restarts"].sum())
+            if not self._has_warned:
+                self._has_warned = True
+                failure = next(filter(None, infos["failure"]))
+                warnings.warn(
+                    f"{self.id}: {failure}; it was made anew, as it and the others will be up to "
+                    f"restart_failed={self.vector.restart_failed} times each; metrics count them "
+                    "as episode/restarts",
+                    stacklevel=3,
+                )
+
+    def _check_observations(self, obs) -> None:
+        """Raises BadValue for those outside their space, and warns once of those beyond a Box."""
+        from megastep.hosting.values import beyond_bounds
+
+        self._n_to_check -= 1
+        for problem, is_box in beyond_bounds(self.vector.single_observation_space, obs):
+            sentence = f"an observation is not in its space: {problem}"
+            if not is_box:
+                raise BadValue.of(sentence, str(self.id))
+            self._n_to_check = 0
+            warnings.warn(f"{self.id}: {sentence}. It is used as it is", stacklevel=4)
+
+    def _world(self, obs, reward, terminated, truncated, infos) -> arrdict:
+        """Returns the world after a step, in which lanes that had ended before it began again."""
+        reset = self._ended.copy()
+        terminal = terminated > reset
+        truncated = truncated > (reset | terminal)
+        if self._n_to_check > 0:
+            self._check_observations(obs)
+        self._ended[:] = ~infos["present"] if self._has_present else terminal | truncated
+        world = arrdict(
+            obs=self._read(obs),
+            reward=np.where(reset, 0.0, reward),
+            reset=reset,
+            terminal=terminal,
+            truncated=truncated,
+        )
+        if self._has_present:
+            world["learns"] = infos["present"].copy()
+        if self._metrics:
+            world["metrics"] = arrdict(self._metrics)
+        if self._n_masked:
+            world["mask"] = infos["action_mask"][:, None]
+        return self._buffers.send(world)
+
+
+def _plain(value) -> object:
+    """Returns a value of a wrapper in a form that checkpoints hold."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.array(value, order="C"))
+    if isinstance(value, Collection):
+        return [getattr(part, "item", lambda part=part: part)() for part in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+class HostBuffers:
+    """Buffers of a world and of actions. With a GPU they are pinned, so copies need no staging.
+
+    Args:
+        n_lanes: number of lanes, B.
+        obs_space: space of one lane's observation.
+        action_space: space of one lane's actions.
+        device: where worlds go and actions come from.
+        metrics: names of the metrics in worlds.
+        flags: names of the bools in worlds.
+        n_masked: actions of the mask in worlds; 0 without.
+    """
+
+    IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
+
+    def __init__(
+        self,
+        n_lanes: int,
+        obs_space: Space,
+        action_space: Space,
+        device: torch.device,
+        metrics: Sequence[str],
+        flags: Sequence[str],
+        n_masked: int,
+    ):
+        self.device, self.on_gpu = device, device.type == "cuda"
+
+        def empty(dtype, *shape) -> torch.Tensor:
+            return torch.empty((n_lanes, *shape), dtype=dtype, pin_memory=self.on_gpu)
+
+        def of_space(space) -> torch.Tensor:
+            dtypes = {spaces.MultiDiscrete: torch.int64, spaces.MultiContinuous: torch.float32}
+            return empty(dtypes.get(type(space)) or space.dtype, *space.shape)
+
+        self.world = arrdict(
+            obs=spaces.map(of_space, obs_space),
+            reward=empty(torch.float32),
+            **{name: empty(torch.bool) for name in flags},
+        )
+        if metrics:
+            self.world["metrics"] = arrdict({name: empty(torch.float32) for name in metrics})
+        if n_masked:
+            self.world["mask"] = empty(torch.bool, 1, n_masked)
+        self.actions = spaces.map(of_space, action_space)
+        self.arrays = [leaf.numpy() for leaf in leaves(self.world)]
+        self.copied = torch.cuda.Event() if self.on_gpu else None
+
+    def send(self, world: arrdict) -> arrdict:
+        """Returns a world of arrays as one of new tensors on the device."""
+        if self.copied is None:
+            pairs = zip(leaves(world), self.arrays, strict=True)
+            tensors = iter([torch.from_numpy(np.array(array, to.dtype)) for array, to in pairs])
+            return self.world.map(lambda _: next(tensors))
+        self.copied.synchronize()  # the last world may still be on its way
+        for buffer, array in zip(self.arrays, leaves(world), strict=True):
+            np.copyto(buffer, array, casting="unsafe")
+        sent = self.world.map(lambda leaf: leaf.to(self.device, non_blocking=True))
+        self.copied.record()
+        return sent
+
+    def receive(self, actions: Tree) -> Tree:
+        """Returns actions as arrays, once the device has chosen them. They are valid until the next
+        call.
+        """
+        if self.copied is None:
+            return spaces.map(lambda _, leaf: leaf.numpy(), self.actions, actions)
+        spaces.map(lambda to, leaf: to.copy_(leaf, non_blocking=True), self.actions, actions)
+        self.copied.record()
+        self.copied.synchronize()
+        return spaces.map(lambda leaf: leaf.numpy(), self.actions)
+
+
+def _as_frame(rendered) -> np.ndarray:
+    """Returns a rendered frame as (H, W, 3) uint8.
+
+    Args:
+        rendered: (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), of which the last channel is left out;
+            uint8, other integers or floats from 0 to 255, or floats from 0 to 1.
+
+    Raises:
+        ValueError: it is none of these.
+    """
+    frame = np.asarray(rendered)
+    frame = frame[..., None] if frame.ndim == 2 else frame
+    is_number = np.issubdtype(frame.dtype, np.number) or frame.dtype == bool
+    if frame.ndim != 3 or frame.shape[-1] not in (1, 3, 4) or not is_number or not frame.size:
+        kind = f"{frame.dtype} of shape {frame.shape}"
+        kind = "None" if rendered is None else kind
+        raise ValueError(f"render() returned {kind}, not an image of shape (H, W, 3)")
+    if frame.dtype != np.uint8:
+        is_fraction = not np.issubdtype(frame.dtype, np.integer) and frame.max() <= MAX_FRACTION
+        frame = np.nan_to_num(frame.astype(np.float64)) * (255 if is_fraction else 1)
+        if frame.min() < -0.5 or frame.max() > (MAX_FRACTION * 255 if is_fraction else 255.5):
+            raise ValueError(
+                f"render() returned numbers from {frame.min():g} to {frame.max():g}; an image has "
+                "uint8, or floats from 0 to 1 or 0 to 255"
+            )
+        frame = np.clip(np.rint(frame), 0, 255).astype(np.uint8)
+    return np.array(np.broadcast_to(frame[..., :3], (*frame.shape[:2], 3)))
