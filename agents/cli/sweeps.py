@@ -437,9 +437,9 @@ def _pooled(rows) -> tuple[list[str], list[list[str]]] | None:
             scores.setdefault(", ".join(varied) or "all", []).append(row["score"])
     if all(len(values) < 2 for values in scores.values()):
         return None
-    from megastep.agents.reports import statistics  # with NumPy, which errors do not need
+    from megastep.agents.reports import seeds  # with NumPy, which errors do not need
 
-    return [text.format("episode/return") for text in statistics.POOLED], statistics.pooled(scores)
+    return [text.format("episode/return") for text in seeds.POOLED], seeds.pooled(scores)
 
 
 def _brief(value: object) -> str:

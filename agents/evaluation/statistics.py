@@ -12,6 +12,16 @@ if TYPE_CHECKING:
     from megastep.agents.types import Row
 
 
+def resamples(n: int, n_resamples: int = 2000, seed: int = 1) -> np.ndarray:
+    """Returns indices for a bootstrap, (n_resamples, n): each row draws n of n with replacement."""
+    return np.random.default_rng(seed).integers(n, size=(n_resamples, n))
+
+
+def bounds(resampled: ArrayLike, level: float = 0.95, axis: int | None = None) -> np.ndarray:
+    """Returns the lower and upper bound of a percentile bootstrap; NaN is left out."""
+    return np.nanquantile(resampled, [(1 - level) / 2, (1 + level) / 2], axis=axis)
+
+
 def interval(
     values: ArrayLike,
     groups: ArrayLike | None = None,
@@ -36,9 +46,8 @@ def interval(
         groups = np.arange(len(values))
     _, groups = np.unique(groups, return_inverse=True)
     sums, counts = np.bincount(groups, values), np.bincount(groups)
-    resamples = np.random.default_rng(seed).integers(len(sums), size=(n_resamples, len(sums)))
-    means = sums[resamples].sum(1) / counts[resamples].sum(1)
-    lower, upper = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    drawn = resamples(len(sums), n_resamples, seed)
+    lower, upper = bounds(sums[drawn].sum(1) / counts[drawn].sum(1), level)
     return float(values.mean()), float(lower), float(upper)
 
 
@@ -101,15 +110,14 @@ def worst_homes(
     # of homes with equal scores, those that do worse by the next score come first
     order = np.lexsort([means[name] for name in reversed(SCORES) if name in means])
     n_worst, n_homes = max(1, round(TAIL * len(numbers))), len(numbers)
-    resamples = np.random.default_rng(seed).integers(n_homes, size=(n_resamples, n_homes))
-    worst = order[np.sort(order.argsort()[resamples], 1)[:, :n_worst]]
+    drawn = resamples(n_homes, n_resamples, seed)
+    worst = order[np.sort(order.argsort()[drawn], 1)[:, :n_worst]]
     result = {}
     for name, by_home in means.items():
         mean, resampled = _finite_mean(by_home[order[:n_worst]]), _finite_mean(by_home[worst])
         numbers_in_worst = [None] * 3
         if np.isfinite(mean):
-            levels = [(1 - level) / 2, (1 + level) / 2]
-            numbers_in_worst = [float(mean), *np.nanquantile(resampled, levels).tolist()]
+            numbers_in_worst = [float(mean), *bounds(resampled, level).tolist()]
         result[name] = dict(zip(("mean", "lower", "upper"), numbers_in_worst, strict=True))
     return numbers[order[:n_worst]], result
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.reports import runs, statistics
+from megastep.agents.reports import runs, seeds
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.settings import closest
 
@@ -39,7 +39,7 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     axes = figure.subplots()
     for name, group in groups.items():
-        one = statistics.band([run.curve(metric) for run in group])
+        one = seeds.band([run.curve(metric) for run in group])
         (line,) = axes.plot(one["x"], one["mean"], label=f"{name} ({len(group)})")
         axes.fill_between(one["x"], one["lower"], one["upper"], alpha=0.2, color=line.get_color())
         columns = zip(*(one[key].tolist() for key in ("x", "mean", "lower", "upper")), strict=True)
@@ -57,7 +57,7 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file.with_suffix(".csv"), text.getvalue().encode())
         write_atomically(file, plot.getvalue())
-    head = [text.format(metric) for text in statistics.POOLED]
-    rows = statistics.pooled(scores)
+    head = [text.format(metric) for text in seeds.POOLED]
+    rows = seeds.pooled(scores)
     console.say(console.table(head, rows, width=console.terminal_width()))
     return file

@@ -16,7 +16,7 @@ import numpy as np
 from megastep.agents import console
 from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import tables
-from megastep.agents.reports import homes, populations, runs, statistics
+from megastep.agents.reports import homes, populations, runs, seeds
 from megastep.agents.runs import checkpoint
 from megastep.agents.runs.atomic_files import write_atomically
 
@@ -148,7 +148,7 @@ def _several(every: list[runs.Run], charts: list) -> str:
         cells = [name, str(len(group))]
         if values:
             scored[name] = values
-            middle, lower, upper = statistics.interval([values])
+            middle, lower, upper = seeds.interval([values])
             cells += [f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}", f"{np.mean(values):.4g}"]
         rows.append([*cells, *["none"] * (5 - len(cells)), f"{samples:,}"])
     parts += ["<h2>Results</h2>", _table(head, rows)]
@@ -168,7 +168,7 @@ def _profiles(scored: Mapping[str, list[float]], charts: list) -> str:
     every = np.concatenate([*scored.values()])
     limits = np.linspace(every.min() - 1e-9, every.max(), 200)
     lines = [
-        dict(label=name, colour=i, is_bound=False, y=_plain(statistics.profile([values], limits)))
+        dict(label=name, colour=i, is_bound=False, y=_plain(seeds.profile([values], limits)))
         for i, (name, values) in enumerate(scored.items())
     ]
     chart = dict(id="profiles", title="seeds above a return", x_label="return", sync="profiles")
@@ -207,7 +207,7 @@ def _charts(names: list[str], groups: Sequence[tuple[list, str]], charts: list) 
 
 def _averaged(curves: Sequence, labels: list[str]) -> tuple[list, list, list]:
     """Returns (x, lines, bands) of groups of curves, on one axis."""
-    averaged = [statistics.band(group) for group in curves]
+    averaged = [seeds.band(group) for group in curves]
     x = np.unique(np.concatenate([one["x"] for one in averaged]))
     x = x[:: max(1, len(x) // N_POINTS)]
     lines, bands = [], []

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from megastep.agents.evaluation.statistics import bounds, resamples
+
 
 def iqm(scores: ArrayLike) -> float:
     """Returns the interquartile mean: of the middle half of all scores, of any shape. A quarter of
@@ -40,7 +42,7 @@ def interval(
     for _ in range(n_resamples):
         drawn = [task[draw.integers(len(task), size=len(task))] for task in tasks]
         resampled.append(statistic(np.concatenate(drawn)))
-    lower, upper = np.quantile(resampled, [(1 - level) / 2, (1 + level) / 2])
+    lower, upper = bounds(resampled, level)
     return statistic(np.concatenate(tasks)), float(lower), float(upper)
 
 
@@ -88,7 +90,6 @@ def band(
     end = max(start, min(np.max(x) for x, _ in curves))
     x = np.linspace(start, end, n_points)
     values = np.stack([np.interp(x, np.asarray(at), np.asarray(y)) for at, y in curves])
-    draws = np.random.default_rng(seed).integers(len(curves), size=(n_resamples, len(curves)))
-    means = values[draws].mean(1)
-    lower, upper = np.quantile(means, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    means = values[resamples(len(curves), n_resamples, seed)].mean(1)
+    lower, upper = bounds(means, level, axis=0)
     return {"x": x, "mean": values.mean(0), "lower": lower, "upper": upper}
