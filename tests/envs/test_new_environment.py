@@ -75,21 +75,6 @@ def test_rover_is_rewarded_for_metres_and_ends_at_walls(names):
     assert max(float(world.reward.max()) for world in worlds) < 0.5, "at most 4 m/s for 0.1 s"
 
 
-def test_fetch_is_rewarded_at_targets_which_then_move(names):
-    env = names["Fetch"](n_envs=64, device="cpu", limit=50)
-    worlds = contract.rollout(env, 100)
-    assert 0 < sum(world.reward.sum() for world in worlds) < 640
-    env.reset()
-    env.core.agents.positions[:32] = env.targets[:32]
-    there, before = torch.arange(64) < 32, env.targets.clone()
-    away = (env.core.agents.positions - env.targets).norm(dim=-1)[:, 0] > 0.4
-    world = env.step(arrdict.arrdict(actions=torch.zeros(64, 1, dtype=torch.int64)))
-    assert world.reward[there].all() and (env.targets != before)[there].any(-1).all()
-    assert away.sum() > 20 and torch.equal(env.targets[away], before[away])
-    offsets = (env.targets - env.core.agents.positions).norm(dim=-1)
-    assert torch.allclose(world.obs.target.norm(dim=-1), offsets, atol=1e-4)
-
-
 def test_rover_is_displayed(names):
     env = names["Rover"](n_envs=2, device="cpu")
     env.reset()
