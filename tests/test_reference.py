@@ -9,7 +9,7 @@ import reference
 from megastep import envs, toys
 from megastep.agents import errors
 from megastep.agents.cli import train
-from megastep.agents.launch import rank
+from megastep.agents.launch import endings
 from tests.helpers.pages import ROOT
 from tests.helpers.tiny import TINY
 
@@ -77,7 +77,7 @@ def test_an_unknown_metric_is_found():
 
 def test_exit_codes_are_described():
     kinds = [errors.UserError, *errors.UserError.__subclasses__()]
-    assert {0, rank.LOST, *(kind.code for kind in kinds)} <= {*errors.EXIT_CODES}
+    assert {0, endings.LOST, *(kind.code for kind in kinds)} <= {*errors.EXIT_CODES}
 
 
 def test_docstrings_become_markdown():

@@ -15,7 +15,7 @@ from megastep.agents import console, package
 from megastep.agents.cli import compose, scripts, sweeps
 from megastep.agents.errors import user_errors
 from megastep.agents.factory import check
-from megastep.agents.launch import gpu, rank, signals
+from megastep.agents.launch import endings, gpu, rank
 
 #: Hydra's options: their names, and argparse's arguments.
 OPTIONS = {
@@ -57,7 +57,7 @@ def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     try:
         words = [script.reword(without_dashes(word)) for word in words]
-        ending = signals.ending_of(lambda: _run(script, words))
+        ending = endings.ending_of(lambda: _run(script, words))
     finally:
         sys.argv[:] = arguments
     if ending.text:

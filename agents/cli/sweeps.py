@@ -113,7 +113,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
     _, jobs, config = jobs_of(composer, words)
-    idle = gpu_slots.check(jobs, config)
+    gpu_slots.check(jobs, config)
     folder = Path(config.sweep.dir)
     if UNDECODED.search(str(folder.absolute())):  # which the settings of jobs hold as text
         raise UserError(f"{str(folder.absolute())!r} {NO_TEXT}")
@@ -138,8 +138,6 @@ def sweep(composer: Composer, words: list[str]) -> int:
         os.environ["PYTHONPATH"] = os.pathsep.join(
             filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
         )
-    if idle:
-        console.say(idle)
     job, problem = new_job(composer, folder), ""
     try:
         with _lock(job.path("sweep.lock")):

@@ -1,4 +1,4 @@
-"""Detects ranks that differ in weights, code or configuration."""
+"""Detects ranks whose weights differ."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import torch
 
 from megastep.agents.distributed.pooling import all_gather
-from megastep.agents.distributed.process_group import gather_objects, n_ranks, waiting
+from megastep.agents.distributed.process_group import n_ranks, waiting
 
 #: Integer dtype of each item size, to view the bits of floats.
 INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
@@ -36,7 +36,7 @@ def first_difference(policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()
         rows = all_gather(checksums(tensors.values())).T.tolist()
     for name, sums in zip(tensors, rows, strict=True):
         if different := [rank for rank, value in enumerate(sums) if value != sums[0]]:
-            return f"policy.{name} differs on {_ranks(different)}"
+            return f"policy.{name} differs on {ranks_named(different)}"
     return None
 
 
@@ -56,37 +56,11 @@ def check_drift(policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()) -> 
 def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
     """Returns the sum of the bits of each of n tensors as integers, mod 2^64: (n,) int64."""
     with torch.no_grad():
-        parts = [_bits(tensor.detach()).sum(dtype=torch.int64) for tensor in tensors]
-        return torch.stack(parts) if parts else torch.zeros(0, dtype=torch.int64)
+        bits = [tensor.detach().view(INTEGERS[tensor.element_size()]) for tensor in tensors]
+        return torch.stack([part.sum(dtype=torch.int64) for part in bits])
 
 
-def _bits(tensor) -> torch.Tensor:
-    if tensor.is_complex():
-        tensor = torch.view_as_real(tensor)
-    return tensor if tensor.dtype == torch.bool else tensor.view(INTEGERS[tensor.element_size()])
-
-
-def first_differing_fact(facts: dict[str, object]) -> str | None:
-    """Compares facts, such as versions and settings, of all ranks. Waits for the other ranks.
-
-    Args:
-        facts: this rank's facts by name, the most important first.
-
-    Returns:
-        The first that differs, such as `learner.lr is 0.001 on rank 0, and 0.01 on ranks 1 and 3`;
-        None if all are equal.
-    """
-    everyones = gather_objects({name: str(value) for name, value in facts.items()})
-    for name in dict.fromkeys(name for theirs in everyones for name in theirs):
-        holders: dict[str, list[int]] = {}
-        for rank, theirs in enumerate(everyones):
-            holders.setdefault(theirs.get(name, "missing"), []).append(rank)
-        if len(holders) > 1:
-            values = (f"{value} on {_ranks(ranks)}" for value, ranks in holders.items())
-            return f"{name} is {', and '.join(values)}"
-    return None
-
-
-def _ranks(ranks) -> str:
+def ranks_named(ranks: Sequence[int]) -> str:
+    """Returns `rank 1` or `ranks 1, 2 and 5`."""
     *others, last = map(str, ranks)
     return f"ranks {', '.join(others)} and {last}" if others else f"rank {last}"

@@ -2,10 +2,8 @@
 takes seconds.
 """
 
-import contextlib
 import os
 import socket
-from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 NAMES = "RANK", "WORLD_SIZE", "LOCAL_RANK"
@@ -67,17 +65,3 @@ def is_first_here() -> bool:
 
 def hostname() -> str:
     return socket.gethostname()
-
-
-@contextlib.contextmanager
-def variables(changes: Mapping[str, str]) -> Iterator[None]:
-    """Sets environment variables for the duration of the context. Child processes inherit them."""
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, text in before.items():
-            os.environ.pop(name, None)
-            if text is not None:
-                os.environ[name] = text

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import dataclasses
 import datetime
 import faulthandler
 import functools
 import itertools
+import json
 import os
 import secrets
 from collections.abc import Iterator, Sequence
@@ -32,66 +34,77 @@ T = TypeVar("T")
 #: it, and a rank must have left.
 START_SECONDS, CONNECT_SECONDS, STOP_SECONDS = 300.0, 50.0, 30.0
 
-#: Limit of an operation on the host.
+#: Limit of an operation. A rank may evaluate or write files for long: `watch` finds those that are
+#: lost.
 LONGEST_WAIT = datetime.timedelta(days=1)
+
+#: Counts the starts of this process, equally on all ranks.
+_STARTS = itertools.count()
 
 
 class RankLost(RuntimeError):
     """Another rank has ended or does not answer."""
 
 
-class Counts:
-    """Progress of this rank, which `watch` compares.
+@dataclasses.dataclass
+class Heartbeat:
+    """The progress of a rank, which `watch` compares.
 
     Attributes:
+        host: name of its machine.
+        number: counts heartbeats.
         n_operations: collective operations started.
         n_updates: updates that the ranks have agreed to start.
         n_phases: phases of updates that the GPU has finished.
-        is_exempt: True while the others wait for this rank without limit.
+        is_exempt: True while the others wait for this rank without limit, as during an evaluation.
         is_waiting: True while it waits for the others.
+        has_left: True once it is done and no longer monitored.
     """
 
-    n_operations = n_updates = n_phases = 0
-    is_exempt = is_waiting = False
+    host: str
+    number: int = 0
+    n_operations: int = 0
+    n_updates: int = 0
+    n_phases: int = 0
+    is_exempt: bool = False
+    is_waiting: bool = False
+    has_left: bool = False
 
     def finish_phase(self) -> None:
         self.n_phases += 1
 
 
-counts = Counts()
+counts = Heartbeat(hostname())
 
 
 @contextlib.contextmanager
-def unhurried() -> Iterator[None]:
+def _flagged(name: str) -> Iterator[None]:
+    before = getattr(counts, name)
+    setattr(counts, name, True)
+    try:
+        yield
+    finally:
+        setattr(counts, name, before)
+
+
+def unhurried() -> contextlib._GeneratorContextManager[None]:
     """Lets the other ranks wait for this one without limit, for example while it evaluates.
 
-    Otherwise a rank counts as hung once the others have waited `watch.LOST_SECONDS` for it.
+    Otherwise a rank counts as hung once the others have waited `watch.HUNG_SECONDS` for it.
     """
-    counts.is_exempt, before = True, counts.is_exempt
-    try:
-        yield
-    finally:
-        counts.is_exempt = before
+    return _flagged("is_exempt")
 
 
-@contextlib.contextmanager
-def waiting() -> Iterator[None]:
-    """Wraps a wait for other ranks. If all ranks wait for `watch.STALLED_SECONDS` in the same
+def waiting() -> contextlib._GeneratorContextManager[None]:
+    """Wraps a wait for other ranks. If all ranks wait for `watch.HUNG_SECONDS` in the same
     operation, they cannot reach each other.
     """
-    counts.is_waiting, before = True, counts.is_waiting
-    try:
-        yield
-    finally:
-        counts.is_waiting = before
+    return _flagged("is_waiting")
 
 
-def start(seconds: float = START_SECONDS) -> None:
+def start() -> None:
     """Joins the ranks that torchrun started; returns when all have joined. A no-op in a single
     process, or if this one has joined already.
-
-    Args:
-        seconds: time limit.
 
     Raises:
         RuntimeError, ValueError: the ranks cannot connect.
@@ -100,28 +113,28 @@ def start(seconds: float = START_SECONDS) -> None:
     if info is None or distributed.is_initialized():
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-    wait = datetime.timedelta(seconds=seconds)
     # a new prefix: after a restart the store may still hold addresses of the ended ranks
-    name = f"ranks {token()} {meeting.name or info.attempt} {next(_STARTS)}"
-    keys = _prefixed(name, _store())
+    keys = store(f"ranks {meeting.name or info.attempt} {next(_STARTS)}")
+    options: dict = dict(rank=info.rank, world_size=info.n_ranks, timeout=LONGEST_WAIT)
     with waiting():
-        distributed.init_process_group(
-            backend, store=keys, rank=info.rank, world_size=info.n_ranks, timeout=wait
-        )
-    # a rank may evaluate or write files for longer; `watch` finds those that are lost
-    ranks = distributed.group.WORLD
-    assert ranks is not None
-    on_host = ranks._get_backend(torch.device("cpu"))
-    on_host._set_default_timeout(LONGEST_WAIT)
+        distributed.init_process_group(backend, store=keys, **options)
     atexit.register(stop)  # gloo threads must not outlive the interpreter
 
 
-_STARTS = itertools.count()
+def stop() -> None:
+    """Leaves the process group. If that takes longer than `STOP_SECONDS`, the process ends with
+    exit code 1, whatever blocks it: there is nothing left to save.
+    """
+    if distributed.is_initialized():
+        with open(os.devnull, "w") as nowhere:
+            faulthandler.dump_traceback_later(STOP_SECONDS, file=nowhere, exit=True)
+            distributed.destroy_process_group()
+            faulthandler.cancel_dump_traceback_later()
 
 
 @functools.cache
 def _store() -> Store:
-    """Returns the ranks' key-value store, which torchrun's agent hosts, or else rank 0."""
+    """Returns the ranks' key-value store, which whoever started the ranks hosts, or else rank 0."""
     info = rank_info()
     return _connection(info is not None and info.rank == 0 and not _has_agent())
 
@@ -140,18 +153,17 @@ def _connection(is_master=False) -> TCPStore:
     )
 
 
-def store(name: str) -> Store:
-    """Opens another connection to the ranks' key-value store, for use by another thread.
+def store(name: str, is_shared: bool = True) -> Store:
+    """Returns the ranks' key-value store.
 
     Args:
         name: prefix of its keys.
+        is_shared: uses the connection of this process. False opens one for another thread.
     """
-    _store()  # where rank 0 hosts it, it must do so first
-    return _prefixed(f"megastep {token()} {name}", _connection())
-
-
-def _prefixed(name: str, keys: Store) -> Store:
-    return distributed.PrefixStore(name, keys)  # pyright: ignore[reportPrivateImportUsage]
+    keys = _store()  # where rank 0 hosts it, it must do so first
+    return distributed.PrefixStore(  # pyright: ignore[reportPrivateImportUsage]
+        f"megastep {token()} {name}", keys if is_shared else _connection()
+    )
 
 
 class Meeting:
@@ -171,34 +183,23 @@ class Meeting:
         """Returns the name, or None if rank 0 has not started. Rank 0 calls this until all have."""
         info = rank_info()
         assert info is not None
-        keys = _prefixed(f"megastep {token()} meeting", _store())
+        keys = store("meeting")
         if self.name is None:
             keys.set(f"{info.rank}", self._own)
         if info.rank == 0:
             # the store may hold what ended ranks have left; those that start replace it
             names = (f"{rank}" for rank in range(info.n_ranks))
             everyones = [keys.get(name).decode() if keys.check([name]) else "" for name in names]
-            keys.set("everyone", " ".join(one or "-" for one in everyones))
+            keys.set("everyone", json.dumps(everyones))
             self.name = self._own
         elif self.name is None and keys.check(["everyone"]):
-            first, *others = keys.get("everyone").decode().split(" ")
-            if others[info.rank - 1 : info.rank] == [self._own]:
-                self.name = first
+            everyones = json.loads(keys.get("everyone"))
+            if self._own in everyones:
+                self.name = everyones[0]
         return self.name
 
 
 meeting = Meeting()
-
-
-def stop() -> None:
-    """Leaves the process group. If that takes longer than `STOP_SECONDS`, the process ends with
-    exit code 1, whatever blocks it: there is nothing left to save.
-    """
-    if distributed.is_initialized():
-        with open(os.devnull, "w") as nowhere:
-            faulthandler.dump_traceback_later(STOP_SECONDS, file=nowhere, exit=True)
-            distributed.destroy_process_group()
-            faulthandler.cancel_dump_traceback_later()
 
 
 def rank() -> int:

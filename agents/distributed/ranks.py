@@ -31,7 +31,7 @@ class Ranks(NamedTuple):
 
     def any(self, condition: bool) -> bool:
         """Returns whether a condition is true on any rank."""
-        return condition if self.n == 1 else agreement.any_rank(condition)
+        return any(is_true for (is_true,) in self.exchange([condition]))
 
     def from_first(self, function: Callable[[], T]) -> T:
         """Calls a function on rank 0. Returns its result, or raises its error, on every rank."""

@@ -1,8 +1,7 @@
 """Records a function as several CUDA graphs, with collective operations between them.
 
 NCCL collectives inside CUDA graphs can deadlock, since graphs of different processes may start in
-different orders on a GPU's queues. So they are called between graphs. What may be inside a graph is
-`symmetric_memory.all_reduce_`.
+different orders on a GPU's queues. `symmetric_memory.all_reduce_` cannot.
 """
 
 from __future__ import annotations
@@ -26,8 +25,10 @@ def between_graphs(call: Callable[[], object]) -> None:
     """
     if _recording is None:
         call()
-    else:
-        _recording.split(call)
+        return
+    _recording.end()
+    _recording.parts.append(call)
+    _recording.begin()
 
 
 class SegmentedGraph:
@@ -59,33 +60,29 @@ class SegmentedGraph:
         _recording = self
         try:
             with torch.cuda.stream(stream):
-                self._begin()
+                self.begin()
                 try:
                     self.output = function()
                 finally:  # raises a second error if the function failed
-                    self._end()
+                    self.end()
         except RuntimeError as error:
             end_failed_recording()
             raise error.__context__ or error from None  # the first error is the informative one
         finally:
             _recording = None
 
-    def _begin(self) -> None:
+    def begin(self) -> None:
+        """Begins to record the next graph."""
         self.graph = torch.cuda.CUDAGraph()
         for generator in self.generators:
             self.graph.register_generator_state(generator)
         # thread_local, since NCCL's threads may query events meanwhile
         self.graph.capture_begin(self.pool, capture_error_mode="thread_local")
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """Ends a graph."""
         self.graph.capture_end()
         self.parts.append(self.graph.replay)
-
-    def split(self, call: Callable[[], object]) -> None:
-        """Ends a graph, adds a call and begins another graph."""
-        self._end()
-        self.parts.append(call)
-        self._begin()
 
     def replay(self) -> None:
         """Runs the recorded graphs and the calls between them."""

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
 
-from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu, launcher
@@ -27,15 +26,12 @@ T = TypeVar("T", bound=settings.Common)
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
-def check(jobs: Sequence, hydra: Any) -> str | None:
+def check(jobs: Sequence, hydra: Any) -> None:
     """Checks that every job has a GPU per rank, before the first job starts.
 
     Args:
         jobs: the settings of each job.
         hydra: Hydra's part of the configuration.
-
-    Returns:
-        A sentence about idle GPUs; None if there are none.
 
     Raises:
         ConfigErrors: a job has more ranks than there are GPUs, or Hydra's launcher would run each
@@ -45,50 +41,22 @@ def check(jobs: Sequence, hydra: Any) -> str | None:
     for key in ("nodes", "tasks_per_node"):
         if (n_times := options.get(key) or 1) > 1:
             text = (
-                f"{n_times} would run each job {n_times} times; a job is one task on one node, and"
+                f"{n_times} would run each job {n_times} times; a job is one task on one node, and "
+                "starts its ranks itself; docs/scaling.md has a script for several nodes"
             )
-            text = f"{text} starts its ranks itself; docs/scaling.md has a script for several nodes"
             raise ConfigErrors([(f"hydra.launcher.{key}", text)])
-    hints = []
     for cfg in filter(_has_ranks, jobs):
-        if kind == "submitit_slurm":
-            hints.append(_check_on_node(cfg, options.get("gpus_per_node") or 0))
+        if kind != "submitit_slurm":
+            launcher.n_ranks(cfg)
             continue
-        n_ranks, n_gpus = launcher.n_ranks(cfg), gpu.count() if cfg.device != "cpu" else 0
-        if n_ranks > 1 and n_gpus and len(jobs) > 1:
-            hints.append(idle(n_ranks, n_gpus, is_parallel=kind != "basic"))
-    return next(filter(None, hints), None)
-
-
-def _check_on_node(cfg, n_gpus) -> str | None:
-    # Slurm assigns the GPUs, so those of this machine do not matter
-    if not n_gpus or cfg.ranks == "all" or cfg.device == "cpu":
-        return None
-    given = f"hydra.launcher.gpus_per_node={n_gpus}"
-    if cfg.ranks > n_gpus:
-        text = f"{cfg.ranks} is more than {given}, and a job is on one node; docs/scaling.md has a"
-        raise ConfigErrors([("ranks", f"{text} script for several nodes")])
-    if cfg.ranks < n_gpus:
-        return f"Jobs with ranks={cfg.ranks} leave {n_gpus - cfg.ranks} idle of {given}."
-
-
-def idle(n_ranks: int, n_gpus: int, is_parallel: bool) -> str | None:
-    """Returns a sentence about the GPUs that jobs leave idle; None if there are none.
-
-    Args:
-        n_ranks: ranks per job, at most `n_gpus`.
-        n_gpus: GPUs of this machine.
-        is_parallel: jobs run at the same time.
-    """
-    n_slots = n_gpus // n_ranks
-    n_idle = n_gpus - n_ranks * (n_slots if is_parallel else 1)
-    if not n_idle:
-        return None
-    if is_parallel or n_slots == 1:
-        return f"Jobs with ranks={n_ranks} leave {n_idle} of {n_gpus} GPUs idle."
-    which = f"Jobs with ranks={n_ranks} that run one after another"
-    cure = f"hydra/launcher=joblib hydra.launcher.n_jobs={n_slots} runs {n_slots} at a time"
-    return f"{which} leave {n_idle} of {n_gpus} GPUs idle; {cure}."
+        # Slurm assigns the GPUs, so those of this machine do not matter
+        n_gpus = options.get("gpus_per_node") or 0
+        if n_gpus and cfg.ranks != "all" and cfg.device != "cpu" and int(cfg.ranks) > n_gpus:
+            text = (
+                f"{cfg.ranks} is more than hydra.launcher.gpus_per_node={n_gpus}, and a job is on "
+                "one node; docs/scaling.md has a script for several nodes"
+            )
+            raise ConfigErrors([("ranks", text)])
 
 
 @contextlib.contextmanager
@@ -106,28 +74,36 @@ def taken(cfg: T) -> Iterator[T]:
         The settings; device=cuda is replaced by the GPU's number, such as cuda:1.
     """
     n_gpus = gpu.count() if cfg.device in ("auto", "cuda") else 0
-    with contextlib.ExitStack() as stack:
-        if n_gpus > 1:
-            names = _names(n_gpus)
-            if _has_ranks(cfg):
-                slot = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
-                visible = {VISIBLE: ",".join(names[i] for i in slot)}
-                stack.enter_context(environment.variables(visible))
-            else:
-                (number,) = stack.enter_context(_locked(names, 1))
-                cfg = _on_gpu(cfg, number, stack)
+    if n_gpus < 2:
         yield cfg
+        return
+    # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
+    visible = os.environ.get(VISIBLE) or ",".join(map(str, range(n_gpus)))
+    names = [name.strip() for name in visible.split(",")][:n_gpus]
+    with contextlib.ExitStack() as stack:
+        if _has_ranks(cfg):
+            slot = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
+            stack.callback(_make_visible, os.environ.get(VISIBLE))
+            _make_visible(",".join(names[i] for i in slot))
+        else:
+            import torch
+
+            (number,) = stack.enter_context(_locked(names, 1))
+            stack.callback(torch.cuda.set_device, torch.cuda.current_device())
+            torch.cuda.set_device(number)
+            if cfg.device == "cuda":
+                cfg = settings.changed(cfg, device=f"cuda:{number}")
+        yield cfg
+
+
+def _make_visible(names) -> None:
+    os.environ.pop(VISIBLE, None)
+    if names is not None:
+        os.environ[VISIBLE] = names
 
 
 def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
-
-
-def _names(n_gpus) -> list[str]:
-    # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
-    if visible := os.environ.get(VISIBLE):
-        return [name.strip() for name in visible.split(",")][:n_gpus]
-    return [*map(str, range(n_gpus))]
 
 
 @contextlib.contextmanager
@@ -157,12 +133,3 @@ def _lock(names) -> "ExitStack | None":
             path = Path(tempfile.gettempdir(), prefix + re.sub(r"[^\w-]", "-", name) + ".lock")
             stack.enter_context(filelock.FileLock(path, blocking=False))
         return stack.pop_all()
-
-
-def _on_gpu(cfg: T, number: int, stack: contextlib.ExitStack) -> T:
-    """Makes a GPU the current device until the stack closes. Returns settings that use it."""
-    import torch
-
-    stack.callback(torch.cuda.set_device, torch.cuda.current_device())
-    torch.cuda.set_device(number)
-    return settings.changed(cfg, device=f"cuda:{number}") if cfg.device == "cuda" else cfg

@@ -24,7 +24,7 @@ from megastep.agents import console, package
 from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors, user_errors
 from megastep.agents.factory import check, settings
-from megastep.agents.launch import gpu, rank, signals
+from megastep.agents.launch import endings, gpu, signals
 from megastep.agents.runs import typed_json
 
 ADDRESS = "127.0.0.1"
@@ -108,9 +108,9 @@ class Job:
             prefix=console.prefix,
             parent=os.getpid(),
         )
-        (folder / rank.SETTINGS).write_text(typed_json.dumps(facts))
+        (folder / endings.SETTINGS).write_text(typed_json.dumps(facts))
 
-    def run(self) -> signals.Ending:
+    def run(self) -> endings.Ending:
         """Runs the ranks, again after a loss or a crash if `restarts` allows. Returns how they
         ended.
         """
@@ -121,7 +121,7 @@ class Job:
         )
         store = None
         for attempt in range(self.cfg.restarts + 1):
-            (self.folder / rank.ENDING).unlink(missing_ok=True)
+            (self.folder / endings.ENDING).unlink(missing_ok=True)
             with signals.deferred():
                 self.start(shared | {"TORCHELASTIC_RESTART_COUNT": f"{attempt}"})
             store = store or opened_store(listener)  # while the ranks import modules
@@ -172,19 +172,19 @@ class Job:
         for process in self.processes:
             process.send_signal(number)
 
-    def ending(self, failure: tuple[int, int] | None) -> signals.Ending:
+    def ending(self, failure: tuple[int, int] | None) -> endings.Ending:
         """Returns what a rank wrote about its ending, otherwise what its exit code says."""
         with contextlib.suppress(FileNotFoundError):
-            return signals.Ending(*json.loads((self.folder / rank.ENDING).read_text()))
+            return endings.Ending(*json.loads((self.folder / endings.ENDING).read_text()))
         number, code = failure or (0, 0)
         text = f"ended with exit code {code}"
         if code < 0:
             name = signal.Signals(-code).name
             text = f"was killed by {name}" + ", perhaps out of memory" * (name == "SIGKILL")
-        path = self.folder / rank.RUN
-        hint = rank.hint(Path(path.read_text()) if path.exists() else None)
+        path = self.folder / endings.RUN
+        hint = endings.hint(Path(path.read_text()) if path.exists() else None)
         label = f"rank {number} on {environment.hostname()}"
-        return signals.Ending(rank.LOST, f"{label} {text}. {hint}")
+        return endings.Ending(endings.LOST, f"{label} {text}. {hint}")
 
 
 def opened_store(listener: socket.socket) -> object:
@@ -203,7 +203,7 @@ def opened_store(listener: socket.socket) -> object:
 def variables(job: Path, n_ranks: int) -> dict[str, str]:
     """Returns the environment variables that all ranks on this machine have beside its own."""
     changes = {
-        rank.JOB: str(job),
+        endings.JOB: str(job),
         "WORLD_SIZE": str(n_ranks),
         "LOCAL_WORLD_SIZE": str(n_ranks),
         "MASTER_ADDR": ADDRESS,

@@ -21,6 +21,7 @@ from megastep.agents.evaluation import in_training
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, compare, finishing, gpu, rank, rank_checks, signals
+from megastep.agents.launch.watch import Team
 from megastep.agents.population import decisions
 from megastep.agents.population.population import Learnt, Population, Turns, hosted
 from megastep.agents.runs import folders, populations, provenance
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 KEPT = 3
 
 
-def run(cfg: settings.Train, team: rank.Team | None = None) -> Path:
+def run(cfg: settings.Train, team: Team | None = None) -> Path:
     """Trains a population, of which each rank of a team hosts a part. Returns its folder.
 
     Raises:

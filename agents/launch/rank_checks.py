@@ -19,10 +19,11 @@ import torch
 from megastep.agents import factory, package
 from megastep.agents.distributed import environment, process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
-from megastep.agents.distributed.drift import first_difference, first_differing_fact
+from megastep.agents.distributed.drift import first_difference, ranks_named
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import check, settings
-from megastep.agents.launch.rank import STARTED, Team
+from megastep.agents.launch.endings import STARTED
+from megastep.agents.launch.watch import Team
 from megastep.agents.runs import checkpoint, folders, populations, provenance
 from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
@@ -42,25 +43,41 @@ def check_start(cfg: settings.Train) -> None:
             "megastep": package.version(),
             "the commit of the checkout": provenance.commit(package.ROOT),
         }
-        _check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
+        check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
 
 
 def check_world(cfg: settings.Train, trainer: Trainer) -> None:
     """Raises UserError if the ranks differ in geometries, spaces or initial weights."""
     if process_group.n_ranks() > 1:
         homes = factory.homes(cfg.env, cfg.geometry, "training")
-        _check_equal(
+        check_equal(
             {"the digest of the training homes": digest(homes), **trainer.saver.config["spaces"]}
         )
         if difference := first_difference(trainer.policy):
             raise UserError(f"The ranks start with different weights: {difference}")
 
 
-def _check_equal(facts) -> None:
-    if difference := first_differing_fact(facts):
-        raise UserError(
-            f"The ranks differ: {difference}; start all with the same code, packages and options"
-        )
+def check_equal(facts: dict[str, object]) -> None:
+    """Compares facts, such as versions and settings, of all ranks. Waits for the other ranks.
+
+    Args:
+        facts: this rank's facts by name, the most important first.
+
+    Raises:
+        UserError: with the first that differs, such as `learner.lr is 0.001 on rank 0, and 0.01 on
+            ranks 1 and 3`.
+    """
+    everyones = process_group.gather_objects({name: str(value) for name, value in facts.items()})
+    for name in dict.fromkeys(name for theirs in everyones for name in theirs):
+        holders: dict[str, list[int]] = {}
+        for rank, theirs in enumerate(everyones):
+            holders.setdefault(theirs.get(name, "missing"), []).append(rank)
+        if len(holders) > 1:
+            values = (f"{value} on {ranks_named(ranks)}" for value, ranks in holders.items())
+            raise UserError(
+                f"The ranks differ: {name} is {', and '.join(values)}; start all with the same "
+                "code, packages and options"
+            )
 
 
 def digest(homes: Iterable[dict]) -> str:

@@ -11,7 +11,7 @@ from megastep import workers
 from megastep.agents import console
 from megastep.agents.errors import shortened
 from megastep.agents.factory import check, settings
-from megastep.agents.launch import rank, signals, train
+from megastep.agents.launch import endings, train
 from megastep.agents.runs import typed_json
 
 
@@ -21,7 +21,7 @@ def main() -> int:
     Returns:
         The exit code: 0 if this rank's ending is final, otherwise the ranks may be restarted.
     """
-    facts = typed_json.loads(Path(os.environ[rank.JOB], rank.SETTINGS).read_text())
+    facts = typed_json.loads(Path(os.environ[endings.JOB], endings.SETTINGS).read_text())
     sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
     workers.end_with_parent(facts["parent"])
     console.open_streams()
@@ -35,11 +35,11 @@ def main() -> int:
         folder = train.run(check.check(settings.Train, facts["settings"]))
 
     try:
-        ending, code = signals.ending_of(work)._replace(folder=folder and str(folder)), 0
+        ending, code = endings.ending_of(work)._replace(folder=folder and str(folder)), 0
     except Exception as error:
         traceback.print_exc()
-        ending = signals.Ending(1, f"{type(error).__name__}: {shortened(error, 400)}")
+        ending = endings.Ending(1, f"{type(error).__name__}: {shortened(error, 400)}")
         code = 1
     if ending.text or ending.folder:
-        rank.report_ending(ending)
+        endings.report_ending(ending)
     return code

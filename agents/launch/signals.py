@@ -1,8 +1,6 @@
-"""How a script ends: an exit code and one sentence, or a signal.
-
-Signals are Ctrl-C, SIGTERM and SIGHUP, and SIGUSR1 and SIGUSR2, which clusters send before a job's
-time is up. The first stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit code
-is 128 plus the signal's number.
+"""Handles Ctrl-C, SIGTERM and SIGHUP, and SIGUSR1 and SIGUSR2, which clusters send before a job's
+time is up. The first signal stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit
+code is 128 plus the signal's number.
 """
 
 import contextlib
@@ -12,11 +10,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, NoReturn, TextIO, cast
+from typing import NoReturn, TextIO
 
 from megastep.agents import package
 from megastep.agents.distributed import environment
-from megastep.agents.errors import UserError, memory_problem
 
 #: Signals that end a script at once when they are repeated.
 QUITTING = (signal.SIGINT, signal.SIGTERM)
@@ -35,54 +32,6 @@ class Interrupted(BaseException):
         number: the signal's number.
         message: what was saved and how to continue.
     """
-
-
-class Ending(NamedTuple):
-    """How a script ended.
-
-    Attributes:
-        code: exit code of the process.
-        text: the error or the signal; empty after success, or if it was printed already.
-        folder: the run folder, after training finished.
-    """
-
-    code: int = 0
-    text: str = ""
-    folder: str | None = None
-
-    def raise_error(self) -> None:
-        """Raises the error or signal that ended the script, as UserError or Interrupted, if any."""
-        if self.code > 128:
-            raise Interrupted(self.code - 128, self.text)
-        if self.code:
-            error = UserError(self.text)
-            error.code = self.code
-            raise error
-
-
-def ending_of(work: Callable[[], int | None]) -> Ending:
-    """Calls a function and returns how it ended.
-
-    Args:
-        work: returns an exit code, None for 0.
-
-    Raises:
-        Exception: errors that the user cannot fix, such as bugs.
-    """
-    try:
-        with interrupting():
-            return Ending(work() or 0)
-    except SystemExit as end:  # from argparse, Hydra's help, or a rank that exits silently
-        return Ending(cast(int, end.code or 0))
-    except UserError as error:
-        return Ending(error.code, str(error))
-    except (MemoryError, RuntimeError) as error:
-        if not (problem := memory_problem(error)):
-            raise
-        cure = "choose fewer environments or episodes, or a smaller network"
-        return Ending(UserError.code, f"{problem}; {cure}")
-    except Interrupted as stop:
-        return Ending(128 + stop.args[0], stop.args[1])
 
 
 def announce(number: int) -> None:

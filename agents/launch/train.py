@@ -35,6 +35,7 @@ from megastep.agents.launch import (
     rank_checks,
     signals,
 )
+from megastep.agents.launch.watch import Team
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training import curves
 from megastep.agents.training.progress import progress_of
@@ -80,7 +81,7 @@ def run(cfg: settings.Train) -> Path | None:
         return train_here(cfg, team)
 
 
-def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
+def train_here(cfg: settings.Train, team: Team | None) -> Path:
     """Trains in this process, alone or as one rank of a team. Returns the run folder."""
     is_first = process_group.rank() == 0
     device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))

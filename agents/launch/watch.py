@@ -1,4 +1,5 @@
-"""Detects ranks that were killed or hang, in a thread of each rank, and ends the others.
+"""The team of ranks: detects those that were killed or hang, in a thread of each rank, and ends the
+others.
 
 Every rank writes a heartbeat to torchrun's key-value store and reads those of all. The first to
 detect a loss tells the others through the store.
@@ -12,6 +13,7 @@ that the store no longer answers, whatever its other threads are blocked in.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import json
 import math
@@ -21,9 +23,14 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeVar
+from pathlib import Path
+from typing import NoReturn, TypeVar
 
+from megastep.agents import console
 from megastep.agents.distributed import environment, process_group
+from megastep.agents.distributed.process_group import Heartbeat, counts
+from megastep.agents.errors import UserError
+from megastep.agents.launch import endings
 
 #: Seconds between heartbeats.
 PERIOD = 2.0
@@ -37,6 +44,8 @@ PATIENCE = 5
 #: Seconds without an answer of the store after which a rank ends. Together with the seconds of its
 #: last words, below a minute.
 SILENT_SECONDS = 45.0
+#: Seconds after which ranks that have not started yet are named.
+NOTICE_SECONDS = 30.0
 #: Seconds for one call that something lost may block for ever.
 CALL_SECONDS = 4.0
 
@@ -44,30 +53,6 @@ T = TypeVar("T")
 
 #: Numbers the watches of this process, equally on all ranks, so that each has its own keys.
 NUMBERS = itertools.count()
-
-
-class Heartbeat(NamedTuple):
-    """The progress of a rank.
-
-    Attributes:
-        number: counts heartbeats.
-        n_operations: collective operations started.
-        n_updates: updates started.
-        n_phases: phases of updates that its GPU has finished.
-        is_exempt: True while the others wait for it without limit, as during an evaluation.
-        is_waiting: True while it waits for the other ranks.
-        has_left: True once it is done and no longer monitored.
-        host: name of its machine.
-    """
-
-    number: int
-    n_operations: int
-    n_updates: int
-    n_phases: int
-    is_exempt: bool
-    is_waiting: bool
-    has_left: bool
-    host: str
 
 
 class LossDetector:
@@ -92,35 +77,37 @@ class LossDetector:
             What has happened, a sentence without a full stop; None if no rank is lost.
         """
         before, self.before = self.before, rows
-        rows = {rank: row for rank, row in rows.items() if not row.has_left and rank in before}
-        for rank, row in rows.items():
-            self.n_silent[rank] = self.n_silent[rank] + 1 if row == before[rank] else 0
-            if self.n_silent[rank] * PERIOD > (BROKEN_SECONDS if is_broken else LOST_SECONDS):
+        rows = {n: row for n, row in rows.items() if not row.has_left and n in before}
+        if not rows:
+            return None
+        for n, row in rows.items():
+            self.n_silent[n] = self.n_silent[n] + 1 if row == before[n] else 0
+            if self.n_silent[n] * PERIOD > (BROKEN_SECONDS if is_broken else LOST_SECONDS):
                 return (
-                    f"rank {rank} on {row.host} does not answer: it was killed or suspended, the "
+                    f"rank {n} on {row.host} does not answer: it was killed or suspended, the "
                     "system ran out of memory, or its network is down"
                 )
-        n_done = min((row.n_operations for row in rows.values()), default=0)
-        late = {rank: row for rank, row in rows.items() if row.n_operations == n_done}
-        is_stuck = bool(rows) and not any(
-            (row.n_operations, row.n_phases) != (before[rank].n_operations, before[rank].n_phases)
-            for rank, row in late.items()
+        n_done = min(row.n_operations for row in rows.values())
+        late = {n: row for n, row in rows.items() if row.n_operations == n_done}
+        is_stuck = all(
+            (row.n_operations, row.n_phases) == (before[n].n_operations, before[n].n_phases)
+            for n, row in late.items()
         )
         if len(late) < len(rows):
             is_stuck &= not any(row.is_exempt for row in late.values())
         else:
             is_stuck &= all(row.is_waiting for row in rows.values())
-        has_compiled = min((row.n_updates for row in rows.values()), default=0) > 2
-        if not is_stuck:
-            self.longest = max(self.longest, self.n_stuck * has_compiled)
+        has_compiled = min(row.n_updates for row in rows.values()) > 2
+        if has_compiled and not is_stuck:
+            self.longest = max(self.longest, self.n_stuck)
         self.n_stuck = self.n_stuck + 1 if is_stuck else 0
         seconds = self.n_stuck * PERIOD
         limit = max(HUNG_SECONDS, PATIENCE * self.longest * PERIOD)
         if seconds <= (limit if has_compiled else FIRST_SECONDS):
             return None
         if len(late) < len(rows):
-            rank, row = next(iter(late.items()))
-            return f"rank {rank} on {row.host} hangs: others have waited for it for {seconds:.0f} s"
+            n, row = next(iter(late.items()))
+            return f"rank {n} on {row.host} hangs: others have waited for it for {seconds:.0f} s"
         return (
             f"The ranks on {', '.join(dict.fromkeys(row.host for row in rows.values()))} reach "
             f"torchrun's store, but not each other, and have waited for {seconds:.0f} s: a network "
@@ -146,41 +133,74 @@ def within(seconds: float, function: Callable[[], T], default: T) -> T:
     return values[-1]
 
 
-class Watch:
-    """Monitors the ranks of this job until `leave`. Ends this rank if the store falls silent; the
-    others are monitored once they start.
+class Team:
+    """The ranks of a training run, as one of them sees and monitors them, until `leave`.
 
-    Args:
-        on_lost: called in a thread of the watch when a rank is lost; must end this process. Its
-            argument is `rank 1 on node-7 hangs: ...` on the rank that reports the loss, None on the
-            others.
-        may_be_silent: the process with the store may be suspended, but ends this one if it is gone.
+    Attributes:
+        folder: the run folder, once it is known.
     """
 
-    def __init__(self, on_lost: Callable[[str | None], None], may_be_silent: bool = False):
+    def __init__(self) -> None:
         info = environment.rank_info()
         assert info is not None
-        self.on_lost, self.may_be_silent = on_lost, may_be_silent
-        self.is_broken = self.is_gone = self.has_left = False
+        self.folder: Path | None = None
         self.rank, self.n_ranks = info.rank, info.n_ranks
-        self.keys = [f"heartbeat {rank}" for rank in range(info.n_ranks)]
-        self.number = self.n_answers = 0
+        self.is_ours = endings.JOB in os.environ
+        self.is_broken = self.is_gone = counts.has_left = False
+        self.keys = [f"heartbeat {number}" for number in range(info.n_ranks)]
+        self.n_answers = 0
         self._leaves_by = math.inf
         self._wakes = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        threading.Thread(target=self._guard, daemon=True).start()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._job = process_group.store("job")
+        threading.Thread(target=self._watch_store, daemon=True).start()
 
-    def missing(self) -> list[int]:
+    # ---- In the thread that trains ----
+
+    def await_all(self) -> None:
+        """Waits until all ranks have started. Raises UserError if some have not in time."""
+        began, has_warned = time.monotonic(), False
+        while missing := self._missing():
+            seconds = time.monotonic() - began
+            problem = (
+                f"rank{'s' * (len(missing) > 1)} {', '.join(map(str, missing))} of {self.n_ranks} "
+                f"did not start within {seconds:.0f} s; see what torchrun printed on the other "
+                "machines"
+            )
+            if seconds > process_group.START_SECONDS:
+                raise UserError(problem)
+            if seconds > NOTICE_SECONDS and not has_warned and environment.is_first_here():
+                console.warn(f"{problem}. Waiting on")
+                has_warned = True
+            time.sleep(0.1)
+
+    def _missing(self) -> list[int]:
         """Returns the ranks that have not started yet. Each rank calls this until all have."""
         name = process_group.meeting.poll()
         self.n_answers += 1
         if name is None:
             return [0]
         if self._thread.ident is None:
-            self.store = process_group.store(f"watch {name} {next(NUMBERS)}")
+            self.store = process_group.store(f"watch {name} {next(NUMBERS)}", is_shared=False)
             self._beat()
             self._thread.start()
-        return [rank for rank, key in enumerate(self.keys) if not self.store.check([key])]
+        return [number for number, key in enumerate(self.keys) if not self.store.check([key])]
+
+    def set_folder(self, folder: Path) -> None:
+        """Publishes the run folder, which holds the token of this start, to restarted ranks and to
+        the launcher.
+        """
+        self.folder = folder
+        if self.rank == 0:
+            with contextlib.suppress(OSError):  # without a token, a restart begins another run
+                token = (folder / endings.STARTED).read_text()
+                self._job.set(endings.KEY, json.dumps([str(folder), token]))
+            if self.is_ours:
+                Path(os.environ[endings.JOB], endings.RUN).write_text(str(folder))
+
+    def earlier_folder(self) -> Path | None:
+        """Returns the run folder of an earlier attempt, if the ranks were restarted."""
+        return endings.proven_folder(self._job)
 
     def claim(self) -> bool:
         """Returns True on the first rank that calls this: it reports the error, the others end."""
@@ -191,12 +211,13 @@ class Watch:
         # if the store is gone, or has not been opened, no other rank can report
         return within(CALL_SECONDS, is_first, True)
 
-    def await_verdict(self) -> None:
-        """Waits after a broken connection until the lost rank is found, which ends this process."""
+    def end_lost(self, loss: object) -> NoReturn:
+        """Exits after a broken connection, once the lost rank is found, or cannot be."""
         self.is_broken = True
-        self._thread.join(LOST_SECONDS + 2 * PERIOD)
+        self._thread.join(LOST_SECONDS + 2 * PERIOD)  # which ends this process
         if self.is_gone:
             self._end_in_silence("closed the connection")
+        self.end(f"A rank is lost: {loss}" if self.claim() else None)
 
     def leave(self, seconds: float = 0.0) -> None:
         """Stops the watch; this rank no longer counts as lost.
@@ -205,22 +226,31 @@ class Watch:
             seconds: how long to wait for rank 0 to leave, too.
         """
         self._leaves_by = time.monotonic() + seconds
-        self.has_left = True
+        counts.has_left = True
         self._wakes.set()
         if self._thread.is_alive():
             self._thread.join(seconds + CALL_SECONDS)
 
-    def _run(self) -> None:
+    def finish(self) -> None:
+        """Leaves the finished run, and removes the token by which restarted ranks would find it."""
+        if self.rank == 0 and self.folder is not None:
+            with contextlib.suppress(OSError):
+                (self.folder / endings.STARTED).unlink()
+        self.leave()
+
+    # ---- In threads of the watch ----
+
+    def _watch(self) -> None:
         detector = LossDetector()
         try:
             while not self._wakes.wait(PERIOD):
                 self._beat()
                 if self.store.check(["end"]):
-                    return self.on_lost(None)
+                    self.end(None)
                 if self.store.check(self.keys):
                     problem = detector.poll(dict(enumerate(self._heartbeats())), self.is_broken)
-                    if problem and not self.has_left:
-                        return self._end(problem)
+                    if problem and not counts.has_left:
+                        self._end_all(problem)
                 self.n_answers += 1
             self._beat()
             while self.rank > 0 and time.monotonic() < self._leaves_by:
@@ -229,50 +259,57 @@ class Watch:
                 time.sleep(0.1)
         except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
             self.is_gone = True
-            if not self.has_left:
+            if not counts.has_left:
                 # saves, as SIGTERM would, but bears one of torchrun's after it
                 os.kill(os.getpid(), signal.SIGUSR1)
 
-    def _end(self, problem: str) -> None:
-        """Ends all ranks. The first to call this reports what has happened."""
-        if not self.claim():
-            return self.on_lost(None)
-        if not self.may_be_silent:  # torchrun's store may end with this rank: the others read first
-            time.sleep(2 * PERIOD)
-        self.on_lost(problem)
-
-    def _guard(self) -> None:
+    def _watch_store(self) -> None:
         # counts polls, as a suspended job may go on later
         n_silent, n_answers = 0, 0
         while not self._wakes.wait(PERIOD):
-            may_be_silent = self.may_be_silent and not self.is_gone
+            # a launcher that Ctrl-Z suspends may be silent, but ends this process if it is gone
+            may_be_silent = self.is_ours and not self.is_gone
             n_silent = n_silent + 1 if self.n_answers == n_answers and not may_be_silent else 0
             n_answers = self.n_answers
             if n_silent * PERIOD > SILENT_SECONDS:
-                return self._end_in_silence(f"not answered for {n_silent * PERIOD:.0f} s")
+                self._end_in_silence(f"not answered for {n_silent * PERIOD:.0f} s")
 
-    def _end_in_silence(self, silence: str) -> None:
+    def _beat(self) -> None:
+        counts.number += 1
+        self.store.set(self.keys[self.rank], json.dumps(dataclasses.asdict(counts)))
+
+    def _heartbeats(self) -> list[Heartbeat]:
+        return [Heartbeat(**json.loads(text)) for text in self.store.multi_get(self.keys)]
+
+    # ---- The end of all ranks ----
+
+    def _end_all(self, problem: str) -> NoReturn:
+        """Ends all ranks. The first to call this reports what has happened."""
+        if not self.claim():
+            self.end(None)
+        if not self.is_ours:  # torchrun's store may end with this rank: the others read first
+            time.sleep(2 * PERIOD)
+        self.end(problem)
+
+    def _end_in_silence(self, silence: str) -> NoReturn:
         """Ends this rank. One of this machine reports it, as the others may be out of reach."""
         problem = (
             f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, has "
             f"{silence}: torchrun has ended there, or that machine or the network is down"
         )
-        self.on_lost(problem if environment.is_first_here() else None)
+        self.end(problem if environment.is_first_here() else None)
 
-    def _beat(self) -> None:
-        self.number += 1
-        counts = process_group.counts
-        heartbeat = Heartbeat(
-            self.number,
-            counts.n_operations,
-            counts.n_updates,
-            counts.n_phases,
-            counts.is_exempt,
-            counts.is_waiting,
-            self.has_left,
-            environment.hostname(),
-        )
-        self.store.set(self.keys[self.rank], json.dumps(heartbeat))
+    def end(self, problem: str | None) -> NoReturn:
+        """Exits at once, because a rank was lost.
 
-    def _heartbeats(self) -> list[Heartbeat]:
-        return [Heartbeat(*json.loads(text)) for text in self.store.multi_get(self.keys)]
+        Args:
+            problem: what to report; None if another rank reports it.
+        """
+        # a folder on a machine that is gone blocks whoever reads it, and so may a pipe
+        if problem:
+            unknown = "Its run folder does not answer, so what is saved is not known"
+            advice = within(CALL_SECONDS, lambda: endings.hint(self.folder), unknown)
+            ending = endings.Ending(endings.LOST, f"{problem}. {advice}")
+            within(CALL_SECONDS, lambda: endings.report_ending(ending), None)
+        within(CALL_SECONDS, console.restore, None)
+        os._exit(0 if problem is None and self.is_ours else endings.LOST)

@@ -12,8 +12,8 @@ import torch
 
 from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue
+from megastep.agents.distributed.agreement import Plan, agree
 from megastep.agents.distributed.drift import check_drift
-from megastep.agents.distributed.plan import Plan, agree
 from megastep.agents.distributed.process_group import counts, unhurried, waiting
 from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import user_errors

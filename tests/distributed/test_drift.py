@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from megastep.agents.distributed import drift
-from megastep.agents.distributed.drift import check_drift, first_difference, first_differing_fact
+from megastep.agents.distributed.drift import check_drift, first_difference
+from megastep.agents.errors import UserError
+from megastep.agents.launch import rank_checks
 from tests.helpers import ranks
 
 
@@ -26,28 +28,21 @@ def test_checksum_sees_negative_zero_and_nan():
 
 def test_one_process_cannot_drift():
     check_drift(torch.nn.Linear(2, 2))
-    assert first_differing_fact({"seed": 1}) is None
 
 
 @pytest.mark.parametrize(
     "everyones, expected",
     [
-        ([{"a": 1, "b": 2}] * 3, None),
-        ([{"a": 1, "b": 2}, {"a": 1, "b": 3}], "b is 2 on rank 0, and 3 on rank 1"),
-        (
-            [{"a": 1}, {"a": 2}, {"a": 1}, {"a": 2}],
-            "a is 1 on ranks 0 and 2, and 2 on ranks 1 and 3",
-        ),
-        ([{"a": 1}, {}], "a is 1 on rank 0, and missing on rank 1"),
-        ([{}, {"a": 1}], "a is missing on rank 0, and 1 on rank 1"),
+        ([{"a": "1", "b": "2"}, {"a": "1", "b": "3"}], "b is 2 on rank 0, and 3 on rank 1"),
+        ([{"a": "1"}, {"a": "2"}, {"a": "1"}], "a is 1 on ranks 0 and 2, and 2 on rank 1"),
+        ([{}, {"a": "1"}], "a is missing on rank 0, and 1 on rank 1"),
     ],
 )
 def test_first_differing_fact(monkeypatch, everyones, expected):
-    def gather(facts):
-        return [{name: str(value) for name, value in each.items()} for each in everyones]
-
-    monkeypatch.setattr(drift, "gather_objects", gather)
-    assert first_differing_fact(everyones[0]) == expected
+    rank_checks.check_equal({"a": 1})
+    monkeypatch.setattr(rank_checks.process_group, "gather_objects", lambda facts: everyones)
+    with pytest.raises(UserError, match=f"^The ranks differ: {expected}; start all with the same "):
+        rank_checks.check_equal({})
 
 
 def test_first_difference_names_tensor_and_ranks(monkeypatch):

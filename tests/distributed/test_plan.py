@@ -2,8 +2,8 @@
 
 import pytest
 
-from megastep.agents.distributed import agreement, plan, process_group
-from megastep.agents.distributed.plan import Plan
+from megastep.agents.distributed import agreement, process_group
+from megastep.agents.distributed.agreement import Plan, agree
 from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.errors import UserError
 from megastep.agents.generator import rank_seed
@@ -15,12 +15,12 @@ GOES_ON = Plan(goes_on=True, saves=False, lr_fraction=0.75)
 def others(monkeypatch):
     """Sets what the other ranks say; this one is rank `rank`."""
 
-    def are(module, values, rank=0):
+    def are(values, rank=0):
         def gathered(value):
             return [*values[:rank], value, *values[rank:]]
 
         for name in "exchange", "gather_objects":
-            monkeypatch.setattr(module, name, gathered, raising=False)
+            monkeypatch.setattr(agreement, name, gathered)
         monkeypatch.setattr(agreement, "n_ranks", lambda: 1 + len(values))
         monkeypatch.setattr(agreement, "rank", lambda: rank)
         monkeypatch.setattr(agreement, "rank_label", lambda: f"rank {rank} on here")
@@ -29,36 +29,36 @@ def others(monkeypatch):
 
 
 def test_one_process_follows_its_own_plan():
-    assert plan.agree(GOES_ON, False, False) == GOES_ON
-    assert plan.agree(Plan(False, True, 1 / 3), False, False) == Plan(False, True, 1 / 3)
-    assert not plan.agree(GOES_ON, True, False).goes_on
-    assert not plan.agree(GOES_ON._replace(saves=True), False, True).saves
+    assert agree(GOES_ON, False, False) == GOES_ON
+    assert agree(Plan(False, True, 1 / 3), False, False) == Plan(False, True, 1 / 3)
+    assert not agree(GOES_ON, True, False).goes_on
+    assert not agree(GOES_ON._replace(saves=True), False, True).saves
 
 
 def test_clock_of_rank_0_decides(others):
-    others(plan, [[True, True, 0.5, False, False]], rank=1)
-    assert plan.agree(Plan(False, False, 0.25), False, False) == Plan(True, True, 0.5)
+    others([[True, True, 0.5, False, False]], rank=1)
+    assert agree(Plan(False, False, 0.25), False, False) == Plan(True, True, 0.5)
 
 
 def test_a_signal_or_a_slow_disk_of_any_rank_counts(others):
     saving = GOES_ON._replace(saves=True)
-    others(plan, [[1, 1, 0.9, 0, 0], [1, 1, 0.9, 1, 0]])
-    assert plan.agree(saving, False, False) == saving._replace(goes_on=False)
-    others(plan, [[1, 1, 0.9, 0, 0], [1, 1, 0.9, 0, 1]])
-    assert plan.agree(saving, False, False) == GOES_ON
+    others([[1, 1, 0.9, 0, 0], [1, 1, 0.9, 1, 0]])
+    assert agree(saving, False, False) == saving._replace(goes_on=False)
+    others([[1, 1, 0.9, 0, 0], [1, 1, 0.9, 0, 1]])
+    assert agree(saving, False, False) == GOES_ON
 
 
 def test_error_of_one_rank_is_the_error_of_all(others):
     def fails():
         raise UserError("no GPU")
 
-    others(agreement, [UserError("rank 1 on node-7: no GPU")])
+    others([UserError("rank 1 on node-7: no GPU")])
     with pytest.raises(UserError, match="rank 1 on node-7: no GPU"):
         agreement.together(lambda: 1)
-    others(agreement, [None], rank=1)
+    others([None], rank=1)
     with pytest.raises(UserError, match="rank 1 on here: no GPU"):
         agreement.together(fails)
-    others(agreement, [None])
+    others([None])
     with pytest.raises(UserError, match="^no GPU"):
         agreement.together(fails)
     assert agreement.together(lambda: 3) == 3
@@ -72,7 +72,7 @@ def test_error_that_cannot_be_sent_is_sent_as_text(others, monkeypatch):
         raise Local("bad")
 
     sent = []
-    others(agreement, [None], rank=1)
+    others([None], rank=1)
     gather = agreement.gather_objects
     monkeypatch.setattr(agreement, "gather_objects", lambda one: sent.append(one) or gather(one))
     with pytest.raises(Local, match="rank 1 on here: bad"):
@@ -80,10 +80,10 @@ def test_error_that_cannot_be_sent_is_sent_as_text(others, monkeypatch):
     assert type(sent[0]) is RuntimeError and "Local: rank 1 on here: bad" in str(sent[0])
 
 
-def test_any_rank(others):
-    assert agreement.any_rank(True) and not agreement.any_rank(False)
-    others(agreement, [[0.0], [1.0]])
-    assert agreement.any_rank(False)
+def test_any_rank(monkeypatch):
+    assert ONE.any(True) and not ONE.any(False)
+    monkeypatch.setattr(process_group, "exchange", lambda row: [[*row], [1.0]])
+    assert Ranks(0, 2).any(False)
 
 
 def test_mean_over_ranks_leaves_out_nan(monkeypatch):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from megastep.agents.launch.rank import LOST
+from megastep.agents.launch.endings import LOST
 from megastep.agents.runs import checkpoint, json_lines
 from tests.cli.test_exact_resume import differences
 from tests.helpers import tiny
@@ -62,11 +62,11 @@ LATE = """
 import os, sys, time
 from megastep.agents.cli import entry
 from megastep.agents.distributed import process_group
-from megastep.agents.launch import rank
+from megastep.agents.launch import watch
 
 if os.environ["RANK"] == "1":
     time.sleep(3600)
-rank.NOTICE_SECONDS, process_group.START_SECONDS = 2.0, 8.0
+watch.NOTICE_SECONDS, process_group.START_SECONDS = 2.0, 8.0
 sys.exit(entry.run_command("train"))
 """
 

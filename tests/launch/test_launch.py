@@ -12,8 +12,8 @@ import torch
 from megastep.agents.cli import train
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.launch import gpu, launcher
-from megastep.agents.launch.rank import LOST
-from megastep.agents.launch.signals import Ending, Interrupted
+from megastep.agents.launch.endings import LOST, Ending
+from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from tests.helpers import tiny
 from tests.helpers.hosts import children
@@ -141,13 +141,13 @@ def test_dry_run_counts_lanes_that_learn(here, capsys):
 #: Two ranks, of which the second writes an ending and ends; the first ends for good as well.
 ENDS = """
 import json, os, signal, sys, time
-from megastep.agents.launch import rank
+from megastep.agents.launch import endings
 
 ending, code = {}[int(os.environ["TORCHELASTIC_RESTART_COUNT"])]
 if os.environ["RANK"] == "1":
     if ending:
-        path = rank.Path(os.environ[rank.JOB], rank.ENDING)
-        rank.write_atomically(path, json.dumps(ending).encode())
+        path = endings.Path(os.environ[endings.JOB], endings.ENDING)
+        endings.write_atomically(path, json.dumps(ending).encode())
     os.kill(os.getpid(), 9) if code < 0 else os._exit(code)
 time.sleep(60 * bool(code))
 """

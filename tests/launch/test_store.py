@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from torch import distributed
 
-from megastep.agents.launch import rank
+from megastep.agents.launch import endings
 from tests.helpers import tiny
 from tests.helpers.hosts import children
 from tests.helpers.processes import start, wait_until
@@ -19,17 +19,17 @@ def test_only_a_folder_with_the_token_of_this_start_is_gone_on_with(tmp_path):
     run, other, link = tmp_path / "run", tmp_path / "other", tmp_path / "link"
     for folder, text in ((run, token), (other, token[::-1]), (link, token)):
         folder.mkdir()
-        (folder / rank.STARTED).write_text(text)
-    (link / rank.STARTED).unlink()
-    (link / rank.STARTED).symlink_to(run / rank.STARTED)
-    assert rank.proven_folder(store) is None
+        (folder / endings.STARTED).write_text(text)
+    (link / endings.STARTED).unlink()
+    (link / endings.STARTED).symlink_to(run / endings.STARTED)
+    assert endings.proven_folder(store) is None
     forged = [[str(other), token], [str(tmp_path), token], [str(run), ""], [str(run), None], 3]
     forged += [[str(link), token], [str(run), "0" * 64], str(run), [None, token], ["\0", token]]
     for value in [*map(json.dumps, forged), b"\xff"]:
-        store.set(rank.KEY, value)
-        assert rank.proven_folder(store) is None, value
-    store.set(rank.KEY, json.dumps([str(run), token]))
-    assert rank.proven_folder(store) == run
+        store.set(endings.KEY, value)
+        assert endings.proven_folder(store) is None, value
+    store.set(endings.KEY, json.dumps([str(run), token]))
+    assert endings.proven_folder(store) == run
 
 
 def listening(pids):

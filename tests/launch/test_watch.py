@@ -6,8 +6,8 @@ import pytest
 from torch import distributed
 
 from megastep.agents.distributed import process_group
-from megastep.agents.launch import watch
-from megastep.agents.launch.watch import Heartbeat, LossDetector
+from megastep.agents.launch import endings, watch
+from megastep.agents.launch.watch import LossDetector
 
 #: The rank that others wait for, and those.
 LATE, AHEAD = dict(n_operations=100), dict(n_operations=101, is_waiting=True)
@@ -15,7 +15,8 @@ LATE, AHEAD = dict(n_operations=100), dict(n_operations=101, is_waiting=True)
 
 def heartbeat(number, rank, n_operations=100, n_updates=9, n_phases=27, **flags):
     flags = dict(is_exempt=False, is_waiting=False, has_left=False) | flags
-    return Heartbeat(number, n_operations, n_updates, n_phases, host=f"node-{rank}", **flags)
+    counts = dict(n_operations=n_operations, n_updates=n_updates, n_phases=n_phases)
+    return process_group.Heartbeat(f"node-{rank}", number, **counts, **flags)
 
 
 def polled(*ranks, n=40, is_broken=False, detector=None):
@@ -90,8 +91,8 @@ def as_rank(monkeypatch):
     return be
 
 
-@pytest.mark.parametrize("may_be_silent", [False, True])
-def test_rank_that_the_store_does_not_answer_ends(as_rank, monkeypatch, may_be_silent):
+@pytest.mark.parametrize("is_launched", [False, True])
+def test_rank_that_the_store_does_not_answer_ends(as_rank, monkeypatch, is_launched):
     """Although the thread that asks it, and whoever else does, is blocked for ever. The store of a
     launcher that is suspended may be silent, but not one that is gone.
     """
@@ -100,19 +101,26 @@ def test_rank_that_the_store_does_not_answer_ends(as_rank, monkeypatch, may_be_s
         def compare_set(self, *arguments):
             threading.Event().wait()
 
-    monkeypatch.setattr(watch, "PERIOD", 0.01)
-    monkeypatch.setattr(watch, "SILENT_SECONDS", 0.2)
-    monkeypatch.setattr(watch, "CALL_SECONDS", 0.01)
+    for name, seconds in dict(PERIOD=0.01, SILENT_SECONDS=0.2, CALL_SECONDS=0.01).items():
+        monkeypatch.setattr(watch, name, seconds)
+    monkeypatch.setattr(process_group, "store", lambda name: None)
     monkeypatch.setattr(process_group.meeting, "poll", threading.Event().wait)
+    if is_launched:
+        monkeypatch.setenv(endings.JOB, "job")
     has_ended, problems = threading.Event(), []
-    one = watch.Watch(lambda text: (problems.append(text), has_ended.set()), may_be_silent)
-    one.store = Silent()
-    threading.Thread(target=one.missing, daemon=True).start()
-    if may_be_silent:
+    monkeypatch.setattr(
+        watch.Team,
+        "end",
+        lambda self, text: (problems.append(text), has_ended.set(), self._wakes.set()),
+    )
+    team = watch.Team()
+    team.store = Silent()
+    threading.Thread(target=team.await_all, daemon=True).start()
+    if is_launched:
         assert not has_ended.wait(0.5)
-        one.is_gone = True
+        team.is_gone = True
     assert has_ended.wait(60) and "where torchrun keeps the ranks' store, has not" in problems[0]
-    assert one.claim()  # as no other rank can
+    assert team.claim()  # as no other rank can
 
 
 def test_ranks_that_start_again_find_one_name(as_rank, monkeypatch):

@@ -1,0 +1,116 @@
+"""How a script ends, an exit code and one sentence, and how the ranks of a run say so."""
+
+import contextlib
+import hmac
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+from megastep.agents import console, package
+from megastep.agents.distributed import environment
+from megastep.agents.errors import UserError, memory_problem
+from megastep.agents.launch import signals
+from megastep.agents.runs import checkpoint, folders, populations, strange_files
+from megastep.agents.runs.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    from torch.distributed import Store  # pyright: ignore[reportPrivateImportUsage]
+
+#: Environment variable with the job folder, set for ranks that `launcher` started.
+JOB = "MEGASTEP_JOB"
+#: Files of the job folder: settings; how the ranks ended; the run folder's path.
+SETTINGS, ENDING, RUN = "settings.json", "ending.json", "run"
+#: The file of a run folder with the token of its start, and the store's key with folder and token.
+STARTED, KEY = ".started", "run"
+#: Exit code if a rank was killed, hangs or cannot be reached.
+LOST = 3
+
+
+class Ending(NamedTuple):
+    """How a script ended.
+
+    Attributes:
+        code: exit code of the process.
+        text: the error or the signal; empty after success, or if it was printed already.
+        folder: the run folder, after training finished.
+    """
+
+    code: int = 0
+    text: str = ""
+    folder: str | None = None
+
+    def raise_error(self) -> None:
+        """Raises the error or signal that ended the script, as UserError or Interrupted, if any."""
+        if self.code > 128:
+            raise signals.Interrupted(self.code - 128, self.text)
+        if self.code:
+            error = UserError(self.text)
+            error.code = self.code
+            raise error
+
+
+def ending_of(work: Callable[[], int | None]) -> Ending:
+    """Calls a function and returns how it ended.
+
+    Args:
+        work: returns an exit code, None for 0.
+
+    Raises:
+        Exception: errors that the user cannot fix, such as bugs.
+    """
+    try:
+        with signals.interrupting():
+            return Ending(work() or 0)
+    except SystemExit as end:  # from argparse, Hydra's help, or a rank that exits silently
+        return Ending(cast(int, end.code or 0))
+    except UserError as error:
+        return Ending(error.code, str(error))
+    except (MemoryError, RuntimeError) as error:
+        if not (problem := memory_problem(error)):
+            raise
+        cure = "choose fewer environments or episodes, or a smaller network"
+        return Ending(UserError.code, f"{problem}; {cure}")
+    except signals.Interrupted as stop:
+        return Ending(128 + stop.args[0], stop.args[1])
+
+
+def report_ending(ending: Ending) -> None:
+    """Reports the ranks' ending to the process that launched them, or on stderr under torchrun."""
+    info = environment.rank_info()
+    if JOB in os.environ:
+        assert info is not None
+        if info.rank > 0 and ending.code != LOST:
+            name = f"rank {info.rank} on {environment.hostname()}: "
+            ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
+        path = Path(os.environ[JOB], ENDING)
+        if not path.exists():
+            write_atomically(path, json.dumps(ending).encode())
+    elif ending.text:
+        console.say(f"{package.command('train')}: {ending.text}", sys.stderr)
+
+
+def hint(folder: Path | None) -> str:
+    """Returns how to continue a run whose ranks were lost in the middle of an update."""
+    runs = () if folder is None else populations.members(folder) or [folder]
+    if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
+        return "Nothing was saved yet"
+    return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
+
+
+def proven_folder(store: "Store") -> Path | None:
+    """Returns the run folder in the ranks' store if it is this user's and holds the token that is
+    beside it there, else None: anyone who reaches the store can write another path.
+    """
+    if not store.check([KEY]):
+        return None
+    with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
+        folder, token = json.loads(store.get(KEY))
+        path = Path(folder) / STARTED
+        content = strange_files.read_bytes(path, 1024)
+        is_ours = {os.stat(one).st_uid for one in (folder, path)} == {os.geteuid()}
+        if is_ours and hmac.compare_digest(content, token.encode()) and len(token) == 64:
+            return Path(folder)
+    return None
