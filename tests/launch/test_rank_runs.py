@@ -9,12 +9,10 @@ import time
 import pytest
 import torch
 
-from megastep import spaces
 from megastep.agents.cli import train
 from megastep.agents.distributed import process_group
 from megastep.agents.launch import train as launch_train
 from megastep.agents.runs import annealing, checkpoint, json_lines
-from megastep.arrdict import arrdict
 from tests.cli.test_exact_resume import CASES, EVERY_UPDATE, differences
 from tests.helpers import ranks, tiny
 
@@ -174,55 +172,3 @@ def test_ranks_share_duels_and_evaluations(here):
         names = "lanes", "duels", "homes", "unfinished"
         counts.append([[row.get(name) for name in names] for row in rows])
     assert counts[0] == counts[1] and len(counts[0]) == 2
-
-
-class Copy:
-    """Reward 1 for the action that equals the observed bit; episodes of four steps."""
-
-    def __init__(self, n_envs, seed=1, device="cpu"):
-        self.n_envs, self.device = n_envs, torch.device(device)
-        self.obs_space, self.action_space = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 2)
-        self.generator = torch.Generator().manual_seed(seed)
-        self.age, self.bits = torch.zeros(n_envs), torch.zeros(n_envs, dtype=torch.int64)
-
-    def world(self, reward, reset):
-        self.age = (self.age + 1).masked_fill(reset, 0)
-        self.bits = torch.randint(2, (self.n_envs,), generator=self.generator)
-        return arrdict(
-            obs=torch.nn.functional.one_hot(self.bits, 2)[:, None].float(),
-            reward=reward.masked_fill(reset, 0),
-            reset=reset,
-            terminal=self.age == 4,
-            truncated=torch.zeros(self.n_envs, dtype=torch.bool),
-        )
-
-    def reset(self):
-        return self.world(torch.zeros(self.n_envs), torch.ones(self.n_envs, dtype=torch.bool))
-
-    def step(self, decision):
-        return self.world((decision.actions[:, 0] == self.bits).float(), self.age == 4)
-
-
-def learning_curves(n_envs):
-    """Returns the mean returns of each report of three runs with other seeds."""
-    words = ["env=tests.launch.test_rank_runs:Copy", "device=cpu"]
-    words += ["agent.width=16", f"env.n_envs={n_envs}", "learner.n_steps=8", "learner.lr=3e-3"]
-    words += ["logging.every=5", "samples=10240", "learner.n_minibatches=2", "desync=false"]
-    curves = []
-    for seed in (1, 2, 3):
-        folder = f"copy-{n_envs}-{seed}"
-        trained(*words, *NO_FINISH, f"seed={seed}", f"folder={folder}")
-        rows = json_lines.read(f"{folder}/metrics.jsonl")
-        curves.append([row["episode/return"] for row in rows])
-    return curves
-
-
-def test_two_ranks_learn_as_fast_as_one_process_of_twice_the_environments(here):
-    shared, _ = (torch.tensor(curves) for curves in ranks.call(learning_curves, 16))
-    alone = torch.tensor(learning_curves(32))
-    assert shared.shape == alone.shape  # reports at the same samples
-    assert (alone[:, 0] < 2.6).all() and (alone[:, -1] > 3.4).all()  # from chance, 2 of 4
-    spread = ((shared.var(0) + alone.var(0)) / 2).sqrt().clamp(min=0.03)  # of seeds
-    difference = (shared.mean(0) - alone.mean(0)).abs()
-    assert (difference < 3 * spread).all(), (difference / spread).tolist()
-    assert difference.mean() < 0.1

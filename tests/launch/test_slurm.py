@@ -1,7 +1,6 @@
 """Jobs of a real Slurm with two nodes: docs/scaling.md's script and sweeps."""
 
 import csv
-import os
 import re
 import subprocess
 import sys
@@ -153,13 +152,6 @@ def sweep(cluster, *words, meanwhile=lambda: None):
         return list(csv.DictReader(file))
 
 
-def test_sweep_of_four_jobs(cluster, checkout):
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    table = sweep(cluster, f"samples={5 * tiny.UPDATE}", "seed=1,2,3,4")
-    assert [(row["seed"], row["state"]) for row in table] == [(f"{n}", "done") for n in range(1, 5)]
-    assert all(rows(path)[-1]["updates"] == 5 for path in Path("sweep").glob("?_seed=?"))
-
-
 def test_job_of_a_sweep_that_outlives_its_time_goes_on_in_another(cluster, checkout):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
 
@@ -185,25 +177,3 @@ def test_job_without_gpus_names_its_node(cluster, checkout):
     assert done.returncode == 2
     text = r"PyTorch sees no GPU on node[ab].*, and job \d+ of Slurm may have been given none "
     assert re.search(text, done.stderr), done.stderr
-
-
-def test_login_node_without_a_gpu_tells_the_sizes_of_a_job(cluster, checkout):
-    words = sys.executable, "train.py", *WORDS, "device=cuda", "ranks=8", "dry_run=true"
-    done = cluster.run(*words, capture_output=True, text=True)
-    assert done.returncode == 0 and "Would train on 8 x cuda:" in done.stdout, done.stderr
-
-
-def test_command_of_the_script_runs_on_a_login_node_and_leaves_nothing():
-    if reason := slurm_cluster.problem():
-        pytest.skip(reason)
-    script = ROOT / "scripts" / "slurm_cluster.py"
-    words = "sh", "-c", "echo $SLURM_CONF; srun --nodes=2 hostname; exit 7"
-    done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True)
-    config, *nodes = done.stdout.split()
-    assert done.returncode == 7 and sorted(nodes) == [*slurm_cluster.NODES]
-    assert not os.path.exists(config)
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            assert config.encode() not in path.read_bytes()
-        except (FileNotFoundError, ProcessLookupError):
-            continue
