@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from PIL import Image
 
 __all__ = ["GifWriter", "Mp4Writer", "as_image"]
 
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"
 MAX_PENDING = 4  # images that wait for the encoder
-EXACT_COLOURS, GREYS = 64, 32  # of a GIF's palette
 
 
 class Mp4Writer:
@@ -29,20 +29,17 @@ class Mp4Writer:
         fps: frames per second.
     """
 
-    container, codec, pixels = "mp4", "libx264", "yuv420p"
-    options = {"crf": QUALITY, "preset": "veryfast"}
-
     def __init__(self, fps: float):
         import av  # which is needed for no other output
 
         self._from_array: Any = av.VideoFrame.from_ndarray
         self._buffer = io.BytesIO()
-        self._container = av.open(self._buffer, "w", format=self.container)
+        self._container = av.open(self._buffer, "w", format="mp4")
         self._stream: Any = self._container.add_stream(
-            self.codec, rate=Fraction(fps).limit_denominator(1000)
+            "libx264", rate=Fraction(fps).limit_denominator(1000)
         )
-        self._stream.pix_fmt = self.pixels
-        self._stream.options = self.options
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.options = {"crf": QUALITY, "preset": "veryfast"}
         self._shape = None
         self._thread = ThreadPoolExecutor(1)
         self._pending: deque[Future] = deque()
@@ -55,13 +52,8 @@ class Mp4Writer:
             Exception: an earlier one could not be encoded.
         """
         if self._shape is None:
-            self._shape = image.shape
             self._stream.height, self._stream.width = (size + size % 2 for size in image.shape[:2])
-        if image.shape != self._shape:
-            raise ValueError(
-                "all frames must have the size of the first, {1} x {0} pixels, "
-                "but this one has {3} x {2}".format(*self._shape[:2], *image.shape[:2])
-            )
+        self._shape = check_size(image, self._shape)
         self._pending.append(self._thread.submit(self._add, image))
         self._wait(MAX_PENDING)
 
@@ -72,10 +64,7 @@ class Mp4Writer:
     def _add(self, image) -> None:
         padding = [(0, size % 2) for size in image.shape[:2]]  # yuv420p halves both sides
         padded = np.pad(image, [*padding, (0, 0)], mode="edge")
-        self._encode(self._from_array(padded, format="rgb24"))
-
-    def _encode(self, frame) -> None:
-        self._container.mux(self._stream.encode(frame))
+        self._container.mux(self._stream.encode(self._from_array(padded, format="rgb24")))
 
     def close(self) -> bytes:
         """Returns the finished file, empty if there were no frames."""
@@ -112,69 +101,62 @@ def small_gif(path: str | os.PathLike, height: int, n_frames: int) -> tuple[byte
     return writer.close(), size
 
 
-class GifWriter(Mp4Writer):
-    """Encodes images into a GIF in memory, with one palette of 256 colours."""
+class GifWriter:
+    """Encodes images into a GIF in memory, with one palette of 256 colours.
 
-    container, codec, pixels = "gif", "gif", "pal8"
-    options = {}
+    A GIF counts in hundredths of a second, and browsers show frames of one hundredth for ten: above
+    50 frames per second some frames are left out.
+
+    Args:
+        fps: frames per second.
+    """
 
     def __init__(self, fps: float):
-        super().__init__(fps)
+        self._fps, self._shape = fps, None
         self._frames: list[bytes] = []  # compressed: the palette is known when all are there
 
-    def _add(self, image) -> None:
-        height, width = self._stream.height, self._stream.width
-        padding = [(0, height - len(image)), (0, width - image.shape[1]), (0, 0)]
-        self._frames.append(zlib.compress(np.pad(image, padding, mode="edge").tobytes(), 1))
+    def add(self, image: np.ndarray) -> None:
+        """Adds a frame, (H, W, 3) uint8. Raises ValueError if its size is not the first's."""
+        self._shape = check_size(image, self._shape)
+        self._frames.append(zlib.compress(image.tobytes(), 1))
 
     def close(self) -> bytes:
         """Returns the finished file, empty if there were no frames."""
-        from PIL import Image
-
-        self._wait(0)
-        if self._frames:
-            sample = [self._image(i) for i in np.linspace(0, len(self._frames) - 1, 12).astype(int)]
-            colours = _palette(np.concatenate(sample))
-            palette = Image.new("P", (1, 1))
-            palette.putpalette(colours.ravel().tolist())
-            argb = np.concatenate([np.full((256, 1), 255, np.uint8), colours], 1)
-            exact = _packed(colours[:EXACT_COLOURS])
-            order = np.argsort(exact)
-            for i in range(len(self._frames)):
-                image, packed = self._image(i), _packed(self._image(i))
-                close = Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
-                # Pillow takes a colour nearby even where there is the exact one
-                nearest = order[np.searchsorted(exact[order], packed).clip(max=len(exact) - 1)]
-                indices = np.where(exact[nearest] == packed, nearest, np.array(close))
-                self._encode(self._from_array((indices.astype(np.uint8), argb), format="pal8"))
-        return super().close()
+        if not self._frames:
+            return b""
+        every = int(np.ceil(self._fps / 50))
+        self._frames = self._frames[::every]
+        buffer, n = io.BytesIO(), len(self._frames)
+        sample = np.concatenate([self._image(i) for i in np.linspace(0, n - 1, 12).astype(int)])
+        palette = Image.fromarray(sample).quantize(256, Image.Quantize.FASTOCTREE)
+        images = (
+            Image.fromarray(self._image(i)).quantize(palette=palette, dither=Image.Dither.NONE)
+            for i in range(n)
+        )
+        ends = np.round(np.arange(n + 1) * 100 * every / self._fps)  # hundredths of a second
+        next(images).save(
+            buffer,
+            "GIF",
+            save_all=True,
+            append_images=images,
+            duration=(10 * np.diff(ends)).astype(int).tolist(),
+            loop=0,
+            optimize=False,
+        )
+        return buffer.getvalue()
 
     def _image(self, i) -> np.ndarray:
-        content = np.frombuffer(zlib.decompress(self._frames[i]), np.uint8)
-        return content.reshape(self._stream.height, self._stream.width, 3)
+        return np.frombuffer(zlib.decompress(self._frames[i]), np.uint8).reshape(self._shape)
 
 
-def _palette(image) -> np.ndarray:
-    """Returns 256 colours, (256, 3) uint8: the most frequent ones of an image exactly, and what
-    fits the others best.
-    """
-    from PIL import Image
-
-    packed, counts = np.unique(_packed(image), return_counts=True)
-    packed = packed[np.argsort(-counts)]
-    colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], 1).astype(np.uint8)
-    exact, rare = np.split(colours, [EXACT_COLOURS])
-    if len(rare):
-        fitted = Image.fromarray(rare[None]).quantize(256 - EXACT_COLOURS - GREYS)
-        rare = np.array(fitted.getpalette(), np.uint8).reshape(-1, 3)
-    greys = np.linspace(0, 255, GREYS).astype(np.uint8)[:, None].repeat(3, 1)  # of depth
-    return np.concatenate([exact, greys, rare, np.zeros((256, 3), np.uint8)])[:256]
-
-
-def _packed(image) -> np.ndarray:
-    """Returns a number for each colour."""
-    red, green, blue = np.moveaxis(image.astype(np.int32), -1, 0)
-    return (red << 16) + (green << 8) + blue
+def check_size(image: np.ndarray, shape: tuple[int, ...] | None) -> tuple[int, ...]:
+    """Returns the shape of a film's images. Raises ValueError if an image has not the first's."""
+    if shape is not None and image.shape != shape:
+        raise ValueError(
+            "all frames must have the size of the first, {1} x {0} pixels, "
+            "but this one has {3} x {2}".format(*shape[:2], *image.shape[:2])
+        )
+    return image.shape
 
 
 def as_image(array: ArrayLike) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Videos: order and size of frames, worker processes, errors, files."""
 
+import io
 import os
 import subprocess
 import sys
@@ -12,12 +13,14 @@ import av
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from megastep import engine, envs, modules, recording
 from megastep.arrdict import arrdict
 from megastep.core import AGENT_RADIUS
 from megastep.geometries import sample
 from megastep.recording import ParallelEncoder
+from megastep.video import GifWriter
 from tests.helpers.processes import HUNG, is_running, wait_until
 
 SIZE = 32
@@ -491,3 +494,14 @@ def test_state_renders_the_environment_that_is_shown_alone(monkeypatch):
         assert (state.core.positions == env.core.agents.positions[e]).all()
         assert len(state.core.objects.shapes) == int(env.core.scenery.objects.visible[e].sum()) > 0
     assert seen and {*seen} == {1}
+
+
+@pytest.mark.parametrize("fps", [10, 24, 50, 60, 120])
+def test_a_gif_takes_as_long_as_the_film_in_browsers_too(fps):
+    """Which show a frame of one hundredth of a second for ten."""
+    writer = GifWriter(fps)
+    for i in range(2 * fps):
+        writer.add(np.full((8, 8, 3), i, np.uint8))
+    gif = Image.open(io.BytesIO(writer.close()))
+    delays = [gif.info["duration"] for i in range(gif.n_frames) if gif.seek(i) is None]
+    assert sum(delays) == pytest.approx(2000, abs=10) and min(delays) >= 20

