@@ -70,15 +70,13 @@ class EnvState:
             generators["cuda"] = torch.cuda.default_generators[index]
         generators |= dict(numpy=np.random.mtrand._rand, python=random.seed.__self__)
         self.root = python_types.SimpleNamespace(env=env, bot=bot, generators=generators)
-        self._first_values, self._first_digests, self._first_constants = {}, {}, {}
+        self._first_values, self._first_digests = {}, {}
         for path, node, is_users in self._nodes():
             if isinstance(node, torch.Tensor) and not isinstance(node, ReadOnlyTensor):
                 if not host_only and node.nbytes >= _LARGE:
                     self._first_digests[path] = _digest(node)
             elif is_users and _is_plain(node):
                 self._first_values[path] = "value", _encoded(node)
-            elif is_users and isinstance(node, _CONSTANT):
-                self._first_constants[path] = node
 
     # ---- Saving ----
 
@@ -226,8 +224,11 @@ class EnvState:
             elif kind == "same":
                 if _identity(now) != _identity(same := node_at(self.root, value)):
                     self._replace(path, same)
+            elif kind == "array":
+                dtype, shape = more
+                self._set_array(path, now, _decoded(("$numpy", dtype, shape, value.cpu().numpy())))
             else:
-                self._set_array(path, now, value, more[0], written)
+                self._set_tensor(path, now, value, *more, written)
 
     def _set_value(self, path, now, value) -> None:
         if isinstance(now, enum.Enum):
@@ -241,12 +242,24 @@ class EnvState:
         else:
             self._replace(path, value)
 
-    def _set_array(self, path, now, value, kind, written) -> None:
-        """Writes into a tensor or an array, or replaces what has no such one yet, or began as one
-        with another, whose number is in `written`.
+    def _set_array(self, path, now, array) -> None:
+        is_alike = isinstance(now, np.ndarray) and (now.dtype, now.shape) == (
+            array.dtype,
+            array.shape,
+        )
+        if is_alike and now.flags.writeable:
+            now[...] = array
+        else:
+            self._replace(path, array)
+
+    def _set_tensor(self, path, now, value, device, written) -> None:
+        """Writes into a tensor, or replaces what is none of this shape yet, or began as one with
+        another, which is in `written`.
         """
-        if _fits(now, value) and (_identity(now) not in written or _equal(now, value)):
-            _as_tensor(now).copy_(value)
+        is_tensor = isinstance(now, torch.Tensor) and not is_expanded(now)
+        is_alike = is_tensor and (now.shape, now.dtype) == (value.shape, value.dtype)
+        if is_alike and (_identity(now) not in written or _equal(now, value)):
+            now.copy_(value)
             written.add(_identity(now))
             return
         owner = node_at(self.root, _parent(path))
@@ -254,7 +267,8 @@ class EnvState:
         if is_fixed and now.shape != value.shape:  # of another version of megastep
             shapes = f"was {tuple(value.shape)} and is {tuple(now.shape)}"
             raise ValueError(f"the shape of {_name(path)} {shapes}")
-        self._replace(path, _as_kind(value, kind))
+        device = device if torch.cuda.is_available() else "cpu"
+        self._replace(path, value.to(device, copy=True))
 
     def _replace(self, path, value) -> Any:
         parent, step = node_at(self.root, _parent(path)), path[len(_parent(path)) :]
@@ -275,18 +289,8 @@ class EnvState:
         return [
             f"{_name(path)} ({type(node).__name__})"
             for path, node, is_users in self._nodes()
-            if is_users and not self._is_reached(path, node)
+            if is_users and not _is_reached(node)
         ]
-
-    def _is_reached(self, path, node) -> bool:
-        if isinstance(node, np.ndarray):
-            return _is_savable(node)
-        if isinstance(node, _CONSTANT):
-            return self._first_constants.get(path, node) == node
-        is_known = isinstance(
-            node, (Resets, *_STATEFUL, *_NUMBERS, list, tuple, dict, collections.deque)
-        )
-        return is_known or _is_plain(node) or hasattr(node, "__dict__")
 
     def _nodes(self) -> Iterator[tuple[str, Any, bool]]:
         """Yields (path, node, whether it is below an object of a class that is not megastep's).
@@ -310,7 +314,8 @@ def _record(node, is_users) -> tuple | None:
     if isinstance(node, _GENERATORS):
         return "generator", _generator_state(node)
     if isinstance(node, np.ndarray):
-        return ("array", *_copied(node)) if _is_savable(node) else None
+        is_savable = _is_savable(node.dtype)
+        return ("array", _as_bytes(node), node.dtype.str, node.shape) if is_savable else None
     if not is_users or isinstance(node, torch.Tensor):
         return None
     if _is_plain(node):
@@ -379,6 +384,13 @@ def _is_state(root, parent, step, value) -> bool:
     return is_data and not (name.startswith("__") and name.endswith("__"))
 
 
+def _is_reached(node) -> bool:
+    if isinstance(node, np.ndarray):
+        return _is_savable(node.dtype)
+    known = (Resets, *_STATEFUL, *_CONSTANT, list, tuple, dict, collections.deque)
+    return isinstance(node, known) or _is_plain(node) or hasattr(node, "__dict__")
+
+
 def _is_object(node) -> bool:
     return hasattr(node, "__dict__") and not isinstance(node, (*_STATEFUL, *_CONSTANT))
 
@@ -398,30 +410,13 @@ def _is_plain(node) -> bool:
     return isinstance(node, _NUMBERS)
 
 
-def _is_savable(array) -> bool:
-    return _is_of_numbers(array.dtype) or (array.dtype.kind in "SUmM" and array.dtype.itemsize > 0)
+def _is_savable(dtype) -> bool:
+    return dtype.kind in "biufcSUmM"
 
 
-def _is_of_numbers(dtype) -> bool:
-    """Returns whether PyTorch has this type of NumPy's."""
-    is_long = dtype.itemsize > 16 or dtype == np.longdouble
-    return dtype.kind in "biufc" and not is_long and dtype.isnative
-
-
-def _as_tensor(leaf) -> torch.Tensor:
-    """Returns a tensor, or an array as a tensor that shares its memory: of characters or times, as
-    bytes on a last axis.
-    """
-    if isinstance(leaf, torch.Tensor):
-        return leaf
-    is_of_numbers = _is_of_numbers(leaf.dtype)
-    return torch.from_numpy(leaf if is_of_numbers else leaf[..., None].view(np.uint8))
-
-
-def _copied(array) -> tuple[torch.Tensor, str]:
-    """Returns a copy of an array as a tensor, and the kind from which `_as_kind` makes it again."""
-    kind = "numpy" if _is_of_numbers(array.dtype) else f"numpy {array.dtype.str}"
-    return _as_tensor(np.array(array, order="C")), kind
+def _as_bytes(array) -> torch.Tensor:
+    """Returns a copy of an array's bytes, (n,) uint8."""
+    return torch.from_numpy(np.frombuffer(array.tobytes(), np.uint8).copy())
 
 
 def _parent(path) -> str:
@@ -452,77 +447,48 @@ def _digest(tensor) -> int:
     return int(total)
 
 
-def _fits(leaf, value) -> bool:
-    """Returns whether a tensor or array can take a saved value in place."""
-    if isinstance(leaf, np.ndarray):
-        is_usable = _is_savable(leaf) and leaf.flags.writeable and min(leaf.strides, default=0) >= 0
-        return is_usable and _fits(_as_tensor(leaf), value)
-    if not isinstance(leaf, torch.Tensor):
-        return False
-    return leaf.shape == value.shape and leaf.dtype == value.dtype and not is_expanded(leaf)
-
-
 def _equal(leaf, value) -> bool:
     # as bytes, since NaN is not equal to itself
-    pair = (_as_tensor(one).cpu().contiguous().view(-1) for one in (leaf, value))
+    pair = (one.detach().cpu().contiguous().view(-1) for one in (leaf, value))
     return torch.equal(*(one.view(torch.uint8) for one in pair))
-
-
-def _as_kind(value, kind) -> np.ndarray | torch.Tensor:
-    """Returns a saved tensor as what it was: an array, or a tensor on a kind of device."""
-    if kind.startswith("numpy"):
-        array, dtype = value.cpu().numpy().copy(), kind.removeprefix("numpy ")
-        return array if dtype == kind else array.view(dtype)[..., 0]
-    has_device = kind != "cuda" or torch.cuda.is_available()
-    return value.to(kind if has_device else "cpu", copy=True)
 
 
 # ---- Plain values and generators, in types that a file without code can hold ----
 
 
 def _encoded(value) -> Any:
-    if isinstance(value, np.generic):
-        return {"numpy": (value.dtype.str, value.tobytes().hex())}
+    """Returns a plain value or a generator's state as what `torch.load(weights_only=True)` reads:
+    tuples whose first part names other types.
+    """
+    if isinstance(value, (np.generic, np.ndarray)):
+        return "$numpy", value.dtype.str, value.shape, value.tobytes()
     if isinstance(value, enum.Enum):
         return value.name
     if isinstance(value, dict):
-        return {"dict": [[_encoded(key), _encoded(part)] for key, part in value.items()]}
-    if isinstance(value, (set, frozenset)):
-        return {type(value).__name__: sorted(map(_encoded, value), key=repr)}
-    if isinstance(value, collections.deque):
-        return {"deque": [*map(_encoded, value)], "maxlen": value.maxlen}
-    if isinstance(value, tuple):
-        return {"tuple": [*map(_encoded, value)]}
-    if isinstance(value, list):
-        return [*map(_encoded, value)]
-    if isinstance(value, bytes):
-        return {"bytes": value.hex()}
-    if isinstance(value, complex):
-        return {"complex": [value.real, value.imag]}
-    kinds = (bool, int, float, str)
+        return {_encoded(key): _encoded(part) for key, part in value.items()}
+    if isinstance(value, (frozenset, collections.deque)):
+        length = getattr(value, "maxlen", None)
+        return f"${type(value).__name__}", length, [*map(_encoded, value)]
+    kinds = (list, tuple, set)
+    if kind := next((kind for kind in kinds if isinstance(value, kind)), None):
+        return kind(map(_encoded, value))
+    kinds = (bool, int, float, str, bytes, complex)
     return next((kind(value) for kind in kinds if isinstance(value, kind)), value)
 
 
 def _decoded(value) -> Any:
-    if isinstance(value, list):
-        return [*map(_decoded, value)]
     match value:
-        case {"numpy": (dtype, data)}:
-            return np.frombuffer(bytes.fromhex(data), dtype)[0]
-        case {"dict": pairs}:
-            return {_decoded(key): _decoded(part) for key, part in pairs}
-        case {"set": parts}:
-            return {*map(_decoded, parts)}
-        case {"frozenset": parts}:
+        case ("$numpy", dtype, shape, data):
+            array = np.frombuffer(data, dtype).reshape(shape)
+            return array.copy() if shape else array[()]
+        case ("$frozenset", _, parts):
             return frozenset(map(_decoded, parts))
-        case {"deque": parts, "maxlen": length}:
+        case ("$deque", length, parts):
             return collections.deque(map(_decoded, parts), length)
-        case {"tuple": parts}:
-            return tuple(map(_decoded, parts))
-        case {"bytes": text}:
-            return bytes.fromhex(text)
-        case {"complex": (real, imaginary)}:
-            return complex(real, imaginary)
+        case dict():
+            return {_decoded(key): _decoded(part) for key, part in value.items()}
+        case list() | tuple() | set():
+            return type(value)(map(_decoded, value))
     return value
 
 
@@ -530,10 +496,10 @@ def _generator_state(generator) -> Any:
     if isinstance(generator, torch.Generator):
         return generator.get_state()
     if isinstance(generator, random.Random):
-        return _encoded(generator.getstate())
+        return generator.getstate()
     if isinstance(generator, np.random.RandomState):
-        return _encoded(_without_arrays(generator.get_state(legacy=False)))
-    return _encoded(_without_arrays(generator.bit_generator.state))
+        return _encoded(generator.get_state(legacy=False))
+    return _encoded(generator.bit_generator.state)
 
 
 def _set_generator_state(generator, state) -> bool:
@@ -542,24 +508,11 @@ def _set_generator_state(generator, state) -> bool:
         if isinstance(generator, torch.Generator):
             generator.set_state(state.cpu())
         elif isinstance(generator, random.Random):
-            generator.setstate(_decoded(state))
+            generator.setstate(state)
         elif isinstance(generator, np.random.RandomState):
-            generator.set_state(_with_arrays(_decoded(state)))
+            generator.set_state(_decoded(state))
         else:
-            generator.bit_generator.state = _with_arrays(_decoded(state))
+            generator.bit_generator.state = _decoded(state)
     except (TypeError, ValueError, RuntimeError, AttributeError, KeyError):
         return False
     return True
-
-
-def _without_arrays(state) -> object:
-    """Returns the state of one of NumPy's generators as plain values."""
-    if isinstance(state, dict):
-        return {key: _without_arrays(value) for key, value in state.items()}
-    return (state.dtype.name, state.tolist()) if isinstance(state, np.ndarray) else state
-
-
-def _with_arrays(state) -> Any:
-    if isinstance(state, dict):
-        return {key: _with_arrays(value) for key, value in state.items()}
-    return np.array(state[1], state[0]) if isinstance(state, tuple) else state

@@ -123,13 +123,11 @@ def test_what_cannot_be_saved_is_named():
     env = Env()
     assert EnvState(env).unreachable() == []
     env.counter, env.nodes, env.objects = iter([1]), {object()}, np.array([env])
-    env.words, env.span = np.zeros(1, "i4,f4"), range(2)
+    env.words = np.zeros(1, "i4,f4")
     env.fixed = (1, 2.0, b"bytes", range(3), slice(1), torch.float16, np.float32(1), len)
     state = EnvState(env)
     names = ["counter (list_iterator)", "nodes (set)", "objects (ndarray)", "words (ndarray)"]
     assert state.unreachable() == names
-    env.span = range(3)
-    assert state.unreachable() == [*names, "span (range)"]
 
 
 def test_plain_values_that_never_change_are_not_saved():
