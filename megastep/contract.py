@@ -5,15 +5,14 @@ the first world that breaks a clause. Axes: N environments, A agents, B = N A la
 """
 
 import numbers
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
 
 import torch
 
 from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.engine.state_tree import restore, snapshot
-from megastep.types import Env, Space, Tree, World, n_lanes, optional, takes_masks
+from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
 __all__ = [
     "ATTRIBUTES",
@@ -47,11 +46,6 @@ class ContractError(AssertionError):
     """An environment breaks a clause of the contract. The message names class and clause."""
 
 
-def _require(env: Env, holds: bool, clause: str) -> None:
-    if not holds:
-        raise ContractError(f"{type(env).__name__} breaks the contract: {clause}")
-
-
 # ---- The environment ----
 
 
@@ -61,43 +55,44 @@ def check_environment(env: Env) -> None:
     Raises:
         ContractError: if one is missing or wrong.
     """
+    _raise_first(env, _problems_of_environment(env))
+
+
+def _raise_first(env, problems) -> None:
+    for problem in problems:
+        raise ContractError(f"{type(env).__name__} breaks the contract: {problem}")
+
+
+def _problems_of_environment(env) -> Iterator[str]:
+    """Yields what is wrong, as clauses. Those after the first may not hold."""
     for name, meaning in ATTRIBUTES.items():
-        _require(env, hasattr(env, name), f"it has no {name}: {meaning}")
+        if not hasattr(env, name):
+            yield f"it has no {name}: {meaning}"
     for path, space in spaces.leaves(env.action_space, "action_space").items():
-        _require(
-            env,
-            isinstance(space, (spaces.MultiDiscrete, spaces.MultiContinuous)),
-            f"{path} must be MultiDiscrete, MultiContinuous or a dict of them, not {space!r}",
-        )
+        if not isinstance(space, (spaces.MultiDiscrete, spaces.MultiContinuous)):
+            yield f"{path} must be MultiDiscrete, MultiContinuous or a dict of them, not {space!r}"
     names = "n_agents", "fps", "check", "layout", "roles"
     n_agents, fps, check, layout, roles = (optional(env, name) for name in names)
-    is_count = isinstance(n_agents, numbers.Integral) and int(n_agents) > 0
-    _require(env, is_count, f"n_agents must be a positive integer, not {n_agents!r}")
-    is_rate = isinstance(fps, numbers.Real) and float(fps) > 0
-    _require(env, is_rate, f"fps must be a positive number, not {fps!r}")
-    _require(env, callable(check), f"check must be a method without arguments, not {check!r}")
+    if not (isinstance(n_agents, numbers.Integral) and int(n_agents) > 0):
+        yield f"n_agents must be a positive integer, not {n_agents!r}"
+    if not (isinstance(fps, numbers.Real) and float(fps) > 0):
+        yield f"fps must be a positive number, not {fps!r}"
+    if not callable(check):
+        yield f"check must be a method without arguments, not {check!r}"
     check()
-    _require(
-        env,
-        layout is None or (layout.shape == (env.n_envs,) and not layout.is_floating_point()),
-        f"layout must hold one integer per environment, shape ({env.n_envs},)",
-    )
-    is_list = isinstance(roles, (tuple, list)) and len(roles) == n_agents
-    _require(
-        env,
-        roles is None or is_list,
-        f"roles must hold one name per agent, {n_agents} in all, not {roles!r}",
-    )
-    _require(
-        env,
-        roles is None or _are_names(roles),
-        f"roles must be identifiers, such as red_team, as metrics have them in their names, not "
-        f"{roles!r}",
-    )
+    if layout is not None and (layout.shape != (env.n_envs,) or layout.is_floating_point()):
+        yield f"layout must hold one integer per environment, shape ({env.n_envs},)"
+    if roles is None:
+        return
+    if not isinstance(roles, (tuple, list)) or len(roles) != n_agents:
+        yield f"roles must hold one name per agent, {n_agents} in all, not {roles!r}"
+    if not all(map(_is_name, roles)):
+        names = "such as red_team, as metrics have them in their names"
+        yield f"roles must be identifiers, {names}, not {roles!r}"
 
 
-def _are_names(words) -> bool:
-    return all(isinstance(word, str) and word.isidentifier() for word in words)
+def _is_name(word) -> bool:
+    return isinstance(word, str) and word.isidentifier()
 
 
 # ---- A world ----
@@ -114,172 +109,143 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
     Raises:
         ContractError: if the world breaks a clause.
     """
-    kind = type(world).__name__
-    _require(env, isinstance(world, arrdict), f"a world must be a megastep.arrdict, not a {kind}")
+    _raise_first(env, _problems_of_world(env, world, last))
+
+
+def _problems_of_world(env, world, last) -> Iterator[str]:
+    if not isinstance(world, arrdict):
+        yield f"a world must be a megastep.arrdict, not a {type(world).__name__}"
     for key in ("obs", "reward", *FLAGS):
-        _require(env, key in world, f"the world has no {key}")
-    _check_per_lane(env, "reward", world["reward"], torch.float32)
+        if key not in world:
+            yield f"the world has no {key}"
+    yield from _problems_per_lane(env, "reward", world["reward"], torch.float32)
     for key in FLAGS:
-        _check_per_lane(env, key, world[key], torch.bool)
-    for path, space, values in _leaves(env, env.obs_space, world["obs"], "obs"):
-        _check_observation(env, path, space, values)
-    _check_privileged(env, world)
-    _check_episodes(env, world, last)
-    _check_metrics(env, world, last)
-    _check_game_over(env, world)
-    _require(
-        env,
-        last is None or ("learns" in world) == ("learns" in last),
-        "learns must be in every world or in none",
-    )
+        yield from _problems_per_lane(env, key, world[key], torch.bool)
+    yield from _problems_of_keys(env.obs_space, world["obs"], "obs")
+    values = spaces.leaves(world["obs"], "obs")
+    for path, space in spaces.leaves(env.obs_space, "obs").items():
+        yield from _problems_of_observation(env, path, space, values[path])
+    yield from _problems_of_privileged(env, world)
+    yield from _problems_of_episodes(env, world, last)
+    yield from _problems_of_metrics(env, world, last)
+    for key in ("learns", "mask"):
+        if last is not None and (key in world) != (key in last):
+            yield f"{key} must be in every world or in none"
     if "learns" in world:
-        _check_per_lane(env, "learns", world["learns"], torch.bool)
-    _require(
-        env,
-        last is None or ("mask" in world) == ("mask" in last),
-        "mask must be in every world or in none",
-    )
+        yield from _problems_per_lane(env, "learns", world["learns"], torch.bool)
     if "mask" in world:
-        _check_mask(env, world["mask"])
+        yield from _problems_of_mask(env, world["mask"])
 
 
-def _check_tensor(env, path, values, shape, dtypes, kind=None) -> None:
+def _problems_of_tensor(env, path, values, shape, dtypes, kind=None) -> Iterator[str]:
     """Requires a tensor of this shape, of one of the dtypes, on the environment's device."""
-    described = repr(values)
+    described, device = repr(values), torch.device(env.device).type
     if isinstance(values, torch.Tensor):
         described = f"{values.dtype} {tuple(values.shape)} on {values.device.type}"
-    device = torch.device(env.device).type
+        is_alike = values.shape == shape and values.dtype in dtypes
+        if is_alike and values.device.type == device:
+            return
     kind = kind or " or ".join(str(dtype) for dtype in dtypes)
-    _require(
-        env,
-        isinstance(values, torch.Tensor)
-        and values.shape == shape
-        and values.dtype in dtypes
-        and values.device.type == device,
-        f"{path} must be {kind} {tuple(shape)} on {device}, not {described}",
-    )
+    yield f"{path} must be {kind} {tuple(shape)} on {device}, not {described}"
 
 
-def _check_per_lane(env, path, values, dtype) -> None:
-    _check_tensor(env, path, values, (n_lanes(env),), (dtype,))
+def _problems_per_lane(env, path, values, dtype) -> Iterator[str]:
+    return _problems_of_tensor(env, path, values, (n_lanes(env),), (dtype,))
 
 
-def _leaves(env: Env, space: Space, values: Tree, name: str) -> Iterator[tuple[str, Space, Any]]:
-    """Yields (path, leaf space, leaf value). The values must have the keys of the space."""
+def _problems_of_keys(space, values, name) -> Iterator[str]:
     expected, present = spaces.leaves(space, name), spaces.leaves(values, name)
-    _require(
-        env,
-        expected.keys() == present.keys(),
-        f"the world must have {', '.join(expected)}, as {name}_space has, not {', '.join(present)}",
-    )
-    for path, leaf in expected.items():
-        yield path, leaf, present[path]
+    if expected.keys() != present.keys():
+        has = f"{', '.join(expected)}, as {name}_space has, not {', '.join(present)}"
+        yield f"the world must have {has}"
 
 
-def _check_observation(env, path, space, values) -> None:
+def _problems_of_observation(env, path, space, values) -> Iterator[str]:
     shape = n_lanes(env), *space.shape
     if isinstance(space, spaces.MultiDiscrete):
-        _check_tensor(env, path, values, shape, INTEGERS, "integers")
-        inside = bool(((values >= 0) & (values < space.n_actions)).all())
-        _require(env, inside, f"{path} must be from 0 to {space.n_actions - 1}")
+        yield from _problems_of_tensor(env, path, values, shape, INTEGERS, "integers")
+        if not bool(((values >= 0) & (values < space.n_actions)).all()):
+            yield f"{path} must be from 0 to {space.n_actions - 1}"
         return
     dtype = getattr(space, "dtype", None)
-    _check_tensor(env, path, values, shape, (dtype,) if dtype else FLOATS)
-    _require(env, bool(values.isfinite().all()), f"{path} must be finite")
+    yield from _problems_of_tensor(env, path, values, shape, (dtype,) if dtype else FLOATS)
+    if not bool(values.isfinite().all()):
+        yield f"{path} must be finite"
     if getattr(space, "low", None) is not None or getattr(space, "high", None) is not None:
         low, high = space.bounds(values.device)
-        inside = (values >= low) & (values <= high)
-        outside = values[~inside].float().tolist()[:1]
-        _require(
-            env, not outside, f"{path} must be within {space.low} and {space.high}, not {outside}"
-        )
+        outside = values[(values < low) | (values > high)].float().tolist()[:1]
+        if outside:
+            yield f"{path} must be within {space.low} and {space.high}, not {outside}"
 
 
-def _check_privileged(env, world) -> None:
+def _problems_of_privileged(env, world) -> Iterator[str]:
     space = optional(env, "privileged_space")
-    has_values, has_space = "privileged" in world, space is not None
-    _require(
-        env,
-        has_values == has_space,
-        "privileged must be in the world if, and only if, privileged_space is not None",
-    )
+    if ("privileged" in world) != (space is not None):
+        yield "privileged must be in the world if, and only if, privileged_space is not None"
     if space is None:
         return
-    for path, leaf, values in _leaves(env, space, world["privileged"], "privileged"):
+    yield from _problems_of_keys(space, world["privileged"], "privileged")
+    values = spaces.leaves(world["privileged"], "privileged")
+    for path, leaf in spaces.leaves(space, "privileged").items():
         shape = n_lanes(env), *leaf.shape
-        _check_tensor(env, path, values, shape, (torch.float32,))
-        _require(env, bool(values.isfinite().all()), f"{path} must be finite")
+        yield from _problems_of_tensor(env, path, values[path], shape, (torch.float32,))
+        if not bool(values[path].isfinite().all()):
+            yield f"{path} must be finite"
 
 
-def _check_mask(env, mask) -> None:
+def _problems_of_mask(env, mask) -> Iterator[str]:
     """Requires a bool per action of discrete spaces, of which at least one is true."""
-    actions, masks = spaces.leaves(env.action_space, "mask"), spaces.leaves(mask, "mask")
-    for path, values in masks.items():
+    actions = spaces.leaves(env.action_space, "mask")
+    for path, values in spaces.leaves(mask, "mask").items():
         space = actions.get(path)
-        is_discrete = isinstance(space, spaces.MultiDiscrete)
-        _require(env, is_discrete, f"{path} is of no discrete action space: leave it out")
-        assert space is not None
+        if not isinstance(space, spaces.MultiDiscrete):
+            yield f"{path} is of no discrete action space: leave it out"
+            return
         shape = n_lanes(env), *space.shape, space.n_actions
-        _check_tensor(env, path, values, shape, (torch.bool,))
-        _require(env, bool(values.any(-1).all()), f"{path} must allow at least one action")
+        yield from _problems_of_tensor(env, path, values, shape, (torch.bool,))
+        if not bool(values.any(-1).all()):
+            yield f"{path} must allow at least one action"
 
 
-def _check_episodes(env, world, last) -> None:
+def _problems_of_episodes(env, world, last) -> Iterator[str]:
     """Requires finite rewards, and flags that agree with those of the last step."""
     reward, (reset, terminal, truncated) = world["reward"], (world[key] for key in FLAGS)
-    _require(env, bool(reward.isfinite().all()), "reward must be finite")
-    both, ended = terminal & truncated, terminal | truncated
-    _require(env, not bool(both.any()), "terminal and truncated exclude each other")
-    _require(
-        env,
-        not bool((reset & ended).any()),
-        "an episode must not end at its first observation: where reset is True, terminal and "
-        "truncated are False",
-    )
-    _require(
-        env,
-        not bool(reward[reset].any()),
-        "reward must be 0 at the first observation of an episode",
-    )
+    ended = terminal | truncated
+    if not bool(reward.isfinite().all()):
+        yield "reward must be finite"
+    if bool((terminal & truncated).any()):
+        yield "terminal and truncated exclude each other"
+    if bool((reset & ended).any()):
+        yield (
+            "an episode must not end at its first observation: where reset is True, terminal and "
+            "truncated are False"
+        )
+    if bool(reward[reset].any()):
+        yield "reward must be 0 at the first observation of an episode"
     expected = torch.ones_like(reset) if last is None else last["terminal"] | last["truncated"]
     learned = True if last is None else last.get("learns", True)
-    _require(
-        env,
-        torch.equal(reset & (expected | learned), expected),
-        "reset must be True after env.reset() and in the step after an episode ended, and False "
-        "otherwise, but may be True in lanes whose learns was False",
-    )
-
-
-def _check_metrics(env, world, last) -> None:
-    metrics = world.get("metrics", {})
-    _require(env, isinstance(metrics, Mapping), "metrics must be a dict of tensors")
-    _require(
-        env,
-        last is None or metrics.keys() == last.get("metrics", {}).keys(),
-        "metrics must have the same keys in every world",
-    )
-    for name, values in metrics.items():
-        _require(
-            env,
-            _are_names([name]) and name not in RESERVED,
-            f"the name of a metric must be an identifier other than {', '.join(RESERVED)}, "
-            f"not {name!r}",
+    if not torch.equal(reset & (expected | learned), expected):
+        yield (
+            "reset must be True after env.reset() and in the step after an episode ended, and "
+            "False otherwise, but may be True in lanes whose learns was False"
         )
-        _check_per_lane(env, f"metrics.{name}", values, torch.float32)
+    if (over := optional(env, "game_over")) is not None:
+        yield from _problems_of_tensor(env, "game_over", over, (env.n_envs,), (torch.bool,))
+        if bool((over & ~ended.view(env.n_envs, -1).all(1)).any()):
+            yield "where game_over is True, every lane must be terminal or truncated"
 
 
-def _check_game_over(env, world) -> None:
-    over = optional(env, "game_over")
-    if over is None:
-        return
-    _check_tensor(env, "game_over", over, (env.n_envs,), (torch.bool,))
-    ended = (world["terminal"] | world["truncated"]).view(env.n_envs, -1).all(1)
-    _require(
-        env,
-        not bool((over & ~ended).any()),
-        "where game_over is True, every lane must be terminal or truncated",
-    )
+def _problems_of_metrics(env, world, last) -> Iterator[str]:
+    metrics = world.get("metrics", {})
+    if not isinstance(metrics, Mapping):
+        yield "metrics must be a dict of tensors"
+    if last is not None and metrics.keys() != last.get("metrics", {}).keys():
+        yield "metrics must have the same keys in every world"
+    for name, values in metrics.items():
+        if not _is_name(name) or name in RESERVED:
+            words = ", ".join(RESERVED)
+            yield f"the name of a metric must be an identifier other than {words}, not {name!r}"
+        yield from _problems_per_lane(env, f"metrics.{name}", values, torch.float32)
 
 
 # ---- Stepping ----
@@ -293,30 +259,28 @@ def check_resets(env: Env) -> None:
         ContractError: if a masked reset changes other lanes or begins no episode in its own, or one
             seed gives two first worlds.
     """
-    n, n_agents, before = n_lanes(env), optional(env, "n_agents"), snapshot(env)
-    reset: Callable = env.reset
+    before = snapshot(env)
+    _raise_first(env, _problems_of_resets(env))
+    restore(env, before)
+
+
+def _problems_of_resets(env) -> Iterator[str]:
+    n, reset = n_lanes(env), env.reset
     first = reset(seed=1).clone()
-    check_world(env, first)
+    yield from _problems_of_world(env, first, None)
     decision = arrdict(actions=random_actions(env, torch.Generator().manual_seed(1)))
     last = env.step(decision).clone()
-    mask = torch.arange(n, device=env.device) // n_agents % 2 == 0  # every other environment
+    # every other environment
+    mask = torch.arange(n, device=env.device) // optional(env, "n_agents") % 2 == 0
     world = reset(seed=torch.ones(n, dtype=torch.int64, device=env.device), mask=mask)
-    _require(
-        env, bool(world["reset"][mask].all()), "reset must be True in the lanes of a masked reset"
-    )
+    if not bool(world["reset"][mask].all()):
+        yield "reset must be True in the lanes of a masked reset"
     for path, leaf in spaces.leaves(world).items():
         was, begins = spaces.leaves(last)[path], spaces.leaves(first)[path]
-        _require(
-            env,
-            torch.equal(leaf[~mask], was[~mask]),
-            f"a masked reset must leave other lanes as they are, but {path} has changed",
-        )
-        _require(
-            env,
-            torch.equal(leaf[mask], begins[mask]) or not path.startswith("obs"),
-            f"a seed must give the same first world each time, but {path} differs",
-        )
-    restore(env, before)
+        if not torch.equal(leaf[~mask], was[~mask]):
+            yield f"a masked reset must leave other lanes as they are, but {path} has changed"
+        if path.startswith("obs") and not torch.equal(leaf[mask], begins[mask]):
+            yield f"a seed must give the same first world each time, but {path} differs"
 
 
 def random_actions(env: Env, generator: torch.Generator, mask: Tree = None) -> Tree:
