@@ -129,17 +129,11 @@ def _members(container) -> list:
 
 
 def _refill(container, members) -> None:
-    if isinstance(container, (list, collections.deque)):
-        container.clear()
+    container.clear()
+    if isinstance(container, dict):
+        container.update(zip(members[::2], members[1::2]))
+    else:
         container.extend(members)
-        return
-    pairs = zip(members[::2], members[1::2])
-    if isinstance(container, collections.OrderedDict):
-        container.clear()
-        container.update(pairs)
-    else:  # not methods of a subclass, which may do something else
-        dict.clear(container)
-        dict.update(container, pairs)
 
 
 def _storage(tensor) -> tuple[torch.device, int]:

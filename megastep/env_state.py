@@ -226,7 +226,8 @@ class EnvState:
                     self._replace(path, same)
             elif kind == "array":
                 dtype, shape = more
-                self._set_array(path, now, _decoded(("$numpy", dtype, shape, value.cpu().numpy())))
+                array = np.frombuffer(value.cpu().numpy().tobytes(), dtype).reshape(shape)
+                self._set_array(path, now, array.copy())
             else:
                 self._set_tensor(path, now, value, *more, written)
 
@@ -457,37 +458,46 @@ def _equal(leaf, value) -> bool:
 
 
 def _encoded(value) -> Any:
-    """Returns a plain value or a generator's state as what `torch.load(weights_only=True)` reads:
-    tuples whose first part names other types.
+    """Returns a plain value or a generator's state as numbers, strings, lists, dicts and tuples,
+    those of other types as tuples that begin with the type's name.
     """
     if isinstance(value, (np.generic, np.ndarray)):
-        return "$numpy", value.dtype.str, value.shape, value.tobytes()
+        return "$numpy", value.dtype.str, value.shape, value.tobytes().hex()
     if isinstance(value, enum.Enum):
         return value.name
     if isinstance(value, dict):
         return {_encoded(key): _encoded(part) for key, part in value.items()}
-    if isinstance(value, (frozenset, collections.deque)):
-        length = getattr(value, "maxlen", None)
-        return f"${type(value).__name__}", length, [*map(_encoded, value)]
-    kinds = (list, tuple, set)
+    if isinstance(value, collections.deque):
+        return "$deque", [*map(_encoded, value)], value.maxlen
+    if isinstance(value, (set, frozenset)):
+        return f"${type(value).__name__}", (*sorted(map(_encoded, value), key=repr),)
+    if isinstance(value, bytes):
+        return "$bytes", value.hex()
+    if isinstance(value, complex):
+        return "$complex", value.real, value.imag
+    kinds = (list, tuple)
     if kind := next((kind for kind in kinds if isinstance(value, kind)), None):
         return kind(map(_encoded, value))
-    kinds = (bool, int, float, str, bytes, complex)
+    kinds = (bool, int, float, str)
     return next((kind(value) for kind in kinds if isinstance(value, kind)), value)
 
 
 def _decoded(value) -> Any:
     match value:
-        case ("$numpy", dtype, shape, data):
-            array = np.frombuffer(data, dtype).reshape(shape)
+        case ("$numpy", dtype, shape, text):
+            array = np.frombuffer(bytes.fromhex(text), dtype).reshape(shape)
             return array.copy() if shape else array[()]
-        case ("$frozenset", _, parts):
-            return frozenset(map(_decoded, parts))
-        case ("$deque", length, parts):
+        case ("$deque", parts, length):
             return collections.deque(map(_decoded, parts), length)
+        case ("$set" | "$frozenset" as name, parts):
+            return (set if name == "$set" else frozenset)(map(_decoded, parts))
+        case ("$bytes", text):
+            return bytes.fromhex(text)
+        case ("$complex", real, imaginary):
+            return complex(real, imaginary)
         case dict():
             return {_decoded(key): _decoded(part) for key, part in value.items()}
-        case list() | tuple() | set():
+        case list() | tuple():
             return type(value)(map(_decoded, value))
     return value
 

@@ -68,10 +68,10 @@ class VectorProcesses:
                 self.pipes.append(pipe)
                 self.processes.append(process)
         # in a worker, since a fault may end the process that it happens in
-        self.pipes[0].send(("probe", ()))
+        self.pipes[0].send(("probe", {}))
         self.found = self._receive(0)
         self.found = Probe() if isinstance(self.found, Exception) else self.found
-        (example, *_) = self._ask("begin", [(self.found,) for _ in self.rows])
+        (example, *_) = self._ask("begin", [{"found": self.found}] * len(self.rows))
         self.metadata, self.render_mode, spaces = example
         self.single_observation_space, self.single_action_space = spaces
         self.observations = create_empty_array(self.single_observation_space, n_envs)
@@ -80,7 +80,7 @@ class VectorProcesses:
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
         """Resets every environment. Returns (observations, infos), see `step`."""
-        seeds = [(seed and list(seed[rows]),) for rows in self.rows]
+        seeds = [{"seed": seed and list(seed[rows])} for rows in self.rows]
         answers = self._ask("reset", seeds)
         for rows, (obs, _) in zip(self.rows, answers):
             _write(self.observations, rows, obs)
@@ -90,7 +90,7 @@ class VectorProcesses:
         """Takes one step. Returns (observations, rewards, terminated, truncated, infos), which are
         valid until the next call.
         """
-        answers = self._ask("step", [(_read(actions, rows),) for rows in self.rows])
+        answers = self._ask("step", [{"actions": _read(actions, rows)} for rows in self.rows])
         for rows, (obs, *results, _) in zip(self.rows, answers):
             _write(self.observations, rows, obs)
             _write(self.results, rows, results)
@@ -98,7 +98,7 @@ class VectorProcesses:
 
     def render(self) -> list:
         """Returns a frame of every environment."""
-        answers = self._ask("render", [() for _ in self.rows])
+        answers = self._ask("render", [{}] * len(self.rows))
         return [frame for frames in answers for frame in frames]
 
     def wrapper_state(self) -> Tree:
@@ -107,7 +107,7 @@ class VectorProcesses:
         """
         if self.found.learnt:
             with contextlib.suppress(OSError, EnvError, MemoryError):
-                self.pipes[0].send(("wrapper_state", ()))
+                self.pipes[0].send(("wrapper_state", {}))
                 answer = self._receive(0)
                 if not isinstance(answer, Exception):
                     self.latest_state = answer
@@ -115,7 +115,8 @@ class VectorProcesses:
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
         """As :meth:`~megastep.hosting.guard.HostedEnvs.load_wrapper_state`."""
-        self._ask("load_wrapper_state", [(state, is_frozen) for _ in self.pipes])
+        arguments = dict(state=state, is_frozen=is_frozen)
+        self._ask("load_wrapper_state", [arguments] * len(self.rows))
 
     def close(self) -> None:
         """Closes the environments and ends their processes, by force after `PATIENCE` seconds.
@@ -126,7 +127,7 @@ class VectorProcesses:
         answers, pipes = [], [*self.pipes]
         for pipe in pipes:
             with contextlib.suppress(EOFError, OSError):  # it has ended
-                pipe.send(("close", ()))
+                pipe.send(("close", {}))
         end = time.monotonic() + PATIENCE
         for pipe in pipes:
             with contextlib.suppress(EOFError, OSError):
@@ -135,20 +136,14 @@ class VectorProcesses:
                 else:
                     answers.append(EnvError(f"close() did not return in {PATIENCE} s"))
         self._finalizer()
-        for answer in answers:
-            if isinstance(answer, Exception):
-                raise answer
+        _raise_first(answers)
 
     def _ask(self, command, arguments) -> list:
         """Returns the answer of each process to a command."""
         for pipe, own in zip(self.pipes, arguments, strict=True):
             with contextlib.suppress(OSError):  # of a process that has ended, as its answer says
                 pipe.send((command, own))
-        answers = [self._receive(number) for number in range(len(self.pipes))]
-        for error in answers:
-            if isinstance(error, Exception):
-                raise error
-        return answers
+        return _raise_first([self._receive(number) for number in range(len(self.pipes))])
 
     def _receive(self, number) -> Any:
         """Returns the answer of a process, which may be an error of an environment.
@@ -191,6 +186,7 @@ class _Worker:
 
     def __init__(self, make, rows, settings) -> None:
         self.make, self.rows, self.settings = make, rows, settings
+        self.envs: Any = None
 
     def serve(self, pipe) -> None:
         seeds = np.random.SeedSequence([self.settings["seed"], self.rows.start])
@@ -201,37 +197,28 @@ class _Worker:
         with contextlib.suppress(EOFError, OSError):
             while command != "close":
                 command, arguments = pipe.recv()
-                pipe.send(_attempt(getattr(self, command), *arguments))
-        if command != "close":
-            _attempt(self.close)
+                pipe.send(_attempt(self.answer, command, arguments))
+        if command != "close" and self.envs is not None:
+            _attempt(self.envs.close)
 
-    def probe(self) -> Probe:
-        return probe(self.make)
+    def answer(self, command, arguments) -> Any:
+        if command == "probe":
+            return probe(self.make)
+        if command == "begin":
+            n_envs, first = self.rows.stop - self.rows.start, self.rows.start
+            self.envs = envs = HostedEnvs(self.make, n_envs, first, **arguments, **self.settings)
+            spaces = envs.single_observation_space, envs.single_action_space
+            return envs.metadata, envs.render_mode, spaces
+        if command == "render":
+            start_rendering(self.envs)
+        return getattr(self.envs, command)(**arguments)
 
-    def begin(self, found) -> tuple:
-        n_envs, first = self.rows.stop - self.rows.start, self.rows.start
-        self.envs = envs = HostedEnvs(self.make, n_envs, first, found, **self.settings)
-        spaces = envs.single_observation_space, envs.single_action_space
-        return envs.metadata, envs.render_mode, spaces
 
-    def reset(self, seed) -> tuple:
-        return self.envs.reset(seed=seed)
-
-    def step(self, actions) -> tuple:
-        return self.envs.step(actions)
-
-    def render(self) -> object:
-        start_rendering(self.envs)
-        return self.envs.render()
-
-    def wrapper_state(self) -> Tree:
-        return self.envs.wrapper_state()
-
-    def load_wrapper_state(self, state, is_frozen) -> None:
-        self.envs.load_wrapper_state(state, is_frozen)
-
-    def close(self) -> None:
-        self.envs.close()
+def _raise_first(answers) -> list:
+    for answer in answers:
+        if isinstance(answer, Exception):
+            raise answer
+    return answers
 
 
 def _attempt(function, *arguments) -> Any:
