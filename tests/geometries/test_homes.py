@@ -4,7 +4,6 @@ import hashlib
 import math
 import shutil
 import time
-import tracemalloc
 
 import matplotlib
 import numpy as np
@@ -19,16 +18,13 @@ from megastep.envs.pointgoal.path_graph import PathGraph
 from megastep.geometries import checks, homes
 from megastep.geometries.homes import (
     database,
-    furniture,
-    openings,
     partition,
     plan,
     portable_generator,
     regions,
-    walls,
 )
 from megastep.geometries.homes.portable_generator import PortableGenerator
-from scripts import check_homes, make_homes, show_homes
+from scripts import check_homes, make_homes
 
 matplotlib.use("Agg")
 
@@ -77,40 +73,6 @@ def test_exp():
         assert portable_generator.exp(float(x)) == pytest.approx(math.exp(x), rel=1e-11)
 
 
-def test_distributions_have_the_right_moments():
-    generator, n = PortableGenerator(1), 20_000
-    uniform = np.array([generator.uniform() for _ in range(n)])
-    normal = np.array([generator.normal() for _ in range(n)])
-    error = 4 / np.sqrt(n)  # four standard errors
-    assert abs(uniform.mean() - 0.5) < error * 12**-0.5 and 0 <= uniform.min() and uniform.max() < 1
-    assert abs(normal.mean()) < error and abs(normal.var() - 1) < error * 2**0.5
-    picks = np.bincount([generator.pick([1, 0, 3]) for _ in range(n)], minlength=3) / n
-    assert picks[1] == 0 and abs(picks[2] - 0.75) < error * 0.433
-    assert {generator.between(2, 4) for _ in range(100)} == {2, 3, 4}
-
-
-def test_regions_of_an_l_shape():
-    assert regions.area(L_SHAPE) == 400 * 600 + 300 * 250
-    assert regions.bounds(L_SHAPE) == (0, 0, 700, 600)
-    assert regions.narrowest(L_SHAPE) == 250
-    assert regions.widest(L_SHAPE) == (0, 0, 400, 600)
-    assert regions.corners(L_SHAPE, 0) == {400: 1}, "outdoors is beyond x = 400"
-    assert regions.corners(L_SHAPE, 1) == {250: 1}
-    lower, upper = regions.cut(L_SHAPE, 1, 300)
-    assert lower == [(0, 0, 400, 300), (400, 0, 700, 250)] and upper == [(0, 300, 400, 600)]
-    assert regions.connected(L_SHAPE, 250) and not regions.connected(L_SHAPE, 255)
-    for axis in (0, 1):
-        for share in (0.1, 0.5, 0.77):
-            at = regions.position(regions.bands(L_SHAPE, axis), int(share * regions.area(L_SHAPE)))
-            below = regions.area(regions.cut(L_SHAPE, axis, at)[0]) / regions.area(L_SHAPE)
-            assert at % regions.LATTICE == 0 and abs(below - share) < 0.01
-
-
-def test_of_equally_wide_rectangles_the_largest_is_the_widest():
-    """Both are 400 cm wide. The smaller one is the further from the origin."""
-    assert regions.widest([(0, 1000, 400, 1400), (600, 0, 1000, 600)]) == (600, 0, 1000, 600)
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_a_partition_covers_its_footprint_once(seed):
     generator = PortableGenerator(seed)
@@ -131,35 +93,6 @@ def test_a_partition_covers_its_footprint_once(seed):
         )
         for b in pieces[:i]:
             assert min(a[2], b[2]) <= max(a[0], b[0]) or min(a[3], b[3]) <= max(a[1], b[1])
-
-
-def test_contacts():
-    rooms = [
-        partition.Room("living", [(0, 0, 400, 600)]),
-        partition.Room("bath", [(400, 0, 700, 250)]),
-        partition.Room("bedroom", [(400, 250, 700, 600)]),
-    ]
-    assert openings.contacts(rooms) == [
-        (0, 400, 0, 250, 0, 1),
-        (0, 400, 250, 600, 0, 2),
-        (1, 250, 400, 700, 1, 2),
-    ]
-
-
-def test_walls_that_meet_fill_their_corner():
-    """Walls 10 cm thick along x = 400 up to y = 250, and from there to the right."""
-    upright = openings.Contact(0, 400, 0, 250, 0, 1)
-    level = openings.Contact(1, 250, 400, 700, 1, 2)
-    rectangles = walls.solids([upright, level], walls.depths({}, thickness=10))
-    assert rectangles == [(395, 0, 405, 255), (395, 245, 700, 255)]
-
-
-def test_a_light_is_at_the_centroid_unless_a_wall_is_near_or_it_is_outside():
-    far, near = np.array([[[0, 900], [700, 900]]]), np.array([[[290, 200], [290, 400]]])
-    assert walls.light(L_SHAPE, far) == (283, 258)
-    assert walls.light(L_SHAPE, near) == (200, 300)
-    narrow = [(0, 0, 120, 600), (120, 0, 800, 100)]  # its centroid is (254, 178)
-    assert walls.light(narrow, far) == (60, 300)
 
 
 def test_a_home_is_determined_by_its_seed():
@@ -215,44 +148,6 @@ def test_no_room_has_cells_inside_furniture(dense):
         fine = np.maximum(g.masks, 0).repeat(4, 0).repeat(4, 1)
         assert len(np.unique(labels[(fine > 0) & (labels > 0)])) == 1, g.id
         assert (labels[fine > 0] > 0).mean() > 0.99, "a cell that no wall touches is free"
-
-
-def test_a_room_less_its_walls():
-    """Walls along all sides, and the end of one that meets the left wall from outside."""
-    sides = [(-5, 0, 5, 300), (395, 0, 405, 300), (-5, -5, 405, 5), (-5, 290, 405, 300)]
-    assert furniture.clear((0, 0, 400, 300), [*sides, (-200, 145, 5, 155)]) == (5, 5, 395, 290)
-
-
-def test_sides_of_an_l_shape_with_a_wall_all_along():
-    assert furniture.walled(L_SHAPE, (0, 0, 400, 600)) == [True, True, False, True]
-    assert furniture.walled(L_SHAPE, (400, 0, 700, 250)) == [False, True, True, True]
-
-
-def test_furniture_leaves_a_passage_around_itself_and_in_front_of_doors():
-    """In a room of 8 m x 6 m with a door in the middle of its lower wall."""
-    room, door, passage = (0, 0, 800, 600), (360, -65, 440, 65), furniture.PASSAGE
-    n_pieces = n_shapes = 0
-    for seed in range(100):
-        boxes = furniture.furnish([room], [], [door], 0.6, PortableGenerator(seed))
-        n_pieces += len(boxes)
-        for i, a in enumerate(boxes):
-            assert min(a[:2]) >= 0 and a[2] <= 800 and a[3] <= 600
-            assert not furniture.overlap(a, door)
-            near = [b for b in boxes[:i] if furniture.overlap(a, b, passage)]
-            assert len(near) <= 1, "the other half of an L-shape"
-            n_shapes += len(near)
-            assert not any(furniture.overlap(a, b) for b in near)
-    assert n_pieces > 1000 and 0.2 < n_shapes / (n_pieces - n_shapes) < 0.5
-
-
-def test_an_l_shape_never_walls_in_a_corner():
-    """Free cells of 5 cm of furnished rooms are connected."""
-    for seed in range(200):
-        boxes = furniture.furnish([(0, 0, 300, 250)], [], [], 2.0, PortableGenerator(seed))
-        free = np.ones((50, 60), bool)
-        for x0, y0, x1, y1 in boxes:
-            free[y0 // 5 : y1 // 5, x0 // 5 : x1 // 5] = False
-        assert checks.components(free)[1] == 1
 
 
 def test_dense_homes_of_the_source_are_generated_ones(monkeypatch, tmp_path):
@@ -322,13 +217,6 @@ def test_many_cluttered_homes_pass_the_checks():
     assert 195 < np.median([len(g.walls) for g in plans]) < 215
 
 
-def test_clutter_changes_furniture_alone(dense, cluttered):
-    for g, other in zip(dense, cluttered):
-        assert g.rooms == other.rooms
-        assert (g.doors == other.doors).all() and (g.openings == other.openings).all()
-        assert (g.lights == other.lights).all() and not np.array_equal(g.walls, other.walls)
-
-
 def test_a_third_of_the_ways_in_cluttered_homes_are_narrow(dense, cluttered):
     """A body 41 cm wide can walk two thirds of those of an agent, and one 23 cm wide all."""
     for plans, (least, most) in ((dense[:30], (0, 0.1)), (cluttered, (0.2, 0.45))):
@@ -348,23 +236,6 @@ def blocked(plans, wider):
         wide = PathGraph([home], AGENT_RADIUS + wider, cpu).lengths(*pairs)
         ways.append(wide[(lengths >= 1) & (lengths <= 15)])
     return torch.cat(ways).isinf().float().mean()
-
-
-def test_clutter_leaves_gaps_for_an_agent_and_half_of_a_doorway():
-    """In a room of 4 m x 3 m with a door of 80 cm in its lower wall, of which 30 cm are left."""
-    kept, rest = (160, -30, 190, 30), (190, -10, 240, 0)
-    n_blocked = 0
-    for seed in range(100):
-        generator = PortableGenerator(seed)
-        boxes = furniture.furnish([(0, 0, 400, 300)], [], [kept], 0.6, generator, 1.0, [rest])
-        n_blocked += any(a[1] == 0 and a[0] == 190 for a in boxes)
-        for i, a in enumerate(boxes):
-            assert min(a[:2]) >= 0 and a[2] <= 400 and a[3] <= 300
-            assert not furniture.overlap(a, kept)
-            near = [b for b in boxes[:i] if furniture.overlap(a, b, furniture.TIGHT[0])]
-            assert len(near) <= 1, "the other half of an L-shape"
-            assert not any(furniture.overlap(a, b) for b in near)
-    assert n_blocked > 60
 
 
 @pytest.mark.parametrize("clutter", [-0.1, 1.1, float("nan"), "much"])
@@ -493,43 +364,6 @@ def test_masks_agree_with_rooms_and_areas(generated):
         assert ((door_widths(g) > 0.599) & (door_widths(g) < 0.951)).all()
 
 
-def test_leaving_out_the_outer_face_changes_nothing_else(generated):
-    for g in generated[:5]:
-        inner, stored = homes.generate(g.id, outer=False), database.home(g.id, outer=False)
-        whole = database.home(g.id)
-        assert len(inner.walls) == len(g.walls) - g.n_outer == len(stored.walls)
-        for other in inner, stored:
-            assert (other.walls == whole.walls[: -g.n_outer]).all()
-            assert (other.masks == whole.masks).all()
-            assert other.n_outer == 0 and (other.lights == whole.lights).all()
-
-
-def test_some_corners_are_slanted(packaged):
-    slanted = [g for g in packaged if (g.walls[:, 0] != g.walls[:, 1]).all(-1).any()]
-    assert 0.05 < len(slanted) / len(packaged) < 0.12
-    lines = slanted[0].walls
-    spans = np.abs(lines[:, 1] - lines[:, 0])
-    diagonal = spans[(spans > 0).all(-1)]
-    assert len(diagonal) == 2 and np.allclose(diagonal[:, 0], diagonal[:, 1])
-    a, b = lines[(spans > 0).all(-1)]
-    normal = (b[1] - b[0])[::-1] * [1, -1] / np.linalg.norm(b[1] - b[0])
-    thickness = abs((a[0] - b[0]) @ normal)
-    assert abs(thickness - np.array([0.20, 0.24, 0.30])).min() < 0.011, "to 1 cm"
-
-
-def test_statistics_of_packaged_homes(packaged):
-    lengths = [np.linalg.norm(g.walls[:, 1] - g.walls[:, 0], axis=-1).sum() for g in packaged]
-    values = {
-        "walls": [len(g.walls) for g in packaged],
-        "wall length, m": lengths,
-        "long side, m": [np.ptp(g.walls, axis=(0, 1)).max() for g in packaged],
-        "rooms": [g.masks.max() for g in packaged],
-    }
-    bands = [band for band in make_homes.BANDS if band[0] in values]
-    assert len(bands) == 7
-    assert make_homes.outside(values, bands) == []
-
-
 def test_statistics_of_generated_homes(generated):
     medians = [band for band in make_homes.BANDS if band[1] == 50]  # 60 homes are few for a 95 %
     assert make_homes.outside(make_homes.statistics(generated), medians) == []
@@ -541,12 +375,6 @@ def test_statistics_of_a_thousand_homes_generated_in_seconds():
     plans = [homes.generate(seed) for seed in range(10_000, 11_000)]
     assert time.process_time() - start < 100  # seconds, ten times what one core takes
     assert make_homes.outside(make_homes.statistics(plans), make_homes.BANDS) == []
-
-
-def test_statistics_outside_their_bands_are_named(generated):
-    small = make_homes.statistics([g for g in generated if len(g.rooms) < 6])
-    messages = make_homes.outside(small, make_homes.BANDS)
-    assert any(message.startswith("rooms: the 50 %") for message in messages)
 
 
 @pytest.mark.slow
@@ -583,20 +411,6 @@ def test_a_damaged_database_is_named(tmp_path):
         database.home(5, path=path)
 
 
-def test_a_planted_database_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
-    path = tmp_path / "homes.npz"
-    arrays = {name: np.zeros(1, np.int8) for name in database.NAMES}
-    np.savez_compressed(path, **arrays | {"masks": np.zeros(2**26, np.int8)})
-    path.with_suffix(".sha256").write_text(hashlib.sha256(path.read_bytes()).hexdigest())
-    database._arrays.cache_clear()
-    monkeypatch.setattr(database, "MAX_EACH", 1 << 12)
-    tracemalloc.start()
-    with pytest.raises(ValueError, match="unpacks to more than 5,000 homes can have"):
-        database.home(4, path=path)
-    assert tracemalloc.get_traced_memory()[1] < 2**23
-    tracemalloc.stop()
-
-
 def test_a_written_database_can_be_read(tmp_path, generated):
     path, plans = tmp_path / "homes.npz", generated[:3]
     digest = make_homes.write(plans, path)
@@ -606,18 +420,3 @@ def test_a_written_database_can_be_read(tmp_path, generated):
     for index, g in enumerate(plans):
         stored = database.home(index, path=path)
         assert all(np.array_equal(stored[key], g[key]) for key in stored)
-
-
-def test_make_homes_prints_statistics(monkeypatch, capsys):
-    monkeypatch.setattr(make_homes, "BANDS", [("rooms", 50, 7, 10)])
-    make_homes.main(["--count", "20", "--dry"])
-    output = capsys.readouterr().out
-    assert "20 homes" in output and "20 different plans" in output
-    assert "all checks passed" in output
-
-
-def test_show_homes_draws_every_home():
-    figure = show_homes.sheet_of_homes(range(3))
-    assert [ax.get_title()[:7] for ax in figure.axes] == ["home 0:", "home 1:", "home 2:", "", ""]
-    assert len(figure.axes[1].collections[0].get_segments()) == len(homes.generate(1).walls)
-    matplotlib.pyplot.close(figure)

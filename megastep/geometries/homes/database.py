@@ -93,13 +93,11 @@ def unpack(
             cannot be read. The message ends with the remedy.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            entries = {entry.filename: entry for entry in archive.infolist()}
-            n_bytes = sum(entry.file_size for entry in entries.values())
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            n_bytes = sum(entry.file_size for entry in archive.zip.infolist())
             if n_bytes > n_homes * MAX_EACH + MAX_HEADERS:
                 raise ValueError(f"it unpacks to more than {n_homes:,} homes can have")
-            names = *NAMES, *further
-            arrays = {name: files.read_array(archive, entries[f"{name}.npy"]) for name in names}
+            arrays = {name: archive[name] for name in (*NAMES, *further)}
     except (*files.UNREADABLE, KeyError) as error:
         raise ValueError(f"The database of homes cannot be read ({error}); {remedy}.") from error
     widths = arrays["widths"]
