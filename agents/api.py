@@ -64,7 +64,7 @@ class Run:
     @functools.cached_property
     def config(self) -> "Config":
         """The settings of the training, as nested dicts."""
-        return folders.load_checkpoint(self.path, trust=False).config["train"]
+        return folders.load_checkpoint(self.path, False).config["train"]
 
     @property
     def metrics(self) -> dict[str, list]:

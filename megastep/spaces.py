@@ -10,6 +10,7 @@ contract's checker holds an environment to them, and adapters for other librarie
 would replace Python's.
 """
 
+import ast
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -188,6 +189,22 @@ class MultiEmpty(_Space):
     @property
     def shape(self) -> tuple[int, ...]:
         return (0,)
+
+
+def from_text(text: str) -> _Space:
+    """Returns the space whose `repr` a text is. Raises ValueError if it is none."""
+    try:
+        call = cast("Any", ast.parse(text, mode="eval").body)
+        kind = {name: globals()[name] for name in __all__}[call.func.id]
+        values = {}
+        for word in call.keywords:
+            is_dtype = isinstance(word.value, ast.Attribute)
+            values[word.arg] = (
+                getattr(torch, word.value.attr) if is_dtype else ast.literal_eval(word.value)
+            )
+        return kind(**values)
+    except (SyntaxError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{text!r} is not a space: {error}") from None
 
 
 def random_actions(

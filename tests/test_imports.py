@@ -17,7 +17,7 @@ SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
     ("types",),
-    ("global_generators",),
+    ("atomic_files", "global_generators"),
     (
         "cache",
         "colour",
@@ -48,7 +48,7 @@ ENGINE = (
 )
 AGENTS = (
     ("errors", "generator", "package", "types"),
-    ("distributed",),
+    ("distributed", "hardware"),
     ("console", "networks"),
     ("storage",),
     ("algorithms",),
@@ -67,6 +67,7 @@ THREADS = "megastep.engine.devices"
 SHARED = {
     "megastep",
     "megastep.arrdict",
+    "megastep.atomic_files",
     "megastep.capture",
     "megastep.coefficients",
     "megastep.dotdict",
@@ -88,7 +89,8 @@ SHARED_WITH_BOTS = SHARED | {
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
 # environments, keeps the global generators, writes videos and starts processes.
-UPPER_ROOMS = ("api", "cli", "evaluation", "export", "factory", "launch", "pretrained", "reports")
+UPPER_ROOMS = ("api", "cli", "evaluation", "export", "factory", "hardware", "launch")
+UPPER_ROOMS += ("pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",

@@ -2,14 +2,10 @@
 may stand for more than there is memory, or never end.
 """
 
-import os
-from pathlib import Path
-
 import yaml
 from hydra.errors import ConfigCompositionException
 
 from megastep.agents.errors import shortened
-from megastep.agents.runs import strange_files
 
 #: Of one file: bytes, values with those that aliases repeat, and levels of brackets or blanks.
 MAX_BYTES, MAX_VALUES, MAX_DEPTH = 2**18, 20_000, 40
@@ -26,8 +22,10 @@ def check(path: str) -> None:
             no YAML.
     """
     try:
-        # ours, and a user's, may be links: what is typed is trusted
-        content = strange_files.read_bytes(Path(os.path.realpath(path)), MAX_BYTES)
+        with open(path, "rb") as file:
+            content = file.read(MAX_BYTES + 1)
+        if len(content) > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
         _check_events(content.decode())
     except OSError as error:
         raise ConfigCompositionException(f"{path} cannot be read: {error.strerror}") from None

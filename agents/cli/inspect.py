@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from megastep.agents import console
 from megastep.agents.errors import UserError
-from megastep.agents.runs import agent_file, checkpoint, checkpoint_format, folders
+from megastep.agents.runs import agent_file, checkpoint, folders
 
 if TYPE_CHECKING:
     import torch
@@ -64,8 +64,8 @@ def _inspect(
 
 def _lines(path: Path) -> Iterator[str]:
     """Yields the text about a checkpoint."""
-    manifest = checkpoint_format.read_manifest(path)
-    loaded = checkpoint_format.read(path, "cpu", is_whole=True)
+    manifest = checkpoint.read_manifest(path)
+    loaded = checkpoint.read(path, "cpu", is_whole=True)
     try:
         written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
     except FileNotFoundError:

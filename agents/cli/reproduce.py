@@ -17,7 +17,7 @@ import yaml
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.runs import json_lines
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.atomic_files import write_atomically
 from megastep.settings import closest
 
 #: The rows; its head says what they consist of.

@@ -15,7 +15,7 @@ from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, settings
 from megastep.agents.launch import launcher
 from megastep.agents.launch.again import AUTO, RESUMABLE, automatic
-from megastep.agents.runs import agent_file, folders, formats, populations
+from megastep.agents.runs import agent_file, folders, populations
 
 Tree = dict[str, Any]
 
@@ -164,14 +164,13 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
         groups = ("env", "geometry", "agent")
         groups = {group: saved[group] for group in groups if group not in typed}
         saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
-    elif not loaded.numbers:
+    elif not {"samples", "seconds", "updates"} <= loaded.numbers.keys():
         raise UserError(
             f"{loaded.path} is a snapshot, which has the weights only. init={loaded.path} starts "
             f"a new run from it; {how}= takes the run's folder"
         )
     if how != "init":
         with user_errors(f"{loaded.path} cannot be used: ", (ValueError, ConfigErrors)):
-            formats.check(formats.Progress, loaded.numbers)
             check.check(settings.Train, saved | {"logger": {}})  # a typed one replaces it
     if how == "rerun":
         saved |= {"resume": None, "folder": None}

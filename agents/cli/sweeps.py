@@ -40,7 +40,7 @@ from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
 from megastep.agents.launch.again import AUTO
 from megastep.agents.runs import folders, scores
-from megastep.agents.runs.atomic_files import make_folders, write_atomically
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -121,7 +121,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     with user_errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
             folder = folders.make(folder)  # another sweep may start in the same second
-        make_folders(folder)
+        folder.mkdir(parents=True, exist_ok=True)
     options = SEARCH if config.runtime.choices["hydra/sweeper"] == "optuna" else {}
     options = options | {
         "hydra.job.name": composer.script.name,

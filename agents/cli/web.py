@@ -61,11 +61,11 @@ def write(
     if path.suffix != ".html":
         raise UserError(f"file={path} is no page; its name ends with .html")
     from megastep.agents.export import web  # with PyTorch
-    from megastep.agents.runs.atomic_files import make_folders, write_atomically
+    from megastep.atomic_files import write_atomically
 
     text = web.make(run, against, homes, seed)
     with user_errors(f"{path} cannot be written: "):
-        make_folders(path.parent)
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, text.encode())
     console.say(f"Wrote {path}, {len(text) / 1e6:.2f} MB: open it in a browser")
     return path

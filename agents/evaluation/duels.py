@@ -16,7 +16,7 @@ from megastep.agents.evaluation.playing import step_until
 from megastep.agents.evaluation.statistics import TAIL, interval, lanes_by_source, worst_homes
 from megastep.agents.factory import settings
 from megastep.agents.generator import SeededGenerator
-from megastep.agents.runs import checkpoint
+from megastep.agents.runs import checkpoint, restore
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.arrdict import arrdict
@@ -126,7 +126,7 @@ class Duels:
         self.where = EvalEnv(env, homes, cfg.episodes, cfg.seed, device, is_duel=True)
         self.env, self.sample = self.where.env, self.where.sample
         self.agent = players.load_player(run, self.sample, run)
-        factory.load_wrappers(self.env, run)
+        restore.load_wrappers(self.env, run)
         self.others = [self.player(name) for name in cfg.against or ()]
         shard = self.where.shard
         slots = rotating_slots(shard.n_envs, optional(self.env, "n_agents"), self.env.device)

@@ -11,7 +11,7 @@ from megastep.agents.evaluation import players, playing, ratings, statistics, ta
 from megastep.agents.evaluation.duels import Duels
 from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory import env_failures, settings
-from megastep.agents.runs import checkpoint, folders
+from megastep.agents.runs import checkpoint, folders, restore
 from megastep.env_state import EnvState
 from megastep.types import optional
 
@@ -157,9 +157,8 @@ def players_of(
     cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, where: EvalEnv
 ) -> list[tuple[players.Player, bool]]:
     """Returns who plays, the run's agent and each of `cfg.baseline`, and whether it is greedy."""
-    policy = factory.make_policy(factory.config_of(loaded).agent, where.env)
-    policy = factory.load_weights(policy, where.env, loaded)
-    factory.load_wrappers(where.env, loaded)
+    policy = restore.policy_of(loaded, where.env)
+    restore.load_wrappers(where.env, loaded)
     every = [(players.Player("trained, greedy" if cfg.greedy else "trained", policy), cfg.greedy)]
     for name in cfg.baseline:
         player = players.find_player(name, loaded, where.settings, where.sample, cfg.trust)

@@ -13,8 +13,7 @@ from megastep.agents import console, factory
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import duels, eval_env, players, replay
 from megastep.agents.factory import components, env_failures, settings
-from megastep.agents.runs import folders
-from megastep.agents.runs.atomic_files import make_folders, remove_folders
+from megastep.agents.runs import folders, restore
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.types import PolicyLike, optional
 
@@ -97,7 +96,7 @@ def film(
             undo.callback(path.unlink, missing_ok=True)
         else:
             with user_errors(f"The video {path} could not be made: "):
-                undo.callback(remove_folders, make_folders(path.parent))
+                path.parent.mkdir(parents=True, exist_ok=True)
         # a video is the last thing that a run should fail for
         problem = f"The video {path} could not be made: "
         look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail", "axes")}
@@ -129,7 +128,7 @@ def _player(cfg, loaded, runs, env_settings, env) -> PolicyLike:
     if loaded is None:
         return RandomActions(env.action_space)
     policy = players.load_player(loaded, env, runs[0]).policy
-    factory.load_wrappers(env, loaded)
+    restore.load_wrappers(env, loaded)
     if cfg.against is None:
         return policy
     eval_env.check_duels(env)

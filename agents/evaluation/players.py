@@ -9,7 +9,7 @@ import torch
 from megastep.agents import factory
 from megastep.agents.errors import UserError
 from megastep.agents.factory import settings
-from megastep.agents.runs import checkpoint, folders
+from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.selfplay.bots import BOTS
 from megastep.types import Env, PolicyLike
 
@@ -32,7 +32,7 @@ def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpo
             f"{loaded.path} was trained in {settings.label(trained.env.name)} and {run.path} in "
             f"{settings.label(own.env.name)}; choose a run in the same environment"
         )
-    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    policy = restore.policy_of(loaded, env)
     if _of_wrappers(loaded) != _of_wrappers(run):
         warnings.warn(
             f"{loaded.path} observes through what the wrappers of {run.path} have learnt, not its "

@@ -19,7 +19,7 @@ from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import tables
 from megastep.agents.evaluation.duels import Duels
 from megastep.agents.runs import checkpoint, folders
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row

@@ -2,7 +2,6 @@
 on the same kind of device.
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,16 +15,13 @@ from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.evaluation.statistics import SCORES
 from megastep.agents.factory import check, settings
 from megastep.agents.generator import SeededGenerator
-from megastep.agents.runs import checkpoint, folders, strange_files, trust
+from megastep.agents.runs import checkpoint, folders, restore, trust
 from megastep.agents.runs.typed_json import loads
 from megastep.types import Env, PolicyLike, Tree, World, optional
 
 if TYPE_CHECKING:
     from megastep.agents.runs.checkpoint import Checkpoint
     from megastep.agents.types import Row
-
-#: Largest table that is read, bytes.
-MAX_BYTES = 2**28
 
 
 class AsEvaluated:
@@ -114,7 +110,7 @@ class Table(NamedTuple):
         """
         homes = factory.homes(self.env, self.geometry, self.cfg.split)
         parts, made = tables.parts_of(self.geometry, homes), {}
-        sources, agent = [source for source, _ in parts], factory.config_of(loaded).agent
+        sources = [source for source, _ in parts]
         where: dict[str, Any] = dict(seed=self.cfg.seed, device=device)
         n_agents = optional(factory.make_sample(self.env, homes, **where), "n_agents")
         for row in rows:
@@ -128,8 +124,8 @@ class Table(NamedTuple):
                     rank=(number, self.n_ranks),
                     films=True,
                 )
-                policy = factory.load_weights(factory.make_policy(agent, one.env), one.env, loaded)
-                factory.load_wrappers(one.env, loaded)
+                policy = restore.policy_of(loaded, one.env)
+                restore.load_wrappers(one.env, loaded)
                 made[part, number] = one.env, AsEvaluated(policy, one.seed, self.cfg.greedy)
             yield row, *made[part, number], (e // self.n_ranks) * n_agents + slot
 
@@ -151,11 +147,11 @@ def newest(folder: Path, loaded: checkpoint.Checkpoint, is_trusted: bool) -> Tab
         raise UserError(f"{folder} has no evaluation yet with episodes to film; first {command}")
     path = max(paths, key=lambda path: path.stat().st_mtime)
     with user_errors(f"{path} cannot be used: ", (Exception,)):
-        table = loads(strange_files.read_bytes(path, MAX_BYTES))
-        names = trust.foreign_names(json.dumps({"train": table["evaluation"]}).encode())
-        known = trust.foreign_names(json.dumps({"train": loaded.config["train"]}).encode())
-        if (strange := {*names} - {*known}) and not is_trusted:
-            raise ValueError(f"it would import {shortened(sorted(strange))}; trust=true allows it")
+        table = loads(path.read_bytes())
+        names = trust.untrusted(trust.foreign_names({"train": table["evaluation"]}))
+        foreign = {*names} - {*trust.foreign_names(loaded.config)}
+        if foreign and not is_trusted:
+            raise ValueError(f"it would import {shortened(sorted(foreign))}; trust=true allows it")
         cfg = check.check(settings.Evaluate, table["evaluation"])
         trained = factory.config_of(loaded)
         env = cfg.env or trained.env

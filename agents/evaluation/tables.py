@@ -15,9 +15,9 @@ from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree
 from megastep.agents.factory.settings import Evaluate, Geometry, env_name, label
 from megastep.agents.runs import checkpoint
-from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.runs.folders import folder_of, for_file
 from megastep.agents.runs.typed_json import encoded
+from megastep.atomic_files import write_atomically
 
 INTERVAL = "95 % interval"
 #: The source of a suite of which the worst homes have a row of their own.

@@ -16,8 +16,16 @@ from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import tables
 from megastep.agents.factory import components, settings
 from megastep.agents.networks.policy import Policy
-from megastep.agents.runs import agent_file, checkpoint, folders, json_lines, provenance, trust
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.runs import (
+    agent_file,
+    checkpoint,
+    folders,
+    json_lines,
+    provenance,
+    restore,
+    trust,
+)
+from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves
 from megastep.types import n_lanes
 
@@ -158,9 +166,9 @@ def write(run: str, file: Path, max_error: float = MAX_ERROR) -> tuple[Path, Pat
     env = factory.construct(
         settings.changed(trained.env, n_envs=N_ENVS), geometries=homes, seed=1, device="cpu"
     )
-    factory.load_wrappers(env, loaded)
-    original = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
-    state, exported = rounded(original), factory.make_policy(trained.agent, env)
+    restore.load_wrappers(env, loaded)
+    original, exported = (restore.policy_of(loaded, env) for _ in range(2))
+    state = rounded(original)
     exported.load_state_dict(state)
     error = rounding_error(exported, original, env)
     if not error <= max_error:
@@ -168,7 +176,7 @@ def write(run: str, file: Path, max_error: float = MAX_ERROR) -> tuple[Path, Pat
             f"{loaded.path} acts otherwise with weights in float16: its logits differ by "
             f"{error:.1%}, and may by {max_error:.1%}"
         )
-    if names := trust.foreign_names(json.dumps(config).encode()):
+    if names := trust.foreign_names(config):
         console.warn(f"{file} needs {', '.join(names)}, and of others who load it trust=true")
     if not (rows := tables_of(run_folder, loaded.step, bool(homes))):
         words = " geometry=suite episodes=8000" if homes else ""

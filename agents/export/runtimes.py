@@ -16,8 +16,8 @@ from megastep.agents.errors import UserError, shortened
 from megastep.agents.export.step import Step
 from megastep.agents.networks.kernels.library import plain_operations
 from megastep.agents.networks.outputs import FORBIDDEN
-from megastep.agents.runs.atomic_files import write_atomically
 from megastep.arrdict import arrdict
+from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves
 from megastep.types import Env, n_lanes
 

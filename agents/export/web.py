@@ -9,7 +9,7 @@ from megastep.agents.evaluation import eval_env, players
 from megastep.agents.export.launches import add_policy
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
-from megastep.agents.runs import folders
+from megastep.agents.runs import folders, restore
 from megastep.kernels.build.compile import EngineError
 from megastep.types import Env, n_lanes
 from megastep.web.page import module, page
@@ -46,8 +46,8 @@ def make(
     env_settings = settings.changed(trained.env, **changes)
     where = dict(geometries=chosen, seed=seed, device="cpu")
     env = cast(Env, factory.construct(env_settings, **where))
-    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
-    factory.load_wrappers(env, loaded)
+    policy = restore.policy_of(loaded, env)
+    restore.load_wrappers(env, loaded)
     lanes, names = n_lanes(env), {0: (name, policy)}
     if against is not None:
         eval_env.check_duels(env)

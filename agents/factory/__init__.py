@@ -19,8 +19,6 @@ _FUNCTIONS = (
     "homes",
     "in_env",
     "layout_sources",
-    "load_weights",
-    "load_wrappers",
     "make_bot",
     "make_curriculum",
     "make_device",
@@ -30,7 +28,6 @@ _FUNCTIONS = (
     "make_sample",
     "share_threads",
     "sources_of",
-    "spaces_of",
     "spread",
     "typed_or",
 )

@@ -5,13 +5,13 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from megastep import contract, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
-from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
+from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check
 from megastep.agents.factory.settings import (
     Agent,
@@ -28,8 +28,11 @@ from megastep.agents.factory.settings import (
     wrapper_settings,
 )
 from megastep.agents.generator import stream_seed
-from megastep.agents.networks.policy import TRAINING_ONLY, Policy
-from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
+from megastep.agents.hardware import make_device as make_device
+from megastep.agents.hardware import share_threads
+from megastep.agents.networks.policy import Policy
+from megastep.agents.runs import checkpoint
+from megastep.agents.runs.saver import check_plain
 from megastep.agents.selfplay.bots import BOTS
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import loggers
@@ -136,22 +139,6 @@ def _wrappers_of(settings, taken) -> tuple[list[str], list]:
         else:
             inside.append(name)
     return inside, outside
-
-
-def make_device(name: str, index: int | None = None) -> torch.device:
-    """Returns the device of this name, and makes a GPU the current one.
-
-    Args:
-        name: `auto`, `cpu`, `cuda` or `cuda:1`.
-        index: of the GPU that `auto` and `cuda` mean.
-    """
-    if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
-        name = f"cuda:{index}"
-    with errors():
-        device = engine.device(name)
-    if device.type == "cuda":
-        torch.cuda.set_device(device)  # on which graphs are captured
-    return device
 
 
 def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
@@ -295,21 +282,12 @@ def make_policy(
         return Policy(*spaces, seed=seed, **arguments).to(env.device)
 
 
-def share_threads(width: int) -> None:
-    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
-    layers, threads lose more by waiting for each other than they gain.
-    """
-    n_threads = engine.threads()
-    engine.set_threads(n_threads)
-    torch.set_num_threads(max(1, min(n_threads, width // 128)))
-
-
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_types.Learner":
     learner = construct(settings, policy=policy, seed=seed, graph=True)
     with errors(f"{settings.name} is not a learner: "):
         check_learner(learner)
         try:
-            checkpoint_format.check_plain(learner.state_dict(), "state_dict")
+            check_plain(learner.state_dict(), "state_dict")
         except TypeError as error:
             raise LearnerError(error) from error
     return learner
@@ -419,75 +397,6 @@ def config_of(loaded: checkpoint.Checkpoint) -> Trained:
     tree = {key: train[key] for key in Trained.__dataclass_fields__ if key in train}
     with user_errors(f"{loaded.path} cannot be used: ", (ConfigErrors,)):
         return check.check(Trained, tree)
-
-
-def spaces_of(env: types.Env) -> dict[str, str]:
-    """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
-    tree = {"obs": env.obs_space, "actions": env.action_space}
-    return {name: repr(space) for name, space in spaces.leaves(tree).items()}
-
-
-def load_weights(policy: Policy, env: types.Env, loaded: checkpoint.Checkpoint) -> Policy:
-    """Returns a policy made for `env` with a checkpoint's weights, the critic's too if both have
-    one. With the file of an agent, which only acts, the critic keeps the weights that it has.
-
-    Raises:
-        UserError: naming what differs, if they do not fit.
-    """
-    saved, present = loaded.config["spaces"], spaces_of(env)
-    if differing := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]:
-        changes = [f"{k} was {saved.get(k)} and is {present.get(k)}" for k in differing]
-        ids = loaded.config["train"]["env"].get("id"), getattr(env, "id", None)
-        names = f", {ids[0]} and not {ids[1]}" if ids[0] != ids[1] else ""
-        raise UserError(
-            f"{loaded.path} was trained in another environment{names}: {'; '.join(changes)}. "
-            "Choose the env it was trained in"
-        )
-    assert loaded.state is not None
-    weights, own = cast(dict, loaded.state.get("policy")), policy.state_dict()
-    with errors(f"{loaded.path} cannot be used: "):
-        check_weights(weights, own)
-    if policy.critic is None:
-        weights = {k: v for k, v in weights.items() if not k.startswith(TRAINING_ONLY)}
-    elif agent_file.is_agent_file(loaded.path):
-        weights = weights | {k: v for k, v in own.items() if k.startswith(TRAINING_ONLY)}
-    agent = " ".join(f"agent.{k}={v}" for k, v in loaded.config["train"]["agent"].items())
-    with user_errors(f"{loaded.path} needs an agent with {agent}: ", (RuntimeError,)):
-        policy.load_state_dict(weights)
-    return policy
-
-
-def load_wrappers(env: Env, loaded: checkpoint.Checkpoint, is_frozen: bool = True) -> None:
-    """Gives the wrappers of an environment what those of a checkpoint's have learnt.
-
-    Args:
-        is_frozen: it stays as it is from now on.
-
-    Raises:
-        UserError: the environment is not in the same wrappers.
-    """
-    if state := (loaded.state or {}).get("wrappers"):
-        load = optional(env, "load_wrapper_state")
-        with errors(f"{loaded.path} cannot be used here: "):
-            if load is None:
-                raise ValueError(f"{type(env).__name__} has no load_wrapper_state")
-            load(state, is_frozen)
-
-
-def check_weights(weights: Any, own: Mapping[str, torch.Tensor]) -> None:
-    """Raises ValueError for what are no weights: other numbers than a policy's own are, which would
-    be converted without a word, and NaN and infinity.
-    """
-    if not isinstance(weights, Mapping) or not all(isinstance(name, str) for name in weights):
-        raise ValueError("its weights are no tensors by name")
-    for name, weight in weights.items():
-        if not isinstance(weight, torch.Tensor) or weight.layout != torch.strided:
-            raise ValueError(f"its {shortened(name, 60)} is no dense tensor")
-        dtype = own[name].dtype if name in own else weight.dtype
-        if weight.dtype != dtype and not (weight.is_floating_point() and dtype.is_floating_point):
-            raise ValueError(f"its {name} is {weight.dtype}, and the policy's is {dtype}")
-        if not weight.isfinite().all():
-            raise ValueError(f"its {shortened(name, 60)} has a NaN or an infinity")
 
 
 def _nbytes(env) -> int:

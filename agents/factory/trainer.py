@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from megastep.agents import console, factory, package
-from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, settings
@@ -25,12 +24,11 @@ from megastep.agents.runs import (
     annealing,
     checkpoint,
     folders,
-    formats,
     populations,
     provenance,
+    restore,
     saver,
 )
-from megastep.agents.runs.rank_files import RankFiles
 from megastep.agents.training import budget, loggers, repeat
 from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.snapshots import SnapshotSaver
@@ -95,15 +93,12 @@ def make_trainer(
     if start := cfg.resume or cfg.init:
         path = folders.find(start)
         loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
-        factory.load_weights(policy, env, loaded)
+        restore.load_weights(policy, loaded, env)
         if cfg.init:
-            factory.load_wrappers(env, loaded, is_frozen=False)
+            restore.load_wrappers(env, loaded, is_frozen=False)
         if cfg.resume:
             state = loaded.state or {}
             with state_errors(loaded.path):
-                formats.check(formats.Counts, {k: state.get(k) for k in formats.COUNTS})
-                if name := nonfinite_leaf(state["learner"]):
-                    raise ValueError(f"learner.{name} has a NaN or an infinity")
                 if check_state := getattr(learner, "check_state", None):
                     check_state(state["learner"])  # before anything is written
         if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
@@ -118,7 +113,7 @@ def make_trainer(
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
-    config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
+    config = {"train": check.as_tree(cfg), "spaces": restore.spaces_of(env)}
     made_with = provenance.made_with(device, package.version(), n_ranks)
     checkpoints = folder / "checkpoints"
     had: dict = (loaded.state or {}) if cfg.resume else Counter()
@@ -126,7 +121,7 @@ def make_trainer(
         limits = budget_of(cfg, folder, loaded if cfg.resume else None)
         logger: RunLogger = loggers.NoLogger()
         writers: dict = {}
-        rank_files = RankFiles(checkpoints, token, number, n_ranks)
+        rank_files = saver.RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
             step = had["samples_at_report"]
             logger = make_loggers(cfg, folder, step)

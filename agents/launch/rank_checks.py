@@ -25,8 +25,8 @@ from megastep.agents.factory import check, settings
 from megastep.agents.launch.endings import STARTED
 from megastep.agents.launch.watch import Team
 from megastep.agents.runs import checkpoint, folders, populations, provenance
-from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
+from megastep.atomic_files import write_atomically
 
 #: Seconds within which a file of rank 0 must be visible on the other machines.
 SHARED_SECONDS = 10.0

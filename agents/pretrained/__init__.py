@@ -15,14 +15,15 @@ line its name stands for a run: `evaluate.py run=NAME`.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from megastep.agents import factory
 from megastep.agents.errors import UserError
-from megastep.agents.factory import settings
-from megastep.agents.networks.policy import Policy
-from megastep.agents.runs import folders
-from megastep.types import Env
+from megastep.agents.hardware import make_device
+from megastep.agents.runs import folders, restore
+
+if TYPE_CHECKING:
+    from megastep.agents.networks.policy import Policy
+    from megastep.types import Env
 
 #: Where an agent's spaces are read from, which no floor plan changes. Keys needs doorways.
 _HOMES, _N_HOMES = "megastep.geometries.sources:homes", 4
@@ -33,7 +34,7 @@ def names() -> list[str]:
     return [*folders.pretrained()]
 
 
-def load(name: str, device: str = "auto") -> Policy:
+def load(name: str, device: str = "auto") -> "Policy":
     """Returns a trained policy, ready to act: `decision, state = policy(world, state)`.
 
     It acts only: it has no critic, and its weights need no gradient. On a CPU this sets the number
@@ -45,28 +46,32 @@ def load(name: str, device: str = "auto") -> Policy:
         device: `auto`, `cpu`, `cuda` or `cuda:1`; `auto` is a GPU if there is one.
 
     Raises:
-        UserError: there is none; or it names modules outside megastep and another user made it.
+        UserError: there is none; or it names modules outside megastep that you have not trained
+            with here.
     """
-    return load_with_env(name, device)[0]
+    where = make_device(device)
+    loaded = folders.load_checkpoint(folders.find(name), False, where)
+    return restore.policy_of(loaded, device=where)
 
 
-def load_with_env(name: str, device: str = "auto", **options: bool) -> tuple[Policy, Env]:
+def load_with_env(name: str, device: str = "auto", **options: bool) -> "tuple[Policy, Env]":
     """Returns what `load` does, and a small environment that it acts in.
 
     Args:
         name, device: as for `load`.
         options: further arguments of the environment, such as `films=True`.
     """
-    device = factory.make_device(device)
-    loaded = folders.load_checkpoint(folders.find(name), False, device)
+    from megastep.agents import factory  # which a policy alone does not need
+    from megastep.agents.factory import settings
+
+    where = make_device(device)
+    loaded = folders.load_checkpoint(folders.find(name), False, where)
     trained = factory.config_of(loaded)
     geometry = settings.kind_of("geometry", _HOMES)(name=_HOMES, n=_N_HOMES)
     homes = factory.homes(trained.env, geometry, "test")
-    where = dict(seed=trained.seed, device=device)
-    env = factory.make_sample(trained.env, homes, **where, **options)
-    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
-    factory.load_wrappers(env, loaded)
-    return policy.requires_grad_(False), env
+    env = factory.make_sample(trained.env, homes, seed=trained.seed, device=where, **options)
+    restore.load_wrappers(env, loaded)
+    return restore.policy_of(loaded, env), env
 
 
 def make_env(
@@ -92,8 +97,11 @@ def make_env(
     Raises:
         UserError: as `load`; or the environment has no such setting, or refuses its value.
     """
-    device = factory.make_device(device)
-    loaded = folders.load_checkpoint(folders.find(name), False, device)
+    from megastep.agents import factory
+    from megastep.agents.factory import settings
+
+    where = make_device(device)
+    loaded = folders.load_checkpoint(folders.find(name), False, where)
     trained = factory.config_of(loaded).env
     if unknown := [key for key in changes if not hasattr(trained, key)]:
         raise UserError(
@@ -101,6 +109,6 @@ def make_env(
             f"{', '.join(key for key in vars(trained) if key != 'name')}"
         )
     env = settings.changed(trained, n_envs=n_envs, **changes)
-    made = factory.construct(env, geometries=[*geometries], seed=seed, device=device)
-    factory.load_wrappers(made, loaded)
+    made = factory.construct(env, geometries=[*geometries], seed=seed, device=where)
+    restore.load_wrappers(made, loaded)
     return made

@@ -8,7 +8,7 @@ from pathlib import Path
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.reports import runs, seeds
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.atomic_files import write_atomically
 from megastep.settings import closest
 
 #: Endings of plots.

@@ -18,7 +18,7 @@ from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import tables
 from megastep.agents.reports import homes, populations, runs, seeds
 from megastep.agents.runs import checkpoint
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row

@@ -11,15 +11,13 @@ import yaml
 from megastep.agents.errors import UserError
 from megastep.agents.factory.check import leaves
 from megastep.agents.factory.settings import label
-from megastep.agents.runs import folders, json_lines, scores, strange_files
+from megastep.agents.runs import folders, json_lines, scores
 
 if TYPE_CHECKING:
     from megastep.agents.types import Config, Row
 
 #: Settings that differ between seeds of one experiment, or do not change what is learnt.
 OF_A_SEED = "seed", "folder", "resume", "rerun", "ranks", "device", "finish", "logger", "dry_run"
-#: Largest file that is read, bytes.
-MAX_BYTES = 64_000_000
 
 
 class Run(NamedTuple):
@@ -83,7 +81,7 @@ def read(folder: Path) -> Run:
 def _config(folder: Path) -> "Config":
     path = folder / "config.yaml"
     try:
-        config = yaml.safe_load(strange_files.read_bytes(path, MAX_BYTES))
+        config = yaml.safe_load(path.read_bytes())
     except FileNotFoundError:
         raise UserError(f"{folder} is not a run: it has no config.yaml") from None
     except (ValueError, yaml.YAMLError, RecursionError):
@@ -95,7 +93,7 @@ def _config(folder: Path) -> "Config":
 
 def _evaluation(path: Path) -> "Row | None":
     with contextlib.suppress(OSError, ValueError, RecursionError):
-        table = json.loads(strange_files.read_bytes(path, MAX_BYTES))
+        table = json.loads(path.read_bytes())
         if isinstance(table, dict) and isinstance(table.get("rows"), list) and table["rows"]:
             return table
     return None

@@ -10,37 +10,37 @@ maps names to strings:
     wrappers  what wrappers around its environment have learnt, if anything; JSON
     sha256    hash of the whole file, with zeros in place of these 64 digits
 
-Weights are float16, statistics float32. Without a device, reading does not import PyTorch. In files
-of format 1, `sha256` is the hash of all bytes after the header, those of the tensors.
+Weights are float16, statistics float32. Without a device, reading does not import PyTorch.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import safetensors
 
 from megastep.agents.errors import shortened
-from megastep.agents.runs import formats, strange_files, trust, typed_json
-from megastep.agents.runs.atomic_files import write_atomically
-from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
+from megastep.agents.runs import typed_json
+from megastep.agents.runs.checkpoint import Checkpoint, CheckpointError
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
-    import numpy as np
     import torch
 
     from megastep.agents.types import Config, Row
 
-SUFFIX = ".safetensors"
-FORMAT, FIRST_FORMAT = "2", "1"
-#: NumPy's name of each dtype by safetensors' name.
-DTYPES = {"F16": "float16", "F32": "float32", "F64": "float64", "I64": "int64"}
-_MAX_HEADER, _MAX_BYTES = 2**24, 2**31
+SUFFIX, FORMAT = ".safetensors", "2"
+#: The models of the texts in the header.
+MODELS = {
+    "config": typed_json.Config,
+    "facts": typed_json.Facts,
+    "tables": typed_json.Tables,
+    "wrappers": None,
+}
 #: The digest in a header. Texts in the header have their quotes escaped.
 _SEAL = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 
@@ -69,40 +69,32 @@ def write(
         wrappers: of the environment, what they have learnt, by path: tensors and numbers.
 
     Raises:
-        ValueError: a dtype is not in `DTYPES`.
         OSError: the file cannot be written.
     """
-    from safetensors.numpy import save
+    from safetensors.torch import save
 
-    arrays = {name: tensor.detach().contiguous().numpy() for name, tensor in tensors.items()}
-    for name, array in arrays.items():
-        if array.dtype.name not in DTYPES.values():
-            allowed = ", ".join(DTYPES.values())
-            raise ValueError(f"{name} is {array.dtype}, but agent files hold {allowed}")
-    metadata = {"format": FORMAT, "sha256": "0" * 64}
-    texts = dict(config=config, facts=dict(facts), tables=[*tables])
+    texts: dict = dict(config=config, facts=dict(facts), tables=[*tables])
     if wrappers:
         texts["wrappers"] = {
             path: getattr(value, "tolist", lambda value=value: value)()
             for path, value in wrappers.items()
         }
-    metadata |= {name: typed_json.dumps(value) for name, value in texts.items()}
-    write_atomically(path, sealed(save(arrays, metadata)))
+    metadata = {name: typed_json.dumps(value) for name, value in texts.items()}
+    metadata |= {"format": FORMAT, "sha256": "0" * 64}
+    tensors = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
+    write_atomically(path, sealed(save(tensors, metadata)))
 
 
 def sealed(content: bytes) -> bytes:
-    """Returns a file's bytes with the SHA-256 in its header recomputed."""
-    match = _SEAL.search(content)
-    assert match is not None
+    """Returns a file's bytes with the SHA-256 in its header recomputed. Raises ValueError if it has
+    none.
+    """
+    header_end = 8 + int.from_bytes(content[:8], "little")
+    if not (match := _SEAL.search(content, 0, header_end)):
+        raise ValueError("its header has no SHA-256")
     start, end = match.span(1)
     digest = hashlib.sha256(content[:start] + b"0" * 64 + content[end:]).hexdigest()
     return content[:start] + digest.encode() + content[end:]
-
-
-def _split(content) -> tuple[bytes, bytes]:
-    """Returns the header of a file and the bytes of its tensors."""
-    end = 8 + int.from_bytes(content[:8], "little")
-    return content[8:end], content[end:]
 
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
@@ -113,93 +105,38 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
         device: device of the tensors; None loads no state and does not import PyTorch.
 
     Raises:
-        DamagedCheckpoint: the file is damaged or not an agent file.
-        CheckpointError: a later version of megastep wrote it.
+        CheckpointError: the file is damaged or not an agent file, or another version of megastep
+            wrote it.
     """
-    metadata, entries = _read(path)
-    return Checkpoint(
-        path,
-        step=metadata["facts"]["samples"],
-        numbers={},
-        config=metadata["config"],
-        made_with={},
-        state=None
-        if device is None
-        else {"policy": _tensors(entries, device), "wrappers": metadata["wrappers"]},
-        untrusted=metadata["untrusted"],
-    )
+    metadata, state = read_metadata(path), None
+    if device is not None:
+        from safetensors.torch import load_file
+
+        tensors = load_file(path, str(device))
+        state = {"policy": tensors, "wrappers": metadata["wrappers"]}
+    return Checkpoint(path, metadata["facts"]["samples"], {}, metadata["config"], {}, state)
 
 
 def read_metadata(path: Path) -> Row:
-    """Returns `config`, `facts`, `tables` and `wrappers` of an agent file, and `untrusted`: the
-    import paths outside megastep in its configuration.
+    """Returns `config`, `facts`, `tables` and `wrappers` of an agent file.
 
     Raises:
         CheckpointError: as `read`.
     """
-    return _read(path)[0]
-
-
-def _read(path) -> tuple[Row, Row]:
-    """Returns the result of `read_metadata`, and dtype, shape and bytes of each tensor by name."""
     try:
-        # the given path may be a link, as in caches of downloaded files
-        content = strange_files.read_bytes(path.resolve(), _MAX_BYTES)
-    except OSError as error:
-        raise DamagedCheckpoint(f"{path} cannot be read ({error.strerror})") from None
-    import numpy as np  # not for commands that only look for a run
-
-    header, data = _split(content)
-    try:
-        if len(header) > _MAX_HEADER:
-            raise ValueError("its header is too long")
-        entries = dict(sorted(safetensors.deserialize(content)))
-        texts = json.loads(header)["__metadata__"]
-        version = texts["format"]
-        if version in (FORMAT, FIRST_FORMAT):
-            if not _is_intact(content, data, texts):
+        with safetensors.safe_open(path, framework="np") as file:
+            texts = {"wrappers": "{}", **(file.metadata() or {})}
+        if (version := texts.get("format")) == FORMAT:
+            if (content := path.read_bytes()) != sealed(content):
                 raise ValueError("its bytes do not match their SHA-256")
-            if any(entry["dtype"] not in DTYPES for entry in entries.values()):
-                raise ValueError(f"its tensors are not all of {', '.join(DTYPES)}")
-            texts = {"wrappers": "{}", **texts}
-            names = "config", "facts", "tables", "wrappers"
-            metadata = {name: typed_json.loads(texts[name]) for name in names}
-            formats.check(formats.Facts, metadata["facts"])
-            formats.check(formats.Tables, metadata["tables"])
-            if not {"train", "spaces"} <= metadata["config"].keys():
-                raise ValueError("incomplete configuration")
-            for name, array in _arrays(entries):
-                if array.dtype.kind == "f" and not np.isfinite(array).all():
-                    raise ValueError(f"{shortened(name, 60)} has a NaN or an infinity")
-            metadata["untrusted"] = tuple(trust.foreign_names(texts["config"].encode()))
-            return metadata, entries
-    except safetensors.SafetensorError as error:
-        problem = shortened(error)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        problem = str(error) if type(error) is ValueError else "unexpected header"
-    else:
+            return {name: typed_json.loads(texts[name], model) for name, model in MODELS.items()}
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read ({shortened(error)})") from None
+    except (safetensors.SafetensorError, ValueError, KeyError) as error:
         raise CheckpointError(
-            f"{path} has format {version!r}, and this version of megastep reads {FORMAT}. Update "
-            "megastep"
-        )
-    raise DamagedCheckpoint(f"{path} is damaged or not an agent file of megastep: {problem}")
-
-
-def _is_intact(content, data, texts) -> object:
-    if texts["format"] == FIRST_FORMAT:
-        return hashlib.sha256(data).hexdigest() == texts["sha256"]
-    return _SEAL.search(content, 0, len(content) - len(data)) and sealed(content) == content
-
-
-def _arrays(entries) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields (name, array) of tensors."""
-    import numpy as np
-
-    for name, entry in entries.items():
-        yield name, np.frombuffer(entry["data"], DTYPES[entry["dtype"]]).reshape(entry["shape"])
-
-
-def _tensors(entries, device) -> dict:
-    import torch
-
-    return {name: torch.tensor(array, device=device) for name, array in _arrays(entries)}
+            f"{path} is damaged or not an agent file of megastep: {shortened(error)}"
+        ) from None
+    raise CheckpointError(
+        f"{path} has format {shortened(repr(version), 20)}, and this version of megastep reads "
+        f"{FORMAT}; export the agent again"
+    )

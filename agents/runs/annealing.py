@@ -4,30 +4,25 @@ With `seconds=` the factors depend on the clock; the record lets `megastep rerun
 """
 
 import contextlib
-import math
 from array import array
 from pathlib import Path
 
-from megastep.agents.runs import strange_files
-from megastep.agents.runs.atomic_files import AppendedFile
+from megastep.atomic_files import AppendedFile
 
-FILE, MAX_BYTES = "annealing.f64", 2**32
-#: Most updates that may lack a record, because an earlier version made them.
-MAX_MISSING = 10**7
+FILE = "annealing.f64"
 
 
 def read(folder: Path | str) -> array:
-    """Returns the factor of each update of a run; empty without a record. NaN marks updates made by
-    versions that kept no record.
+    """Returns the factor of each update of a run; empty without a record.
 
     Raises:
-        ValueError: a factor is neither NaN nor from 0 to 1.
+        ValueError: a factor is not from 0 to 1.
     """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
-        data = strange_files.read_bytes(path, MAX_BYTES)
+        data = path.read_bytes()
         factors.frombytes(data[: len(data) // factors.itemsize * factors.itemsize])
-    if not all(0 <= factor <= 1 or math.isnan(factor) for factor in factors):
+    if not all(0 <= factor <= 1 for factor in factors):
         raise ValueError(f"{path} is damaged: factors of the learning rate are from 0 to 1")
     return factors
 
@@ -37,21 +32,15 @@ class AnnealingRecord:
 
     Args:
         folder: the run folder.
-        n_updates: updates of the run so far. Factors of later updates are removed; missing factors
-            become NaN.
+        n_updates: updates of the run so far. Factors of later updates are removed.
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: the record is damaged, or `n_updates` is far more than it holds.
     """
 
     def __init__(self, folder: Path | str, n_updates: int = 0):
-        n_kept = min(n_updates, len(read(folder)))
-        self.file = AppendedFile(Path(folder) / FILE, n_kept * array("d").itemsize)
-        if n_updates - n_kept > MAX_MISSING:
-            raise ValueError(f"{folder} has had no {n_updates:,} updates, as its checkpoint says")
-        for _ in range(n_kept, n_updates):
-            self.append(math.nan)
+        n_bytes = min(n_updates, len(read(folder))) * array("d").itemsize
+        self.file = AppendedFile(Path(folder) / FILE, n_bytes)
 
     def append(self, factor: float) -> None:
         """Appends the factor of an update, in memory until the next `flush`."""

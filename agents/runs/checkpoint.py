@@ -1,48 +1,99 @@
 """Saves, lists and loads the checkpoints of a run. Each is a folder `step_<N>`, after N steps.
 
-A checkpoint is written to a temporary folder, flushed to disk, verified and renamed, so a reader
-sees a complete checkpoint or none. Damage is detected (:mod:`checkpoint_format`). A second
-checkpoint of the same step is `step_<N>-2`; the first is deleted once the second is verified.
+    manifest.json  size and SHA-256 of every file and of itself, to detect damage; format, step,
+                   score, versions and device, and the counters of the state, such as samples
+    config.json    the run's configuration, as `typed_json` writes it
+    state.pt       weights, optimizer, statistics and everything else that is small
+    world.pt       environments and the actor state (observations and hidden states)
+    replay.pt      the replay buffer, if it was saved
+    rank1.pt, ...  with several ranks: the state of each other rank without the policy's weights,
+                   which are equal on all ranks. The files above are rank 0's
+
+The .pt files hold plain dicts of tensors, numbers and strings. Resuming reads all files; evaluation
+only `state.pt`. JSON is read without PyTorch.
+
+A checkpoint is written to a temporary folder, flushed to disk and renamed, so a reader sees a
+complete checkpoint or none. A second checkpoint of the same step is `step_<N>-2`; the first is
+deleted once the second is written.
 """
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import errno
+import hashlib
+import json
 import os
+import pickle
 import re
-import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-from megastep.agents.runs import checkpoint_format
-from megastep.agents.runs.atomic_files import delete_leftovers, sync_folder, temporary_path
-from megastep.agents.runs.checkpoint_format import (
-    Checkpoint,
-    CheckpointError,
-    DamagedCheckpoint,
-    GoneCheckpoint,
-)
+from megastep.agents.errors import memory_problem, shortened
+from megastep.agents.runs import trust, typed_json
+from megastep.atomic_files import MARK, delete, replacing, sync
 
 if TYPE_CHECKING:
     import torch
 
     from megastep.agents.types import Config, Row, StateDict
 
-_NAME = re.compile(r"step_\d+(-\d+)?")
+#: The format number. Increase it if an earlier version would misread these checkpoints, or this
+#: version earlier ones.
+FORMAT = 8
+#: Files besides state.pt, and the keys of the state that they hold.
+PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
+_NAME = re.compile(r"step_(\d+)(?:-(\d+))?")
 
-__all__ = [
-    "Checkpoint",
-    "CheckpointError",
-    "DamagedCheckpoint",
-    "GoneCheckpoint",
-    "list_checkpoints",
-    "is_intact",
-    "load_latest",
-    "save",
-    "set_aside_after",
-    "step_of",
-]
+
+class CheckpointError(RuntimeError):
+    """No checkpoint can be used. The message names each one tried, its problem and the cure."""
+
+
+class DamagedCheckpoint(CheckpointError):
+    """A checkpoint does not match its manifest. An earlier checkpoint may be intact."""
+
+    def __init__(self, path: Path, problem: object):
+        super().__init__(f"Checkpoint {path} is damaged: {shortened(problem, 300)}")
+
+
+class GoneCheckpoint(CheckpointError):
+    """A checkpoint was deleted before all its files were open, because its run saved later ones."""
+
+    def __init__(self, path: Path):
+        super().__init__(
+            f"Checkpoint {path} is gone: a run deletes its earlier checkpoints as it saves later "
+            "ones; name the run's folder to get its newest"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """A loaded checkpoint, or an agent file.
+
+    Attributes:
+        path: its folder, or the file.
+        step: environment steps of all lanes before it was saved.
+        numbers: counters of the state, such as samples and seconds.
+        config: the run's configuration, as saved.
+        made_with: versions, device and threads that the numbers depend on.
+        state: dicts of tensors and numbers, as saved; None if it was not loaded.
+        n_ranks: number of ranks whose state it holds.
+    """
+
+    path: Path
+    step: int
+    numbers: dict[str, float]
+    config: Config
+    made_with: Row
+    state: StateDict | None = None
+    n_ranks: int = 1
+
+
+# ---- Writing ----
 
 
 def save(
@@ -53,10 +104,10 @@ def save(
     keep_checkpoints: int = 2,
     score: float | None = None,
     made_with: Row | None = None,
-    replay_seconds: float | None = None,
-    add_files: Callable[[Path], Row] = lambda path: {},
+    add_files: Callable[[Path], object] = lambda path: None,
 ) -> Path:
-    """Writes a checkpoint and deletes old ones. Returns its folder.
+    """Writes a checkpoint and deletes old ones. Returns its folder. Only one process may save into
+    a folder at a time.
 
     Args:
         folder: the run's `checkpoints` folder.
@@ -66,35 +117,87 @@ def save(
         keep_checkpoints: number of latest steps to keep, besides the one with the highest score.
         score: such as the mean return, higher is better; None if unknown.
         made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
-        replay_seconds: a replay buffer that takes longer to write is left out; None: no limit.
-        add_files: as for `checkpoint_format.write`.
+        add_files: puts the files of other ranks into the checkpoint's folder.
 
     Raises:
         OSError: the disk is full or not writable. Other checkpoints are unchanged.
-        DamagedCheckpoint: the disk does not return the bytes written. Other checkpoints are
-            unchanged.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    delete_leftovers(folder)
-    temporary = temporary_path(folder / f"step_{step}")
-    try:
-        checkpoint_format.write(
-            temporary, step, state, config, score, made_with, replay_seconds, add_files
-        )
-        # verify it before deleting older ones
-        manifest = checkpoint_format.read_manifest(temporary)
-        with checkpoint_format.verified(temporary, manifest, manifest["files"]):
-            pass
-        path = folder / _next_name(folder, step)
-        os.replace(temporary, path)
-        sync_folder(folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+    for leftover in folder.glob(f"step_*{MARK}*"):  # of a process that was killed
+        delete(leftover)
+    trust.remember(trust.foreign_names(config))
+    numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
+    parts = {name: {k: state[k] for k in keys if k in state} for name, keys in PARTS.items()}
+    others = {key for part in parts.values() for key in part}
+    parts["state.pt"] = {key: part for key, part in state.items() if key not in others}
+    path = folder / _next_name(folder, step)
+    with replacing(path) as temporary:
+        temporary.mkdir()
+        for name, part in parts.items():
+            if part:
+                save_tensors(temporary / name, part)
+        _write(temporary / "config.json", typed_json.dumps(config, indent=2).encode())
+        add_files(temporary)
+        manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
+        manifest |= dict(made_with=made_with or {}, files=_entries(temporary))
+        _write(temporary / "manifest.json", sealed(manifest))
     set_aside_after(folder, step)
     _prune(folder, keep_checkpoints, step)
     return path
+
+
+def save_tensors(path: Path, tree: StateDict) -> None:
+    """Writes plain dicts of tensors and numbers into a file and flushes it to disk.
+
+    Raises:
+        OSError: the disk is full or not writable.
+    """
+    import torch
+
+    try:
+        torch.save(tree, path)
+    except RuntimeError as error:  # which does not name the error of the disk
+        if memory_problem(error):
+            raise
+        raise OSError(errno.EIO, "the disk is full or cannot be written") from error
+    sync(path)
+
+
+def rank_file(rank: int) -> str:
+    """Returns the file name of a rank's state, for ranks other than 0."""
+    return f"rank{rank}.pt"
+
+
+def sealed(manifest: Row) -> bytes:
+    """Returns a manifest as JSON, with its own SHA-256 added."""
+    digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
+    return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
+
+
+def _write(path, content) -> None:
+    path.write_bytes(content)
+    sync(path)
+
+
+def _entries(folder) -> Row:
+    """Returns the manifest's entries of the files in a folder."""
+    entries = {}
+    for path in sorted(folder.iterdir()):
+        with open(path, "rb") as file:
+            entries[path.name] = {"sha256": _digest(file), "bytes": path.stat().st_size}
+    return entries
+
+
+def _digest(file) -> str:
+    digest = hashlib.sha256()
+    while chunk := file.read(2**24):
+        digest.update(chunk)
+    file.seek(0)
+    return digest.hexdigest()
+
+
+# ---- Reading ----
 
 
 def load_latest(
@@ -112,7 +215,7 @@ def load_latest(
         device: device of weights and optimizer; the rest is loaded to the CPU. None loads no state
             and does not import PyTorch.
         is_whole: also loads environments and replay buffer.
-        rank: the rank whose state is loaded, see `checkpoint_format.read`.
+        rank: the rank whose state is loaded, see `read`.
 
     Raises:
         GoneCheckpoint: its run has deleted the one at `folder`.
@@ -120,12 +223,12 @@ def load_latest(
     """
     folder, messages = Path(folder), []
     if (folder / "manifest.json").exists() or _NAME.fullmatch(folder.name):
-        return checkpoint_format.read(folder, device, is_whole, rank)
+        return read(folder, device, is_whole, rank)
     paths = list_checkpoints(folder)
     while paths:
         path = paths.pop()
         try:
-            checkpoint = checkpoint_format.read(path, device, is_whole, rank)
+            checkpoint = read(path, device, is_whole, rank)
         except GoneCheckpoint:  # deleted, as its run has saved another
             paths, messages = list_checkpoints(folder), []
             continue
@@ -140,14 +243,146 @@ def load_latest(
     raise CheckpointError(f"There is no checkpoint in {folder}; has the run saved one yet?")
 
 
+def read(
+    path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
+) -> Checkpoint:
+    """Loads a checkpoint. Opens all files before it reads any, so it can still read them if the run
+    deletes them meanwhile.
+
+    Args:
+        path: the checkpoint's folder.
+        device: device of the tensors in `state.pt`; None verifies all files and loads no state.
+        is_whole: also loads the rank's other files, to the CPU; rank 0 verifies all files.
+        rank: the rank whose state is loaded. If it has no file, only rank 0's `state.pt` is read.
+
+    Raises:
+        DamagedCheckpoint: a file is missing, damaged, or could run code when loaded.
+        GoneCheckpoint: it was deleted before all files were open.
+        CheckpointError: another version of megastep wrote it.
+    """
+    manifest = read_manifest(path)
+    parts = ["state.pt"]
+    if is_whole:
+        parts += [rank_file(rank)] if rank else PARTS
+        parts = [name for name in parts if name in manifest["files"]]
+    is_verified = device is None or (is_whole and rank == 0)
+    names = manifest["files"] if is_verified else [*parts, "config.json"]
+    with verified(path, manifest, names) as files:
+        try:
+            config = typed_json.loads(files["config.json"].read())
+        except ValueError as error:
+            raise DamagedCheckpoint(path, f"config.json: {error}") from None
+        state: StateDict | None = None if device is None else {}
+        for name in parts if state is not None else ():
+            state |= _load(path, name, files[name], device if name == "state.pt" else "cpu")
+    n_ranks = 1 + sum(name.startswith("rank") for name in manifest["files"])
+    numbers, made_with = manifest["numbers"], manifest["made_with"]
+    return Checkpoint(path, manifest["step"], numbers, config, made_with, state, n_ranks)
+
+
+def read_manifest(path: Path) -> Row:
+    """Returns a checkpoint's manifest.
+
+    Raises:
+        DamagedCheckpoint: its bytes are not those that `sealed` writes.
+        GoneCheckpoint: the checkpoint no longer exists.
+        CheckpointError: it has another format.
+    """
+    try:
+        with _readable(path, "manifest.json"):
+            data = (path / "manifest.json").read_bytes()
+        manifest = typed_json.loads(data)
+        version = manifest["format"]
+        body = {key: value for key, value in manifest.items() if key != "sha256"}
+        if data != sealed(body):
+            raise ValueError("it does not match its own SHA-256")
+        if version == FORMAT:
+            typed_json.check(typed_json.Manifest, manifest)
+            if not {"config.json", "state.pt"} <= manifest["files"].keys():
+                raise ValueError("it lacks config.json or state.pt")
+            return manifest
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedCheckpoint(path, f"manifest.json: {error}") from None
+    cure = "update megastep"
+    if isinstance(version, int) and version < FORMAT:
+        cure = "use the commit in the provenance.jsonl of its run"
+    raise CheckpointError(
+        f"Checkpoint {path} has format {shortened(repr(version), 20)}, and this version of "
+        f"megastep reads format {FORMAT}; {cure}"
+    )
+
+
+@contextlib.contextmanager
+def verified(path: Path, manifest: Row, names: Iterable[str]) -> Iterator[dict[str, BinaryIO]]:
+    """Opens files of a checkpoint and compares each with the SHA-256 in its manifest.
+
+    Yields:
+        The open files by name, each at its beginning.
+
+    Raises:
+        DamagedCheckpoint: a file is missing or differs.
+        GoneCheckpoint: the checkpoint was deleted before all were open.
+    """
+    with contextlib.ExitStack() as stack:
+        files = {}
+        for name in names:
+            with _readable(path, name):
+                files[name] = stack.enter_context(open(path / name, "rb"))
+        for name, file in files.items():
+            with _readable(path, name):
+                digest = _digest(file)
+            if digest != manifest["files"][name]["sha256"]:
+                raise DamagedCheckpoint(path, f"{name} does not match the SHA-256 in its manifest")
+        yield files
+
+
+@contextlib.contextmanager
+def _readable(path, name) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if not path.exists():
+            raise GoneCheckpoint(path) from None
+        raise DamagedCheckpoint(path, f"{name} cannot be read ({error.strerror})") from None
+
+
+def _load(path, name, file, device) -> Any:
+    """Returns the state in an open file. Raises DamagedCheckpoint."""
+    import torch
+
+    try:
+        return dict(torch.load(file, map_location=device, weights_only=True))
+    except pickle.UnpicklingError:
+        problem = "holds more than tensors and numbers, so loading it could run code"
+        raise DamagedCheckpoint(path, f"{name} is refused, as it {problem}") from None
+    except Exception as error:  # unpickling a damaged file may raise anything
+        if memory_problem(error):
+            raise
+        raise DamagedCheckpoint(path, f"{name} cannot be read ({shortened(error)})") from None
+
+
 def is_intact(path: Path) -> bool:
     """Returns whether a checkpoint is whole: every file is the one that was written."""
     try:
-        manifest = checkpoint_format.read_manifest(path)
-        with checkpoint_format.verified(path, manifest, manifest["files"]):
+        manifest = read_manifest(path)
+        with verified(path, manifest, manifest["files"]):
             return True
     except CheckpointError:
         return False
+
+
+# ---- The checkpoints of a folder ----
+
+
+def list_checkpoints(folder: Path | str) -> list[Path]:
+    """Returns the checkpoints in a folder, oldest first. Skips unfinished and set-aside ones."""
+    paths = Path(folder).glob("step_*")
+    return sorted((path for path in paths if _NAME.fullmatch(path.name)), key=_step_and_number)
+
+
+def step_of(path: Path) -> int:
+    """Returns the step in a checkpoint's folder name."""
+    return _step_and_number(path)[0]
 
 
 def set_aside_after(folder: Path | str, step: int) -> None:
@@ -162,30 +397,17 @@ def set_aside_after(folder: Path | str, step: int) -> None:
             os.replace(path, aside)
 
 
-def list_checkpoints(folder: Path | str) -> list[Path]:
-    """Returns the checkpoints in a folder, oldest first. Skips unfinished and set-aside ones."""
-    paths = Path(folder).glob("step_*")
-    return sorted((path for path in paths if _NAME.fullmatch(path.name)), key=_step_and_number)
-
-
-def step_of(path: Path) -> int:
-    """Returns the step in a checkpoint's folder name."""
-    return _step_and_number(path)[0]
-
-
 def _step_and_number(path: Path) -> tuple[int, int]:
     """Returns a checkpoint's step, and its number among those of that step, from 1."""
-    match = re.match(r"step_(\d+)(?:-(\d+))?", path.name)
+    match = _NAME.match(path.name)
     assert match is not None
-    step, number = match.groups()
-    return int(step), int(number or 1)
+    return int(match[1]), int(match[2] or 1)
 
 
 def _next_name(folder: Path, step: int) -> str:
     """Returns `step_<N>`, or `step_<N>-2` and so on if the step has checkpoints already."""
-    pairs = map(_step_and_number, list_checkpoints(folder))
-    last = max((number for other_step, number in pairs if other_step == step), default=0)
-    return f"step_{step}-{last + 1}" if last else f"step_{step}"
+    numbers = [n for other, n in map(_step_and_number, list_checkpoints(folder)) if other == step]
+    return f"step_{step}-{numbers[-1] + 1}" if numbers else f"step_{step}"
 
 
 def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
@@ -208,16 +430,14 @@ def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
 
 def _score(path: Path) -> float | None:
     try:
-        return checkpoint_format.read_manifest(path)["score"]
+        return read_manifest(path)["score"]
     except CheckpointError:
         return None
 
 
 def _delete(path: Path) -> None:
     """Deletes a checkpoint. If killed midway, leaves a temporary folder, not a damaged one."""
-    leftover = temporary_path(path)
-    try:
+    leftover = path.with_name(f"{path.name}{MARK}")
+    with contextlib.suppress(OSError):  # it does not exist or cannot be moved
         os.replace(path, leftover)
-    except OSError:  # it does not exist or cannot be moved
-        return
-    shutil.rmtree(leftover, ignore_errors=True)
+        delete(leftover)

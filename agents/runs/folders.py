@@ -1,7 +1,6 @@
 """Run folders: creating, finding and locking them."""
 
 import contextlib
-import dataclasses
 import difflib
 import errno
 import itertools
@@ -17,20 +16,8 @@ import yaml
 
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.runs import (
-    agent_file,
-    checkpoint,
-    checkpoint_format,
-    formats,
-    populations,
-    strange_files,
-)
-from megastep.agents.runs.atomic_files import (
-    check_room,
-    make_folders,
-    remove_folders,
-    write_atomically,
-)
+from megastep.agents.runs import agent_file, checkpoint, populations, trust, typed_json
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     import torch
@@ -40,8 +27,6 @@ if TYPE_CHECKING:
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: File with the run folder of each start, one per line.
 STARTED = RUNS / "started.txt"
-#: Settings in older runs that no longer exist and had no effect on learning.
-REMOVED = ("nonfinite_replay",)
 #: Prefix of error messages.
 CANNOT = "{} cannot be written; choose another with folder=: "
 
@@ -57,17 +42,12 @@ def for_file(name: str) -> str:
 def make(path: Path) -> Path:
     """Creates a folder and returns it; if it exists, `path`-2, -3, ..."""
     with user_errors(CANNOT.format(shortened(path))):
-        check_room(path)
-        made = make_folders(path.parent)
-        try:
-            for number in itertools.count(1):
-                folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
-                with contextlib.suppress(FileExistsError):  # taken, perhaps by another process
-                    folder.mkdir()
-                    return folder
-        except OSError:
-            remove_folders(made)
-            raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(1):
+            folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
+            with contextlib.suppress(FileExistsError):  # taken, perhaps by another process
+                folder.mkdir()
+                return folder
     raise AssertionError("counting never ends")
 
 
@@ -85,7 +65,9 @@ def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
     if folder is None:
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
     check_free(folder, is_again)
-    return Path(folder) if os.path.exists(folder) else make(Path(folder))
+    with user_errors(CANNOT.format(shortened(folder))):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    return Path(folder)
 
 
 def check_free(name: str | None, is_again: bool = False) -> None:
@@ -95,18 +77,11 @@ def check_free(name: str | None, is_again: bool = False) -> None:
         is_again: also allows the folder of a run that ended before it saved anything.
     """
     folder = Path(name or "")
-    if os.path.islink(folder) and not os.path.exists(folder):
-        target = os.readlink(folder)
-        raise UserError(f"{CANNOT.format(folder)}it is a link to {target}, which does not exist")
     with user_errors(CANNOT.format(shortened(folder))):
-        check_room(folder)
         entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
     # Hydra writes .hydra/ and a log before the job of a sweep starts
-    used = [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]
-    if is_again and used:
-        strange_files.check_folder(folder)
-        used = used if not {"lock", "config.yaml"} & {path.name for path in used} else []
-    if used:
+    used = {path.name for path in entries if path.name != ".hydra" and path.suffix != ".log"}
+    if used and not (is_again and {"lock", "config.yaml"} & used):
         text = f"The run folder {folder} is not empty; choose another with folder="
         if checkpoint.list_checkpoints(folder / "checkpoints"):
             text = f"{text}, or continue its run: {resume_command(folder)}"
@@ -135,8 +110,7 @@ def locked(folder: Path) -> Iterator[None]:
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
         lock.acquire()
-        with open(path, "w", opener=strange_files.opener) as file:
-            file.write(str(os.getpid()))
+        path.write_text(str(os.getpid()))
     except filelock.Timeout:
         with user_errors(f"The run folder {folder} is in use, or was just now: "):
             pid = path.read_text()  # fails if the previous owner has just deleted it
@@ -195,18 +169,14 @@ def find(name: str, member: int | str | None = "best") -> Path:
             or `best`; None: the population's own folder.
 
     Raises:
-        UserError: nothing is found (the message has the most similar names), or the run holds a
-            link that leads out of it, or something that is neither a file nor a folder.
+        UserError: nothing is found; the message has the most similar names.
     """
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
         path = folders[-1]
     if populations.is_root(path):
-        strange_files.check_folder(path)
         return path if member is None else populations.member(path, member)
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
-        is_in_run = path.parent.name in ("checkpoints", "snapshots")
-        strange_files.check_folder(folder_of(path) if is_in_run else path)
         return path
     if agent_file.is_agent_file(path) and os.path.isfile(path):
         return path
@@ -229,7 +199,7 @@ def find(name: str, member: int | str | None = "best") -> Path:
 
 def load_checkpoint(
     path: Path,
-    trust: bool,
+    is_trusted: bool,
     device: "torch.device | str | None" = None,
     is_whole: bool = False,
     rank: int = 0,
@@ -238,31 +208,28 @@ def load_checkpoint(
 
     Args:
         path: from `find`.
-        trust: whether to allow import paths outside megastep in a run that another user made.
+        is_trusted: also allows import paths outside megastep that this user has not trained with.
         device: device of the state; None loads no state and does not import PyTorch.
         is_whole: also loads environments and replay buffer, to resume.
         rank: the rank whose environments and replay buffer are loaded.
 
     Raises:
-        UserError: there is no intact checkpoint, or `trust` is needed.
+        UserError: there is no intact checkpoint, or `trust=true` is needed.
     """
-    with user_errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
+    with user_errors(kinds=(OSError, checkpoint.CheckpointError)):
         if agent_file.is_agent_file(path):
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
-    config = loaded.config
     with user_errors(f"The configuration in {loaded.path} is not a run's: "):
-        formats.check(formats.Config, config)
-    for key in REMOVED:
-        config["train"].pop(key, None)
-    if loaded.untrusted and not trust:
+        typed_json.check(typed_json.Config, loaded.config)
+    names = trust.untrusted(trust.foreign_names(loaded.config))
+    if names and not is_trusted:
         raise UserError(
-            f"{loaded.path} was not made by this user here, and would import "
-            f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
-            "trust it, add trust=true"
+            f"{loaded.path} would import {shortened(', '.join(names))}, which runs code outside "
+            "megastep that you have not trained with here; if you trust it, add trust=true"
         )
-    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(config))
+    return loaded
 
 
 def resume_command(folder: Path, key: str = "resume") -> str:

@@ -9,13 +9,11 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from megastep.agents.runs import formats, strange_files
-from megastep.agents.runs.atomic_files import AppendedFile, write_atomically
+from megastep.agents.runs import typed_json
+from megastep.atomic_files import AppendedFile, write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
-
-MAX_BYTES = 2**32
 
 
 class JsonLines:
@@ -59,25 +57,19 @@ def truncate_after(path: Path | str, step: int) -> None:
         return
     lines = (line + b"\n" for row, line in _intact_lines(path) if row["samples"] <= step)
     data = b"".join(lines)
-    if data != strange_files.read_bytes(path, MAX_BYTES):
+    if data != path.read_bytes():
         write_atomically(path, data)
 
 
 def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
     """Returns (object, bytes) of each intact line."""
-    *lines, last = strange_files.read_bytes(path, MAX_BYTES).split(b"\n")
-    rows = [(_parsed(line), line) for line in [*lines, last]]
-    damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]
-    if damaged:
+    intact, damaged, lines = [], [], path.read_bytes().split(b"\n")
+    for number, line in enumerate(lines, 1):
+        try:
+            intact.append((typed_json.loads(line, typed_json.Row), line))
+        except ValueError:
+            damaged.append(str(number))
+    if damaged := [number for number in damaged if number != str(len(lines))]:
         which = f"line {damaged[0]} is" if len(damaged) == 1 else f"lines {', '.join(damaged)} are"
         warnings.warn(f"{path}: {which} damaged and skipped", stacklevel=3)
-    return [(row, line) for row, line in rows if row is not None]
-
-
-def _parsed(line: bytes) -> "Row | None":
-    """Returns a line's object, or None if it is damaged."""
-    try:
-        formats.check(formats.Row, row := json.loads(line))
-    except (ValueError, RecursionError):
-        return None
-    return row
+    return intact

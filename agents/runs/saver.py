@@ -1,8 +1,8 @@
-"""Saves checkpoints of a run."""
+"""Saves checkpoints of a run in the background, with the states of all ranks."""
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import math
 import os
 import shutil
@@ -16,16 +16,81 @@ import torch
 from torch.utils._pytree import tree_leaves
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
-from megastep.agents.runs import checkpoint, checkpoint_format
-from megastep.agents.runs.rank_files import RankFiles
+from megastep.agents.runs import checkpoint
+from megastep.atomic_files import delete, replacing
 
 if TYPE_CHECKING:
     from megastep.agents.types import Config, Row, StateDict
 
-#: A replay buffer of up to this many bytes is in every checkpoint.
-SMALL_REPLAY = 2**28
-#: Seconds that a larger replay buffer may take to write when a run ends.
-REPLAY_SECONDS = 5.0
+#: A replay buffer of up to so many bytes is in every checkpoint; in the last one of a run.
+SMALL_REPLAY, LAST_REPLAY = 2**28, 2**32
+#: Seconds that rank 0 waits for the other ranks' files.
+RANK_SECONDS = 60.0
+
+
+class RankFiles:
+    """The files by which ranks give rank 0 their states, in one launch of a run.
+
+    Args:
+        folder: the run's `checkpoints` folder, which all ranks share.
+        launch: name of this launch, the same on all ranks. Rank 0 deletes files of other launches.
+        rank: this rank.
+        n_ranks: number of ranks.
+    """
+
+    def __init__(self, folder: Path, launch: str = "", rank: int = 0, n_ranks: int = 1):
+        self.folder, self.launch, self.rank, self.n_ranks = folder, launch, rank, n_ranks
+        self._is_given_up = threading.Event()
+        if rank == 0:
+            for path in folder.glob(".rank*"):
+                delete(path)
+
+    def _path(self, rank, number) -> Path:
+        return self.folder / f".rank{rank}-{self.launch}-{number}"
+
+    def hand_in(self, number: int, state: StateDict) -> None:
+        """Writes this rank's file: its state without the policy's weights, which rank 0 saves.
+
+        Args:
+            number: number of the checkpoint, the same on all ranks.
+            state: as for `checkpoint.save`.
+
+        Raises:
+            OSError: the disk is full or not writable.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        own = {name: part for name, part in state.items() if name != "policy"}
+        with replacing(self._path(self.rank, number)) as path:
+            checkpoint.save_tensors(path, own)
+
+    def collect(self, number: int, folder: Path) -> None:
+        """Waits for the other ranks' files and moves them into a checkpoint, as `rank1.pt` and so
+        on.
+
+        Args:
+            number: number of the checkpoint.
+            folder: the checkpoint's folder.
+
+        Raises:
+            OSError: a rank did not write its file in time.
+        """
+        deadline = time.monotonic() + RANK_SECONDS
+        for rank in range(1, self.n_ranks):
+            path = self._path(rank, number)
+            while not path.exists():
+                if self._is_given_up.wait(0.02) or time.monotonic() > deadline:
+                    seconds = f"{RANK_SECONDS:.0f} s"
+                    raise OSError(f"rank {rank} did not write its state within {seconds}")
+            os.replace(path, folder / checkpoint.rank_file(rank))
+
+    @property
+    def is_given_up(self) -> bool:
+        """True if another rank has ended and will write no file."""
+        return self._is_given_up.is_set()
+
+    def give_up(self) -> None:
+        """Makes `collect` stop waiting, because another rank has ended."""
+        self._is_given_up.set()
 
 
 class Saver:
@@ -40,7 +105,7 @@ class Saver:
         keep_checkpoints: number of checkpoints to keep, besides the one with the best score.
         made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
         replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is saved once per
-            this many checkpoints, and with the last one if that takes `REPLAY_SECONDS` or less.
+            this many checkpoints, and with the last one if it has at most `LAST_REPLAY` bytes.
         rank_files: passes the states of the other ranks to rank 0. Each rank has a saver, and rank
             0's writes the checkpoints.
 
@@ -64,7 +129,7 @@ class Saver:
         self.made_with, self.replay_every = made_with, replay_every
         self.rank_files = rank_files or RankFiles(folder)
         self.error: str | None = None
-        self.lacks_replay = self.has_warned_of_memory = False
+        self.lacks_replay = False
         self.seconds, self._n_since_replay, self._number = 0.0, 0, 0
         self._host_copy = _HostCopy()
         self._thread: threading.Thread | None = None
@@ -86,53 +151,46 @@ class Saver:
         """
         self.wait()
         self._number += 1
-        state, seconds = self._with_replay(state, is_last)
-        state = self._host_copy(state)
+        state = self._host_copy(self._with_replay(state, is_last))
         # environments may hold infinities, weights may not
         learnt = {name: state[name] for name in ("policy", "learner") if name in state}
         if path := nonfinite_leaf(learnt):
             raise NonFiniteError(
                 f"The checkpoint at {step:,} samples was not saved: {path} is not finite"
             )
-        self._thread = threading.Thread(target=self._write, args=(step, state, score, seconds))
+        self._thread = threading.Thread(target=self._write, args=(step, state, score))
         self._thread.start()
 
-    def _with_replay(self, state, is_last) -> tuple[StateDict, float | None]:
-        """Returns the state, without the replay buffer if that is not due, and the time limit in
-        seconds for the buffer (None for no limit).
+    def _with_replay(self, state, is_last) -> StateDict:
+        """Returns the state, without a large replay buffer that is not due, or that there is too
+        little memory to copy.
         """
         self.lacks_replay = False
-        if "replay" not in state or _nbytes(state["replay"]) <= SMALL_REPLAY:
-            return state, None
+        n_bytes = _nbytes(state.get("replay"))
+        if n_bytes <= SMALL_REPLAY:
+            return state
         self._n_since_replay += 1
-        if is_last or self._n_since_replay >= self.replay_every:
-            if _nbytes(state["replay"]) > _free_memory() / 2:
-                self._warn_of_memory()
-            else:
+        is_due = self._n_since_replay >= self.replay_every
+        if is_due or (is_last and n_bytes <= LAST_REPLAY):
+            if n_bytes <= _free_memory() / 2:
                 self._n_since_replay = 0
-                return state, REPLAY_SECONDS if is_last else None
+                return state
+            problem = "since there is too little memory to copy it"
+            warnings.warn(f"Checkpoints leave out the replay buffer, {problem}", stacklevel=3)
         self.lacks_replay = True
-        return {name: part for name, part in state.items() if name != "replay"}, None
-
-    def _warn_of_memory(self) -> None:
-        if not self.has_warned_of_memory:
-            self.has_warned_of_memory = True
-            warnings.warn(
-                "Checkpoints leave out the replay buffer, since there is too little memory to copy "
-                "it",
-                stacklevel=4,
-            )
+        return {name: part for name, part in state.items() if name != "replay"}
 
     @property
     def is_writing(self) -> bool:
         """True while the thread writes."""
         return self._thread is not None and self._thread.is_alive()
 
-    def _write(self, step, state, score, replay_seconds) -> None:
+    def _write(self, step, state, score) -> None:
         began = time.monotonic()
+        files, number = self.rank_files, self._number
         try:
-            if self.rank_files.rank > 0:
-                self.rank_files.hand_in(self._number, state, replay_seconds)
+            if files.rank > 0:
+                files.hand_in(number, state)
             else:
                 checkpoint.save(
                     self.folder,
@@ -142,8 +200,7 @@ class Saver:
                     self.keep_checkpoints,
                     score,
                     self.made_with,
-                    replay_seconds,
-                    functools.partial(self.rank_files.collect, self._number),
+                    lambda folder: files.collect(number, folder),
                 )
         except Exception as error:
             self._failure = step, _nbytes(state), error
@@ -167,7 +224,7 @@ class Saver:
         if failure is None:
             self.error = None
             return
-        if not isinstance(failure[-1], (OSError, checkpoint.DamagedCheckpoint)):
+        if not isinstance(failure[-1], OSError):
             raise failure[-1]
         self._n_since_replay = self.replay_every  # so that the next checkpoint includes it
         has_warned = self.error is not None or self.rank_files.is_given_up
@@ -232,7 +289,7 @@ class _HostCopy:
             return {key: self._copied(part, (*path, key)) for key, part in node.items()}
         if isinstance(node, (list, tuple)):
             return type(node)(self._copied(part, (*path, i)) for i, part in enumerate(node))
-        checkpoint_format.check_plain(node, ".".join(map(str, path)))
+        check_plain(node, ".".join(map(str, path)))
         return node
 
     def _copied_tensor(self, tensor, path) -> torch.Tensor:
@@ -248,12 +305,37 @@ class _HostCopy:
         return kept.copy_(tensor, non_blocking=True)
 
 
+def check_plain(tree: object, name: str) -> None:
+    """Checks that a tree can be loaded without running code: it may hold tensors, numbers, strings,
+    None, and lists, tuples and dicts of these.
+
+    Args:
+        tree: what to check.
+        name: the tree's name in messages.
+
+    Raises:
+        TypeError: naming the path of anything else.
+    """
+    if isinstance(tree, dict):
+        for key, part in tree.items():
+            check_plain(part, f"{name}.{key}")
+    elif isinstance(tree, (list, tuple)):
+        for i, part in enumerate(tree):
+            check_plain(part, f"{name}.{i}")
+    elif type(tree) not in (bool, int, float, str, type(None)) and not hasattr(
+        tree, "untyped_storage"
+    ):
+        raise TypeError(
+            f"{name} is a {type(tree).__module__}.{type(tree).__name__}, and checkpoints hold "
+            "tensors, numbers, strings, lists and dicts only: convert it, for example with float()"
+        )
+
+
 def _free_memory() -> float:
     """Returns free memory in bytes, infinity if unknown."""
-    try:
+    with contextlib.suppress(ValueError, OSError):
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):
-        return math.inf
+    return math.inf
 
 
 def _nbytes(state) -> int:

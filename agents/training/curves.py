@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from megastep.agents.runs import json_lines
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row

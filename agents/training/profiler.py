@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 from megastep.agents import console
-from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training.performance import PHASES, PhaseTimer
+from megastep.atomic_files import write_atomically
 
 #: Updates before a profile: the first ones initialise libraries and capture CUDA graphs.
 N_SKIPPED = 3

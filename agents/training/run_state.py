@@ -50,6 +50,7 @@ class RunState:
 
     @property
     def is_resumable(self) -> bool:
+        """Whether checkpoints hold the environment."""
         return optional(self.env_state.env, "resumable")
 
     def incomplete(self) -> str | None:

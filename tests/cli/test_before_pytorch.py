@@ -10,13 +10,11 @@ import sys
 import pytest
 from pydantic import ValidationError
 
-from megastep.agents import factory
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.factory import components
 from megastep.agents.factory.check import as_tree
-from megastep.agents.factory.settings import loggers
 from megastep.agents.launch import again
-from megastep.agents.runs import checkpoint, folders
+from megastep.agents.runs import checkpoint
 from megastep.imports import import_object
 from megastep.settings import arguments_of, sentence, settings_class
 from tests.helpers.tiny import TINY, settings
@@ -134,44 +132,6 @@ def test_errors_need_no_pytorch(stopped):
     assert process.returncode == 0, process.stderr
     assert process.stderr.splitlines()[-1] == "[]", "modules that errors do not need"
     assert "Traceback" not in process.stderr and process.stdout.count("most common words") == 2
-
-
-# ---- Loggers of runs ----
-
-WANDB = {"name": "wandb", "project": "p", "mode": "offline", "group": None}
-WANDB_ONLINE = WANDB | {"mode": "online"}
-
-
-@pytest.mark.parametrize(
-    "logger, words, expected",
-    [
-        ({"name": "none"}, [], {"tensorboard": {}}),
-        (WANDB, [], {"tensorboard": {}, "wandb": {**WANDB}}),
-        (WANDB, ["logger.wandb.mode=online"], {"tensorboard": {}, "wandb": WANDB_ONLINE}),
-        (WANDB, ["logger=none"], {}),
-        ({"name": "none"}, ["logger=csv"], {"csv": {}}),
-        ({}, [], {}),
-    ],
-)
-def test_run_with_the_keys_of_a_single_logger_is_resumed(stopped, logger, words, expected):
-    stopped(logger=logger)
-    chosen = as_tree(settings("resume=run", *words))["logger"]
-    paths = {label: {"name": path} for label, path in loggers().items()}
-    assert chosen == {label: keys | paths[label] for label, keys in expected.items()}
-
-
-def test_logger_that_a_resumed_run_does_not_have(stopped):
-    stopped(logger={"name": "none"})
-    with pytest.raises(ConfigErrors, match="logger.wandb: is not chosen; add logger=wandb"):
-        settings("resume=run", "logger.wandb.mode=offline")
-
-
-def test_evaluation_needs_no_logger(stopped):
-    stopped(logger={"gone": {"name": "gone:Gone", "uri": "x"}})
-    loaded = folders.load_checkpoint(pathlib.Path("run"), trust=True)
-    assert factory.config_of(loaded).logger == {}
-    with pytest.raises(ConfigErrors, match="logger.gone: gone:Gone cannot be imported"):
-        settings("resume=run", "trust=true")
 
 
 # ---- Budgets of resumed runs ----

@@ -49,16 +49,6 @@ def test_a_hostile_file_is_refused_in_one_sentence(content, text, tmp_path, monk
     assert os.listdir() == ["conf"]
 
 
-def test_special_files_are_none(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    os.makedirs("conf/env")
-    os.mkfifo("conf/env/x.yaml")
-    os.symlink("/dev/zero", "conf/env/y.yaml")
-    for name in "xy":
-        assert train.main(["--config-dir", "conf", f"env={name}", "device=cpu"]) == 2
-        assert "Traceback" not in (err := capsys.readouterr().err) and err.count("\n") == 2
-
-
 @pytest.mark.parametrize("loader", [yaml.BaseLoader, config_files.LOADER])
 def test_ordinary_files_pass(loader, monkeypatch, tmp_path):
     monkeypatch.setattr(config_files, "LOADER", loader)

@@ -1,27 +1,29 @@
 """Agents in one file: exported from a run, and then used by their names. Those of the package."""
 
-import hashlib
 import json
 import re
 import shutil
 from pathlib import Path
 
 import pytest
-import safetensors.torch
 import torch
 
 from megastep import geometries
-from megastep.agents import factory, package, pretrained
+from megastep.agents import package, pretrained
 from megastep.agents.cli import evaluate, export, inspect, record, train
 from megastep.agents.errors import UserError
 from megastep.agents.export import agent
 from megastep.agents.networks.policy import TRAINING_ONLY
 from megastep.agents.networks.running_norm import RunningNorm
-from megastep.agents.runs import agent_file, checkpoint, folders
-from megastep.agents.runs.checkpoint_format import CheckpointError, DamagedCheckpoint
+from megastep.agents.runs import agent_file, checkpoint, folders, restore, trust
+from megastep.agents.runs.checkpoint import CheckpointError
 from megastep.types import n_lanes
 
 NAME = "tiny_agent"
+CONFIG = {
+    "train": {**dict.fromkeys(("env", "geometry", "learner"), {"name": "x"}), "agent": {}},
+    "spaces": {},
+}
 PARTS = "geometry.parts={bench: 2, braided: {source: maze, n: 2, braid: 1}}"
 TINY = [
     *("env=deathmatch", "env.n_agents=2", "env.res=16", "env.n_envs=4", "env.limit=20"),
@@ -65,9 +67,7 @@ def file(folder):
 def original_of(exported, env):
     """The run's own policy."""
     loaded = checkpoint.load_latest(exported / "run/checkpoints")
-    return factory.load_weights(
-        factory.make_policy(factory.config_of(loaded).agent, env), env, loaded
-    )
+    return restore.policy_of(loaded, env)
 
 
 # ---- Exporting ----
@@ -81,7 +81,7 @@ def test_weights_are_float16_and_statistics_float32(file):
     for name, tensor in state.items():
         is_statistic = name.rpartition(".")[0] in norms
         assert tensor.dtype == (torch.float32 if is_statistic else torch.float16), name
-    assert (read.step, read.numbers, read.untrusted) == (512, {}, ())
+    assert (read.step, read.numbers) == (512, {})
     train = read.config["train"]
     assert (train["folder"], train["resume"], train["init"]) == (None, None, None)
 
@@ -291,14 +291,12 @@ DAMAGES = {
     "header": (lambda content: content[:30] + b"!" + content[31:], "not an agent file of megastep"),
     "no text": (lambda content: content[:30] + b"\xff" + content[31:], "invalid UTF-8 in header"),
     "long header": (lambda content: b"\xff" * 8 + content, "header too large"),
-    "spaces": (lambda content: (2**25).to_bytes(8, "little") + b" " * 2**25, "too long"),
-    "of others": (lambda content: b"\x02" + b"\0" * 7 + b"{}", "unexpected header"),
+    "of others": (lambda content: b"\x02" + b"\0" * 7 + b"{}", "has format None"),
     "no samples": (lambda content: changed(content, facts='{"samples": null}'), "samples"),
-    "true samples": (lambda content: changed(content, facts='{"samples": true}'), "samples"),
     "tables": (lambda content: changed(content, tables='[{"rows": 3}]'), "0.title"),
-    "no config": (lambda content: changed(content, config="{}"), "incomplete configuration"),
-    "deep": (lambda content: changed(content, tables="[" * 100_000), "unexpected header"),
-    "newer": (lambda content: changed(content, format="99"), "Update megastep"),
+    "no config": (lambda content: changed(content, config="{}"), "train: Field required"),
+    "deep": (lambda content: changed(content, tables="[" * 100_000), "too deeply nested"),
+    "newer": (lambda content: changed(content, format="99"), "has format '99', and this"),
 }
 
 
@@ -311,33 +309,9 @@ def test_damaged_files_are_one_sentence(damage, text, file, capsys):
     assert text in (err := capsys.readouterr().err) and err.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "entry",
-    [
-        {"dtype": "F16", "shape": [3], "data_offsets": [0, 4]},
-        {"dtype": "F16", "shape": [2], "data_offsets": [4, 8]},
-        {"dtype": "F16", "shape": [-2], "data_offsets": [0, 4]},
-        {"dtype": "F8", "shape": [2], "data_offsets": [0, 4]},
-        {"dtype": "BF16", "shape": [2], "data_offsets": [0, 4]},
-        {"dtype": "F16", "shape": [2**62, 2**62], "data_offsets": [0, 4]},
-        {"dtype": "F16", "shape": [2]},
-        {"dtype": "a\nb", "shape": [2], "data_offsets": [0, 4]},
-    ],
-)
-def test_tensors_that_do_not_fill_the_file_are_refused(entry, tmp_path):
-    path, config = tmp_path / "a.safetensors", {"train": {}, "spaces": {}}
-    agent_file.write(path, {"w": torch.ones(2).half()}, config, {"samples": 1})
-    path.write_bytes(changed(path.read_bytes(), {"w": entry}))
-    with pytest.raises(
-        DamagedCheckpoint, match="a.safetensors is damaged or not an agent file"
-    ) as info:
-        agent_file.read(path, "cpu")
-    assert "\n" not in str(info.value)
-
-
 def test_every_flipped_bit_of_a_header_is_found(tmp_path):
     path = tmp_path / "a.safetensors"
-    agent_file.write(path, {"w": torch.ones(2)}, {"train": {}, "spaces": {}}, {"samples": 1})
+    agent_file.write(path, {"w": torch.ones(2)}, CONFIG, {"samples": 1})
     content = path.read_bytes()
     for bit in range(8 * len(content)):
         flipped = bytearray(content)
@@ -345,37 +319,6 @@ def test_every_flipped_bit_of_a_header_is_found(tmp_path):
         path.write_bytes(flipped)
         with pytest.raises(CheckpointError):
             agent_file.read(path, None)
-
-
-def test_format_1_has_a_digest_of_its_tensors(tmp_path):
-    path, tensors = tmp_path / "a.safetensors", {"w": torch.ones(2)}
-    agent_file.write(path, tensors, {"train": {}, "spaces": {}}, {"samples": 1})
-    content = path.read_bytes()
-    metadata = json.loads(content[8:-8])["__metadata__"]
-    metadata |= {"format": "1", "sha256": hashlib.sha256(content[-8:]).hexdigest()}
-    path.write_bytes(first := safetensors.torch.save(tensors, metadata))
-    assert torch.equal(agent_file.read(path, "cpu").state["policy"]["w"], torch.ones(2))
-    path.write_bytes(first[:-1] + b"!")
-    with pytest.raises(DamagedCheckpoint, match="SHA-256"):
-        agent_file.read(path, None)
-
-
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, True, 1])
-def test_weights_that_are_none_are_refused(value, file, exported, capsys):
-    read, about = agent_file.read(file, "cpu"), agent_file.read_metadata(file)
-    weights = read.state["policy"]
-    name = next(name for name, weight in weights.items() if weight.dtype == torch.float16)
-    weight = torch.full_like(weights[name], value, dtype=torch.tensor(value).dtype)
-    weights[name] = weight.half() if weight.is_floating_point() else weight.long()
-    agent_file.write(file, weights, read.config, about["facts"], about["tables"])
-    loaded = checkpoint.load_latest(exported / "run/checkpoints")
-    loaded.state["policy"][name] = weight
-    checkpoint.save("run/checkpoints", 512, loaded.state, loaded.config)
-    for words in ([f"run={NAME}"], ["run=run"]):
-        assert evaluate.main(words) == 2
-        err = capsys.readouterr().err
-        assert name in err and ("NaN" in err or "int64" in err or "bool" in err), err
-        assert err.count("\n") == 1
 
 
 def test_modules_of_others_need_trust(file, capsys):
@@ -396,13 +339,11 @@ def test_tensors_are_read_as_written(tmp_path):
     path = tmp_path / "a.safetensors"
     tensors = {"b": torch.rand(2, 3).half().T, "a": torch.tensor(3.5)}
     tensors["c"] = torch.zeros(0, 2, dtype=torch.int64)
-    agent_file.write(path, tensors, {"train": {}, "spaces": {}}, {"samples": 7})
+    agent_file.write(path, tensors, CONFIG, {"samples": 7})
     read = agent_file.read(path, "cpu").state["policy"]
-    assert [*read] == ["a", "b", "c"]
+    assert {*read} == {"a", "b", "c"}
     for name, tensor in tensors.items():
         assert read[name].dtype == tensor.dtype and torch.equal(read[name], tensor)
-    with pytest.raises(ValueError, match="w is bool"):
-        agent_file.write(path, {"w": torch.ones(1).bool()}, {}, {})
 
 
 # ---- The agents of the package ----
@@ -413,7 +354,7 @@ def test_tensors_are_read_as_written(tmp_path):
 def test_agent_of_the_package(path):
     """It loads, acts, is small, and has a card whose numbers are those of the file."""
     assert path.stat().st_size <= 4_000_000
-    assert agent_file.read(path, None).untrusted == ()
+    assert trust.foreign_names(agent_file.read(path, None).config) == []
     assert agent_file.read_metadata(path)["tables"], "evaluated in the suite"
     card = path.with_suffix(".md").read_text()
     assert card.startswith(agent.card(path)), (

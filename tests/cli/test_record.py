@@ -151,7 +151,7 @@ def full_disk(*_):
 @pytest.mark.parametrize("ending", ["mp4", "gif", "png"])
 def test_full_disk(trained, here, monkeypatch, capsys, ending):
     monkeypatch.setattr(recording.os, "fsync", full_disk)
-    file = f"new/film.{ending}"
+    file = f"film.{ending}"
     assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
     assert "No space left on device" in capsys.readouterr().err and not os.listdir()
 
@@ -194,7 +194,7 @@ def test_several_cameras(env, tmp_path):
             "file: 'a/video.avi' is neither a film, .mp4 or .gif, nor its last frame, ",
         ),
         ("folder.mp4", "The video folder.mp4 could not be made: folder.mp4 is a folder"),
-        (f"{300 * 'longer/'}{300 * 'x'}.mp4", "File name too long"),
+        (f"{300 * 'x'}.mp4", "File name too long"),
     ],
 )
 def test_video_that_cannot_be_made(trained, here, monkeypatch, capsys, file, text):

@@ -15,7 +15,7 @@ from megastep.agents import factory
 from megastep.agents.cli import train
 from megastep.agents.evaluation import playing
 from megastep.agents.launch import signals
-from megastep.agents.runs import checkpoint, checkpoint_format, folders, provenance
+from megastep.agents.runs import checkpoint, folders, provenance
 from megastep.agents.storage.collector import Collector
 from megastep.agents.training import loggers
 from tests.helpers import tiny
@@ -125,7 +125,7 @@ def reporting(monkeypatch, number):
 
 def saving(monkeypatch, number):
     # in the second checkpoint, which is written while training goes on
-    signalled(monkeypatch, checkpoint_format, "_write_file", number, call=6)
+    signalled(monkeypatch, checkpoint, "save_tensors", number, call=3)
 
 
 @pytest.mark.parametrize(

@@ -404,7 +404,7 @@ def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
         )
     warning, *others, error = capsys.readouterr().err.splitlines()
     assert code == 2 and all("curves.png" in line for line in others)
-    assert "at 64 samples could not be saved (File too large)" in warning
+    assert "at 64 samples could not be saved (the disk is full or cannot be written)" in warning
     assert "at 160 samples could not be saved" in error
     assert re.search(r"it needs about [\d.]+ MB, and [\d.]+ MB are free in run", error)
     assert len(json_lines.read(here / "run" / "metrics.jsonl")) == 5
@@ -453,11 +453,8 @@ def test_too_many_environments(here, capsys):
     assert not any((here / "runs").iterdir())
 
 
-LONG = "/".join(570 * ["longer"])
-
-
 @pytest.mark.parametrize(
-    "folder", ["file", "file/below", "/proc/run", "full", "link", "link/below", 300 * "x", LONG]
+    "folder", ["file", "file/below", "/proc/run", "full", "link", "link/below", 300 * "x"]
 )
 def test_unusable_run_folder(here, monkeypatch, capsys, folder):
     (here / "file").write_text("")

@@ -8,7 +8,7 @@ from megastep.agents.cli import train
 from megastep.agents.distributed.ranks import ONE
 from megastep.agents.evaluation import in_training
 from megastep.agents.factory import settings as settings_module
-from megastep.agents.runs import checkpoint, checkpoint_format
+from megastep.agents.runs import checkpoint
 from tests.helpers.tiny import (
     ON_GPU,
     SHORT_EPISODES,
@@ -39,7 +39,7 @@ def test_evaluations_change_nothing_of_the_training(here):
     at = [row["samples"] // UPDATE for row in rows if "eval/return" in row]
     assert at == [4, 8], "the first report after every fourth update"
     paths = checkpoint.list_checkpoints(evaluated / "checkpoints")
-    scores = {path.name: checkpoint_format.read_manifest(path)["score"] for path in paths}
+    scores = {path.name: checkpoint.read_manifest(path)["score"] for path in paths}
     returns = {f"step_{row['samples']}": row["eval/return"] for row in rows if "eval/return" in row}
     assert {name: score for name, score in scores.items() if score is not None}.items() <= (
         returns.items()

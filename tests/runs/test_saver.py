@@ -99,9 +99,9 @@ def test_checkpoint_with_a_large_replay_buffer_is_kept(tmp_path, monkeypatch):
     assert [checkpoint.step_of(p) for p in checkpoint.list_checkpoints(tmp_path)] == [4, 6, 7]
 
 
-def test_replay_buffer_that_takes_too_long_is_left_out(writes, tmp_path, monkeypatch):
+def test_replay_buffer_that_would_delay_the_end_is_left_out(writes, tmp_path, monkeypatch):
     monkeypatch.setattr(saver, "SMALL_REPLAY", 100)
-    monkeypatch.setattr(saver, "REPLAY_SECONDS", -1.0)
+    monkeypatch.setattr(saver, "LAST_REPLAY", 200)
     writes(1, state(), is_last=True)
     writes.wait()
     assert writes.error is None and with_replay(tmp_path) == []

@@ -4,7 +4,7 @@ import csv
 import io
 from pathlib import Path
 
-from megastep.agents.runs.atomic_files import write_atomically
+from megastep.atomic_files import write_atomically
 
 
 class CSV:

@@ -8,9 +8,9 @@ from typing import Literal
 
 from megastep.agents import package
 from megastep.agents.runs import provenance
-from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.training.loggers import first_line
 from megastep.agents.types import RunResult
+from megastep.atomic_files import write_atomically
 
 #: Seconds that Weights & Biases may take to start before the run goes on without it.
 TIMEOUT = 20

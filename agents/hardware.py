@@ -1,0 +1,34 @@
+"""The device that a program uses, and the threads of a CPU."""
+
+import torch
+
+from megastep import engine
+from megastep.agents.errors import user_errors
+
+
+def make_device(name: str, index: int | None = None) -> torch.device:
+    """Returns the device of this name, and makes a GPU the current one.
+
+    Args:
+        name: `auto`, `cpu`, `cuda` or `cuda:1`.
+        index: of the GPU that `auto` and `cuda` mean.
+
+    Raises:
+        UserError: there is no such device.
+    """
+    if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
+        name = f"cuda:{index}"
+    with user_errors(kinds=(engine.EngineError,)):
+        device = engine.device(name)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)  # on which graphs are captured
+    return device
+
+
+def share_threads(width: int) -> None:
+    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
+    layers, threads lose more by waiting for each other than they gain.
+    """
+    n_threads = engine.threads()
+    engine.set_threads(n_threads)
+    torch.set_num_threads(max(1, min(n_threads, width // 128)))

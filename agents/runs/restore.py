@@ -1,0 +1,109 @@
+"""What a checkpoint or an agent file becomes: a policy that acts, weights to learn from, and what
+wrappers have learnt.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, cast
+
+import torch
+
+from megastep import spaces
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.hardware import share_threads
+from megastep.agents.networks.policy import TRAINING_ONLY, Policy
+from megastep.types import Env, optional
+
+if TYPE_CHECKING:
+    from megastep.agents.runs.checkpoint import Checkpoint
+
+
+def policy_of(
+    loaded: "Checkpoint", env: Env | None = None, device: torch.device | str = "cpu"
+) -> Policy:
+    """Returns the policy of a checkpoint, which only acts: it has no critic, and its weights need
+    no gradient. On a CPU this sets the number of threads that PyTorch uses, as training does.
+
+    Args:
+        loaded: with its state.
+        env: where it is to act. Default: an environment with the spaces of its training.
+        device: of the policy without an environment.
+
+    Raises:
+        UserError: naming what differs, if the weights do not fit the spaces.
+    """
+    device = torch.device(device if env is None else env.device)
+    settings = loaded.config["train"]["agent"]
+    kinds = (ValueError, TypeError, KeyError, RuntimeError)
+    with user_errors(f"{loaded.path} cannot be used: ", kinds):
+        tree = _nested(loaded.config["spaces"])
+        if device.type == "cpu":
+            share_threads(settings["width"])
+        policy = Policy(tree["obs"], tree["actions"], **{**settings, "critic": None}).to(device)
+    return load_weights(policy, loaded, env).requires_grad_(False)
+
+
+def load_weights(policy: Policy, loaded: "Checkpoint", env: Env | None = None) -> Policy:
+    """Returns a policy with a checkpoint's weights, the critic's too if both have one. With the
+    file of an agent, which only acts, the critic keeps the weights that it has.
+
+    Args:
+        env: what the policy was made for. Default: an environment with the spaces of its training.
+
+    Raises:
+        UserError: naming what differs, if they do not fit.
+    """
+    saved, present = loaded.config["spaces"], {} if env is None else spaces_of(env)
+    if present and (names := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]):
+        changes = [f"{name} was {saved.get(name)} and is {present.get(name)}" for name in names]
+        ids = loaded.config["train"]["env"].get("id"), getattr(env, "id", None)
+        of_ids = f", {ids[0]} and not {ids[1]}" if ids[0] != ids[1] else ""
+        raise UserError(
+            f"{loaded.path} was trained in another environment{of_ids}: {'; '.join(changes)}. "
+            "Choose the env it was trained in"
+        )
+    agent = " ".join(f"agent.{k}={v}" for k, v in loaded.config["train"]["agent"].items())
+    kinds = (AttributeError, KeyError, TypeError, RuntimeError)
+    with user_errors(f"{loaded.path} needs an agent with {agent}: ", kinds):
+        weights = cast("dict", loaded.state)["policy"]
+        of_training = {k: v for k, v in weights.items() if k.startswith(TRAINING_ONLY)}
+        if policy.critic is None:
+            weights = {k: v for k, v in weights.items() if k not in of_training}
+        elif not of_training:
+            weights = policy.state_dict() | weights
+        policy.load_state_dict(weights)
+    return policy
+
+
+def load_wrappers(env: Env, loaded: "Checkpoint", is_frozen: bool = True) -> None:
+    """Gives the wrappers of an environment what those of a checkpoint's have learnt.
+
+    Args:
+        is_frozen: it stays as it is from now on.
+
+    Raises:
+        UserError: the environment is not in the same wrappers.
+    """
+    if state := (loaded.state or {}).get("wrappers"):
+        load = optional(env, "load_wrapper_state")
+        with user_errors(f"{loaded.path} cannot be used here: "):
+            if load is None:
+                raise ValueError(f"{type(env).__name__} has no load_wrapper_state")
+            load(state, is_frozen)
+
+
+def spaces_of(env: Env) -> dict[str, str]:
+    """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
+    tree = {"obs": env.obs_space, "actions": env.action_space}
+    return {name: repr(space) for name, space in spaces.leaves(tree).items()}
+
+
+def _nested(texts: Mapping[str, str]) -> dict:
+    """Returns the tree of spaces that `spaces_of` wrote."""
+    tree = {}
+    for name, text in texts.items():
+        *keys, last = name.split(".")
+        branch = tree
+        for key in keys:
+            branch = branch.setdefault(key, {})
+        branch[last] = spaces.from_text(text)
+    return tree

@@ -1,0 +1,108 @@
+"""Files and folders that are whole or absent, and files that grow."""
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+#: Marks temporary names.
+MARK = ".tmp-"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields an unused path beside `path`. The file or folder that is made there takes the place of
+    `path` at the end of the context, or is deleted if there is an error.
+
+    Readers see the old content or the new, even if the process is killed or the power fails. The
+    last of several writers wins.
+    """
+    temporary = path.with_name(f"{path.name[:40]}{MARK}{secrets.token_hex(8)}")
+    try:
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, path)
+        sync(path.parent)
+    except BaseException:
+        delete(temporary)
+        raise
+
+
+def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
+    """Writes a file as `replacing` does.
+
+    Args:
+        mode: permissions, less those that the umask takes.
+
+    Raises:
+        OSError: the disk is full or not writable. The old file is unchanged.
+    """
+    with replacing(path) as temporary:
+        with open(temporary, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            file.write(data)
+
+
+def sync(path: Path) -> None:
+    """Flushes a file, or the names in a folder, to disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def delete(path: Path) -> None:
+    """Deletes a file or a folder, if it is there and can be deleted."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        path.unlink()
+
+
+class AppendedFile:
+    """A file that bytes are appended to. Those that a full disk refuses are written with the next.
+
+    Args:
+        path: the file, which need not exist.
+        n_bytes: length to cut the file to; None leaves it.
+
+    Attributes:
+        unwritten: bytes that the next `flush` writes.
+
+    Raises:
+        OSError: the file cannot be opened.
+    """
+
+    def __init__(self, path: Path, n_bytes: int | None = None):
+        self.path, self.unwritten = path, bytearray()
+        self.file = open(path, "ab", buffering=0)
+        if n_bytes is not None:
+            self.file.truncate(n_bytes)
+
+    def write(self, data: bytes) -> None:
+        """Appends bytes.
+
+        Raises:
+            OSError: the disk is full or not writable.
+        """
+        self.unwritten += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Writes `unwritten`. Raises as `write`."""
+        while self.unwritten:
+            del self.unwritten[: self.file.write(self.unwritten)]
+
+    def sync(self) -> None:
+        """Writes `unwritten` and flushes the file to disk. Raises as `write`."""
+        self.flush()
+        os.fsync(self.file.fileno())
+
+    def close(self) -> None:
+        """Writes `unwritten` and closes the file."""
+        try:
+            self.flush()
+        finally:
+            self.file.close()
