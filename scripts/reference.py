@@ -64,9 +64,9 @@ REPORTERS = {
 }
 #: Megastep's own machinery, which nobody needs to import; and `cuda`, another name of `engine`.
 INTERNAL = re.compile(
-    r"megastep\.(__main__|adapters\.(?!gymnasium)\w+|cache|compat|cuda|colour|demo|global_generators|hosting|imports|kernels"
+    r"megastep\.(__main__|adapters\.(?!gymnasium)\w+|atomic_files|cache|compat|cuda|colour|demo|global_generators|hosting|imports|kernels"
     r"|web|agents\.(cli|console|export|distributed\.(?!pooling)"
-    r"\w+|factory|launch|package|pretrained|runs|networks\.(kernels|web|\w+_cpu)|storage\.\w*kernels"
+    r"\w+|factory|hardware|launch|package|pretrained|runs|networks\.(kernels|web|\w+_cpu)|storage\.\w*kernels"
     r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.\w+\.(?!(env|bot)\b)\w+)\b"
 )
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from megastep import contract
-from megastep.agents import factory, pretrained
+from megastep.agents import pretrained
 from megastep.agents.cli import evaluate, train
-from megastep.agents.runs import agent_file, checkpoint
+from megastep.agents.runs import agent_file, checkpoint, restore
 
 gymnasium = pytest.importorskip("gymnasium")
 from megastep.envs import Gymnasium  # noqa: E402
@@ -135,7 +135,7 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     agent_file.write(path, weights, saved.config, {"samples": 256}, wrappers=learnt)
     env = pretrained.make_env("run", n_envs=1, device="cpu", vectorization="sync")
     assert env.wrapper_state()["1.NormalizeObservation.obs_rms.count"] > count + 25
-    factory.load_wrappers(env, agent_file.read(path, "cpu"))
+    restore.load_wrappers(env, agent_file.read(path, "cpu"))
     assert is_same(env.wrapper_state(), learnt)
 
 

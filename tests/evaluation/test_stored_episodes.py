@@ -12,6 +12,7 @@ from megastep import recording
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.evaluation import playing, replay
 from megastep.agents.evaluation.eval_env import EvalEnv
+from megastep.agents.runs import restore
 from tests.helpers import tiny
 from tests.helpers.tiny import settings
 
@@ -115,8 +116,7 @@ def test_an_episode_of_several_ranks_is_the_same_again(evaluated, device="cpu"):
     trained = replay.factory.config_of(loaded)
     homes = replay.factory.homes(trained.env, trained.geometry, "test")
     rank = EvalEnv(trained.env, homes[:8], 8, rank=(1, 2))
-    policy = replay.factory.make_policy(trained.agent, rank.env)
-    policy = replay.factory.load_weights(policy, rank.env, loaded)
+    policy = restore.policy_of(loaded, rank.env)
     played = playing.first_episodes(rank.env, policy, rank.seed)
     cfg = settings(f"run={evaluated}", "episodes=8", script="evaluate")
     table = replay.Table(evaluated, "", "", cfg, trained.env, trained.geometry, [], 2)
