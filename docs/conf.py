@@ -90,12 +90,5 @@ def film(match):
     )
 
 
-def write_llms(app, error):
-    """Writes llms.txt, a list of the pages with their first sentences."""
-    if not error and app.builder.name == "html":
-        (Path(app.outdir) / "llms.txt").write_text(reference.llms(Path(app.srcdir)))
-
-
 def setup(app):
     app.connect("source-read", prepare)
-    app.connect("build-finished", write_llms)

@@ -601,25 +601,3 @@ def expand(text: str) -> str:
         return PAGES[name](*words)
 
     return re.sub(r"^```\{generated\} (.*)\n```$", generated, text, flags=re.M)
-
-
-def llms(docs: Path) -> str:
-    """Returns llms.txt: the pages by title, with their first sentences."""
-    index = (docs / "index.md").read_text()
-    groups = re.findall(r":caption: (.*)\n:hidden:\n\n((?:[\w/-]+\n)+)", index)
-    summary = re.search(r"^(megastep simulates.*?)\n\n", index, re.M | re.S)[1]
-    lines = ["# megastep", "", f"> {' '.join(summary.split())}"]
-    for caption, names in groups:
-        lines += ["", f"## {caption}", ""]
-        for name in names.split():
-            text = expand((docs / f"{name}.md").read_text())
-            title, _, body = text.removeprefix("# ").partition("\n")
-            lines.append(f"- [{title}]({name}.html): {_first_sentence_of(body)}")
-    return "\n".join(lines) + "\n"
-
-
-def _first_sentence_of(body):
-    body = re.sub(r"^```.*?^```", "", body, flags=re.M | re.S)
-    paragraph = re.search(r"^(?![!#|\n:-]).+(?:\n.+)*", body, re.M)
-    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(paragraph[0].split()))
-    return re.split(r"(?<=\.) (?=[A-Z])", text)[0]

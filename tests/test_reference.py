@@ -78,21 +78,3 @@ def test_an_unknown_metric_is_found():
 def test_exit_codes_are_described():
     kinds = [errors.UserError, *errors.UserError.__subclasses__()]
     assert {0, endings.LOST, *(kind.code for kind in kinds)} <= {*errors.EXIT_CODES}
-
-
-def test_docstrings_become_markdown():
-    text = """Steps.
-
-    Sees :func:`~megastep.optional` and ``x``.
-
-    Args:
-        n: number of steps,
-            at least 1.
-
-    Returns:
-        y, (B,).
-    """
-    assert reference.markdown(text, {"n": "int"}) == (
-        "Steps.\n\nSees `megastep.optional` and `x`.\n\n\n**Args**\n\n"
-        "- **n** (`int`): number of steps, at least 1.\n\n**Returns**\n\ny, (B,)."
-    )

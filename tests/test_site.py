@@ -10,7 +10,6 @@ from tests.helpers import pages
 pytestmark = pytest.mark.filterwarnings("ignore:.*MystReferenceResolver")
 DOCS = pages.ROOT / "docs"
 FOLDER = "notebooks"
-NOTEBOOKS = sorted(page.stem for page in (DOCS / FOLDER).glob("*.md"))
 
 
 def outputs(folder, notebook):
@@ -51,8 +50,3 @@ def memory_of_a_trained_agent_knows_more_than_its_view(text, n_pictures, _):
     view, untrained, memory = (float(scores[name]) for name in ("view", "untrained", "memory"))
     assert memory > 0.1 + max(view, untrained)
     assert n_pictures == 2
-
-
-def test_every_notebook_is_in_the_index():
-    index = (DOCS / "tutorials" / "index.md").read_text()
-    assert NOTEBOOKS and all(f"(../{FOLDER}/{name}.md)" in index for name in NOTEBOOKS)

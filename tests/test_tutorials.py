@@ -91,11 +91,3 @@ def blocks(page):
     """Returns the blocks of a page that are run and are no files."""
     found = BLOCK.findall((FOLDER / page).read_text())
     return [body for reason, _, body in found if not reason and not FILE.match(body)]
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_page_ends_with_three_things_to_try(page):
-    text = (FOLDER / page).read_text()
-    end = text.split("\n## Three things to try\n")[1]
-    assert re.findall(r"^(\d)\. ", end, re.M) == ["1", "2", "3"]
-    assert f"({page})" in (FOLDER / "index.md").read_text()
