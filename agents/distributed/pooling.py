@@ -57,13 +57,6 @@ def all_gather(tensor: torch.Tensor) -> torch.Tensor:
     return all_reduce(gathered)  # adding zeros keeps every bit
 
 
-def on_all_ranks(condition: torch.Tensor) -> torch.Tensor:
-    """Returns () bool, true if the condition, () bool, is true on every rank."""
-    if n_pooled() == 1:
-        return condition
-    return all_reduce((~condition).int()) == 0
-
-
 def pool_moments(*moments: Moments) -> list[Moments]:
     """Pools the moments (count, mean, variance) of all ranks (Chan et al. 1979).
 
@@ -107,7 +100,9 @@ def _in_common_dtype(x, others) -> torch.Tensor:
 def pool_with_condition(
     condition: torch.Tensor, *moments: Moments
 ) -> tuple[torch.Tensor, list[Moments]]:
-    """Returns `on_all_ranks(condition)` and `pool_moments(*moments)`, in one collective."""
+    """Returns whether a condition, () bool, is true on every rank, as () bool, and
+    `pool_moments(*moments)`, in one collective.
+    """
     if n_pooled() == 1:
         return condition, list(moments)
     one = torch.ones_like(condition, dtype=torch.int64)

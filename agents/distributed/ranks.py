@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import torch
 
 from megastep.agents.distributed import agreement, process_group
-from megastep.agents.distributed.pooling import all_gather, on_all_ranks
+from megastep.agents.distributed.pooling import all_gather
 
 T = TypeVar("T")
 
@@ -60,19 +60,15 @@ class Ranks(NamedTuple):
                 means[name] = math.fsum(column) / len(column)
         return means
 
-    def gather_if_any(self, value: T, is_needed: bool, device: torch.device | str) -> list[T]:
+    def gather_if_any(self, value: T, is_needed: bool) -> list[T]:
         """Returns the values of all ranks if any rank needs them, otherwise only this rank's.
 
         Args:
             value: small and picklable.
             is_needed: this rank needs the values.
-            device: device on which the ranks exchange `is_needed`. Synchronises.
         """
-        if self.n == 1:
-            return [value]
-        with process_group.waiting():
-            nobody_needs_them = bool(on_all_ranks(torch.tensor(not is_needed, device=device)))
-        return [value] if nobody_needs_them else process_group.gather_objects(value)
+        is_needed = self.any(is_needed)
+        return process_group.gather_objects(value) if is_needed and self.n > 1 else [value]
 
 
 #: A process that trains a policy of its own.

@@ -5,6 +5,7 @@ The interface of PyTorch's symmetric memory is private, so no other file uses it
 be set up, NCCL takes its place.
 """
 
+import contextlib
 import os
 import threading
 from pathlib import Path
@@ -49,11 +50,9 @@ def buffer(n: int, device: torch.device) -> torch.Tensor | None:
 def all_reduce_(buffer: torch.Tensor) -> None:
     """Sums a `buffer` over the ranks, in place, in one kernel on the current stream.
 
-    Unlike an operation of NCCL, it may be part of a CUDA graph, without a deadlock. It is a plain
-    kernel on this stream, with no stream, thread or queue of its own. Each block waits for the
-    block of the same number on the other GPUs, not for other blocks of its own GPU, so a GPU need
-    not hold them all at once. And all ranks launch these sums in the same order on one stream: when
-    a rank waits, nothing that the others run before the same sum waits for that rank.
+    Unlike an operation of NCCL, it may be part of a CUDA graph: each of its blocks waits for the
+    block of the same number on the other GPUs alone, and all ranks launch these sums in the same
+    order on one stream, so nothing that the others run before a sum waits for a rank that is in it.
 
     One GPU sums a number, in the order of the ranks, and writes it to all. So results are
     deterministic and equal on all ranks, and with two ranks they have NCCL's bits.
@@ -74,9 +73,16 @@ def _set_up(n, device) -> torch.Tensor | None:
     everyones = gather_objects((_machine(), memory is not None))
     if memory is None or set(everyones) != {(_machine(), True)}:
         return None
-    # a rank that fails leaves the others waiting in PyTorch's code
     is_open = threading.Event()
-    thread = threading.Thread(target=_open, args=(memory, is_open), daemon=True)
+
+    def open_all() -> None:
+        with contextlib.suppress(Exception):  # of any kind, from a version of PyTorch or a driver
+            # Launches no kernel. Python's `rendezvous` would hold its lock, and stop heartbeats.
+            _sum(memory[:0])
+            is_open.set()
+
+    # in a thread, as a rank that fails leaves the others waiting in PyTorch's code
+    thread = threading.Thread(target=open_all, daemon=True)
     thread.start()
     thread.join(SETUP_SECONDS)
     return memory if all(gather_objects(is_open.is_set())) else None
@@ -95,18 +101,8 @@ def _allocate(n, device) -> torch.Tensor | None:
 
         # PyTorch's `empty` may put several buffers into one allocation
         return _SymmetricMemory.empty_strided_p2p((n,), (1,), torch.float32, device)
-    except Exception:  # of any kind, from a version of PyTorch or a driver without it
-        return None
-
-
-def _open(memory, is_open) -> None:
-    """Opens the other ranks' memory, then sets the event."""
-    try:
-        # Launches no kernel. Python's `rendezvous` would hold its lock, and so stop heartbeats.
-        _sum(memory[:0])
     except Exception:  # as above
-        return
-    is_open.set()
+        return None
 
 
 def _machine() -> tuple[str, str]:

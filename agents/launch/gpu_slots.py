@@ -11,14 +11,11 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu, launcher
-
-if TYPE_CHECKING:
-    from contextlib import ExitStack
 
 T = TypeVar("T", bound=settings.Common)
 
@@ -80,19 +77,18 @@ def taken(cfg: T) -> Iterator[T]:
     # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
     visible = os.environ.get(VISIBLE) or ",".join(map(str, range(n_gpus)))
     names = [name.strip() for name in visible.split(",")][:n_gpus]
-    with contextlib.ExitStack() as stack:
+    locks, slot = _locked(names, launcher.n_ranks(cfg) if _has_ranks(cfg) else 1)
+    with locks, contextlib.ExitStack() as stack:
         if _has_ranks(cfg):
-            slot = stack.enter_context(_locked(names, launcher.n_ranks(cfg)))
             stack.callback(_make_visible, os.environ.get(VISIBLE))
             _make_visible(",".join(names[i] for i in slot))
         else:
             import torch
 
-            (number,) = stack.enter_context(_locked(names, 1))
             stack.callback(torch.cuda.set_device, torch.cuda.current_device())
-            torch.cuda.set_device(number)
+            torch.cuda.set_device(slot[0])
             if cfg.device == "cuda":
-                cfg = settings.changed(cfg, device=f"cuda:{number}")
+                cfg = settings.changed(cfg, device=f"cuda:{slot[0]}")
         yield cfg
 
 
@@ -106,30 +102,24 @@ def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
 
 
-@contextlib.contextmanager
-def _locked(names: list[str], size: int) -> Iterator[range]:
-    """Locks the first of the slots with the fewest jobs. Yields the indices of its GPUs.
+def _locked(names: list[str], size: int) -> tuple[contextlib.ExitStack, list[int]]:
+    """Locks the first of the slots with the fewest jobs.
 
     Args:
         names: names of this process's GPUs.
         size: GPUs per slot; the first slot starts at the first GPU.
+
+    Returns:
+        The locks, and the indices of the slot's GPUs.
     """
-    starts = range(0, len(names) - size + 1, size)
-    for n_jobs, start in ((n, start) for n in itertools.count() for start in starts):
-        slot = range(start, start + size)
-        if locks := _lock([f"{names[i]}-{n_jobs}" for i in slot]):
-            with locks:
-                yield slot
-            return
-
-
-def _lock(names) -> "ExitStack | None":
-    # returns all locks, or None if one is taken
     import filelock  # slow to import
 
-    prefix = f"megastep-{os.getuid()}-gpu-"
-    with contextlib.suppress(filelock.Timeout), contextlib.ExitStack() as stack:
-        for name in names:
-            path = Path(tempfile.gettempdir(), prefix + re.sub(r"[^\w-]", "-", name) + ".lock")
-            stack.enter_context(filelock.FileLock(path, blocking=False))
-        return stack.pop_all()
+    starts = range(0, len(names) - size + 1, size)
+    for n_jobs, start in ((n, start) for n in itertools.count() for start in starts):
+        with contextlib.suppress(filelock.Timeout), contextlib.ExitStack() as stack:
+            for name in names[start : start + size]:
+                name = re.sub(r"[^\w-]", "-", f"megastep-{os.getuid()}-gpu-{name}-{n_jobs}")
+                path = Path(tempfile.gettempdir(), f"{name}.lock")
+                stack.enter_context(filelock.FileLock(path, blocking=False))
+            return stack.pop_all(), [*range(start, start + size)]
+    raise AssertionError  # the slots of the loop have no end

@@ -48,8 +48,7 @@ def joined() -> "Iterator[Team | None]":
     global _team
     with user_errors():
         info = environment.rank_info()
-    is_alone = info is None or (info.n_ranks == 1 and endings.JOB not in os.environ)
-    if is_alone or _team is not None:
+    if info is None or _team is not None or (info.n_ranks == 1 and endings.JOB not in os.environ):
         yield _team
         return
     from megastep.agents.distributed import process_group

@@ -18,7 +18,6 @@ import itertools
 import json
 import math
 import os
-import signal
 import threading
 import time
 from collections import Counter
@@ -146,14 +145,15 @@ class Team:
         self.folder: Path | None = None
         self.rank, self.n_ranks = info.rank, info.n_ranks
         self.is_ours = endings.JOB in os.environ
-        self.is_broken = self.is_gone = counts.has_left = False
+        self.is_broken = counts.has_left = False
         self.keys = [f"heartbeat {number}" for number in range(info.n_ranks)]
         self.n_answers = 0
         self._leaves_by = math.inf
         self._wakes = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._job = process_group.store("job")
-        threading.Thread(target=self._watch_store, daemon=True).start()
+        if not self.is_ours:  # the store is in `launcher`, which Ctrl-Z suspends
+            threading.Thread(target=self._watch_store, daemon=True).start()
 
     # ---- In the thread that trains ----
 
@@ -215,8 +215,6 @@ class Team:
         """Exits after a broken connection, once the lost rank is found, or cannot be."""
         self.is_broken = True
         self._thread.join(LOST_SECONDS + 2 * PERIOD)  # which ends this process
-        if self.is_gone:
-            self._end_in_silence("closed the connection")
         self.end(f"A rank is lost: {loss}" if self.claim() else None)
 
     def leave(self, seconds: float = 0.0) -> None:
@@ -258,18 +256,13 @@ class Team:
                     break
                 time.sleep(0.1)
         except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
-            self.is_gone = True
-            if not counts.has_left:
-                # saves, as SIGTERM would, but bears one of torchrun's after it
-                os.kill(os.getpid(), signal.SIGUSR1)
+            if not counts.has_left and not self.is_ours:  # `launcher` ends its ranks as it goes
+                self._end_in_silence("closed the connection")
 
     def _watch_store(self) -> None:
-        # counts polls, as a suspended job may go on later
         n_silent, n_answers = 0, 0
         while not self._wakes.wait(PERIOD):
-            # a launcher that Ctrl-Z suspends may be silent, but ends this process if it is gone
-            may_be_silent = self.is_ours and not self.is_gone
-            n_silent = n_silent + 1 if self.n_answers == n_answers and not may_be_silent else 0
+            n_silent = n_silent + 1 if self.n_answers == n_answers else 0
             n_answers = self.n_answers
             if n_silent * PERIOD > SILENT_SECONDS:
                 self._end_in_silence(f"not answered for {n_silent * PERIOD:.0f} s")

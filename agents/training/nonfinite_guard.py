@@ -54,7 +54,7 @@ class NonFiniteGuard:
         ranks: Ranks = ONE,
     ):
         self.ranks = ranks
-        self.learner, self.make_hint, self.device = learner, make_hint, env.device
+        self.learner, self.make_hint = learner, make_hint
         self.n_agents = optional(env, "n_agents")
         self.nonfinite_check = with_defaults(learner, LearnerOptions).check
         self.value, self.hint = None, ""
@@ -77,7 +77,7 @@ class NonFiniteGuard:
         if value:
             value = value.in_env(_env_lanes(rollout), self.n_agents)
         is_bad = value is not None or n_skipped > 0
-        reports = self.ranks.gather_if_any((n_skipped, value, rank_label()), is_bad, self.device)
+        reports = self.ranks.gather_if_any((n_skipped, value, rank_label()), is_bad)
         n_skipped = max(report[0] for report in reports)
         _, value, label = next((one for one in reports if one[1]), reports[0])
         text = f"{value}{f' ({label})' * (len(reports) > 1)}"
@@ -108,7 +108,7 @@ class NonFiniteGuard:
             for name, lane in episode_stats.pop_bad_metrics().items()
         }
         of_rank = {name: (lane, rank_label()) for name, lane in bad.items()}
-        reports = self.ranks.gather_if_any(of_rank, bool(bad), self.device)
+        reports = self.ranks.gather_if_any(of_rank, bool(bad))
         of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
         episode_stats.named |= of_all.keys()
         for name, (lane, label) in of_all.items() if self.ranks.rank == 0 else ():

@@ -6,7 +6,7 @@ import pytest
 from torch import distributed
 
 from megastep.agents.distributed import process_group
-from megastep.agents.launch import endings, watch
+from megastep.agents.launch import watch
 from megastep.agents.launch.watch import LossDetector
 
 #: The rank that others wait for, and those.
@@ -91,11 +91,8 @@ def as_rank(monkeypatch):
     return be
 
 
-@pytest.mark.parametrize("is_launched", [False, True])
-def test_rank_that_the_store_does_not_answer_ends(as_rank, monkeypatch, is_launched):
-    """Although the thread that asks it, and whoever else does, is blocked for ever. The store of a
-    launcher that is suspended may be silent, but not one that is gone.
-    """
+def test_rank_that_the_store_does_not_answer_ends(as_rank, monkeypatch):
+    """Although the thread that asks it, and whoever else does, is blocked for ever."""
 
     class Silent:
         def compare_set(self, *arguments):
@@ -105,8 +102,6 @@ def test_rank_that_the_store_does_not_answer_ends(as_rank, monkeypatch, is_launc
         monkeypatch.setattr(watch, name, seconds)
     monkeypatch.setattr(process_group, "store", lambda name: None)
     monkeypatch.setattr(process_group.meeting, "poll", threading.Event().wait)
-    if is_launched:
-        monkeypatch.setenv(endings.JOB, "job")
     has_ended, problems = threading.Event(), []
     monkeypatch.setattr(
         watch.Team,
@@ -116,9 +111,6 @@ def test_rank_that_the_store_does_not_answer_ends(as_rank, monkeypatch, is_launc
     team = watch.Team()
     team.store = Silent()
     threading.Thread(target=team.await_all, daemon=True).start()
-    if is_launched:
-        assert not has_ended.wait(0.5)
-        team.is_gone = True
     assert has_ended.wait(60) and "where torchrun keeps the ranks' store, has not" in problems[0]
     assert team.claim()  # as no other rank can
 
