@@ -20,7 +20,7 @@ from megastep.agents.errors import ConfigErrors, EnvFailed, NonFinite, UserError
 from megastep.agents.evaluation import in_training
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
-from megastep.agents.launch import again, compare, finishing, gpu, rank, rank_checks, signals
+from megastep.agents.launch import again, compare, finishing, gpu, rank_checks, signals
 from megastep.agents.launch.watch import Team
 from megastep.agents.population import decisions
 from megastep.agents.population.population import Learnt, Population, Turns, hosted
@@ -186,7 +186,7 @@ def _train(cfg, root, population) -> None:
     try:
         with (
             env_failures.told(cfg.env, root, hint, population.rank),
-            signals.handled(rank.announce) as numbers,
+            signals.handled() as numbers,
             engine.without_early_starts(),
             _without_garbage(),
             progress if population.rank == 0 else contextlib.nullcontext(),

@@ -22,12 +22,6 @@ _team = None
 T = TypeVar("T")
 
 
-def announce(number: int) -> None:
-    """Announces on rank 0 that training stops."""
-    if environment.rank() == 0:
-        signals.announce(number)
-
-
 def refuse(problem: str) -> None:
     """Raises UserError on rank 0 if torchrun started this process; other ranks exit silently."""
     if environment.rank_info():

@@ -35,7 +35,8 @@ class Interrupted(BaseException):
 
 
 def announce(number: int) -> None:
-    _write(sys.__stdout__, "\nStopping after this update (Ctrl-C again to quit now).")
+    if environment.rank() == 0:
+        _write(sys.__stdout__, "\nStopping after this update (Ctrl-C again to quit now).")
 
 
 def interrupt(number: int) -> NoReturn:

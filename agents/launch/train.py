@@ -143,7 +143,7 @@ def train_here(cfg: settings.Train, team: Team | None) -> Path:
         try:
             with (
                 env_failures.told(cfg.env, folder, saved, process_group.rank()),
-                signals.handled(rank.announce) as numbers,
+                signals.handled() as numbers,
                 progress if is_first else contextlib.nullcontext(),
                 contextlib.closing(trainer),
             ):

@@ -1,13 +1,9 @@
-"""The team of ranks: detects those that were killed or hang, in a thread of each rank, and ends the
-others.
+"""Detects ranks that were killed or hang, in a thread of each rank, and ends the others.
 
-Every rank writes a heartbeat to torchrun's key-value store and reads those of all. The first to
-detect a loss tells the others through the store.
-
-A rank is lost if its heartbeat stops (it was killed or suspended, or is cut off), or if it hangs:
-others have waited too long for it in a collective operation. If all wait for each other in the same
-operation, they cannot reach each other. A second thread, which never touches the store, ends a rank
-that the store no longer answers, whatever its other threads are blocked in.
+Every rank writes a heartbeat to the ranks' key-value store and reads those of all. The first to
+detect a loss tells the others through the store. A rank is lost if its heartbeat stops, or if
+others have waited too long for it in a collective operation. A second thread, which never touches
+the store, ends a rank that the store no longer answers, whatever its other threads are blocked in.
 """
 
 from __future__ import annotations
@@ -50,7 +46,7 @@ CALL_SECONDS = 4.0
 
 T = TypeVar("T")
 
-#: Numbers the watches of this process, equally on all ranks, so that each has its own keys.
+#: Numbers the teams of this process, equally on all ranks, so that each has its own keys.
 NUMBERS = itertools.count()
 
 
@@ -255,8 +251,8 @@ class Team:
                 if not self.store.check(self.keys) or self._heartbeats()[0].has_left:
                     break
                 time.sleep(0.1)
-        except RuntimeError:  # the store is gone, with torchrun or the machine of rank 0
-            if not counts.has_left and not self.is_ours:  # `launcher` ends its ranks as it goes
+        except RuntimeError:  # the store is gone; `launcher` ends its ranks itself
+            if not self.is_ours and not self._wakes.wait(CALL_SECONDS):
                 self._end_in_silence("closed the connection")
 
     def _watch_store(self) -> None:
