@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
+    "components",
     "centers",
     "content_hash",
     "display",
@@ -293,3 +294,13 @@ def display(g: dotdict, ax: "Axes | None" = None) -> "Axes":
         ylabel="y, m",
     )
     return ax
+
+
+def components(free: np.ndarray) -> tuple[np.ndarray, int]:
+    """Labels the 4-connected components of cells, (H, W) bool. Returns the labels, (H, W) integers
+    with 0 where not free, and the number of components.
+    """
+    from scipy import ndimage  # which takes a while to import
+
+    labels, count = ndimage.label(free)  # pyright: ignore[reportGeneralTypeIssues]
+    return labels, int(count)

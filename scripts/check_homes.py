@@ -31,7 +31,7 @@ def errors(g, is_cluttered=False):
         messages.append("a light is in a wall")
     if not is_cluttered:
         fine = np.maximum(g.masks, 0).repeat(ratio, 0).repeat(ratio, 1)
-        labels, _ = checks.components(distance > GAP / 2 - 1e-3)
+        labels, _ = geometry.components(distance > GAP / 2 - 1e-3)
         if not checks.joins(labels, fine):
             messages.append("a disc as wide as the narrowest gap cannot reach every room")
     light_cells = tuple(geometry.indices(g.lights, g.masks.shape, g.res).T)

@@ -9,7 +9,7 @@ import numpy as np
 from megastep import geometry
 from megastep.dotdict import dotdict
 
-__all__ = ["clearance", "components", "errors", "fine_rooms", "joins"]
+__all__ = ["clearance", "errors", "fine_rooms", "joins"]
 
 FINE = 0.05  # metres per cell of the raster
 MAX_FINE_CELLS = 2_250_000  # of the raster; a plan of 75 m x 75 m
@@ -18,33 +18,6 @@ SPAWN = 0.15  # metres; each room has a point this far from all walls
 NEAR = 1e-3  # metres; points nearer than this are the same
 PARALLEL = 1e-6  # sine of an angle below which two walls are parallel
 CHUNK = 256  # walls compared with all others at a time
-
-
-def components(free: np.ndarray) -> tuple[np.ndarray, int]:
-    """Labels the 4-connected components of cells, (H, W) bool. Returns the labels, (H, W) integers
-    with 0 where not free, and the number of components.
-    """
-    edges = np.diff(np.pad(free, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    (row, start), end = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
-    # the number of the first run of free cells in each row
-    first = np.searchsorted(row, np.arange(len(free) + 1))
-    parents = list(range(len(row)))
-
-    def root(run) -> int:
-        while parents[run] != run:
-            parents[run] = run = parents[parents[run]]
-        return run
-
-    for i in range(1, len(free)):
-        a, b = first[i - 1], first[i]
-        while a < first[i] and b < first[i + 1]:
-            if start[a] < end[b] and start[b] < end[a]:
-                parents[root(b)] = root(a)
-            a, b = (a + 1, b) if end[a] < end[b] else (a, b + 1)
-    _, labels = np.unique([root(run) for run in range(len(row))], return_inverse=True)
-    result = np.zeros(free.shape, int)
-    result[free] = np.repeat(labels + 1, end - start)
-    return result, int(labels.max(initial=-1)) + 1
 
 
 def clearance(g: dotdict, limit: float = 0.3, cell: float = FINE) -> np.ndarray:
@@ -146,7 +119,7 @@ def errors(g: dotdict, fine: float = FINE) -> list[str]:
         messages.append("two walls are the same")
     elif crosses(valid.walls):
         messages.append("two walls cross or overlap; split them where they meet")
-    labels, _ = components(np.pad(valid.masks >= 0, 1, constant_values=True))
+    labels, _ = geometry.components(np.pad(valid.masks >= 0, 1, constant_values=True))
     if (valid.masks[labels[1:-1, 1:-1] == labels[0, 0]] > 0).any():
         messages.append("the envelope is open: a room leads outside")
 
@@ -155,11 +128,11 @@ def errors(g: dotdict, fine: float = FINE) -> list[str]:
     cells = geometry.indices(valid.lights, distance.shape, cell)
     is_within = ((cells >= 0) & (cells < distance.shape)).all(1)
     lit = tuple(cells[is_within].T)
-    labels, _ = components(distance > cell * 0.75)
+    labels, _ = geometry.components(distance > cell * 0.75)
     if not is_within.all() or (labels[lit] == labels[0, 0]).any():
         messages.append("a light is outdoors")
     is_reachable = distance > RADIUS - 1e-3
-    labels, _ = components(is_reachable)
+    labels, _ = geometry.components(is_reachable)
     if not joins(labels, rooms):
         messages.append("an agent cannot reach every room")
     if len(np.unique(labels[is_room & (distance >= SPAWN)])) > 1:

@@ -266,6 +266,7 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     from contourpy import contour_generator
     from matplotlib.path import Path
     from PIL import Image, ImageDraw
+    from scipy import ndimage
 
     lines = np.frombuffer(lines_bytes, np.float32).reshape(-1, 2, 2)
     if not len(lines):
@@ -279,9 +280,8 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     wall = np.array(image, bool)
     points = np.frombuffer(lights_bytes, np.float32).reshape(-1, 2)
     columns, rows = np.clip(((points - low) / CELL).astype(int), 0, [n_columns - 1, n_rows - 1]).T
-    room = np.zeros_like(wall)
-    room[rows, columns] = True
-    room = _flooded(room & ~wall, wall)
+    parts: Any = ndimage.label(~wall)[0]  # pyright: ignore[reportIndexIssue]
+    room = np.isin(parts, parts[rows, columns]) & ~wall
     if not room.any() or room[0, 0]:
         (x0, y0), (x1, y1) = lines.min((0, 1)), lines.max((0, 1))
         return Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
@@ -303,19 +303,6 @@ def room_outlines(lines: ArrayLike, lights: ArrayLike) -> list[list[list[float]]
     path = _rooms(lines.tobytes(), _points(lights).tobytes())
     polygons = path.to_polygons(closed_only=True)
     return [np.round(polygon.astype(float), 2).tolist() for polygon in polygons]
-
-
-def _flooded(flood, wall) -> np.ndarray:
-    """Returns all cells that are connected with ``flood``, (H, W) bool, but by no ``wall``."""
-    while True:
-        before = flood.sum()
-        for _ in range(2):  # along rows, then along columns
-            run = wall.cumsum(1) + np.arange(len(wall))[:, None] * (wall.shape[1] + 1)
-            reached = np.bincount(run[flood], minlength=run.max() + 1) > 0
-            flood = (reached[run] & ~wall).T
-            wall = wall.T
-        if flood.sum() == before:
-            return flood
 
 
 def _scale_bar(area, plan) -> None:

@@ -144,7 +144,7 @@ def test_density_widens_homes_up_to_those_of_the_benchmarks(generated, dense):
 def test_no_room_has_cells_inside_furniture(dense):
     for g in dense:
         distance = checks.clearance(g)
-        labels, _ = checks.components(distance > checks.FINE / 2)
+        labels, _ = geometry.components(distance > checks.FINE / 2)
         fine = np.maximum(g.masks, 0).repeat(4, 0).repeat(4, 1)
         assert len(np.unique(labels[(fine > 0) & (labels > 0)])) == 1, g.id
         assert (labels[fine > 0] > 0).mean() > 0.99, "a cell that no wall touches is free"
@@ -340,7 +340,7 @@ def test_checks_find(error, change):
 
 def test_components_equal_a_flood_fill():
     free = np.random.default_rng(0).random((40, 50)) < 0.6
-    labels, count = checks.components(free)
+    labels, count = geometry.components(free)
     flooded = np.where(free, np.arange(1, free.size + 1).reshape(free.shape), 0)
     for _ in range(free.size):
         far = np.pad(flooded, 1)

@@ -15,7 +15,7 @@ from megastep import contract, envs, geometry, modules
 from megastep.agents.cli import record
 from megastep.engine import devices
 from megastep.engine.agents import AGENT_RADIUS
-from megastep.geometries import checks, mazes, sample
+from megastep.geometries import mazes, sample
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from megastep.modules.spawning import CLEARANCE, spawn_points
 
@@ -107,7 +107,7 @@ def test_masks_hold_one_connected_room(kind):
     size, corridor, thickness, _, samples = kind
     for g in samples:
         assert g.masks.dtype == np.int16 and set(np.unique(g.masks)) == {-1, 0, 1}
-        labels, count = checks.components(g.masks == 1)
+        labels, count = geometry.components(g.masks == 1)
         assert count == 1
         centres = [place(g, cell, corridor, thickness) for cell in cells(size)]
         at = geometry.indices(centres, g.masks.shape, g.res)

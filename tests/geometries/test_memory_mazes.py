@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from megastep import geometry
-from megastep.geometries import checks, memory_mazes, sample
+from megastep.geometries import memory_mazes, sample
 
 KINDS = memory_mazes.KINDS
 CELL = 0.9
@@ -39,7 +39,7 @@ def test_walls_are_closed_and_every_floor_can_be_reached(kind):
     for g in samples:
         ends, counts = np.unique(g.walls.reshape(-1, 2).round(4), axis=0, return_counts=True)
         assert (counts % 2 == 0).all(), "a wall ends where no other begins"
-        assert checks.components(floor_of(g, size))[1] == 1
+        assert geometry.components(floor_of(g, size))[1] == 1
 
 
 def test_no_dead_end_is_left(kind):
@@ -60,7 +60,7 @@ def test_rooms_are_as_many_and_as_large_as_the_size_has(kind):
             rows, columns = (g.masks == number).nonzero()
             sides = [(np.ptp(at) * g.res + 0.5) / CELL for at in (rows, columns)]
             assert all(3 <= round(side) <= wanted.widest for side in sides)
-            assert checks.components(g.masks == number)[1] == 1
+            assert geometry.components(g.masks == number)[1] == 1
 
 
 def test_there_are_loops_and_corridors():

@@ -49,7 +49,7 @@ class Areas:
     def __init__(self, g: dotdict):
         doors = np.reshape(g.get("doors", ()), (-1, 2, 2))
         blocked = geometry.masks(np.concatenate([g.walls, doors]), [], RES)[::-1] < 0
-        self.labels = _components(~blocked)
+        self.labels, _ = geometry.components(~blocked)
         along = doors[:, 1] - doors[:, 0]
         normal = along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=-1, keepdims=True)
         middle = doors.mean(1)
@@ -63,25 +63,6 @@ class Areas:
         """Returns the areas (P,) at points (P, 2) metres."""
         column, row = np.floor(points / RES).astype(int).T
         return self.labels[row, column]
-
-
-def _components(free) -> np.ndarray:
-    """Returns the connected parts (H, W) of free cells, numbered from 1; 0 elsewhere."""
-    labels = np.zeros(free.shape, int)
-    width, n = free.shape[1], 0
-    left = {int(cell) for cell in np.flatnonzero(free)}
-    flat = labels.reshape(-1)
-    while left:
-        n += 1
-        stack = [left.pop()]
-        while stack:
-            cell = stack.pop()
-            flat[cell] = n
-            for other in (cell - 1, cell + 1, cell - width, cell + width):
-                if other in left:
-                    left.remove(other)
-                    stack.append(other)
-    return labels
 
 
 def cached_episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:

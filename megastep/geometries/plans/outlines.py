@@ -229,7 +229,7 @@ def _across(door, floor) -> np.ndarray | None:
 def _reachable(g, rooms, n_sealed, warnings) -> tuple[dotdict, Notes]:
     """Returns a geometry whose rooms are those that an agent can reach, with a light in each."""
     distance, fine, cell = checks.fine_rooms(g, checks.FINE)
-    labels, _ = checks.components(distance > checks.RADIUS - 1e-3)
+    labels, _ = geometry.components(distance > checks.RADIUS - 1e-3)
     can_spawn = (fine > 0) & (distance >= checks.SPAWN)
     if not can_spawn.any():
         raise ValueError("it has no room that an agent fits into; check the scale")
