@@ -57,3 +57,6 @@ HD void place_objects_of(const PlaceObjectsParams& p, int env) {
         object.visible = 1;
     }
 }
+
+EACH(place_objects, PlaceObjectsParams, p.scenery.n_envs, threads_for(p.scenery, n, 1024),
+     place_objects_of(p, i))

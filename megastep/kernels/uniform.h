@@ -14,3 +14,5 @@ HD void uniform_lane(const UniformParams& p, int lane) {
     out[2] = unit_float(bits.c);
     out[3] = unit_float(bits.d);
 }
+
+EACH(uniform, UniformParams, p.n_lanes, p.n_threads, uniform_lane(p, i))

@@ -40,3 +40,6 @@ HD void update_object(const UpdateObjectsParams& p, int i) {
     float light = o.lit && is_drawn(object) ? light_on(s, layout, object.x, object.y) : 1.f;
     ((Float4*)o.texels)[i] = texel_of(o, object, light);
 }
+
+EACH(update_objects, UpdateObjectsParams, (p.scenery.n_envs * p.objects.n_objects),
+     threads_for(p.scenery, n, 1024), update_object(p, i))

@@ -13,7 +13,7 @@ import torch
 from megastep import core, engine, geometry, scene, toys
 from megastep.dotdict import dotdict
 from megastep.envs.pointgoal.geodesics import CELL, geodesics
-from megastep.envs.pointgoal.path_graph import PathGraph
+from megastep.geodesics import PathGraph
 from megastep.geometries import sample
 from megastep.modules.spawning import distances
 

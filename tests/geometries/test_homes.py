@@ -14,7 +14,7 @@ from megastep import geometries, geometry
 from megastep.dotdict import dotdict
 from megastep.engine import AGENT_RADIUS
 from megastep.envs.pointgoal import geodesics
-from megastep.envs.pointgoal.path_graph import PathGraph
+from megastep.geodesics import PathGraph
 from megastep.geometries import checks, homes
 from megastep.geometries.homes import (
     database,

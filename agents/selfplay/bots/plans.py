@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from megastep import engine
 from megastep.dotdict import dotdict
-from megastep.envs.pointgoal.path_graph import MAX_GOALS, PathGraph
+from megastep.geodesics import MAX_GOALS, PathGraph
 
 CELL = 0.05  # metres, of the grid of clearances
 SQUARE, BLOCK = 6, 4  # cells per side of a square, squares per side of a block, by default

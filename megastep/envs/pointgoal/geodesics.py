@@ -18,7 +18,7 @@ import torch
 
 from megastep.dotdict import dotdict
 from megastep.engine.devices import threads
-from megastep.envs.pointgoal.path_graph import CELL, MAX_GOALS, PathGraph
+from megastep.geodesics import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
 
 __all__ = ["CELL", "Geodesics", "draw_points", "geodesics", "largest_part", "n_cells"]

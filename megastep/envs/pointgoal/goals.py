@@ -16,6 +16,7 @@ from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics, n_cells
 from megastep.envs.pointgoal.goal_fields import GoalFields
+from megastep.geodesics import path_graph
 from megastep.geometry import content_hash
 from megastep.kernels.build.kernel_library import KERNELS
 from megastep.modules import spawning
@@ -29,8 +30,8 @@ MIN_PROGRESS = 48  # layouts; fewer take less than a second or two
 SOURCES = (
     Path(__file__),
     Path(__file__).with_name("geodesics.py"),
-    Path(__file__).with_name("path_graph.py"),
-    *sorted(Path(__file__).with_name("kernels").glob("*.[hc]*")),
+    Path(path_graph.__file__),
+    *sorted(path_graph.LIBRARY.folder.glob("*.[hc]*")),
     *sorted((KERNELS / "common").glob("*.h")),
     Path(spawning.__file__),
 )

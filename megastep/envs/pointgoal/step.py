@@ -1,6 +1,7 @@
 """One step of PointGoal as one operation. N environments, A agents each, B = N A lanes."""
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -16,11 +17,12 @@ from megastep.engine.launch_params import (
 )
 from megastep.engine.scenery import Scenery
 from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.envs.pointgoal.library import LIBRARY
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
 
 __all__ = ["N_PRIVILEGED", "PROGRESS_ROWS", "PointGoalStep", "pointgoal_step"]
 
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 PROGRESS_ROWS = LIBRARY.constants["PROGRESS_ROWS"]  # numbers that describe an episode so far
 N_PRIVILEGED = LIBRARY.constants["N_PRIVILEGED"]  # numbers that a critic sees
 

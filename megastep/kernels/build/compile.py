@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from megastep import cache
+from megastep.kernels.build import headers
 from megastep.kernels.build.forks import end_threads_at_forks
 from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary
 
@@ -113,12 +114,12 @@ def _processor() -> str:
 
 def _build_cpu(library, command) -> bytes:
     """Returns a shared library of all ``.cpp`` files."""
-    files = [str(library.folder / name) for name in library.sources(".cpp")]
     try:
         with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
-            out = Path(folder) / "kernels.so"
+            out, files = Path(folder) / "kernels.so", _cpu_sources(library, folder)
+            folders = f"-I{library.folder}", f"-I{KERNELS}"
             process = _run(
-                [command, *library.cpu_flags, f"-I{KERNELS}", *files, "-o", str(out)], TMPDIR=folder
+                [command, *library.cpu_flags, *folders, *files, "-o", str(out)], TMPDIR=folder
             )
             if not process.returncode:
                 return out.read_bytes()
@@ -220,10 +221,10 @@ def _build_wasm(operations, command, flags, keys) -> bytes:
     with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
         objects = []
         for i, library in enumerate(operations):
-            for name in library.sources(".cpp"):
-                objects.append(str(Path(folder) / f"{i}-{name.replace('/', '-')}.o"))
-                source = str(library.folder / name)
-                _run_clang([command, *flags, f"-I{KERNELS}", "-c", source, "-o", objects[-1]])
+            folders = f"-I{library.folder}", f"-I{KERNELS}"
+            for source in _cpu_sources(library, folder):
+                objects.append(str(Path(folder) / f"{i}-{Path(source).name}.o"))
+                _run_clang([command, *flags, *folders, "-c", source, "-o", objects[-1]])
         out = Path(folder) / "kernels.wasm"
         # without -O: clang would have a wasm-opt that it finds change what it built
         options = "--target=wasm32-wasi", "-mexec-model=reactor", "-Wl,--strip-all"
@@ -348,5 +349,16 @@ def _build_cuda(files, flags) -> bytes:
 
 
 def joined(files: dict[str, str]) -> str:
-    """Returns a source that includes every ``.cu`` file."""
-    return "".join(f'#include "{name}"\n' for name in files if name.endswith(".cu"))
+    """Returns a source that includes every ``.cu`` file, and every header with an operation."""
+    return "".join(
+        f'#include "{name}"\n'
+        for name, text in files.items()
+        if name.endswith(".cu") or headers.operations({name: text} if name.endswith(".h") else {})
+    )
+
+
+def _cpu_sources(library, folder) -> list[str]:
+    """Returns the paths of the sources for a CPU. Writes one, for headers' operations."""
+    source = Path(folder) / "each.cpp"
+    source.write_text(joined(library.sources(".h")))
+    return [*(str(library.folder / name) for name in library.sources(".cpp")), str(source)]

@@ -6,7 +6,8 @@ Three kinds of declarations are recognised:
 * structs whose names end in ``Params``, one field per line: ``const float* positions;``, or an
   array of such structs: ``LeafParams leaves[4];``
 * constants in files called ``constants.h``, one per line: ``constexpr int MAX_RES = 1024;``
-* operations: ``KERNEL render(RenderParams p)``
+* operations: ``KERNEL render(RenderParams p)`` in a source, or ``EACH(uniform, UniformParams, ...)``
+  in a header, for the CPU and the GPU
 """
 
 import re
@@ -25,6 +26,7 @@ DIRECTIVE = re.compile(r"#\s*(?!define)\w.*|#\s*define\s+\w+")  # include guards
 OPERATION = re.compile(
     r"KERNEL\s+(?:BOUNDS\(\d+\)\s+)?(\w+)\((?:const\s+)?(\w+Params)\s*&?\s*\w+\)"
 )
+EACH = re.compile(r"EACH\((\w+), (\w+Params),")
 WAITS = re.compile(r"\s*\{\s*wait_for_previous\(\)\s*;")  # what follows an OPERATION
 STRUCT = re.compile(r"^struct (\w+Params) \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)(?:\[(\d+)\])?")
@@ -178,7 +180,8 @@ def constants(sources: Mapping[str, str]) -> dict[str, Any]:
 
 
 def operations(sources: Mapping[str, str]) -> dict[str, str]:
-    """Returns {operation: name of its struct} for the KERNELs that these sources define.
+    """Returns {operation: name of its struct} for the KERNELs that these sources define, and for
+    EACH in headers.
 
     Raises:
         ValueError: naming file and line, if one cannot be read.
@@ -187,28 +190,33 @@ def operations(sources: Mapping[str, str]) -> dict[str, str]:
 
 
 def early_operations(sources: Mapping[str, str]) -> frozenset[str]:
-    """Returns the operations whose first statement is ``wait_for_previous();``.
+    """Returns the operations whose first statement is ``wait_for_previous();``, as that of EACH is.
 
     One that is defined several times, behind ``#if``, must have it every time.
     """
     waits = [
-        (match[1], bool(WAITS.match(match.string, match.end()))) for match in _kernels(sources)
+        (match[1], match.re is EACH or bool(WAITS.match(match.string, match.end())))
+        for match in _kernels(sources)
     ]
     return frozenset(name for name, _ in waits) - {name for name, does in waits if not does}
 
 
 def _kernels(sources) -> Iterator[re.Match[str]]:
-    """Yields a match of OPERATION, in a text without comments, for every line with KERNEL."""
+    """Yields a match of OPERATION, in a text without comments, for every line with KERNEL, and of
+    EACH for every such line in a header.
+    """
     for source, text in sources.items():
         text = _without_comments(text)
-        for line in re.finditer(r"^(?!#).*\bKERNEL\b.*", text, re.M):
-            match = OPERATION.match(text, line.start())
+        word, pattern = ("EACH", EACH) if source.endswith(".h") else ("KERNEL", OPERATION)
+        for line in re.finditer(rf"^(?!#).*\b{word}\b.*", text, re.M):
+            match = pattern.match(text, line.start())
             if not match:
                 number = text.count("\n", 0, line.start()) + 1
                 raise ValueError(
                     f"{source}:{number}: cannot read '{line[0].strip()}'. Start a line with KERNEL "
                     f"and give the operation one struct: KERNEL drain(const DrainParams& p) in a "
-                    f".cpp file, KERNEL drain(DrainParams p) in a .cu file."
+                    f".cpp file, KERNEL drain(DrainParams p) in a .cu file, EACH(drain, "
+                    f"DrainParams, ...) in a header."
                 )
             yield match
 

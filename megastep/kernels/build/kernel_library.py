@@ -60,8 +60,8 @@ FAST_CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
 class KernelLibrary:
     """The kernels in one folder, which are built together when one is first launched.
 
-    The folder holds one ``.cpp`` file per operation for the CPU, one ``.cu`` file for the GPU, or
-    both; headers; ``params.h``, which declares the struct of each launch; and ``constants.h`` if
+    The folder holds operations: for the CPU in ``.cpp`` files, for the GPU in ``.cu`` files, or for
+    both as EACH in a header, which nothing else includes; other headers; ``params.h``, which declares the struct of each launch; and ``constants.h`` if
     the kernels share constants with Python. Sources include the folder's headers by name and the
     common ones as ``"common/errors.h"``. :mod:`~megastep.kernels.build.headers` lists the
     declarations that are read from headers.
@@ -79,8 +79,8 @@ class KernelLibrary:
             :func:`~megastep.kernels.build.headers.builder` returns it.
         params: a function for each struct; ``params.RowParams(n=64, ...)`` packs one that is a
             field of another.
-        cpu_operations: {operation: struct} of the ``.cpp`` files.
-        cuda_operations: {operation: struct} of the ``.cu`` files.
+        cpu_operations: {operation: struct} for the CPU.
+        cuda_operations: {operation: struct} for the GPU.
         early_operations: those that a GPU may start before the previous kernel has ended: their
             first statement is ``wait_for_previous();`` of ``common/dependent_launch.h``.
     """
@@ -117,15 +117,15 @@ class KernelLibrary:
 
     @cached_property
     def cpu_operations(self) -> dict[str, str]:
-        return headers.operations(self.sources(".cpp"))
+        return headers.operations(self.sources(".h", ".cpp"))
 
     @cached_property
     def cuda_operations(self) -> dict[str, str]:
-        return headers.operations(self.sources(".cu"))
+        return headers.operations(self.sources(".h", ".cu"))
 
     @cached_property
     def early_operations(self) -> frozenset[str]:
-        return headers.early_operations(self.sources(".cu"))
+        return headers.early_operations(self.sources(".h", ".cu"))
 
     def sources(self, *suffixes: str) -> dict[str, str]:
         """Returns the text of the files with these suffixes, by the name that includes them.

@@ -1,5 +1,7 @@
 // Macros that are spelt differently on the CPU and on the GPU:
 //   KERNEL         declares an operation that Python can launch
+//   EACH           defines an operation in a header, for both: a `statement` about parameters p and
+//                  each i below `count`; `threads` of the CPU may depend on n, the count
 //   HD             declares a function for both
 //   ALIGNED, LOAD  16-byte records, and reading one in one instruction
 //   OR_BITS, ADD   update a word that other threads may update too

@@ -4,6 +4,13 @@
 #include "common/dependent_launch.h"
 
 #define HD static __device__ __forceinline__
+#define EACH(operation, Params, count, threads, statement)        \
+    KERNEL operation(Params p) {                                  \
+        wait_for_previous();                                      \
+        int n = count, i = blockIdx.x * blockDim.x + threadIdx.x; \
+        if (i < n)                                                \
+            statement;                                            \
+    }
 // Blocks that a multiprocessor should hold at once, or as many as it can. With 64 threads each, 24
 // blocks leave a thread 40 of its 65,536 registers, 20 leave it 48, and 18 leave it 56.
 #if __CUDA_ARCH__ == 750 || __CUDA_ARCH__ == 860 || __CUDA_ARCH__ == 870

@@ -196,3 +196,7 @@ HD void deathmatch_env(const DeathmatchStepParams& p, int env) {
             write_privileged(p, first, a);
     }
 }
+
+EACH(deathmatch_step, DeathmatchStepParams, p.n_envs, p.n_threads, deathmatch_env(p, i))
+
+EACH(actions_of_live, ActionsOfLiveParams, p.n_lanes, 1, p.out[i] = p.ended[i] ? 0 : p.actions[i])

@@ -12,8 +12,3 @@ constexpr int COLLISIONS = 6;      // since the start
 constexpr int PROGRESS_ROWS = 7;
 
 constexpr int N_PRIVILEGED = 4;  // numbers that a critic sees
-
-constexpr int GROUP = 8;       // walls that share a bounding box in searches for shortest paths
-constexpr int KEPT = 16;       // links of a corner that need not be searched for twice
-constexpr int N_SCRATCH = 18;  // numbers per corner of scratch memory, on the CPU
-constexpr int MAX_GOALS = 16;  // per home, in one search

@@ -4,17 +4,19 @@ D homes, W walls of all homes, V corners of all homes, G goals per home, P point
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from megastep.dotdict import dotdict
 from megastep.engine.devices import threads
-from megastep.envs.pointgoal.library import LIBRARY
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import BLOCK, launch
 
 __all__ = ["CELL", "MAX_GOALS", "PathGraph"]
 
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 CELL = 0.1  # metres, of fields
 SIDES = 16  # of the polygon around the end of a wall
 INFLATION = 1.001  # of the radius, as in physics
