@@ -21,9 +21,7 @@ CELL = 0.1  # metres, of fields
 SIDES = 16  # of the polygon around the end of a wall
 INFLATION = 1.001  # of the radius, as in physics
 SLACK = 5e-5  # metres between a path and the clearance that is tested, for rounding
-MAX_GOALS, GROUP, KEPT, N_SCRATCH = (
-    LIBRARY.constants[name] for name in ("MAX_GOALS", "GROUP", "KEPT", "N_SCRATCH")
-)
+MAX_GOALS, GROUP, KEPT = (LIBRARY.constants[name] for name in ("MAX_GOALS", "GROUP", "KEPT"))
 GROUP_SIDE = 1.5  # metres: walls with their middles in one square are neighbours
 STEP = 5e-3  # metres from a corner where it is tested if a path can turn there
 TURN = 0.026  # radians of that turn
@@ -152,11 +150,9 @@ class PathGraph:
         int32, metres float32.
         """
         v, device = len(self.corner_homes), self.device
-        counts, tangent = torch.empty((2, v), dtype=torch.int32, device=device)
+        counts = torch.empty(v, dtype=torch.int32, device=device)
         kept = torch.empty((v, KEPT), dtype=torch.int32, device=device)
-        always = dict(
-            homes=self._params(), corner_homes=self.corner_homes, tangent=tangent, kept=kept
-        )
+        always = dict(homes=self._params(), corner_homes=self.corner_homes, kept=kept)
         where = LIBRARY, "corner_links", device, v
         launch(*where, **always, counts=counts, starts=None, targets=None, metres=None)
         ends = counts.cumsum(0, dtype=torch.int32)
@@ -216,7 +212,6 @@ class PathGraph:
         )
         n_points = int(counts.sum())
         lengths = torch.empty(n_points * n_goals, device=self.device)
-        n_scratch = N_SCRATCH * len(self.corner_homes) if self.device.type == "cpu" else 0
         launch(
             *(LIBRARY, "path_lengths", self.device, n_points),
             homes=self._params(),
@@ -226,7 +221,7 @@ class PathGraph:
             widths=self.tensor(self.shapes[:, 1], np.int32),
             point_starts=self.tensor(self._starts(counts), np.int32),
             lengths=lengths,
-            scratch=torch.empty(n_scratch, dtype=torch.int32),
+            hints=torch.empty(len(self.corner_homes), dtype=torch.int32, device=self.device),
             cell=CELL,
             n_points=n_points,
             n_goals=n_goals,

@@ -34,7 +34,6 @@ struct CornerLinksParams {
     int* kept;                // (V, KEPT) the first links of each corner; read if links are written
     int* targets;             // (links) out: the corner at the other end
     float* metres;            // (links) out
-    int* tangent;             // (V) scratch on the CPU
 };
 
 struct CornerDistancesParams {
@@ -55,7 +54,7 @@ struct PathLengthsParams {
     const int* widths;        // (D) columns of each home's grid, or 1
     const int* point_starts;  // (D + 1) first point of each home
     float* lengths;           // out: per home (G, points of the home): metres to each goal
-    int* scratch;             // (N_SCRATCH, V) on the CPU
+    int* hints;               // (V) scratch on the CPU
     float cell;               // metres between neighbouring cells
     int n_points;             // P
     int n_goals;              // G

@@ -194,27 +194,25 @@ HD float link_metres(const HomesParams& p, const Corners& corners, int corner, i
 }
 
 // Calls found(other) for each corner of a home that a shortest path may visit next to `corner`.
-// `tangent` may hold which corners have a tangent from here, from the home's first on.
 template <class Found>
-HD void each_link(const HomesParams& p, int home, int corner, const int* tangent, Found found) {
+HD void each_link(const HomesParams& p, int home, int corner, Found found) {
     int first = p.corner_starts[home], end = p.corner_starts[home + 1];
     HomeWalls walls = walls_of(p, home);
     Corners corners = corners_of(p);
     Point here = corner_at(corners, corner);
     for (int other = first; other < end; other++) {
-        if (tangent ? !tangent[other - first] : !is_tangent(corners, other, here))
-            continue;
         Point there = corner_at(corners, other);
-        if (other != corner && is_tangent(corners, corner, there) &&
+        if (is_tangent(corners, other, here) && other != corner &&
+            is_tangent(corners, corner, there) &&
             is_clear(walls, here, there, p.clearance * p.clearance, nullptr))
             found(other);
     }
 }
 
 // Counts a corner's links, and keeps the first KEPT.
-HD void count_links(const CornerLinksParams& p, int corner, const int* tangent) {
+HD void count_links(const CornerLinksParams& p, int corner) {
     int n = 0;
-    each_link(p.homes, p.corner_homes[corner], corner, tangent, [&](int other) {
+    each_link(p.homes, p.corner_homes[corner], corner, [&](int other) {
         if (n < KEPT)
             p.kept[(long long)KEPT * corner + n] = other;
         n++;
@@ -223,7 +221,7 @@ HD void count_links(const CornerLinksParams& p, int corner, const int* tangent) 
 }
 
 // Writes a corner's links behind those of the corners before.
-HD void write_links(const CornerLinksParams& p, int corner, const int* tangent) {
+HD void write_links(const CornerLinksParams& p, int corner) {
     Corners corners = corners_of(p.homes);
     int next = p.starts[corner], n = p.starts[corner + 1] - next;
     auto write = [&](int other) {
@@ -231,7 +229,7 @@ HD void write_links(const CornerLinksParams& p, int corner, const int* tangent) 
         p.metres[next++] = link_metres(p.homes, corners, corner, other);
     };
     if (n > KEPT)
-        each_link(p.homes, p.corner_homes[corner], corner, tangent, write);
+        each_link(p.homes, p.corner_homes[corner], corner, write);
     else
         for (int k = 0; k < n; k++)
             write(p.kept[(long long)KEPT * corner + k]);
