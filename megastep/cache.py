@@ -9,13 +9,18 @@ built at each start.
 """
 
 import hashlib
+import io
 import math
 import os
 import stat
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 DIGEST = 32  # bytes
 
@@ -43,6 +48,41 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
             problem = f"{path.parent} cannot be written ({error.strerror})"
     warn(problem)
     return body, None
+
+
+def arrays(
+    prefix: str,
+    parts: Iterable[object],
+    build: Callable[[], "Mapping[str, np.ndarray]"],
+    max_files: int,
+    max_bytes: float = math.inf,
+) -> "dict[str, np.ndarray]":
+    """Returns arrays by name from the cache. Where it has none, ``build`` makes them.
+
+    Args:
+        prefix: of the file's name.
+        parts: what the arrays depend on: arrays, paths of sources, and what has a repr.
+        build: makes the arrays.
+        max_files, max_bytes: of all files with this prefix; older ones are deleted.
+    """
+    import numpy as np
+
+    key = hashlib.sha256(np.__version__.encode())
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            key.update(repr((part.shape, part.dtype)).encode() + part.tobytes())
+        else:
+            key.update(part.read_bytes() if isinstance(part, Path) else repr(part).encode())
+
+    def write() -> bytes:
+        file = io.BytesIO()
+        np.savez(file, **build())  # pyright: ignore[reportArgumentType]
+        prune(prefix, max_files - 1, max_bytes - file.tell())
+        return file.getvalue()
+
+    body, _ = fetch(f"{prefix}{key.hexdigest()[:20]}", write)
+    with np.load(io.BytesIO(body)) as loaded:
+        return dict(loaded)
 
 
 def warn(problem: str) -> None:

@@ -14,8 +14,7 @@ The lower-left corner of the masks is at (0, 0); row 0 is at the top. Further ke
 this file `shape` is the (H, W) of the masks, and an index is an (i, j) pair of row and column.
 """
 
-import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "components",
     "centers",
-    "content_hash",
+    "contents",
     "display",
     "indices",
     "masks",
@@ -258,15 +257,10 @@ def mirror_image(g: dotdict) -> dotdict:
     return validate_geometry(dotdict(id=g.id, masks=cells, res=g.res, **mirrored))
 
 
-def content_hash(geometries: Sequence[dotdict]) -> "hashlib._Hash":
-    """Returns a SHA-256 hash object of the walls and rooms of geometries. It can be updated
-    further.
-    """
-    key = hashlib.sha256()
+def contents(geometries: Sequence[dotdict]) -> Iterator[np.ndarray]:
+    """Yields the arrays of walls and rooms of geometries, for the keys of caches."""
     for g in geometries:
-        for array in (g.walls, g.masks, np.asarray(g.res)):
-            key.update(repr((array.shape, array.dtype)).encode() + array.tobytes())
-    return key
+        yield from (np.asarray(g.walls), np.asarray(g.masks), np.asarray(g.res))
 
 
 def display(g: dotdict, ax: "Axes | None" = None) -> "Axes":

@@ -9,14 +9,13 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from megastep.envs.pointgoal.library import LIBRARY as POINTGOAL
-
 from megastep.agents.networks.web import LIBRARY as POLICY
-from megastep.envs.deathmatch.step import LIBRARY as DEATHMATCH
-from megastep.envs.explorer.step import LIBRARY as EXPLORER
-from megastep.envs.keys.step import LIBRARY as KEYS
-from megastep.envs.memory.step import LIBRARY as MEMORY
-from megastep.envs.pong.step import LIBRARY as PONG
+from megastep.envs.deathmatch.deathmatch_step import LIBRARY as DEATHMATCH
+from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
+from megastep.envs.keys.keys import LIBRARY as KEYS
+from megastep.envs.memory.memory import LIBRARY as MEMORY
+from megastep.envs.pointgoal.pointgoal import LIBRARY as POINTGOAL
+from megastep.envs.pong.tracker import LIBRARY as PONG
 from megastep.kernels.build import compile
 from megastep.kernels.build.kernel_library import WASM_FLAGS
 from megastep.kernels.build.launch import ENGINE
@@ -26,7 +25,6 @@ LIBRARIES = ENGINE, EXPLORER, POINTGOAL, DEATHMATCH, PONG, MEMORY, KEYS, POLICY
 #: Operations of setting up and of scripted bots, which no page launches.
 ABSENT = {
     *("bake", "place_objects", "uniform", "bot"),
-    *("clearances", "corner_distances", "corner_links", "path_lengths"),
 }
 
 

@@ -26,7 +26,7 @@ from megastep.agents.algorithms.r2d2 import R2D2
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.replay_settings import ReplaySettings
-from megastep.engine import movement, rendering
+from megastep.engine import operations, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
 from megastep.types import n_lanes
@@ -136,7 +136,7 @@ def main(device):
     run_all(device)
     learn_all(device)
     if device == "cuda":  # with the kernels that render and move many agents, too
-        movement.n_resident_threads = rendering.n_resident_threads = lambda *_: 0
+        operations.n_resident_threads = rendering.n_resident_threads = lambda *_: 0
         run_all(device)
     print("done")
 

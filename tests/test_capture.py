@@ -67,7 +67,7 @@ def test_state_tree_finds_tensors_and_generators_by_path():
         ".core.scenery.layout",
         ".seen",
         ".spawner.counts",
-        ".lifecycle.ended",
+        ".ended",
     } <= set(paths)
 
 
@@ -466,10 +466,10 @@ class TestOnTheGPU:
     def test_warming_up_does_not_advance_the_environment(self):
         env = envs.Explorer(8, device="cuda")
         env.reset()
-        counts, ages = env.spawner.counts.clone(), env.lifecycle.ages.clone()
+        counts, ages = env.spawner.counts.clone(), env.ages.clone()
         captured = capture.Captured(env)
         captured.step(arrdict.arrdict(actions=torch.zeros((8, 1), dtype=torch.long, device="cuda")))
-        assert torch.equal(env.spawner.counts, counts) and torch.equal(env.lifecycle.ages, ages + 1)
+        assert torch.equal(env.spawner.counts, counts) and torch.equal(env.ages, ages + 1)
 
     def test_an_environment_may_be_dropped(self):
         decision = arrdict.arrdict(actions=torch.full((64, 1), 3, device="cuda"))

@@ -35,15 +35,16 @@ SIMULATOR = (
     ("hosting",),
     ("core", "cubicasa", "toys"),
     ("cuda", "modules"),
+    ("geodesics",),
     ("compat", "envs", "web", "wrappers"),
     ("adapters", "demo"),
 )
 ENGINE = (
-    ("checks", "outputs", "state_tree", "views"),
+    ("checks", "state_tree", "views"),
     ("objects", "resets"),
     ("agents", "devices", "scenery"),
     ("launch_params",),
-    ("lighting", "movement", "object_updates", "spawning", "texels"),
+    ("operations",),
     ("rendering",),
 )
 AGENTS = (
@@ -84,7 +85,7 @@ SHARED = {
 BOTS = "megastep.agents.selfplay.bots"
 SHARED_WITH_BOTS = SHARED | {
     "megastep.engine",
-    "megastep.envs.pointgoal.path_graph",
+    "megastep.geodesics",
     "megastep.modules.movement",
 }
 # What makes and runs a whole training also caches arguments, chooses a device and homes, checks
@@ -115,9 +116,8 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
 OWN_USERS = {
     "megastep.kernels.build.launch": (
         "megastep/engine/*.py",
-        "megastep/envs/*/step.py",
-        "megastep/envs/deathmatch/bot.py",
-        "megastep/envs/pointgoal/path_graph.py",
+        "megastep/envs/*/*.py",
+        "megastep/geodesics/path_graph.py",
         "megastep/kernels/build/*.py",
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
         "megastep/web/*.py",
@@ -313,9 +313,9 @@ def simulator_knows_no_learner(graph):
 
 def environments_are_independent(graph):
     """An environment is a file, or a folder with its own operation. All share envs.common
-    alone.
+    and envs.first_person alone.
     """
-    envs, shared = "megastep.envs", ("common",)
+    envs, shared = "megastep.envs", ("common", "first_person")
     for name, target in edges(graph, lambda name: name.startswith(f"{envs}.")):
         if is_below(target, envs) and part_of(target, envs) not in (part_of(name, envs), *shared):
             yield f"{name} must not import {target}"

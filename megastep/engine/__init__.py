@@ -5,20 +5,30 @@ allocate their outputs and launch one kernel each. None of them synchronises hos
 argument that does not fit raises a TypeError or ValueError that names it.
 
 The step of a game is an operation too, in the environment's package, for example
-:func:`megastep.envs.deathmatch.step.deathmatch_step`.
+:func:`megastep.envs.deathmatch.deathmatch_step`.
 """
 
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_flag
 from megastep.engine.devices import device, fit, free_memory, set_threads, threads
-from megastep.engine.lighting import bake
-from megastep.engine.movement import physics
-from megastep.engine.object_updates import place_objects, update_objects
 from megastep.engine.objects import Objects, check_objects
-from megastep.engine.outputs import Observation, Physics, Render
-from megastep.engine.rendering import observe, render, update_agent_geometry
+from megastep.engine.operations import (
+    Physics,
+    bake,
+    physics,
+    place_objects,
+    spawn,
+    uniform,
+    update_objects,
+)
+from megastep.engine.rendering import (
+    Observation,
+    Render,
+    observe,
+    render,
+    update_agent_geometry,
+)
 from megastep.engine.resets import Resets
 from megastep.engine.scenery import Layouts, Scenery
-from megastep.engine.spawning import spawn, uniform
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import without_early_starts
 

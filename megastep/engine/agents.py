@@ -15,11 +15,6 @@ from megastep.read_only import SetOnce
 if TYPE_CHECKING:
     from megastep.engine.objects import Objects
 
-__all__ = [
-    *("AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents"),
-    *("check", "check_flag", "check_on_cpu", "check_flag_on_cpu"),
-]
-
 AGENT_WIDTH = 0.15  # metres, of the square that an agent is drawn as
 AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # metres, of the disc around a square of that width
 MAX_RES = ENGINE.constants["MAX_RES"]  # rays per camera
@@ -109,8 +104,7 @@ def check(agents: Agents) -> None:
             action that is NaN, or with an action, layout or goal that does not exist; or naming
             an object, see :func:`check_objects`.
     """
-    flag = checks.instance("agents", agents, Agents).error_flag
-    check_flag(checks.stored("agents.error_flag", flag))
+    check_flag(checks.instance("agents", agents, Agents).error_flag)
     if objects := _objects_of(agents):
         check_objects(objects)
 

@@ -4,33 +4,13 @@ import math
 import numbers
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import torch
 
 from megastep.coefficients import on_device
 from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor
-from megastep.types import is_stored
-
-__all__ = [
-    "address",
-    "alike",
-    "device",
-    "flag",
-    "floats",
-    "instance",
-    "integer",
-    "integers",
-    "items",
-    "lanes",
-    "length",
-    "number",
-    "ragged",
-    "stored",
-    "vectors",
-    "word",
-]
 
 T = TypeVar("T")
 
@@ -38,21 +18,26 @@ _INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fits into float32
 
 
+def _refuse(name, wanted, value, kind: type[Exception] = ValueError) -> NoReturn:
+    raise kind(f"{name} must be {wanted}, but {_described(value)} was given")
+
+
+# ---- Values ----
+
+
 def integer(name: str, value: object, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
     number = value if type(value) is int else _index(value)
     if number is None or not min <= number <= max:
         range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
-        raise ValueError(f"{name} must be an integer {range_}, but {_described(value)} was given")
+        _refuse(name, f"an integer {range_}", value)
     return number
 
 
 def _index(value) -> int | None:
     """Returns a value as an int, or None if it is none."""
-    if isinstance(value, bool) or isinstance(value, torch.Tensor) and not is_stored(value):
-        return None
     try:
-        return operator.index(value)
+        return None if isinstance(value, bool) else operator.index(value)
     except (TypeError, RuntimeError, ValueError):
         return None
 
@@ -65,7 +50,7 @@ def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: 
         kind = f"a number of {unit}" if unit else "a number"
         range_ = f"between {min:g} and {max:g}" if max < math.inf else f"above {min:g}"
         range_ = range_ if min > -math.inf else "that is finite"
-        raise ValueError(f"{name} must be {kind} {range_}{hint}, but {_described(value)} was given")
+        _refuse(name, f"{kind} {range_}{hint}", value)
     return float(value)
 
 
@@ -82,28 +67,28 @@ def weight(name: str, value: object, device: torch.device) -> torch.Tensor:
 def flag(name: str, value: object) -> bool:
     """Returns ``value``. TypeError unless it is True or False."""
     if value is not True and value is not False:
-        raise TypeError(f"{name} must be True or False, but {_described(value)} was given")
+        _refuse(name, "True or False", value, TypeError)
     return value
 
 
 def word(name: str, value: object, words: Sequence[str]) -> str:
     """Returns ``value``. ValueError unless it is one of ``words``."""
     if not isinstance(value, str) or value not in words:
-        raise ValueError(f"{name} must be {' or '.join(words)}, but {_described(value)} was given")
+        _refuse(name, " or ".join(words), value)
     return value
 
 
 def instance(name: str, value: object, kind: type[T]) -> T:
     """Returns ``value``. TypeError unless it is a ``kind``."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} must be a {kind.__name__}, but {_described(value)} was given")
+        _refuse(name, f"a {kind.__name__}", value, TypeError)
     return value
 
 
 def items(name: str, value: object) -> list:
     """Returns ``value`` as a list. TypeError or ValueError unless it is a list and not empty."""
     if isinstance(value, (str, dict)) or not isinstance(value, Iterable):
-        raise TypeError(f"{name} must be a list, but {_described(value)} was given")
+        _refuse(name, "a list", value, TypeError)
     values = list(value)
     if not values:
         raise ValueError(f"{name} must hold at least one, but an empty list was given")
@@ -115,9 +100,10 @@ def device(name: str, value: Any) -> torch.device:
     try:
         return torch.device(value)
     except (RuntimeError, TypeError):
-        raise ValueError(
-            f"{name} must be a device such as cpu or cuda, but {_described(value)} was given"
-        ) from None
+        _refuse(name, "a device such as cpu or cuda", value)
+
+
+# ---- Arrays, which are converted ----
 
 
 def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) -> torch.Tensor:
@@ -131,16 +117,14 @@ def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) 
     """
     try:
         tensor = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
-        usable = is_stored(tensor) and not tensor.is_complex()
         tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
-        tensor = tensor.resolve_neg().to(device=device, dtype=torch.float32) if usable else None
+        is_real = not tensor.is_complex() and tensor.layout is torch.strided
+        is_real &= not tensor.is_meta
+        tensor = tensor.to(device=device, dtype=torch.float32) if is_real else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
     if tensor is None or not _fits(tensor, shape):
-        raise ValueError(
-            f"{name} must be an array of numbers of shape ({_sizes(shape)}), but "
-            f"{_described(value)} was given"
-        )
+        _refuse(name, f"an array of numbers of shape ({_sizes(shape)})", value)
     if not bool((tensor.abs() < LIMIT).all()):
         raise ValueError(
             f"{name} must hold numbers below {LIMIT:g}, but one is NaN, infinite or larger"
@@ -161,16 +145,12 @@ def integers(
     """
     try:
         tensor = torch.as_tensor(value).detach()
-        real = tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool
-        usable = is_stored(tensor) and not (real and tensor.numel())
-        tensor = tensor.clone().to(device=device, dtype=torch.int64) if usable else None
+        is_integer = tensor.dtype in _INTEGERS or not tensor.numel()
+        tensor = tensor.clone().to(device=device, dtype=torch.int64) if is_integer else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
     if tensor is None or not _fits(tensor, (size,)):
-        raise ValueError(
-            f"{name} must be an array of integers of shape ({size},), but "
-            f"{_described(value)} was given"
-        )
+        _refuse(name, f"an array of integers of shape ({size},)", value)
     outside = tensor[(tensor < min) | (tensor > max)]
     if len(outside):
         raise ValueError(
@@ -186,22 +166,25 @@ def _fits(tensor, shape) -> bool:
 
 
 def ragged(name: str, value: Any, shape: Sequence, device: torch.device | None) -> RaggedTorch:
-    """Returns ``value`` as a Ragged of contiguous float32 tensors on ``device``.
+    """Returns a Ragged with vals (*shape) as a RaggedTorch on ``device``.
 
     Raises:
         TypeError: unless it is a Ragged.
         ValueError: unless its vals pass :func:`floats`.
     """
     if not isinstance(value, Ragged) and not hasattr(value, "torchify"):
-        raise TypeError(f"{name} must be a Ragged, but {_described(value)} was given")
+        _refuse(name, "a Ragged", value, TypeError)
     value = value.torchify()
     return RaggedTorch(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
+
+
+# ---- Tensors, which are not: these copy nothing, and do not synchronise ----
 
 
 def length(name: str, value: object, axis: int = 0) -> int:
     """Returns the size of a tensor's ``axis``. TypeError or ValueError unless it has that axis."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{name} must be a tensor, but {_described(value)} was given")
+        _refuse(name, "a tensor", value, TypeError)
     if not -value.ndim <= axis < value.ndim:
         raise ValueError(f"{name} must have more axes than {_described(value)} has")
     return value.shape[axis]
@@ -210,12 +193,11 @@ def length(name: str, value: object, axis: int = 0) -> int:
 def address(
     name: str, value: Any, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> int:
-    """Returns a tensor's address. Copies nothing and does not synchronise.
+    """Returns a tensor's address.
 
     Raises:
         TypeError: unless it is a tensor.
-        ValueError: unless it is contiguous, on ``device``, of that shape and dtype, and inside its
-            storage, which may have been resized.
+        ValueError: unless it is contiguous, on ``device``, of that shape and dtype.
     """
     try:
         fits = (
@@ -223,72 +205,68 @@ def address(
             and value.device == device
             and value.shape == shape
             and value.is_contiguous()
-            and not value.is_neg()
-            and value.storage_offset() * value.itemsize + value.nbytes
-            <= value.untyped_storage().nbytes()
         )
     except (AttributeError, RuntimeError):  # no tensor, or one without memory such as a sparse one
         fits = False
     if not fits:
-        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
-            f"{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but "
-            f"{_described(value)} was given"
-        )
+        wanted = f"a contiguous {dtype} tensor of shape {tuple(shape)} on {device}"
+        _refuse_tensor(name, wanted, value)
     return value.data_ptr()
 
 
-def stored(name: str, tensor: torch.Tensor) -> torch.Tensor:
-    """Returns ``tensor``. ValueError unless it lies inside its storage: most functions of PyTorch
-    crash the interpreter if the storage was resized.
-    """
-    if not is_stored(tensor):
-        raise ValueError(f"{name} must lie inside its storage, but is {_described(tensor)}")
-    return tensor
+def addresses(
+    shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, **tensors: Any
+) -> dict[str, int]:
+    """Returns {name: :func:`address`} of tensors that are alike."""
+    return {name: address(name, one, shape, dtype, device) for name, one in tensors.items()}
+
+
+def optional(
+    name: str, value: Any, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> int:
+    """Returns a tensor's :func:`address`, or 0 for None: a null pointer."""
+    return 0 if value is None else address(name, value, shape, dtype, device)
 
 
 def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
     """Returns ``value``. TypeError or ValueError unless it is a tensor of the shape and dtype of
-    ``like``, on its device. Does not synchronise.
+    ``like``, on its device.
     """
     fits = isinstance(value, torch.Tensor) and value.shape == like.shape
-    if not fits or value.dtype != like.dtype or value.device != like.device or not is_stored(value):
-        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
-            f"{name} must be a {like.dtype} tensor of shape {tuple(like.shape)} on {like.device}, "
-            f"but {_described(value)} was given"
-        )
+    if not fits or value.dtype != like.dtype or value.device != like.device:
+        wanted = f"a {like.dtype} tensor of shape {tuple(like.shape)} on {like.device}"
+        _refuse_tensor(name, wanted, value)
     return value
 
 
 def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Tensor:
     """Returns ``value``. TypeError or ValueError unless it is a tensor on ``device``, of any shape,
-    with one integer per lane. Does not synchronise.
+    with one integer per lane.
     """
     fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
-    if not fits or value.dtype not in _INTEGERS or not is_stored(value):
-        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
-            f"{name} must be a tensor of integers, one for each of the {n_lanes} lanes, on "
-            f"{device}, but {_described(value)} was given"
-        )
+    if not fits or value.dtype not in _INTEGERS:
+        wanted = f"a tensor of integers, one for each of the {n_lanes} lanes, on {device}"
+        _refuse_tensor(name, wanted, value)
     return value
 
 
 def vectors(name: str, value: Any, n_lanes: int, dim: int, device: torch.device) -> torch.Tensor:
     """Returns ``value``. TypeError or ValueError unless it is a float32 tensor on ``device`` with
-    ``dim`` numbers per lane along its last axis. Does not synchronise.
+    ``dim`` numbers per lane along its last axis.
     """
     fits = isinstance(value, torch.Tensor) and value.shape[-1:] == (dim,)
-    if (
-        not fits
-        or value.numel() != n_lanes * dim
-        or value.dtype != torch.float32
-        or value.device != device
-        or not is_stored(value)
-    ):
-        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
-            f"{name} must be a tensor of float32 numbers, {dim} for each of the {n_lanes} lanes, "
-            f"on {device}, but {_described(value)} was given"
-        )
+    fits = fits and value.numel() == n_lanes * dim and value.device == device
+    if not fits or value.dtype != torch.float32:
+        wanted = f"a tensor of float32 numbers, {dim} for each of the {n_lanes} lanes, on {device}"
+        _refuse_tensor(name, wanted, value)
     return value
+
+
+def _refuse_tensor(name, wanted, value) -> NoReturn:
+    _refuse(name, wanted, value, ValueError if isinstance(value, torch.Tensor) else TypeError)
+
+
+# ---- Words ----
 
 
 def _sizes(shape) -> str:
@@ -301,13 +279,7 @@ def _described(value) -> str:
         if value.layout is not torch.strided:
             return f"a {value.layout} tensor"
         layout = "" if value.is_contiguous() else "non-contiguous "
-        text = f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
-        if value.is_neg():
-            return f"{text} that is negated lazily (call resolve_neg)"
-        if not is_stored(value):
-            n_bytes = value.untyped_storage().nbytes()
-            return f"{text} whose storage has only {n_bytes} bytes"
-        return text
+        return f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"a {value.dtype} array of shape {tuple(value.shape)}"
     if value is None or isinstance(value, (bool, int, float, str)):

@@ -1,5 +1,7 @@
 """The fields that many launches share: tensors' addresses, checked without synchronisation."""
 
+from collections.abc import Callable
+
 import torch
 
 from megastep.engine import checks, devices
@@ -7,134 +9,119 @@ from megastep.engine.agents import Agents
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import ENGINE
 
-__all__ = [
-    "error_flag_address",
-    "lanes_of",
-    "scenery_params",
-    "seed_params",
-    "state_params",
-    "texel_bits",
-]
-
 _address = torch.Tensor.data_ptr
-_n_bytes = torch.Tensor.nbytes.__get__  # pyright: ignore[reportAttributeAccessIssue]
+#: Axes of the agents' tensors behind (N, A).
+_STATE = dict(positions=(2,), angles=(), velocity=(2,), angvelocity=())
 
 
 class _Packed:
-    """The packed SceneryParams of a scenery, and the addresses and bytes they were packed from.
-
-    Has no ``__dict__``, so that :func:`~megastep.engine.state_tree.state_tree` does not look
-    inside.
+    """A packed struct, and what it was packed from. Has no ``__dict__``, so that
+    :func:`~megastep.engine.state_tree.state_tree` does not look inside.
     """
 
     __slots__ = ("tensors", "inputs", "params")
 
-    def __init__(self, scenery) -> None:
-        layouts = scenery.layouts
-        self.inputs: list | None = None
-        self.params = b""
-        self.tensors = (
-            layouts.lines.vals,
-            layouts.lights.vals,
-            layouts.texels,
-            layouts.textures.vals,
-            layouts.baked.vals,
-            layouts.agent_textures,
-            scenery.layout,
-            scenery.agent_lines,
-            scenery.agent_light,
-        )
+    def __init__(self, *tensors: torch.Tensor):
+        self.tensors, self.inputs, self.params = tensors, [], b""
+
+    def get(self, pack: Callable[[], bytes], *numbers: float) -> bytes:
+        """Returns the struct; packs it anew if a tensor has moved or a number is another one."""
+        inputs = [*map(_address, self.tensors), *numbers]
+        if inputs != self.inputs:
+            self.params, self.inputs = pack(), inputs
+        return self.params
 
 
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
-    """Returns the packed SceneryParams of a scenery.
-
-    Its tensors cannot be replaced, so they are checked only if the address or size of one has
-    changed since the last call. A storage that is resized moves, so its address changes too.
-
-    Raises:
-        ValueError: naming the tensor that no longer fits.
-    """
+    """Returns the packed SceneryParams of a scenery. Its tensors cannot be replaced."""
     packed = vars(scenery).get("_packed")
     if packed is None:
-        packed = vars(scenery)["_packed"] = _Packed(scenery)
+        parts = scenery.layouts
+        vals = parts.lines.vals, parts.lights.vals, parts.texels, parts.agent_textures
+        moving = scenery.layout, scenery.agent_lines, scenery.agent_light
+        packed = vars(scenery)["_packed"] = _Packed(*vals, *moving)
     n_threads = devices.threads()
-    inputs = [*map(_address, packed.tensors), *map(_n_bytes, packed.tensors), radius, n_threads]
-    if packed.inputs != inputs:
-        packed.params = _pack(scenery, radius, n_threads)
-        packed.inputs = inputs
-    return packed.params
+    return packed.get(lambda: _pack_scenery(scenery, radius, n_threads), radius, n_threads)
 
 
-def _pack(scenery, radius, n_threads) -> bytes:
-    layouts, n, k = scenery.layouts, scenery.n_envs, scenery.n_agent_texels
-    n_model = len(scenery.model)
-
-    def address(name, tensor, *shape, dtype=torch.float32) -> int:
-        return checks.address(name, tensor, shape, dtype, scenery.device)
-
-    texels = address("scenery.layouts.texels", layouts.texels, layouts.n_texels, 4)
-    for name, column in (("textures", 0), ("baked", 3)):
-        vals = getattr(layouts, name).vals
-        if vals.data_ptr() != texels + column * vals.element_size() * bool(len(vals)):
-            raise ValueError(
-                f"scenery.layouts.texels and scenery.layouts.{name}.vals must share their memory: "
-                f"write into them in place instead of replacing one"
-            )
+def _pack_scenery(scenery, radius, n_threads) -> bytes:
+    layouts = scenery.layouts
     return ENGINE.params.SceneryParams(
-        walls=address("scenery.layouts.lines.vals", layouts.lines.vals, layouts.n_walls, 2, 2),
+        walls=layouts.lines.vals,
         wall_starts=layouts.wall_starts,
         texel_starts=layouts.texel_starts,
         boxes=layouts.boxes,
         box_starts=layouts.box_starts,
-        texels=texels,
-        lights=address("scenery.layouts.lights.vals", layouts.lights.vals, layouts.n_lights, 3),
+        texels=layouts.texels,
+        lights=layouts.lights.vals,
         light_starts=layouts.light_starts,
-        layout=address("scenery.layout", scenery.layout, n, dtype=torch.int32),
+        layout=scenery.layout,
         model=scenery.model,
         model_texels=scenery.model_texels,
-        agent_textures=address(
-            "scenery.layouts.agent_textures", layouts.agent_textures, len(layouts), k, 3
-        ),
-        agent_lines=address(
-            "scenery.agent_lines", scenery.agent_lines, n, scenery.n_agents * n_model, 2, 2
-        ),
-        agent_light=address("scenery.agent_light", scenery.agent_light, n, k),
-        n_envs=n,
+        agent_textures=layouts.agent_textures,
+        agent_lines=scenery.agent_lines,
+        agent_light=scenery.agent_light,
+        n_envs=scenery.n_envs,
         n_layouts=len(layouts),
         n_agents=scenery.n_agents,
-        n_model=n_model,
-        n_agent_texels=k,
+        n_model=len(scenery.model),
+        n_agent_texels=scenery.n_agent_texels,
         n_threads=n_threads,
         radius=radius,
         reach=1.001 * scenery.reach,
     )
 
 
-_STATE = dict(
-    positions=("agents.positions", (2,)),
-    angles=("agents.angles", ()),
-    velocity=("agents.velocity", (2,)),
-    angvelocity=("agents.angvelocity", ()),
-)
+_FIELDS = [
+    *("shapes", "line_starts", "line_object", "palette", "extents", "objects", "lines", "texels"),
+    *("error_flag", "n_objects", "n_lines", "n_colours", "lit", "ends"),
+]
+_NO_OBJECTS = ENGINE.params.ObjectsParams(**dict.fromkeys(_FIELDS, 0))
+
+
+def object_params(scenery: Scenery) -> bytes:
+    """Returns the packed ObjectsParams of a scenery, of none if it has no objects."""
+    o = scenery.objects
+    if o is None:
+        return _NO_OBJECTS
+    packed = vars(o).get("_packed")
+    if packed is None:
+        packed = vars(o)["_packed"] = _Packed(o.records, o.lines, o.texels, o.palette)
+    return packed.get(
+        lambda: ENGINE.params.ObjectsParams(
+            shapes=o.shapes,
+            line_starts=o.line_starts,
+            line_object=o.line_object,
+            palette=o.palette,
+            extents=scenery.layouts.extents,
+            objects=o.records,
+            lines=o.lines,
+            texels=o.texels,
+            error_flag=o.error_flag,
+            n_objects=o.n_objects,
+            n_lines=len(o.line_object),
+            n_colours=o.n_colours,
+            lit=int(o.lit),
+            ends=o.ends,
+        )
+    )
 
 
 class _Checked:
-    """The agents' tensors that were last checked for a scenery: {name: (tensor, memory)}.
+    """The agents' tensors that were last checked for a scenery: {name: (tensor, address)}.
 
     Has no ``__dict__``, as :class:`_Packed`.
     """
 
     __slots__ = ("scenery", "tensors")
 
-    def __init__(self, scenery) -> None:
+    def __init__(self, scenery: Scenery):
         self.scenery, self.tensors = scenery, {}
 
 
 def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:
-    """Returns {name: address} of the agents' tensors ``names``.
-
-    Each is checked only if it is another one than in the last call, or has moved or changed size.
+    """Returns {name: address} of the agents' tensors ``names``. Each is checked only if it is
+    another one than in the last call, or has moved.
 
     Raises:
         TypeError, ValueError: naming the first tensor that does not fit the scenery.
@@ -145,23 +132,23 @@ def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int
         checked = tensors["_checked"] = _Checked(scenery)
     addresses = {}
     for name in names:
-        tensor, last = tensors[name], checked.tensors.get(name)
-        if last is None or tensor is not last[0] or _memory(tensor) != last[1]:
-            title, axes = _STATE[name]
-            shape = (scenery.n_envs, scenery.n_agents, *axes)
-            checks.address(title, tensor, shape, torch.float32, scenery.device)
-            last = checked.tensors[name] = tensor, _memory(tensor)
-        addresses[name] = last[1][0]
+        tensor, (last, address) = tensors[name], checked.tensors.get(name, (checked, 0))
+        if tensor is not last or _address(tensor) != address:
+            shape = (scenery.n_envs, scenery.n_agents, *_STATE[name])
+            title, device = f"agents.{name}", scenery.device
+            address = checks.address(title, tensor, shape, torch.float32, device)
+            checked.tensors[name] = tensor, address
+        addresses[name] = address
     return addresses
 
 
-def _memory(tensor) -> tuple[int, int, int]:
-    return tensor.data_ptr(), tensor.nbytes, tensor.untyped_storage().nbytes()
-
-
-def error_flag_address(scenery: Scenery, agents: Agents) -> int:
-    """Returns the address of the flag that :func:`~megastep.engine.check` reads."""
-    return checks.address("agents.error_flag", agents.error_flag, (1,), torch.int32, scenery.device)
+def world_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, bytes | int]:
+    """Returns the fields ``scenery`` and ``error_flag``, the flag that
+    :func:`~megastep.engine.check` reads, and those of :func:`state_params`.
+    """
+    flag = checks.address("agents.error_flag", agents.error_flag, (1,), torch.int32, scenery.device)
+    packed = scenery_params(scenery, agents.radius)
+    return dict(scenery=packed, error_flag=flag, **state_params(scenery, agents, *names))
 
 
 def lanes_of(scenery: Scenery, agents: Agents) -> tuple[int, int]:

@@ -4,7 +4,7 @@ N environments, O objects per environment, P colours, A agents per environment, 
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -12,11 +12,6 @@ from megastep.engine import checks
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
-
-if TYPE_CHECKING:
-    from megastep.engine.scenery import Scenery
-
-__all__ = ["SHAPES", "Objects", "check_objects", "object_params"]
 
 
 def _sides(*corners: tuple[float, float]) -> list[tuple[float, ...]]:
@@ -164,65 +159,6 @@ class Objects(SetOnce):
         return objects.masked_fill(~is_object, -1)
 
 
-_FIELDS = [
-    *("shapes", "line_starts", "line_object", "palette", "extents", "objects", "lines", "texels"),
-    *("error_flag", "n_objects", "n_lines", "n_colours", "lit", "ends"),
-]
-_NONE = ENGINE.params.ObjectsParams(**dict.fromkeys(_FIELDS, 0))
-
-
-class _Packed:
-    """The packed ObjectsParams, and the addresses and bytes that they were packed from. Has no
-    ``__dict__``, so that it is not part of the state.
-    """
-
-    __slots__ = ("inputs", "params", "tensors")
-
-
-def object_params(scenery: "Scenery") -> bytes:
-    """Returns the packed ObjectsParams of a scenery, of none if it has no objects.
-
-    Raises:
-        ValueError: naming the tensor that does not fit.
-    """
-    objects = scenery.objects
-    if objects is None:
-        return _NONE
-    packed = vars(objects).get("_packed")
-    if packed is None:
-        packed = vars(objects)["_packed"] = _Packed()
-        packed.inputs = None
-        packed.tensors = objects.records, objects.lines, objects.texels, objects.palette
-    inputs = [(t.data_ptr(), t.nbytes, t.untyped_storage().nbytes()) for t in packed.tensors]
-    if packed.inputs != inputs:
-        packed.params, packed.inputs = _pack(scenery, objects), inputs
-    return packed.params
-
-
-def _pack(scenery, o) -> bytes:
-    shape, n_lines = (o.n_envs, o.n_objects), len(o.line_object)
-
-    def address(name, tensor, *shape) -> int:
-        return checks.address(f"objects.{name}", tensor, shape, torch.float32, scenery.device)
-
-    return ENGINE.params.ObjectsParams(
-        shapes=o.shapes,
-        line_starts=o.line_starts,
-        line_object=o.line_object,
-        palette=address("palette", o.palette, o.n_colours, 3),
-        extents=scenery.layouts.extents,
-        objects=address("records", o.records, *shape, _BYTES // 4),
-        lines=address("lines", o.lines, o.n_envs, n_lines, 2, 2),
-        texels=address("texels", o.texels, *shape, 4),
-        error_flag=o.error_flag,
-        n_objects=o.n_objects,
-        n_lines=n_lines,
-        n_colours=o.n_colours,
-        lit=int(o.lit),
-        ends=o.ends,
-    )
-
-
 def check_objects(objects: Objects) -> None:
     """Raises the error of an object that the device flagged since the last check, if any.
 
@@ -231,7 +167,7 @@ def check_objects(objects: Objects) -> None:
     Raises:
         EngineError: naming the environment and the object.
     """
-    flag = checks.stored("objects.error_flag", objects.error_flag).item()
+    flag = objects.error_flag.item()
     if flag:
         objects.error_flag.zero_()
         index, kind = divmod(int(flag), _KINDS)

@@ -5,6 +5,7 @@ R rays per camera, P = R / subsample pixels.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 
@@ -12,19 +13,15 @@ from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
 from megastep.engine.devices import n_resident_threads
 from megastep.engine.launch_params import (
-    error_flag_address,
     lanes_of,
-    scenery_params,
+    object_params,
     state_params,
     texel_bits,
+    world_params,
 )
-from megastep.engine.object_updates import update_objects
-from megastep.engine.objects import object_params
-from megastep.engine.outputs import Observation, Render
+from megastep.engine.operations import update_objects
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, Blocks, launch
-
-__all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
@@ -45,14 +42,33 @@ _OPTIONAL = dict.fromkeys(
 )
 
 
+class Render(NamedTuple):
+    """The cameras' views, ray by ray. A ray that hits nothing has -1, NaN, NaN, inf, black."""
+
+    indices: torch.Tensor  # (N, A, C, R) int32: the line hit, an index into its environment
+    locations: torch.Tensor  # (N, A, C, R): position along the line, 0 to 1
+    dots: torch.Tensor  # (N, A, C, R): cosine between ray and line
+    distances: torch.Tensor  # (N, A, C, R): metres
+    screen: torch.Tensor  # (N, A, C, R, 3): linear light; call gamma_encode to display it
+
+
+class Observation(NamedTuple):
+    """Observations for a policy; None where not requested."""
+
+    rgb: torch.Tensor | None  # (N, A, C, 3, P) fp16, linear light
+    depth: torch.Tensor | None  # (N, A, C, P) fp16: 1 at the agent's radius, 0 at max_depth beyond
+    centre_line: torch.Tensor | None  # (N, A, C) int32: the line at the centre, as Render.indices
+    agent_ray: torch.Tensor | None  # (N, A, C) int32: ray closest to the centre that hits an agent
+    imu: torch.Tensor | None  # (N, A, 3) fp16: angvelocity / 360, own velocity ahead and left / 10
+    newly_seen: torch.Tensor | None  # (N, A) int32: texels newly marked in `seen`
+
+
 def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) -> None:
     """Moves the agents' lines to their current poses, and computes the light on them if ``lit``."""
     n, a = lanes_of(scenery, agents)
     launch(
         *(ENGINE, "update_agent_geometry", scenery.device, WARP * n * a),
-        scenery=scenery_params(scenery, agents.radius),
-        **state_params(scenery, agents, "positions", "angles"),
-        error_flag=error_flag_address(scenery, agents),
+        **world_params(scenery, agents, "positions", "angles"),
         lit=int(checks.flag("lit", lit)),
     )
     check_on_cpu(agents)
@@ -145,13 +161,12 @@ def _per_camera(lanes, agents) -> tuple[int, ...]:
 
 def _seen_fields(scenery, seen, clear_mask) -> dict[str, int]:
     """Returns the fields of RenderParams about the texels seen."""
-    lanes, mask = (scenery.n_envs, scenery.n_agents), 0
+    lanes = scenery.n_envs, scenery.n_agents
     if seen is None:
         raise ValueError("clear_mask clears seen, but seen was not given")
-    if clear_mask is not None:
-        mask = checks.address("clear_mask", clear_mask, lanes, torch.bool, scenery.device)
+    mask = checks.optional("clear_mask", clear_mask, lanes, torch.bool, scenery.device)
     address, n_words = texel_bits(scenery, "seen", seen, lanes)
-    return dict(seen=address, clear_mask=mask, n_words=n_words)
+    return dict(seen=address, n_words=n_words, clear_mask=mask)
 
 
 def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
@@ -169,13 +184,9 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:
         kernel = kernel.replace("render", "render_objects")
     launch(
         *(ENGINE, kernel, device, Blocks(-(-n // n_per_block), shared=shared)),
-        scenery=scenery_params(scenery, agents.radius),
-        **state_params(scenery, agents, "positions", "angles"),
-        yaws=checks.address("agents.yaws", agents.yaws, (agents.n_cameras,), torch.float32, device),
-        ray_lengths=checks.address(
-            "agents.ray_lengths", agents.ray_lengths, (res,), torch.float32, device
-        ),
-        error_flag=error_flag_address(scenery, agents),
+        **world_params(scenery, agents, "positions", "angles"),
+        yaws=agents.yaws,
+        ray_lengths=agents.ray_lengths,
         n_cameras=agents.n_cameras,
         res=res,
         half_width=half_width,

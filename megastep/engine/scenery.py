@@ -22,9 +22,6 @@ from megastep.read_only import ReadOnlyTensor, SetOnce
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
-    from typing_extensions import Self
-
-__all__ = ["Layouts", "Scenery"]
 
 BOX_WALLS = ENGINE.constants["BOX_WALLS"]  # walls per bounding box
 
@@ -239,25 +236,15 @@ class Scenery(SetOnce):
         self.agent_light = torch.ones((self.n_envs, n_texels), device=device)
         self.reach = float(model.norm(dim=-1).max()) if len(model) else 0.0
 
-    def _stored(self) -> "Self":
-        """Returns self. ValueError if the storage of a tensor that may be written was resized."""
-        for name in ("layout", "agent_lines", "agent_light"):
-            checks.stored(f"scenery.{name}", getattr(self, name))
-        for name in ("texels", "agent_textures"):
-            checks.stored(f"scenery.layouts.{name}", getattr(self.layouts, name))
-        for name in ("lines", "lights"):
-            checks.stored(f"scenery.layouts.{name}.vals", getattr(self.layouts, name).vals)
-        return self
-
     @property
     def lines(self) -> JoinedRagged:
         """The lines (l, 2, 2) of each environment, agents' first, as last rendered. Read-only."""
-        return views.lines(self._stored())
+        return views.lines(self)
 
     @property
     def lights(self) -> JoinedRagged:
         """The lights (l, 3) of each environment. Read-only."""
-        return views.lights(self._stored())
+        return views.lights(self)
 
     @property
     def textures(self) -> JoinedRagged:
@@ -265,12 +252,12 @@ class Scenery(SetOnce):
 
         Line l of environment e has the index ``lines.starts[e] + l``.
         """
-        return views.textures(self._stored())
+        return views.textures(self)
 
     @property
     def baked(self) -> JoinedRagged:
         """The light (w,) on each line of all environments, indexed as ``textures``. Read-only."""
-        return views.baked(self._stored())
+        return views.baked(self)
 
     def env(self, e: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...], torch.Tensor]:
         """Returns copies of one environment's lines, lit textures and lights.
@@ -282,38 +269,21 @@ class Scenery(SetOnce):
             objects', then walls.
         """
         e = checks.integer("e", e, -self.n_envs, self.n_envs - 1)
-        layouts, d = self._stored().layouts, int(self.layout[e])
-        lines = torch.cat([*self._moving_lines(e), layouts.lines[d]])
+        layouts, d = self.layouts, int(self.layout[e])
+        moving, of_objects = [self.agent_lines[e]], ()
+        if self.objects is not None:
+            moving.append(self.objects.lines[e])
+            lit = self.objects.texels[e, self.objects.line_object.long()]
+            of_objects = (lit[:, :3] * lit[:, 3:]).split(1)
         first, last = layouts.wall_starts[d : d + 2].tolist()
         bounds = layouts.texel_starts[first : last + 1].tolist()
         model_bounds = self.model_texels.tolist()
         agents = layouts.agent_textures[d] * self.agent_light[e, :, None]
         texels = layouts.texels[bounds[0] : bounds[-1]]
         walls = texels[:, :3] * texels[:, 3:]
-        return (
-            lines,
-            (
-                *agents.split(_widths(model_bounds)),
-                *self._of_objects(e),
-                *walls.split(_widths(bounds)),
-            ),
-            layouts.lights[d].clone(),
-        )
-
-    def _moving_lines(self, e) -> list[torch.Tensor]:
-        # the lines of an environment's agents and objects
-        return (
-            [self.agent_lines[e]]
-            if self.objects is None
-            else [self.agent_lines[e], self.objects.lines[e]]
-        )
-
-    def _of_objects(self, e) -> tuple[torch.Tensor, ...]:
-        # the lit texel (1, 3) of each line of an environment's objects
-        if self.objects is None:
-            return ()
-        texels = self.objects.texels[e, self.objects.line_object.long()]
-        return (texels[:, :3] * texels[:, 3:]).split(1)
+        lines = torch.cat([*moving, layouts.lines[d]])
+        lit = *agents.split(_widths(model_bounds)), *of_objects, *walls.split(_widths(bounds))
+        return lines, lit, layouts.lights[d].clone()
 
 
 def _same(name, what, expected, actual) -> None:

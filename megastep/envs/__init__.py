@@ -3,7 +3,7 @@
 import importlib
 import pkgutil
 
-_SHARED = ("common",)  # modules that hold no environment
+_SHARED = ("common", "first_person")  # modules that hold no environment
 
 #: The environments by module name. A module's environment is the first name in its ``__all__``.
 ENVS = {}

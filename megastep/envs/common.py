@@ -15,21 +15,10 @@ from megastep.types import Env
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "images"]
+__all__ = ["DisplayedEnv", "SceneryEnv", "Weight"]
 
 #: Weight of a part of a reward, a number or a schedule.
 Weight = Annotated[Number, Scheduled(ge=0, le=1000)]
-
-
-def images(view: engine.Observation) -> arrdict:
-    """Returns ``rgb`` (N, A, 3, C, P) and ``d`` (N, A, 1, C, P) as views of an observation's
-    tensors: an image has a row per camera.
-    """
-    rgb, d = view.rgb, view.depth
-    assert rgb is not None and d is not None
-    if rgb.ndim == 4:  # one camera
-        rgb, d = rgb.unsqueeze(2), d.unsqueeze(2)
-    return arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2))
 
 
 class DisplayedEnv:

@@ -1,4 +1,8 @@
-"""The visibility graph of homes, and the lengths of the shortest paths in it.
+"""The visibility graph of homes, and the lengths of the shortest paths of an agent's disc in it.
+
+Corners of polygons around the ends of walls see each other (Lozano-Perez and Wesley 1979);
+`kernels/shortest_paths.h` computes paths with the same bits on CPU and GPU. Every passage that is 5
+mm wider than an agent is found, and no length is more than a body can walk.
 
 D homes, W walls of all homes, V corners of all homes, G goals per home, P points, H x W cells.
 """
@@ -13,8 +17,6 @@ from megastep.dotdict import dotdict
 from megastep.engine.devices import threads
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import BLOCK, launch
-
-__all__ = ["CELL", "MAX_GOALS", "PathGraph"]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 CELL = 0.1  # metres, of fields

@@ -7,7 +7,7 @@ import torch
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
-from megastep.modules.lifecycle import CounterGenerator
+from megastep.modules.lifecycle import CounterGenerator, derived_seed
 from megastep.modules.spawning import MAX_SPAWNS, cached_points
 
 
@@ -46,7 +46,7 @@ class FreePoints:
         self.core, self.per_env = core, checks.integer("per_env", per_env, 1)
         n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
-        seed = seed + (4 << 32)  # differs from the spawns' seed
+        seed = derived_seed(seed, "points")
         n_layouts = len(core.scenery.layouts)
         if len(geometries) < n_layouts:
             raise ValueError(

@@ -13,6 +13,15 @@ from megastep.engine import checks
 ENDLESS = 2**31 - 1  # steps; the largest int32, which ages and limits are
 
 
+#: What draws by seeds derived from that of an environment.
+STREAMS = "spawns", "lifespans", "pointgoal", "ages", "points", "objects", "memory", "keys"
+
+
+def derived_seed(seed: int, stream: str) -> int:
+    """Returns the seed of one of an environment's random streams, named in ``STREAMS``."""
+    return seed + (STREAMS.index(stream) << 32)
+
+
 class CounterGenerator:
     """A counter-based random generator (Philox) with a counter per lane.
 
@@ -50,7 +59,7 @@ def random_ages(limits: torch.Tensor, seed: int) -> torch.Tensor:
     Returns:
         (B,) int32, uniform in [0, limit); 0 where the limit is ``ENDLESS``.
     """
-    generator = CounterGenerator(len(limits), seed + (3 << 32), limits.device)  # not the spawns'
+    generator = CounterGenerator(len(limits), derived_seed(seed, "ages"), limits.device)
     uniform = generator(torch.ones_like(limits, dtype=torch.bool))[:, 0]
     ages = (uniform.double() * limits).int()  # in double precision it stays below the limit
     return ages.masked_fill_(limits == ENDLESS, 0)
@@ -78,8 +87,8 @@ class RandomLifespans:
             )
         self.shortest, self.longest = shortest, longest
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
-        seed = seed + (1 << 32)  # differs from the spawns' seed
-        self.random = CounterGenerator(core.n_envs * core.n_agents, seed, core.device)
+        n_lanes, seed = core.n_envs * core.n_agents, derived_seed(seed, "lifespans")
+        self.random = CounterGenerator(n_lanes, seed, core.device)
 
     def draw(self, reset: torch.Tensor, limits: torch.Tensor) -> None:
         """Writes new lifespans into ``limits``, (B,) int32, where ``reset``, (B,) bool, is True."""

@@ -15,6 +15,7 @@ from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.engine.objects import MAX_OBJECTS, NUMBERS
+from megastep.modules.lifecycle import derived_seed
 from megastep.modules.spawning import MAX_SPAWNS, cached_points
 from megastep.ragged import RaggedNumpy
 
@@ -144,7 +145,7 @@ class Objects:
         core.scenery.objects = self.all
 
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
-        self.seed = seed + (5 << 32)  # differs from the spawns' seed
+        self.seed = derived_seed(seed, "objects")
         n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
         loose = [size * 2**0.5 if shape == "crate" else size for shape, size in zip(shapes, sizes)]
         radius = max(core.agents.radius, *loose)

@@ -3,6 +3,7 @@
 Axes: N environments, A agents, D layouts, P points, M walls.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from megastep import cache, engine
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
-from megastep.geometry import centers, content_hash
+from megastep.geometry import centers, contents
 from megastep.modules.lanes import to_agents
 
 CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
@@ -194,14 +195,6 @@ class RandomSpawns:
         return self._weights
 
 
-def _all_points(geometries, n, n_agents, radius, seed) -> np.ndarray:
-    points = [
-        spawn_points(g, n, n_agents, radius, np.random.Generator(np.random.Philox([seed, d])))
-        for d, g in enumerate(geometries)
-    ]
-    return np.stack(points).astype(np.float32)
-
-
 def cached_points(
     geometries: Sequence[dotdict], n: int, n_agents: int, radius: float, seed: int
 ) -> np.ndarray:
@@ -209,15 +202,13 @@ def cached_points(
 
     Keeps those of many layouts in the cache.
     """
-    arguments = n, n_agents, radius, seed
+
+    def build() -> dict[str, np.ndarray]:
+        generators = (np.random.Generator(np.random.Philox([seed, d])) for d in itertools.count())
+        points = [spawn_points(g, n, n_agents, radius, r) for g, r in zip(geometries, generators)]
+        return dict(points=np.stack(points).astype(np.float32))
+
     if len(geometries) < MIN_CACHED:
-        return _all_points(geometries, *arguments)
-    key = content_hash(geometries)
-    key.update(Path(__file__).read_bytes() + repr((np.__version__, arguments)).encode())
-
-    def build() -> bytes:
-        cache.prune(PREFIX, MAX_FILES - 1)
-        return _all_points(geometries, *arguments).tobytes()
-
-    body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
-    return np.frombuffer(body, np.float32).reshape(len(geometries), -1, 2).copy()
+        return build()["points"]
+    parts = Path(__file__), n, n_agents, radius, seed, *contents(geometries)
+    return cache.arrays(PREFIX, parts, build, MAX_FILES)["points"]

@@ -3,10 +3,8 @@
 Axes: D layouts, P points.
 """
 
-import hashlib
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from megastep import cache, engine
@@ -45,18 +43,11 @@ def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
     points = checks.floats("points", points, (len(layouts), "P", 2), device)
     if device.type != "cpu" or len(layouts) < MIN_CACHED:
         return _visible_from(scenery, points)
-    key = hashlib.sha256(Path(__file__).read_bytes() + repr(engine.AGENT_RADIUS).encode())
-    for name, text in ENGINE.sources(".h", ".cpp").items():
-        key.update(f"{name}\0{text}\0".encode())
-    for tensor in (layouts.lines.vals, layouts.wall_starts, layouts.texel_starts, points):
-        key.update(repr((tensor.shape, tensor.dtype)).encode() + tensor.numpy().tobytes())
-
-    def build() -> bytes:
-        cache.prune(PREFIX, MAX_FILES - 1)
-        return _visible_from(scenery, points).numpy().tobytes()
-
-    body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
-    return torch.from_numpy(np.frombuffer(body, np.int32).reshape(len(layouts), -1).copy())
+    tensors = layouts.lines.vals, layouts.wall_starts, layouts.texel_starts, points
+    parts = Path(__file__), ENGINE.sources(".h", ".cpp"), engine.AGENT_RADIUS
+    parts = *parts, *(tensor.numpy() for tensor in tensors)
+    build = lambda: dict(seen=_visible_from(scenery, points).numpy())  # noqa: E731
+    return torch.from_numpy(cache.arrays(PREFIX, parts, build, MAX_FILES)["seen"])
 
 
 def _visible_from(scenery, points) -> torch.Tensor:

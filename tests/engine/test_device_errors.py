@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from megastep import core, engine, scene, toys
-from megastep.envs.explorer.step import explorer_step
+from megastep.envs.explorer.explorer import explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
-from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
+from megastep.envs.pointgoal.goals import GoalFields
+from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS, pointgoal_step
 
 LAST = 3  # of four environments, so that the buffers end with it
 

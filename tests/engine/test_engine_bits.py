@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from megastep import cuda, engine, scene, toys
-from megastep.engine import devices, movement, rendering
+from megastep.engine import devices, operations, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
 from megastep.ragged import Ragged
@@ -88,7 +88,7 @@ def pretend(patch, amount, n_agents):
     """Makes 24 environments many, some or few."""
     n_threads = 24 * ROOMS[amount]
     patch.setattr(rendering, "n_resident_threads", lambda device: n_agents * n_threads)
-    patch.setattr(movement, "n_resident_threads", lambda device, n=32: n_threads * n // 32)
+    patch.setattr(operations, "n_resident_threads", lambda device, n=32: n_threads * n // 32)
 
 
 @pytest.mark.cuda
@@ -153,10 +153,10 @@ def test_threads_that_a_gpu_runs_at_once(monkeypatch):
 
 def test_threads_of_an_environment_on_an_h200(monkeypatch):
     room = {18: 132 * 18 * 64, None: 132 * 2048}
-    monkeypatch.setattr(movement, "n_resident_threads", lambda device, n=None: room[n])
+    monkeypatch.setattr(operations, "n_resident_threads", lambda device, n=None: room[n])
     counts = 1, 4752, 4753, 9504, 9505, 1_048_576
-    assert [movement._threads_per_env(n, None) for n in counts] == [32, 32, 16, 16, 8, 8]
-    kernels = [movement._kernel(n, None) for n in (1, 33_792, 33_793)]
+    assert [operations._threads_per_env(n, None) for n in counts] == [32, 32, 16, 16, 8, 8]
+    kernels = [operations._physics_kernel(n, None) for n in (1, 33_792, 33_793)]
     assert kernels == ["physics_unspilled", "physics_unspilled", "physics"]
 
 

@@ -8,7 +8,7 @@ import torch
 
 from megastep import capture, cuda, engine, scene, toys
 from megastep.dotdict import dotdict
-from megastep.engine import checks, devices
+from megastep.engine import devices
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, to_global
 from tests.helpers.synchronisation import no_synchronisation
@@ -291,40 +291,11 @@ def test_wrong_tensors_are_named(broken, description):
     cuda.render(core.scenery, core.agents)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda positions: positions.untyped_storage().resize_(0),
-        lambda positions: positions.untyped_storage().resize_(9),
-        lambda positions: positions.resize_(1, 1, 2),
-        lambda positions: setattr(positions, "data", positions.double()),
-    ],
-    ids=["no storage", "short storage", "shape", "dtype"],
-)
-def test_changed_memory_of_agents_is_named(change):
-    core = box("cpu")
-    cuda.render(core.scenery, core.agents)
-    change(core.agents.positions)
-    with pytest.raises(ValueError, match="agents.positions must be a contiguous torch.float32"):
-        cuda.render(core.scenery, core.agents)
-
-
 def test_agents_are_checked_for_each_scenery():
     core, more = box("cpu"), scene.scenery(3 * [toys.box()], n_agents=1, device="cpu")
     cuda.render(core.scenery, core.agents)
     with pytest.raises(ValueError, match=r"agents.positions must be .* \(3, 1, 2\)"):
         cuda.render(more, core.agents)
-
-
-def test_agents_are_checked_again_only_if_exchanged(monkeypatch):
-    core, address, checked = box("cpu"), checks.address, []
-    cuda.render(core.scenery, core.agents)
-    monkeypatch.setattr(checks, "address", lambda *args: checked.append(args[0]) or address(*args))
-    cuda.render(core.scenery, core.agents)
-    assert "agents.positions" not in checked
-    core.agents.positions = core.agents.positions.clone()
-    cuda.render(core.scenery, core.agents)
-    assert "agents.positions" in checked
 
 
 @pytest.mark.parametrize("n", [-1, 0, 10**6, "2", 2.0, True])

@@ -9,8 +9,8 @@ import torch
 
 from megastep import arrdict, contract, core, engine, envs, modules, plotting, scene, toys
 from megastep.agents.cli import evaluate, record, train
-from megastep.engine.outputs import Observation
-from megastep.envs.deathmatch.step import actions_of_live, deathmatch_step
+from megastep.engine.rendering import Observation
+from megastep.envs.deathmatch.deathmatch_step import actions_of_live, deathmatch_step
 from megastep.geometries import sample
 from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned, sound
 

@@ -5,7 +5,7 @@ import torch
 
 from megastep import contract, core, engine, envs, modules, scene, toys
 from megastep.arrdict import arrdict
-from megastep.envs.explorer.step import explorer_step
+from megastep.envs.explorer.explorer import explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.geometries import sample
 from tests.helpers import explorer_twin, random_scenery
@@ -109,7 +109,7 @@ def explorer(device, **settings):
 def test_episodes_match_twin(settings, device):
     """Every world of many short episodes is that of the twin, from the state before it."""
     env = explorer(device, **settings)
-    life, generator, n_ends = env.lifecycle, torch.Generator().manual_seed(1), 0
+    life, generator, n_ends = env, torch.Generator().manual_seed(1), 0
     world, before = env.reset(), None
     for _ in range(50):
         if before is not None:

@@ -12,8 +12,7 @@ import torch
 
 from megastep import core, engine, geometry, scene, toys
 from megastep.dotdict import dotdict
-from megastep.envs.pointgoal.geodesics import CELL, geodesics
-from megastep.geodesics import PathGraph
+from megastep.geodesics import CELL, PathGraph, geodesics
 from megastep.geometries import sample
 from megastep.modules.spawning import distances
 

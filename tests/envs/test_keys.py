@@ -9,7 +9,7 @@ import torch
 from megastep import contract, envs, toys
 from megastep.arrdict import arrdict
 from megastep.envs.keys.episodes import OPEN, Areas, _doors, cached_episodes, episodes
-from megastep.envs.keys.step import keys_step
+from megastep.envs.keys.keys import keys_step
 from megastep.geometries import sample
 from megastep.modules.objects import REACH
 from tests.helpers import keys_twin
@@ -185,7 +185,7 @@ def test_step_matches_twin(seed, device, monkeypatch):
         things = {name: getattr(objects, name).cpu().clone() for name in keys_twin.THINGS}
         expected, positions, things, state = keys_twin.keys_step(
             *(agents.positions[:, 0].cpu(), agents.radius, things, env.layout.cpu(), tables, state),
-            **(env.rules | env.weights.values | {"seed": env.seed, "reach": REACH}),
+            **(env.weights.values | {"seed": env.seed, "reach": REACH, "limit": env.limit}),
         )
         poison = Poison(torch.empty)
         with monkeypatch.context() as patch:
@@ -194,7 +194,7 @@ def test_step_matches_twin(seed, device, monkeypatch):
                 *(env.core.scenery, agents),
                 **env.tables,
                 **{name: getattr(env, name) for name in names},
-                **(env.rules | env.weights.tensors | {"seed": env.seed, "reach": REACH}),
+                **(env.weights.tensors | {"seed": env.seed, "reach": REACH, "limit": env.limit}),
             )
         poison.check(reward=out.reward, metrics=out.metrics, keys_obs=out.keys_obs)
         for name, value in expected.items():

@@ -6,8 +6,8 @@ import torch
 
 from megastep import contract, envs, toys
 from megastep.arrdict import arrdict
-from megastep.envs.memory.arrangements import arrangements
-from megastep.envs.memory.step import memory_step
+from megastep.envs.first_person import images
+from megastep.envs.memory.memory import arrangements, memory_step
 from megastep.geometries import sample
 from megastep.modules.objects import REACH
 from tests.helpers import memory_twin
@@ -98,7 +98,10 @@ def test_cameras_see_the_cue_s_colour():
     put(env, env.cue)
     env.core.agents.positions[:, 0, 0] -= 0.5
     env.core.agents.angles.zero_()
-    pixels, cue = env._view().rgb[:, 0, :, 0, 3:5].float(), world.obs.cue[:, 0, :, None].float()
+    pixels, cue = (
+        images(env._view()).rgb[:, 0, :, 0, 3:5].float(),
+        world.obs.cue[:, 0, :, None].float(),
+    )
     hues, expected = (x / x.sum(1, keepdim=True) for x in (pixels, cue))
     torch.testing.assert_close(hues, expected.expand_as(hues), atol=2e-3, rtol=0)
 

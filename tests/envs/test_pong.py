@@ -10,7 +10,7 @@ import torch
 from megastep import arrdict, contract, envs, plotting
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine import EngineError
-from megastep.envs.pong.step import pong_step
+from megastep.envs.pong.pong import pong_step
 from tests.helpers.pong_twins import NumpyPong, PythonPong, philox
 
 N, STEPS = 40, 500

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import geometries, geometry
+from megastep import geodesics, geometries, geometry
 from megastep.dotdict import dotdict
 from megastep.engine import AGENT_RADIUS
-from megastep.envs.pointgoal import geodesics
 from megastep.geodesics import PathGraph
 from megastep.geometries import checks, homes
 from megastep.geometries.homes import (

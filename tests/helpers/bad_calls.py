@@ -1,5 +1,5 @@
 """Calls of public engine functions with one wrong argument or buffer each: dtype, shape, memory
-layout, device, None, other types, numbers out of range, buffers that were replaced or resized.
+layout, device, None, other types, numbers out of range, buffers that were replaced.
 
 Run as a script, it makes them all and prints each first, so a crash of the interpreter shows its
 call:
@@ -11,7 +11,6 @@ N environments, A agents, D layouts.
 
 import json
 import math
-import operator
 import sys
 from types import SimpleNamespace
 
@@ -20,12 +19,12 @@ import torch
 
 from megastep import core, cuda, engine, modules, scene, toys
 from megastep.engine.scenery import Layouts, Scenery
-from megastep.envs.deathmatch.step import TALLY_ROWS, deathmatch_step
-from megastep.envs.explorer.step import explorer_step
+from megastep.envs.deathmatch.deathmatch_step import TALLY_ROWS, deathmatch_step
+from megastep.envs.explorer.explorer import explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
-from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
-from megastep.envs.pong.step import GAME_FIELDS, PIXELS, pong_step
+from megastep.envs.pointgoal.goals import GoalFields
+from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS, pointgoal_step
+from megastep.envs.pong.pong import GAME_FIELDS, PIXELS, pong_step
 from megastep.ragged import Ragged
 
 ALLOWED = (ValueError, TypeError, AttributeError, IndexError, engine.EngineError)
@@ -74,7 +73,7 @@ def fixture(device):
 
 
 def goal_fields(device):
-    """Right arguments of `GoalFields`."""
+    """Arguments of `GoalFields`."""
     return dict(
         points=D * [np.ones((2, 2))],
         fields=D * [np.ones((2, 3, 3), np.float16)],
@@ -109,23 +108,6 @@ def wrong_tensors(good):
     yield "not contiguous", torch.stack([good, good], -1)[..., 0]
     yield "on another device", good.to("cpu" if good.device.type == "cuda" else "meta")
     yield "sparse", good.to_sparse()
-    yield from unsound(good)
-
-
-def unsound(good):
-    """Tensors whose memory is not what their shape and dtype say."""
-    if good.numel():
-        yield "of an empty storage", in_storage(good.clone(), 0)
-        yield "of a short storage", in_storage(good.clone(), good.nbytes - 1)
-        yield "beyond its storage", in_storage(torch.cat([good, good])[len(good) :], good.nbytes)
-    if good.dtype != torch.bool:
-        yield "negated lazily", torch._neg_view(good)
-
-
-def in_storage(tensor, n_bytes):
-    """The tensor, after its storage was resized."""
-    tensor.untyped_storage().resize_(n_bytes)
-    return tensor
 
 
 def tensors(good):
@@ -151,23 +133,10 @@ def arrays(good):
     yield "complex", good.to(torch.complex64)
     yield "meta", good.to("meta")
     yield "sparse", good.to_sparse()
-    yield from (case for case in unsound(good) if case[0] != "negated lazily")
     if good.numel():
         yield "NaN", good * math.nan
         yield "infinite", good + math.inf
         yield "too large", good + 1e12
-
-
-def arrays_by_layout(good):
-    """Lists that do not hold one array per layout, or not one like `good`'s."""
-    array = good[0]
-    yield from [("None", None), ("a string", "text"), ("empty", []), ("of None", D * [None])]
-    yield from [("of strings", D * ["text"]), ("one more", [*good, array]), ("a number", 3.5)]
-    yield from [("of no rows", D * [array[:0]]), ("an axis more", D * [array[None]])]
-    if array.dtype == bool:
-        yield from [("of -1", D * [-array.astype(int)]), ("of False", D * [array & False])]
-    if array.dtype == float:
-        yield from [("NaN", D * [array * math.nan]), ("complex", D * [array * 1j])]
 
 
 def raggeds(good):
@@ -177,9 +146,6 @@ def raggeds(good):
     yield "NaN", Ragged(good.vals * math.nan, good.widths)
     yield "a subarray less", good[1:]
     yield "complex", Ragged(good.vals.to(torch.complex64), good.widths)
-    for label, vals in unsound(good.vals):
-        if label != "negated lazily":
-            yield label, Ragged(vals, good.widths)
 
 
 def integers(min, max=None):
@@ -228,7 +194,6 @@ def ids(good):
     yield from [("None", None), ("a string", "text"), ("floats", good.float()), ("2d", good[None])]
     yield from [("bools", good.bool()), ("negative", good - 9), ("too large", good + 10**6)]
     yield from [("none", good[:0]), ("huge", good.long() + 2**40)]
-    yield from (case for case in unsound(good) if case[0] != "negated lazily")
 
 
 # ---- The calls: function, right arguments, and the wrong values of each ----
@@ -319,7 +284,6 @@ def operations(f):
             **dict.fromkeys(("games", "actions"), tensors),
             error_flag=lambda good: [c for c in tensors(good) if c[0] != "not contiguous"],
             seed=seeds,
-            restart=flags,
             points=limits,
             limit=limits,
             tracker_speed=numbers(-0.1, 40),
@@ -419,17 +383,12 @@ def constructors(f):
             device=device,
         ),
     )  # fmt: skip
-    each = dict.fromkeys(
-        ("points", "origins", "spawns", "lengths", "allowed", "fields"), arrays_by_layout
-    )
-    yield GoalFields, goal_fields(f.device), dict(each, cell=numbers(0, -1), device=device)
     yield engine.set_threads, dict(n=None), dict(n=lambda good: [*integers(1, 10**6 - 1)(1)][1:])
     yield f.scenery.env, dict(e=0), dict(e=integers(-N, N - 1))
 
 
-# ---- Buffers that were replaced or resized before a call ----
+# ---- Buffers that were replaced before a call ----
 
-READ_ONLY = "model", "model_texels", "wall_starts", "texel_starts", "light_starts", "box_starts"
 CALLS = {
     "render": lambda f: engine.render(f.scenery, f.agents),
     "physics": lambda f: engine.physics(f.scenery, f.agents),
@@ -437,13 +396,7 @@ CALLS = {
 }
 STATE = "positions", "angles", "velocity", "angvelocity"
 SETTINGS = dict(res=10**6, fov=0.0, fps=0.0, radius=-1.0)
-OF_SCENERY = "layout", "agent_lines", "agent_light", "model", "model_texels"
-OF_LAYOUTS = "texels", "agent_textures", "wall_starts", "texel_starts", "light_starts", "box_starts"
-BUFFERS = {name: operator.attrgetter(f"scenery.{name}") for name in OF_SCENERY}
-BUFFERS |= {name: operator.attrgetter(f"layouts.{name}") for name in OF_LAYOUTS}
-BUFFERS |= {name: operator.attrgetter(f"layouts.{name}.vals") for name in ("lines", "lights")}
 OF_AGENTS = "yaws", "ray_lengths", "error_flag"
-BUFFERS |= {name: operator.attrgetter(f"agents.{name}") for name in OF_AGENTS}
 
 
 def replacements(device):
@@ -475,35 +428,6 @@ def _set(owner, name, value, call):
         CALLS[call](f)
 
     return act
-
-
-def resizings(device):
-    """(label, name, act): exchanges a buffer's memory between two calls."""
-    f = fixture(device)
-
-    def between_calls(change):
-        return lambda f: (CALLS["render"](f), change(f), CALLS["render"](f))
-
-    def exchange(buffer, make):
-        return between_calls(lambda f: setattr(buffer(f), "data", make(buffer(f))))
-
-    for name, buffer in BUFFERS.items():
-        yield f"{name}.resize_(0)", name, between_calls(lambda f, b=buffer: b(f).resize_(0))
-        shorten = lambda f, b=buffer: b(f).resize_(len(b(f)) - 1, *b(f).shape[1:])  # noqa: E731
-        yield f"{name}.resize_ by a row", name, between_calls(shorten)
-        yield f"{name}.data a row less", name, exchange(buffer, lambda t: t[1:].clone())
-        yield f"{name}.data of float64", name, exchange(buffer, lambda t: t.clone().double())
-        yield f"{name}.data empty", name, exchange(buffer, lambda t: t.new_empty(0))
-        resizable = buffer(f).untyped_storage().resizable()  # not if it is a NumPy array's
-        for n_bytes in (0, 3) if resizable else ():
-            shrink = lambda f, b=buffer, n=n_bytes: b(f).untyped_storage().resize_(n)  # noqa: E731
-            label = f"{name}, a storage of {n_bytes} bytes"
-            yield label, None if name in READ_ONLY else name, between_calls(shrink)
-    for name in ("textures", "baked"):
-        views = lambda f, name=name: getattr(f.layouts, name).vals  # noqa: E731
-        yield f"{name}.vals.data elsewhere", name, exchange(views, torch.clone)
-    texels = lambda f: f.layouts.texels  # noqa: E731
-    yield "texels.data elsewhere", "texels", exchange(texels, torch.clone)
 
 
 def others(device):
@@ -559,7 +483,7 @@ def cases(device):
         if name is None:
             shared = fixture(device)
         yield label, name, act, shared
-    for source in (replacements, resizings, others):
+    for source in (replacements, others):
         yield from ((*case, fixture(device)) for case in source(device))
 
 

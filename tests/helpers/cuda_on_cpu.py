@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 
-from megastep.engine import movement, rendering
-from megastep.kernels.build import compile, headers
+from megastep.engine import operations, rendering
+from megastep.kernels.build import compile
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
 HEADER = Path(__file__).with_name("blocks_on_cpu.h")
@@ -32,6 +32,14 @@ SCHEDULES = ("forward", False), ("reversed", True), ("shuffled", False), ("shuff
 BACKEND = """
 #undef KERNEL
 #include "common/backend.h"
+#undef EACH
+#define EACH(operation, Params, count, threads, statement) \\
+    KERNEL operation(Params p) { \\
+        wait_for_previous(); \\
+        int n = count, i = blockIdx.x * blockDim.x + threadIdx.x; \\
+        if (i < n) \\
+            statement; \\
+    }
 #define BOUNDS(n_blocks)
 #define PREFETCH(address)
 constexpr unsigned int FULL_WARP = ~0u;
@@ -138,17 +146,16 @@ class CudaOnCpu:
         for name, replacement in REPLACED.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_text(replacement.read_text())
-        kernels = library.sources(".cu")
         lines = [f'#include "{HEADER.name}"']
         lines += [BACKEND] * ("--fmad=false" in library.cuda_flags)
-        lines += [f'#include "{name}"' for name in ("params.h", *kernels)]
+        lines += [compile.joined(library.sources(".h", ".cu"))]
         lines += [
             f'extern "C" const char* run_{operation}(const {struct}* p, unsigned int x, '
             f"unsigned int y, unsigned int n_threads, unsigned int n_shared, "
             f"unsigned int n_cluster, Order thread_order, int is_late) "
             f"{{ return launch_blocks({operation}, *p, x, y, n_threads, n_shared, n_cluster, "
             f"thread_order, is_late); }}"
-            for operation, struct in headers.operations(kernels).items()
+            for operation, struct in library.cuda_operations.items()
         ]
         source, binary = folder / "all.cpp", folder / "all.so"
         source.write_text("\n".join(lines))
@@ -160,7 +167,7 @@ class CudaOnCpu:
     def install(self, monkeypatch):
         """Replaces `launch` in all modules that import it."""
         self.launched.clear()
-        for module in movement, rendering:
+        for module in operations, rendering:
             monkeypatch.setattr(module, "n_resident_threads", lambda *_: RESIDENT_THREADS)
         for path, module in list(sys.modules.items()):
             if path.startswith("megastep.") and vars(module).get("launch") is launch:

@@ -14,12 +14,12 @@ from megastep.agents.networks.kernels.mingru_step import LIBRARY as ACTING
 from megastep.agents.selfplay.opponents import LIBRARY as SELFPLAY
 from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.agents.training.episode_stats import LIBRARY as TRAINING
-from megastep.envs.deathmatch.step import LIBRARY as DEATHMATCH
-from megastep.envs.explorer.step import LIBRARY as EXPLORER
-from megastep.envs.keys.step import LIBRARY as KEYS
-from megastep.envs.memory.step import LIBRARY as MEMORY
-from megastep.envs.pointgoal.step import LIBRARY as POINTGOAL
-from megastep.envs.pong.step import LIBRARY as PONG
+from megastep.envs.deathmatch.deathmatch_step import LIBRARY as DEATHMATCH
+from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
+from megastep.envs.keys.keys import LIBRARY as KEYS
+from megastep.envs.memory.memory import LIBRARY as MEMORY
+from megastep.envs.pointgoal.pointgoal import LIBRARY as POINTGOAL
+from megastep.envs.pong.tracker import LIBRARY as PONG
 from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
@@ -52,7 +52,10 @@ def test_packed_structs_have_the_compilers_layout(library, tmp_path):
     """A compiler reads every field of every packed struct with the value that was packed."""
     structs = headers.struct_fields(library.sources(".h"))
     assert structs.keys() == vars(library.params).keys()
-    packed, code = {}, '#include "common/objects.h"\n#include "params.h"\n'
+    names = [*filter(lambda name: "/" not in name, library.sources(".h"))]
+    declaring = [name for name in names if headers.STRUCT.search(library.sources(".h")[name])]
+    packed, code = {}, '#include "common/objects.h"\n'
+    code += "".join(f'#include "{name}"\n' for name in declaring)
     for name, fields in structs.items():
         values = {field: position + 1 for position, (field, _) in enumerate(fields)}
         values |= {field: bytes(int(kind[2:-1])) for field, kind in fields if kind[-1] == "s"}

@@ -361,9 +361,7 @@ def test_wrong_actions_are_named(name):
 def test_wrong_continuous_actions_are_named():
     move = modules.SimpleMovement(core_of([toys.box()]), control="continuous")
     right = torch.zeros((move.core.n_envs, 1, 3))
-    shrunken = right.clone()
-    shrunken.untyped_storage().resize_(8)
-    wrongs = right[1:], right.mT, right.double(), right.long(), right[..., 0], shrunken, None
+    wrongs = right[1:], right.mT, right.double(), right.long(), right[..., 0], None
     for wrong in (*wrongs, right.to("meta")):
         with pytest.raises((TypeError, ValueError), match="^actions must be .*, 3 for each .* was"):
             move(dict(actions=wrong))
@@ -396,8 +394,6 @@ def test_continuous_actions_are_fractions_of_the_speeds():
     ids=lambda value: getattr(value, "__name__", value),
 )
 def test_wrong_settings_of_modules_are_named(make, name):
-    without_memory = torch.ones(1, dtype=torch.int64)
-    without_memory.untyped_storage().resize_(0)  # PyTorch crashes where it is read
-    for wrong in ("text", math.nan, [1], without_memory):
+    for wrong in ("text", math.nan, [1]):
         with pytest.raises(ValueError, match=f"^{name} must be .* was given"):
             make(core_of([toys.box()]), **{name: wrong})

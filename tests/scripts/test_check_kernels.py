@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_finds_every_folder_with_cuda_kernels():
     folders = {library.folder.resolve() for library in check_kernels.libraries()}
     files = [*(ROOT / "megastep").glob("**/*.cu"), *(ROOT / "agents").glob("**/*.cu")]
+    files += [path for path in (ROOT / "megastep").glob("**/*.h") if "\nEACH(" in path.read_text()]
     assert folders == {file.resolve().parent for file in files}
 
 

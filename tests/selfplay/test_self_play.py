@@ -9,7 +9,7 @@ from megastep import capture
 from megastep.agents.cli import evaluate, train
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.engine import devices
-from megastep.envs.pong.step import CELL
+from megastep.envs.pong.pong import CELL
 from tests.cli.test_duels import PONG, UPDATE
 from tests.cli.test_train import configured
 from tests.helpers import pages

@@ -8,7 +8,7 @@ import torch
 from megastep.arrdict import arrdict
 from megastep.engine import checks
 from megastep.engine.devices import threads
-from megastep.envs.deathmatch.step import LIBRARY
+from megastep.envs.deathmatch.deathmatch_step import LIBRARY
 from megastep.kernels.build.launch import WARP, launch
 
 _STATE = dict(lost=torch.int64, side=torch.int64, around=torch.int64, pushed=torch.bool)

@@ -1,5 +1,5 @@
-"""Keys: the environment, its step as one operation (with its kernel), and its episodes."""
+"""Keys: the environment, and its step as one operation with its kernel."""
 
-from megastep.envs.keys.env import Keys
+from megastep.envs.keys.keys import Keys, KeysStep, keys_step
 
-__all__ = ["Keys"]
+__all__ = ["Keys", "KeysStep", "keys_step"]

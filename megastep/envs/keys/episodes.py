@@ -8,7 +8,6 @@ zone that is open by then. So every episode can be solved. The goal is in the zo
 D layouts, M episodes per layout, C colours, K doorways.
 """
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -70,18 +69,9 @@ def cached_episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed:
     arguments = n, n_colours, seed
     if len(geometries) < MIN_CACHED:
         return episodes(geometries, *arguments)
-    key = geometry.content_hash(geometries)
-    key.update(Path(__file__).read_bytes() + repr((np.__version__, arguments)).encode())
-
-    def build() -> bytes:
-        cache.prune(PREFIX, MAX_FILES - 1)
-        file = io.BytesIO()
-        np.savez_compressed(file, *episodes(geometries, *arguments))
-        return file.getvalue()
-
-    body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
-    with np.load(io.BytesIO(body)) as arrays:
-        return Episodes(*arrays.values())
+    parts = Path(__file__), arguments, *geometry.contents(geometries)
+    build = lambda: episodes(geometries, *arguments)._asdict()  # noqa: E731
+    return Episodes(**cache.arrays(PREFIX, parts, build, MAX_FILES))
 
 
 def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:

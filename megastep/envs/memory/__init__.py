@@ -1,5 +1,5 @@
-"""Memory: the environment, its step as one operation (with its kernel), and where objects lie."""
+"""Memory: the environment, and its step as one operation with its kernel."""
 
-from megastep.envs.memory.env import Memory
+from megastep.envs.memory.memory import Memory, MemoryStep, memory_step
 
-__all__ = ["Memory"]
+__all__ = ["Memory", "MemoryStep", "memory_step"]

@@ -1,5 +1,5 @@
-"""PointGoal: the environment, its step as one operation (with its kernel), and shortest paths."""
+"""PointGoal: the environment, and its step as one operation with its kernel."""
 
-from megastep.envs.pointgoal.env import PointGoal
+from megastep.envs.pointgoal.pointgoal import PointGoal, PointGoalStep, pointgoal_step
 
-__all__ = ["PointGoal"]
+__all__ = ["PointGoal", "PointGoalStep", "pointgoal_step"]

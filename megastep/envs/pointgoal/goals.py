@@ -1,9 +1,9 @@
-"""Goals and shortest paths of layouts, computed once per layout and cached.
+"""Goals of layouts, and the lengths of the shortest paths to them, computed once per layout and
+cached.
 
-D layouts, S spawn points and G goals per layout.
+D layouts, S spawn points and G goals per layout, H x W cells.
 """
 
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -11,13 +11,11 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from megastep import cache, engine
+from megastep import cache, engine, geodesics
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics, n_cells
-from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.geodesics import path_graph
-from megastep.geometry import content_hash
+from megastep.geodesics import CELL, Geodesics
+from megastep.geometry import contents
 from megastep.kernels.build.kernel_library import KERNELS
 from megastep.modules import spawning
 
@@ -29,21 +27,74 @@ MIN_PROGRESS = 48  # layouts; fewer take less than a second or two
 #: Sources that the results depend on: a change invalidates the cache.
 SOURCES = (
     Path(__file__),
-    Path(__file__).with_name("geodesics.py"),
-    Path(path_graph.__file__),
-    *sorted(path_graph.LIBRARY.folder.glob("*.[hc]*")),
+    *sorted(Path(geodesics.__file__).parent.glob("**/*.[hcp]*")),
     *sorted((KERNELS / "common").glob("*.h")),
     Path(spawning.__file__),
 )
 N_GOALS = 16  # per layout
 N_SPAWNS = 128
-#: Fields of Geodesics whose shape is the same for all layouts.
-REST = {
-    "origin": (2,),
-    "spawns": (N_SPAWNS, 2),
-    "goals": (N_GOALS, 2),
-    "lengths": (N_SPAWNS, N_GOALS),
-}
+
+
+class GoalFields:
+    """The goals of a scenery's layouts, as :func:`~megastep.envs.pointgoal.pointgoal_step` reads
+    them.
+
+    Args:
+        points: D arrays (G, 2) metres, the goals.
+        fields: D arrays (G, H, W) float16 of at least 2 x 2 square cells, row 0 at the bottom:
+            metres to each goal from the centre of a cell by the shortest path, infinite if there is
+            none. Layouts may share an array.
+        origins: D arrays (2,) metres, the centre of the first cell.
+        spawns: D arrays (S, 2) metres, the spawn points.
+        lengths: D arrays (S, G) metres, of the shortest paths from spawn points to goals.
+        allowed: D arrays (S, G) bool, the goals that may be drawn; at least one per spawn point.
+        cell: side of a cell in metres.
+        device: where to put the tensors.
+
+    Attributes:
+        points: (D, G, 2) float32.
+        spawns: (D, S, 2) float32.
+        addresses: {field of PointgoalStepParams: address}.
+    """
+
+    IS_STATELESS = True  # nothing of it changes
+
+    def __init__(
+        self,
+        points: Sequence[np.ndarray],
+        fields: Sequence[np.ndarray],
+        origins: Sequence[np.ndarray],
+        spawns: Sequence[np.ndarray],
+        lengths: Sequence[np.ndarray],
+        allowed: Sequence[np.ndarray],
+        cell: float = CELL,
+        device: torch.device | str = "cpu",
+    ):
+        self.cell, self.n_layouts = cell, len(fields)
+        self.n_goals, self.n_spawns = len(points[0]), len(spawns[0])
+        is_allowed = np.stack(allowed)
+        lengths = np.where(is_allowed, np.stack(lengths), 0.0)  # of others it may be infinite
+        distinct = {id(field): field for field in fields}
+        ends = np.cumsum([field.size for field in distinct.values()])
+        starts = {key: end - field.size for (key, field), end in zip(distinct.items(), ends)}
+        arrays = dict(
+            points=np.stack(points).astype(np.float32),
+            origins=np.stack(origins).astype(np.float32),
+            lengths=lengths.astype(np.float32),
+            fields=np.concatenate([field.reshape(-1) for field in distinct.values()]),
+            starts=np.array([starts[id(field)] for field in fields], np.int64),
+            shapes=np.array([field.shape[1:] for field in fields], np.int32),
+            in_range=np.argsort(~is_allowed, axis=2, kind="stable").astype(np.int32),
+            n_in_range=is_allowed.sum(2, dtype=np.int32),
+        )
+        self._tensors = {name: torch.from_numpy(a).to(device) for name, a in arrays.items()}
+        self.points = self._tensors["points"]
+        self.spawns = torch.from_numpy(np.stack(spawns).astype(np.float32)).to(device)
+        self.device = self.points.device
+
+    @property
+    def addresses(self) -> dict[str, int]:
+        return {name: tensor.data_ptr() for name, tensor in self._tensors.items()}
 
 
 def goal_fields(
@@ -74,7 +125,7 @@ def goal_fields(
     seed = core.seed if seed is None else seed
     device = core.device
     geometries = geometries[: len(core.scenery.layouts)]
-    n_bytes = [2 * N_GOALS * n_cells(g) for g in geometries]  # of fields in fp16
+    n_bytes = [2 * N_GOALS * geodesics.n_cells(g) for g in geometries]  # of fields in fp16
     engine.fit(len(geometries), float(np.mean(n_bytes)), device, "layouts")
     layouts = all_geodesics(geometries, core.agents.radius, seed, device)
     spawns, lengths, allowed = zip(
@@ -121,7 +172,7 @@ def all_geodesics(
     """
     distinct = list({id(g): g for g in geometries}.values())
     generators = [np.random.Generator(np.random.Philox([seed, d])) for d in range(len(distinct))]
-    found = geodesics(distinct, N_SPAWNS, N_GOALS, radius, generators, device)
+    found = geodesics.geodesics(distinct, N_SPAWNS, N_GOALS, radius, generators, device)
     if torch.device(device).type == "cpu":
         found = _cached(found, distinct, radius, seed)
     by_id = dict(zip(map(id, distinct), found, strict=True))
@@ -130,35 +181,21 @@ def all_geodesics(
 
 def _cached(found, geometries, radius, seed) -> list[Geodesics]:
     """Returns the list of what the iterator `found` yields, from the cache if it holds it."""
-    key = content_hash(geometries)
-    for path in SOURCES:
-        key.update(path.read_bytes())
-    key.update(repr((np.__version__, radius, seed)).encode())
 
-    def build() -> bytes:
+    def build() -> dict[str, np.ndarray]:
         layouts = list(_with_progress(found, len(geometries)))
-        shapes = np.array([layout.fields.shape for layout in layouts], np.int64)
-        parts = [np.stack([getattr(layout, name) for layout in layouts]) for name in REST]
-        parts = [shapes, *parts, *(layout.fields for layout in layouts)]
-        cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - sum(part.nbytes for part in parts))
-        return b"".join(np.ascontiguousarray(part).data for part in parts)
+        rest = [name for name in Geodesics._fields if name != "fields"]
+        arrays = {name: np.stack([getattr(layout, name) for layout in layouts]) for name in rest}
+        shapes = np.array([layout.fields.shape for layout in layouts])
+        flat = np.concatenate([layout.fields.reshape(-1) for layout in layouts])
+        return dict(arrays, shapes=shapes, flat=flat)
 
-    body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
-    n, start = len(geometries), 0
-
-    def read(shape, dtype) -> np.ndarray:
-        nonlocal start
-        array = np.frombuffer(body, dtype, math.prod(shape), start).reshape(shape)
-        start += array.nbytes
-        return array
-
-    shapes = read((n, 3), np.int64)
-    rest = [read((n, *shape), np.float32) for shape in REST.values()]
-    fields = [read(shape, np.float16) for shape in shapes.tolist()]
-    return [
-        Geodesics(fields=field, **dict(zip(REST, values)))
-        for field, *values in zip(fields, *rest, strict=True)
-    ]
+    parts = *SOURCES, radius, seed, *contents(geometries)
+    arrays = cache.arrays(PREFIX, parts, build, MAX_FILES, MAX_BYTES)
+    shapes, flat = arrays.pop("shapes"), arrays.pop("flat")
+    fields = np.split(flat, shapes.prod(1).cumsum()[:-1])
+    arrays["fields"] = [field.reshape(shape) for field, shape in zip(fields, shapes)]
+    return [Geodesics(*parts) for parts in zip(*(arrays[name] for name in Geodesics._fields))]
 
 
 def _with_progress(items: Iterable[T], total: int) -> Iterable[T]:

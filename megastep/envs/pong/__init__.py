@@ -1,6 +1,6 @@
-"""Pong: the environment, its scripted bot, and its step as one operation (with its kernel)."""
+"""Pong: the environment, its step as one operation with its kernel, and a scripted policy."""
 
-from megastep.envs.pong.bot import Tracker as Tracker
-from megastep.envs.pong.env import Pong
+from megastep.envs.pong.pong import Pong, PongStep, pong_step
+from megastep.envs.pong.tracker import Tracker
 
-__all__ = ["Pong"]
+__all__ = ["Pong", "PongStep", "Tracker", "pong_step"]

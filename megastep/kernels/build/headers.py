@@ -6,8 +6,8 @@ Three kinds of declarations are recognised:
 * structs whose names end in ``Params``, one field per line: ``const float* positions;``, or an
   array of such structs: ``LeafParams leaves[4];``
 * constants in files called ``constants.h``, one per line: ``constexpr int MAX_RES = 1024;``
-* operations: ``KERNEL render(RenderParams p)`` in a source, or ``EACH(uniform, UniformParams, ...)``
-  in a header, for the CPU and the GPU
+* operations: ``KERNEL render(RenderParams p)`` in a source, or in a header, for CPU and GPU,
+  ``EACH(uniform, UniformParams, ...)``
 """
 
 import re

@@ -61,10 +61,10 @@ class KernelLibrary:
     """The kernels in one folder, which are built together when one is first launched.
 
     The folder holds operations: for the CPU in ``.cpp`` files, for the GPU in ``.cu`` files, or for
-    both as EACH in a header, which nothing else includes; other headers; ``params.h``, which declares the struct of each launch; and ``constants.h`` if
-    the kernels share constants with Python. Sources include the folder's headers by name and the
-    common ones as ``"common/errors.h"``. :mod:`~megastep.kernels.build.headers` lists the
-    declarations that are read from headers.
+    both as EACH in a header, which nothing else includes. Headers declare the struct of each
+    launch; ``constants.h`` holds what the kernels share with Python. Sources include the folder's
+    headers by name and the common ones as ``"common/errors.h"``.
+    :mod:`~megastep.kernels.build.headers` lists the declarations that are read from headers.
 
     Args:
         folder: where the sources are.

@@ -22,7 +22,6 @@ struct PongStepParams {
     unsigned int key1;
     int n_envs;         // N
     int n_sides;        // 2: both paddles act; 1: the left one, against the tracker
-    int restart;        // 1: every environment starts a new game
     int points;         // needed to win a game
     int limit;          // steps per game
     int tracker_speed;  // per step
@@ -182,7 +181,7 @@ HD Image image_of(const Game& g, int side) {
 HD Game pong_env(const PongStepParams& p, int env) {
     Game g;
     load_game(g, p.games, p.n_envs, env);
-    int reset = p.restart || g.ended, winner = -1, terminal = 0;
+    int reset = g.ended != 0, winner = -1, terminal = 0;
     if (reset) {
         new_game(g, p, env);
     } else {

@@ -1,12 +1,7 @@
-"""Shortest paths of an agent's disc between walls, to random goals from anywhere in a home.
+"""Random goals and spawn points of homes, and the shortest paths between them. A *field* holds the
+lengths to one goal from the centres of a grid's cells.
 
-Paths are shortest in a visibility graph (Lozano-Perez and Wesley 1979) between corners of polygons
-around the ends of walls; `kernels/shortest_paths.h` computes it, with the same bits on CPU and GPU.
-Every passage that is 5 mm wider than an agent is found, and no length is more than a body can walk.
-A *field* holds the lengths to one goal from the centres of a grid's cells.
-
-D homes, W walls of all homes, V corners of all homes, S spawn points and G goals per home, P
-points, H x W cells.
+D homes, S spawn points and G goals per home, K points, H x W cells.
 """
 
 import itertools
@@ -18,10 +13,8 @@ import torch
 
 from megastep.dotdict import dotdict
 from megastep.engine.devices import threads
-from megastep.geodesics import CELL, MAX_GOALS, PathGraph
+from megastep.geodesics.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
-
-__all__ = ["CELL", "Geodesics", "draw_points", "geodesics", "largest_part", "n_cells"]
 
 SPARE = 1.5  # times as many points are drawn as needed, as some may be in rooms without a door
 #: Cells of the homes that are searched at once, per thread on a CPU, where signals are handled

@@ -10,7 +10,7 @@ from megastep.engine import checks
 from megastep.engine.agents import Agents
 from megastep.engine.devices import threads
 from megastep.engine.launch_params import lanes_of, state_params
-from megastep.engine.outputs import Observation
+from megastep.engine.rendering import Observation
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
@@ -129,57 +129,43 @@ def deathmatch_step(
     if agents.n_cameras > 1:
         raise ValueError(f"deathmatch_step takes one camera per agent, not {agents.n_cameras}")
     checks.instance("view", view, Observation)
-    health_rules = dict(
-        damage=damage, recovery=recovery, drain=drain, health_per_hit=health_per_hit
-    )
     rewards = dict(hit_reward=hit_reward, wound_cost=wound_cost, kill_reward=kill_reward)
     rewards |= dict(death_cost=death_cost, aim_reward=aim_reward)
-    not_negative = dict(health_rules, hearing=hearing)
-    for name, value in dict(not_negative, search_reward=search_reward).items():
-        checks.number(name, value, -math.inf, math.inf)
     rewards = {name: checks.weight(name, value, device) for name, value in rewards.items()}
-    for name, value in not_negative.items():
-        if value < 0:
+    rules = dict(damage=damage, recovery=recovery, drain=drain, health_per_hit=health_per_hit)
+    rules |= dict(hearing=hearing)
+    for name, value in dict(rules, search_reward=search_reward).items():
+        checks.number(name, value, -math.inf, math.inf)
+        if name in rules and value < 0:
             raise ValueError(f"{name} must be at least 0, not {value:g}")
-    agent_ray, poses = 0, dict(positions=0, angles=0)
-    is_scheduled = isinstance(aim_reward, torch.Tensor)
-    if view.agent_ray is not None if is_scheduled else aim_reward:
-        agent_ray = checks.address("view.agent_ray", view.agent_ray, lanes, torch.int32, device)
-    newly_seen = rounds = 0
-    if search_reward:
-        newly_seen = checks.address("view.newly_seen", view.newly_seen, lanes, torch.int32, device)
-    if round_ages is not None:
-        rounds = checks.address("round_ages", round_ages, (n,), torch.int32, device)
+    is_scheduled, poses = isinstance(aim_reward, torch.Tensor), dict(positions=0, angles=0)
+    has_aim = view.agent_ray is not None if is_scheduled else aim_reward
+    wanted = dict(centre_line=True, agent_ray=has_aim, newly_seen=search_reward)
+    int32 = torch.int32, device
+    seen = {
+        name: checks.address(f"view.{name}", getattr(view, name), lanes, *int32) if is_wanted else 0
+        for name, is_wanted in wanted.items()
+    }
     if checks.flag("privileged", privileged) or hearing:
         poses = state_params(scenery, agents, "positions", "angles")
     flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
-    out = DeathmatchStep(
-        torch.empty(n_lanes, device=device),
-        *flags,
-        metrics=torch.empty((4, n_lanes), device=device),
-        health_obs=torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device),
-        sound=(
-            torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device) if hearing else None
-        ),
-        privileged=(
-            torch.empty((n_lanes, 1, privileged_size(a)), device=device) if privileged else None
-        ),
-    )
+    metrics, reward = torch.empty((4, n_lanes), device=device), torch.empty(n_lanes, device=device)
+    health_obs = torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device)
+    sound = torch.empty_like(health_obs) if hearing else None
+    size = n_lanes, 1, privileged_size(a)
+    privileged_out = torch.empty(size, device=device) if privileged else None
+    out = DeathmatchStep(reward, *flags, metrics, health_obs, sound, privileged_out)
     launch(
         *(LIBRARY, "deathmatch_step", device, n),
-        centre_line=checks.address(
-            "view.centre_line", view.centre_line, lanes, torch.int32, device
-        ),
-        agent_ray=agent_ray,
-        newly_seen=newly_seen,
-        round_ages=rounds,
+        **seen,
         **poses,
+        round_ages=checks.optional("round_ages", round_ages, (n,), *int32),
         health=checks.address("health", health, (n_lanes,), torch.float32, device),
         tally=checks.address("tally", tally, (TALLY_ROWS, n_lanes), torch.float32, device),
-        ages=checks.address("ages", ages, (n_lanes,), torch.int32, device),
+        ages=checks.address("ages", ages, (n_lanes,), *int32),
         ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
         **out._asdict(),
-        **not_negative,
+        **rules,
         **rewards,
         search_reward=search_reward,
         limit=checks.integer("limit", limit, 1, 2**31 - 1),

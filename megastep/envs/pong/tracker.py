@@ -1,14 +1,23 @@
 """A scripted policy for Pong that acts on observations alone. B lanes."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 
 from megastep.arrdict import arrdict
-from megastep.envs.pong.step import FEATURES, LIBRARY, PIXELS
+from megastep.kernels.build.kernel_library import KernelLibrary
 
 __all__ = ["Tracker"]
 
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
+FEATURES, PIXELS = (
+    LIBRARY.constants["N_FEATURES"],
+    (
+        LIBRARY.constants["ROWS"],
+        LIBRARY.constants["COLUMNS"],
+    ),
+)
 NOTHING, UP, DOWN = 0, 1, 2
 PADDLE_ROWS, PADDLE_GREY, BALL_GREY = (
     LIBRARY.constants[name] for name in ("PADDLE_ROWS", "PADDLE_GREY", "BALL_GREY")

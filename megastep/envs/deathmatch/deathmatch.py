@@ -18,13 +18,14 @@ from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.envs.common import SceneryEnv
 from megastep.envs.deathmatch.bot import Bot
-from megastep.envs.deathmatch.step import (
+from megastep.envs.deathmatch.deathmatch_step import (
     MAX_AGENTS,
     TALLY_ROWS,
     actions_of_live,
     deathmatch_step,
     privileged_size,
 )
+from megastep.envs.first_person import images
 from megastep.scene import scenery, spread
 from megastep.schedules import Number, Scheduled
 from megastep.settings import MAX_ENVS, checked
@@ -42,6 +43,11 @@ SPAWNS_PER_AGENT = 16  # at least, so that one is likely hidden from the other a
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Reward = Annotated[float, Field(ge=-1000, le=1000)]
 ScheduledReward = Annotated[Number, Scheduled(ge=-1000, le=1000)]
+
+
+def by_lane(obs) -> arrdict:
+    """Returns observations (N, A, ...) as (B, 1, ...)."""
+    return obs.map(lambda leaf: leaf.flatten(0, 1).unsqueeze(1))
 
 
 class Deathmatch(SceneryEnv):
@@ -236,7 +242,10 @@ class Deathmatch(SceneryEnv):
         other ``rules`` than usual if given.
         """
         self.spawner(self.ended)
-        view = self._view(**self._search_arguments())
+        search = {}
+        if self.seen is not None:  # counts newly seen texels
+            search = dict(seen=self.seen, clear_mask=self.ended.view(self.n_envs, self.n_agents))
+        view = self._view(**search)
         step = deathmatch_step(
             self.core.scenery,
             self.core.agents,
@@ -251,7 +260,7 @@ class Deathmatch(SceneryEnv):
             **self.weights.tensors,
         )
         world = arrdict(
-            obs=arrdict(self._images(view), health=step.health_obs),
+            obs=arrdict(by_lane(images(view)), health=step.health_obs),
             reward=step.reward,
             reset=step.reset,
             terminal=step.terminal,
@@ -263,13 +272,6 @@ class Deathmatch(SceneryEnv):
         if step.privileged is not None:
             world["privileged"] = step.privileged
         return world
-
-    def _search_arguments(self) -> dict[str, torch.Tensor]:
-        """The arguments of observe that count newly seen texels, if search_reward is not 0."""
-        if self.seen is None:
-            return {}
-        starts = self.ended.view(self.n_envs, self.n_agents)
-        return dict(seen=self.seen, clear_mask=starts)
 
     def _view(self, core=None, **search) -> engine.Observation:
         core = core or self.core
@@ -283,14 +285,6 @@ class Deathmatch(SceneryEnv):
             **search,
         )
 
-    def _images(self, view) -> arrdict:
-        """The images and the IMU of a view, by lane: (B, 1, ...)."""
-        return arrdict(
-            rgb=view.rgb.view(-1, *self.obs_space.rgb.shape),
-            d=view.depth.view(-1, *self.obs_space.d.shape),
-            imu=view.imu.view(-1, 1, 3),
-        )
-
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`, (A, ...) each.
 
@@ -302,11 +296,11 @@ class Deathmatch(SceneryEnv):
         assert view.centre_line is not None
         line = view.centre_line[0]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
-        images = self._images(view)
+        shown = images(view)
         return arrdict(
             core=self.core.state(e),
-            rgb=images.rgb[:, 0],
-            d=images.d[:, 0],
+            rgb=shown.rgb[0],
+            d=shown.d[0],
             health=self.health[lanes].clone(),
             kills=self.tally[0, lanes].clone(),
             age=self.ages[lanes].clone(),

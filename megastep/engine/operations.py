@@ -1,0 +1,290 @@
+"""Operations of one launch: light, movement, spawning, objects, random numbers. Randomness comes
+from the counter-based generator Philox 4x32-10.
+
+N environments, A agents and O objects per environment, D layouts, B lanes.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+
+from megastep.engine import checks
+from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.devices import n_resident_threads, threads
+from megastep.engine.launch_params import (
+    lanes_of,
+    object_params,
+    scenery_params,
+    seed_params,
+    state_params,
+    world_params,
+)
+from megastep.engine.scenery import Scenery
+from megastep.kernels.build.launch import ENGINE, WARP, launch
+
+#: Threads that move an environment's agents, on a GPU: the most with which all environments move
+#: at once, or else the least.
+GROUPS = (32, 16, 8)
+#: Blocks that a multiprocessor holds, by the bounds of `physics_unspilled`.
+UNSPILLED_BLOCKS = 18
+APART = 0.05  # metres
+
+
+def bake(scenery: Scenery) -> None:
+    """Computes the light on every wall texel, in place. Call it after moving walls or lights.
+
+    Writes ``scenery.layouts.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights of the
+    layout that no wall occludes, with intensity I and distance d. Also refits the walls' bounding
+    boxes.
+    """
+    layouts = checks.instance("scenery", scenery, Scenery).layouts
+    layouts.update_bounding_boxes()
+    launch(
+        *(ENGINE, "bake", scenery.device, layouts.n_texels),
+        scenery=scenery_params(scenery, 0.0),
+        texel_wall=_owners(layouts.textures.widths, layouts.n_texels),
+        wall_layout=_owners(layouts.lines.widths, layouts.n_walls),
+        n_texels=layouts.n_texels,
+    )
+
+
+def _owners(widths, total) -> torch.Tensor:
+    """Returns (total,) int32, the subarray that each element belongs to."""
+    subarrays = torch.arange(len(widths), dtype=torch.int32, device=widths.device)
+    return torch.repeat_interleave(subarrays, widths, output_size=total)
+
+
+class Physics(NamedTuple):
+    """The outcome of a step of physics."""
+
+    # (N, A): free fraction of the step; below 1, the agent hit something and its velocities are now
+    # 0
+    progress: torch.Tensor
+
+
+def physics(
+    scenery: Scenery,
+    agents: Agents,
+    actions: torch.Tensor | None = None,
+    moves: torch.Tensor | None = None,
+    damping: float = 1.0,
+) -> Physics:
+    """Moves the agents by their velocities for 1 / fps seconds, in place.
+
+    An agent stops just before the first wall, agent or solid object that it touches, and its
+    velocities become 0.
+
+    Args:
+        actions: (N, A) int64, or (N, A, n_moves) float32. If given, velocities are first multiplied
+            by ``1 - damping``. An integer then adds one row of ``moves``. Floats, clipped to
+            [-1, 1], add all rows, weighted. If None, ``moves`` must be None too.
+        moves: (n_moves, 3) m/s ahead, m/s left, deg/s, added by actions.
+        damping: fraction of the velocities lost per step.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+        EngineError: on the CPU, if a position or an action is NaN, or an integer action is out of
+            range. On a GPU, :func:`~megastep.engine.check` raises it later.
+    """
+    n, a = lanes = lanes_of(scenery, agents)
+    checks.number("damping", damping, -math.inf, math.inf)
+    device = scenery.device
+    n_moves = actions_at = controls_at = moves_at = 0
+    if actions is not None or moves is not None:
+        n_moves = checks.length("moves", moves)
+        if not n_moves:
+            raise ValueError("moves must have one row per action, but it has none")
+        moves_at = checks.address("moves", moves, (n_moves, 3), torch.float32, device)
+        if isinstance(actions, torch.Tensor) and actions.is_floating_point():
+            shape = (*lanes, n_moves)
+            controls_at = checks.address("actions", actions, shape, torch.float32, device)
+        else:
+            actions_at = checks.address("actions", actions, lanes, torch.int64, device)
+    progress = torch.empty(lanes, device=device)
+    kernel = _physics_kernel(n, device)
+    if scenery.objects is not None:
+        kernel = kernel.replace("physics", "physics_objects")
+    threads_per_env = _threads_per_env(n, device)
+    launch(
+        *(ENGINE, kernel, device, threads_per_env * n),
+        **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        progress=progress,
+        actions=actions_at,
+        controls=controls_at,
+        moves=moves_at,
+        n_moves=n_moves,
+        retained=1 - damping,
+        seconds=1 / agents.fps,
+        threads_per_env=threads_per_env,
+        objects=object_params(scenery),
+    )
+    check_on_cpu(agents)
+    return Physics(progress)
+
+
+def _physics_kernel(n_envs, device) -> str:
+    """Returns the kernel that moves agents: with more registers per thread until environments are
+    many, by what is faster on an H200.
+    """
+    n_threads = GROUPS[-1] * n_envs
+    return "physics_unspilled" if n_threads <= n_resident_threads(device) else "physics"
+
+
+def _threads_per_env(n_envs, device) -> int:
+    room = n_resident_threads(device, UNSPILLED_BLOCKS)
+    return next((size for size in GROUPS if size * n_envs <= room), GROUPS[-1])
+
+
+def spawn(
+    scenery: Scenery,
+    agents: Agents,
+    mask: torch.Tensor,
+    points: torch.Tensor,
+    counts: torch.Tensor,
+    seed: int,
+    resample: bool = False,
+    hidden: bool = False,
+    point_index: torch.Tensor | None = None,
+    cumulative: torch.Tensor | None = None,
+) -> None:
+    """Puts agents at random points of their environment's layout, at rest, with random headings.
+
+    They drop the objects that they carry, and avoid points on solid objects, unless these were of
+    another layout.
+
+    Args:
+        mask: (N, A) bool, agents to respawn.
+        points: (D, n, 2) metres. Each agent has n / A points of a layout, agent 0 the first ones.
+        counts: (N, A) int32, numbers drawn so far. Each respawned agent's is advanced by one.
+        seed: the generator's key.
+        resample: if all agents of an environment respawn, move it to a random layout first.
+        hidden: choose a point that no other agent of the environment sees, except through gaps
+            narrower than an agent's radius. If there is none, choose the point that is furthest
+            from its nearest agent. Agents respawn one after the other and avoid those before them.
+        point_index: (N, A) int32, receives the index of each respawned agent's point.
+        cumulative: (D,) int32, cumulative weights of the layouts, by which `resample` draws them:
+            whole numbers from 0 whose sum, the last entry, is from 1 to 2**31 - 1. Default: every
+            layout is as likely.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    lanes, device, n_layouts = lanes_of(scenery, agents), scenery.device, len(scenery.layouts)
+    n_points = checks.length("points", points, axis=1)
+    if n_points < scenery.n_agents:
+        raise ValueError(
+            f"points must have at least one per agent in each layout, so {scenery.n_agents}, but "
+            f"{n_points} were given"
+        )
+    int32 = torch.int32, device
+    is_hidden, n_envs = checks.flag("hidden", hidden), scenery.n_envs
+    kernel, n_threads = ("spawn_hidden", WARP * n_envs) if is_hidden else ("spawn", n_envs)
+    if scenery.objects is not None:
+        kernel += "_objects"
+    launch(
+        *(ENGINE, kernel, device, n_threads),
+        **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        mask=checks.address("mask", mask, lanes, torch.bool, device),
+        points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, device),
+        counts=checks.address("counts", counts, lanes, *int32),
+        point_index=checks.optional("point_index", point_index, lanes, *int32),
+        cumulative=checks.optional("cumulative", cumulative, (n_layouts,), *int32),
+        **seed_params(seed),
+        n_points=n_points,
+        resample=int(checks.flag("resample", resample)),
+        objects=object_params(scenery),
+    )
+    check_on_cpu(agents)
+
+
+def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tensor) -> torch.Tensor:
+    """Draws four uniform numbers in [0, 1) for each masked lane.
+
+    Args:
+        counts: (B,) int32, numbers drawn so far: with the lane, the generator's counter. Advanced
+            by one where ``mask``.
+        mask: (B,) bool, lanes that draw.
+        seed: the generator's key.
+        out: (B, 4) float32, written where ``mask``.
+
+    Returns:
+        ``out``.
+    """
+    n, device = checks.length("counts", counts), counts.device
+    launch(
+        *(ENGINE, "uniform", device, n),
+        counts=checks.address("counts", counts, (n,), torch.int32, device),
+        mask=checks.address("mask", mask, (n,), torch.bool, device),
+        out=checks.address("out", out, (n, 4), torch.float32, device),
+        **seed_params(seed),
+        n_lanes=n,
+        n_threads=threads(),
+    )
+    counts.add_(mask)
+    return out
+
+
+def update_objects(scenery: Scenery, agents: Agents) -> None:
+    """Moves carried objects to their carriers, and writes all objects' lines and texels. Does
+    nothing if the scenery has no objects. :func:`render` and :func:`observe` do this first.
+    """
+    n, _ = lanes_of(scenery, agents)
+    if scenery.objects is None:
+        return
+    launch(
+        *(ENGINE, "update_objects", scenery.device, n * scenery.objects.n_objects),
+        scenery=scenery_params(scenery, agents.radius),
+        objects=object_params(scenery),
+        **state_params(scenery, agents, "positions", "angles"),
+    )
+    check_on_cpu(agents)
+
+
+def place_objects(
+    scenery: Scenery,
+    agents: Agents,
+    mask: torch.Tensor,
+    points: torch.Tensor,
+    counts: torch.Tensor,
+    seed: int,
+    apart: float = APART,
+) -> None:
+    """Puts objects at random points of their environment's layout, visible, carried by nobody, at
+    random angles.
+
+    Each is put at the first point that fits, counted from a random one: agents and visible objects
+    are at least ``apart`` from it. Crates and doors count as discs of their size. Objects that are
+    placed by the same call do not keep clear of each other's old positions.
+
+    Args:
+        mask: (N, O) bool, objects to place.
+        points: (D, n, 2) metres.
+        counts: (N, O) int32, numbers drawn so far. Each placed object's is advanced by one.
+        seed: the generator's key.
+        apart: metres.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+        EngineError: on the CPU, if an object fits nowhere; on a GPU, :func:`check` raises it later.
+    """
+    lanes_of(scenery, agents)
+    if scenery.objects is None:
+        raise ValueError("scenery has no objects: set scenery.objects = engine.Objects(...) first")
+    device, shape = scenery.device, (scenery.n_envs, scenery.objects.n_objects)
+    n_points = checks.length("points", points, axis=1)
+    checks.integer("the number of points per layout", n_points, 1)
+    points_shape = len(scenery.layouts), n_points, 2
+    launch(
+        *(ENGINE, "place_objects", device, scenery.n_envs),
+        **world_params(scenery, agents),
+        objects=object_params(scenery),
+        agents=state_params(scenery, agents, "positions")["positions"],
+        mask=checks.address("mask", mask, shape, torch.bool, device),
+        points=checks.address("points", points, points_shape, torch.float32, device),
+        counts=checks.address("counts", counts, shape, torch.int32, device),
+        **seed_params(seed),
+        n_points=n_points,
+        apart=checks.number("apart", apart, -1, checks.LIMIT, "metres"),
+    )
+    check_on_cpu(agents)

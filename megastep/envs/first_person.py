@@ -1,0 +1,171 @@
+"""A base of environments in which one agent walks through a floor plan and sees by cameras."""
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import torch
+from pydantic import Field
+
+from megastep import engine, modules, plotting, spaces
+from megastep import geometries as sources
+from megastep.arrdict import arrdict
+from megastep.core import Core
+from megastep.dotdict import dotdict
+from megastep.envs.common import SceneryEnv
+from megastep.scene import scenery, spread
+from megastep.settings import MAX_ENVS, checked
+from megastep.types import Geometries
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["FirstPerson", "images"]
+
+
+def images(view: engine.Observation) -> arrdict:
+    """Returns ``rgb`` (N, A, 3, C, P), ``d`` (N, A, 1, C, P) and ``imu`` (N, A, 3) as views of an
+    observation's tensors: an image has a row per camera.
+    """
+    rgb, d = view.rgb, view.depth
+    assert rgb is not None and d is not None
+    if rgb.ndim == 4:  # one camera
+        rgb, d = rgb.unsqueeze(2), d.unsqueeze(2)
+    return arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2), imu=view.imu)
+
+
+class FirstPerson(SceneryEnv):
+    """N environments of one agent each, which momentum moves. A subclass defines ``_world``, and
+    takes the arguments below as ``*shared`` and ``**options``, which it passes on.
+
+    Args:
+        n_envs: number of environments, N.
+        geometries: floor plans. Default: generated ones, at most 512.
+        seed: of everything random: textures, lights, spawns, and floor plans drawn by default.
+        device: where the tensors are. Default: a GPU if there is one.
+        res: rays per camera.
+        subsample: rays per pixel; divides ``res``.
+        fov: field of view of a camera, degrees.
+        cameras: yaw of each camera, degrees; 0 looks ahead, 90 left.
+        fps: steps per second of simulated time.
+        control: discrete or continuous actions.
+        resample: if True, each episode takes place in a randomly drawn floor plan. Otherwise an
+            environment keeps its own.
+
+    Attributes:
+        ages: (B,) int32, steps since the first observation.
+        ended: (B,) bool, whether the last step ended the episode.
+    """
+
+    n_agents = 1
+    #: Source of the floor plans by default.
+    source = "homes"
+    #: Steps after which an episode is truncated.
+    limit: int
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Gives a constructor's signature, which settings are made from, the arguments above."""
+        super().__init_subclass__(**options)
+        if FirstPerson in cls.__bases__:
+            init: Any = cls.__init__
+            named = {**inspect.signature(FirstPerson.__init__).parameters}
+            own = inspect.signature(init).parameters.items()
+            named |= {name: one for name, one in own if one.kind is one.KEYWORD_ONLY}
+            init.__signature__ = inspect.Signature([*named.values()])
+            init.__annotations__ = FirstPerson.__init__.__annotations__ | init.__annotations__
+
+    @checked
+    def __init__(
+        self,
+        n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
+        geometries: Geometries | None = None,
+        *,
+        seed: int = 1,
+        device: torch.device | str | None = None,
+        res: Annotated[int, Field(ge=1, le=1024)] = 256,
+        subsample: Annotated[int, Field(ge=1, le=32)] = 4,
+        fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
+        cameras: Annotated[Sequence[float], Field(min_length=1, max_length=16)] = (0.0,),
+        fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
+        control: Literal["discrete", "continuous"] = "discrete",
+        resample: bool = False,
+    ):
+        if geometries is None:
+            geometries = sources.sample(self.source, min(n_envs, 512), seed=seed)
+        geometries = geometries if resample else spread(geometries, n_envs)
+        plans = scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device)
+        self.core = Core(plans, res, fov, fps, cameras, seed)
+        self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
+        self.subsample = subsample
+        self.spawner = self._furnish(geometries, resample)
+        self.movement = modules.MomentumMovement(self.core, control=control)
+        self.action_space = self.movement.space
+        self.obs_space = dotdict(
+            rgb=modules.RGB(self.core, subsample).space,
+            d=modules.Depth(self.core, subsample).space,
+            imu=spaces.MultiVector(1, 3),
+        )
+        engine.fit(n_envs, 8 * self.obs_space.d.H * self.obs_space.d.W + 64, self.device)
+        self.ages = self._integers()
+        self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
+        self._resets = engine.Resets()
+        self.privileged_space = None
+
+    def _furnish(self, geometries: Sequence, resample: bool) -> modules.RandomSpawns:
+        """Puts into the floor plans what the game needs. Returns the spawner."""
+        return modules.RandomSpawns(geometries, self.core, resample=resample)
+
+    def _integers(self) -> torch.Tensor:
+        """Returns zeros (B,) int32."""
+        return torch.zeros(self.n_envs, dtype=torch.int32, device=self.device)
+
+    def _begin(self, mask) -> arrdict:
+        self.ended.copy_(mask)
+        return self._world()
+
+    def desync(self) -> None:
+        """Gives every lane a random age, from the seed, so that episodes do not end together."""
+        limits = torch.full_like(self.ages, self.limit)
+        self.ages.copy_(modules.random_ages(limits, self.core.seed))
+
+    def step(self, decision: Mapping) -> arrdict:
+        """Takes one step by ``decision["actions"]``, (B, 1) or (B, 1, 3). Returns a world."""
+        return self._resets.keep(self._world(self.movement(decision).progress))
+
+    def _world(self, free: torch.Tensor | None = None) -> arrdict:
+        """Respawns agents whose episode has ended, computes rewards and flags, and renders.
+
+        Args:
+            free: (N, A), the fraction of the step that was free; None if no step was taken.
+        """
+        raise NotImplementedError
+
+    def _view(self, core: Core | None = None, **seen: torch.Tensor) -> engine.Observation:
+        """Returns what all cameras see, or those of a core. ``seen``: as ``engine.observe``."""
+        core = core or self.core
+        return engine.observe(core.scenery, core.agents, self.subsample, imu=True, **seen)
+
+    def _seen_by(self, e: int) -> arrdict:
+        """Returns the observation of environment ``e``, without a lane's axis."""
+        return images(self._view(self.core.alone(e))).map(lambda leaf: leaf[0])
+
+    @classmethod
+    def _draw(
+        cls, state: arrdict, title: str, goal: tuple | None = None, seen: Any = None
+    ) -> "Figure":
+        """Draws a numpyified state: the floor plan, above the agent's RGB and depth.
+
+        Args:
+            state: with ``core``, ``rgb`` and ``d``.
+            title: of the figure.
+            goal: (place, radius in metres) of a ring.
+            seen: as :meth:`Core.plot_state`.
+        """
+        yaws = state.core.yaws
+        figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))
+        Core.plot_state(state.core, plan, seen)
+        if goal is not None:
+            plotting.plot_goal(plan, *goal)
+        modules.RGB.plot_state(state.rgb, strips[:1], yaws)
+        modules.Depth.plot_state(state.d, strips[1:], yaws)
+        return figure
