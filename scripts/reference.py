@@ -57,7 +57,9 @@ ADDED = {
 }
 #: What reports metrics, by the title of its table. Environments and learners are added.
 REPORTERS = {
-    "Progress and speed": "megastep.agents.training.trainer:Trainer.log",
+    "Progress": "megastep.agents.training.trainer:Trainer.report",
+    "Speed": "megastep.agents.training.performance:Timing.on_report",
+    "Evaluations in training": "megastep.agents.training.callbacks:Evaluations.on_measure",
     "Episodes": "megastep.agents.training.episode_stats:EpisodeStats.pop",
     "Self-play": "megastep.agents.selfplay.opponents:Opponents.pop_win_rates",
     "Curricula": "megastep.agents.training.curriculum:Curriculum.stats",

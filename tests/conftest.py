@@ -56,8 +56,8 @@ def trainers(monkeypatch):
     """The trainers that `train` makes during a test."""
     made, make_trainer = [], launch_train.make_trainer
 
-    def remember(*arguments):
-        made.append(make_trainer(*arguments))
+    def remember(*arguments, **options):
+        made.append(make_trainer(*arguments, **options))
         return made[-1]
 
     monkeypatch.setattr(launch_train, "make_trainer", remember)

@@ -5,16 +5,18 @@ Each function waits for the other ranks. In a single process it just calls its a
 
 import pickle
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
 from megastep.agents.distributed.process_group import (
     counts,
-    exchange,
     gather_objects,
     n_ranks,
     rank,
     rank_label,
 )
+
+if TYPE_CHECKING:
+    from megastep.agents.distributed.ranks import Ranks
 
 T = TypeVar("T")
 
@@ -33,18 +35,17 @@ class Plan(NamedTuple):
     lr_fraction: float
 
 
-def agree(plan: Plan, is_stopped: bool, is_behind: bool) -> Plan:
+def agree(plan: Plan, is_stopped: bool, is_behind: bool, ranks: "Ranks") -> Plan:
     """Returns the plan of rank 0, whose clock decides, unless a rank is stopped or behind.
-
-    Waits for the other ranks, those that train other members of a population included.
 
     Args:
         plan: this rank's plan.
         is_stopped: this rank got a signal; all ranks stop.
         is_behind: this rank is still writing the last checkpoint, so no rank saves another.
+        ranks: those that agree.
     """
     counts.n_updates += 1
-    rows = exchange([*plan, is_stopped, is_behind])
+    rows = ranks.exchange([*plan, is_stopped, is_behind])
     goes_on, saves, lr_fraction, *_ = rows[0]
     *_, are_stopped, are_behind = zip(*rows, strict=True)
     return Plan(

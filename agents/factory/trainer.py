@@ -7,7 +7,7 @@ import functools
 import math
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,15 +30,17 @@ from megastep.agents.runs import (
     saver,
 )
 from megastep.agents.training import budget, loggers, repeat
+from megastep.agents.training.callbacks import Evaluations, Snapshots
 from megastep.agents.training.profiler import Profiler
-from megastep.agents.training.snapshots import SnapshotSaver
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.imports import import_object
 from megastep.types import optional
 
 if TYPE_CHECKING:
-    from megastep.agents.types import Learner, Row, RunLogger
+    from megastep.agents.networks.policy import Policy
+    from megastep.agents.types import Learner, Row
+    from megastep.types import Env
 
 
 def make_trainer(
@@ -46,12 +48,12 @@ def make_trainer(
     folder: Path,
     device: torch.device,
     token: str = "",
-    on_log: Callable[[Trainer], None] = lambda trainer: None,
+    *,
+    ranks: Ranks | None = None,
+    callbacks: Sequence[object] = (),
     make_evaluator: Callable | None = None,
-    leader: Trainer | None = None,
     n_members: int = 1,
     homes: list[dict] | None = None,
-    ranks: Ranks | None = None,
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
@@ -60,13 +62,12 @@ def make_trainer(
 
     Args:
         token: a name that all ranks of this start have, and no other start.
-        on_log: called with the trainer after each report.
-        make_evaluator: returns what measures the policy in training, for `cfg`, the
-            environment of the training and the device, such as `evaluation.in_training.Evaluator`.
-        leader: the first member of a population, for the others.
+        ranks: those that train the policy; None: all that there are.
+        callbacks: of rank 0, before those of `cfg`.
+        make_evaluator: returns what measures the policy in training, for `cfg`, the environment of
+            the training, the device and the ranks, such as `evaluation.in_training.Evaluator`.
         n_members: trainers of a population that memory is to hold from this one on.
         homes: the floor plans to train in, if they are made already.
-        ranks: those that train the policy; None: all that there are.
     """
     number, n_ranks = ranks = world() if ranks is None else ranks
     seed = rank_seed(cfg.seed, number)
@@ -90,82 +91,89 @@ def make_trainer(
     check_population(cfg, learner)
     factory.check_memory(cfg.env, sample, learner, n_members=n_members, **where)
     env = factory.construct(cfg.env, **where)
-    if start := cfg.resume or cfg.init:
-        path = folders.find(start)
-        loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
-        restore.load_weights(policy, loaded, env)
-        if cfg.init:
-            restore.load_wrappers(env, loaded, is_frozen=False)
-        if cfg.resume:
-            state = loaded.state or {}
-            with state_errors(loaded.path):
-                if check_state := getattr(learner, "check_state", None):
-                    check_state(state["learner"])  # before anything is written
-        if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
-            console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
-    measured = {}
+    loaded = load(cfg, policy, env, learner, device, number)
+    resumed = loaded if cfg.resume else None
+    measured = []
     if cfg.evaluation.every is not None and make_evaluator is not None:
-        measured = dict(
-            evaluator=make_evaluator(cfg, env, device, ranks),
-            evaluate_every=settings.every(cfg.evaluation.every),
-            stop=cfg.evaluation.stop,
-        )
+        evaluator = make_evaluator(cfg, env, device, ranks)
+        measured = [
+            Evaluations(evaluator, settings.every(cfg.evaluation.every), cfg.evaluation.stop)
+        ]
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
-    for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
-        checkpoint.set_aside_after(folder / name, loaded.step)
+    if resumed and number == 0:
+        for name in "checkpoints", "snapshots":
+            checkpoint.set_aside_after(folder / name, resumed.step)
     config = {"train": check.as_tree(cfg), "spaces": restore.spaces_of(env)}
     made_with = provenance.made_with(device, package.version(), n_ranks)
     checkpoints = folder / "checkpoints"
-    had: dict = (loaded.state or {}) if cfg.resume else Counter()
+    had: dict = (resumed and resumed.state) or Counter()
     with factory.errors():
-        limits = budget_of(cfg, folder, loaded if cfg.resume else None)
-        logger: RunLogger = loggers.NoLogger()
-        writers: dict = {}
-        rank_files = saver.RankFiles(checkpoints, token, number, n_ranks)
+        files = saver.RankFiles(checkpoints, token, number, n_ranks)
+        keep = cfg.checkpoints.keep, made_with, cfg.checkpoints.replay_every, files
+        saves, limits = saver.Saver(checkpoints, config, *keep), budget_of(cfg, folder, resumed)
+        writers, record = [], None
         if number == 0:  # which alone writes these
-            step = had["samples_at_report"]
-            logger = make_loggers(cfg, folder, step)
-            snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
-            writers = dict(
-                on_log=on_log,
-                snapshot_saver=SnapshotSaver(snapshots, cfg.checkpoints.snapshots),
-                annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
-                profiler=Profiler(folder, cfg.logging.profile, device)
-                if cfg.logging.profile
-                else None,
-            )
+            record = annealing.AnnealingRecord(folder, had["updates"])
+            writers = [record, make_loggers(cfg, folder, had["samples_at_report"]), *callbacks]
+        if number == 0 and cfg.checkpoints.snapshots:
+            shots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
+            writers.append(Snapshots(shots, cfg.checkpoints.snapshots))
+        if number == 0 and cfg.logging.profile:
+            writers.append(Profiler(folder, cfg.logging.profile, device))
         trainer = Trainer(
             opponents or env,
             policy,
             learner,
-            logger,
-            saver.Saver(
-                checkpoints,
-                config,
-                cfg.checkpoints.keep,
-                made_with,
-                cfg.checkpoints.replay_every,
-                rank_files,
-            ),
             limits,
+            saver=saves,
             log_every=cfg.logging.every,
             checkpoint_seconds=cfg.checkpoints.seconds,
-            desync=cfg.desync,
-            make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
-            layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
-            repeat_hint=functools.partial(repeat.hint, is_resumed=cfg.resume is not None),
-            callbacks=[import_object(name)() for name in cfg.callbacks],
-            leader=leader,
+            callbacks=[*measured, *writers, *(import_object(name)() for name in cfg.callbacks)],
             ranks=ranks,
-            timetable=populations.schedule(Path(path)) if (path := cfg.population.schedule) else (),
-            **measured,
-            **writers,
         )
-        if cfg.resume:
-            with state_errors(loaded.path):
-                trainer.load_state_dict(had, is_new_rank=number >= loaded.n_ranks)
-            trainer.lost += differing(loaded.made_with, made_with)
+        if cfg.population.schedule:
+            trainer.tuning.follow(populations.schedule(Path(cfg.population.schedule)))
+        if make_curriculum := factory.make_curriculum(cfg.curriculum, homes):
+            trainer.curriculum = make_curriculum(trainer.env, learner, trainer.rollout)
+        trainer.episodes.begin(trainer, factory.layout_sources(cfg.env, homes), cfg.desync)
+        if record is not None:
+            is_resumed = resumed is not None
+            trainer.nonfinite_guard.make_hint = functools.partial(
+                repeat.hint, trainer, record, is_resumed
+            )
+        if resumed:
+            with state_errors(resumed.path):
+                trainer.run_state.load_state_dict(had, is_new_rank=number >= resumed.n_ranks)
+            trainer.lost += differing(resumed.made_with, made_with)
     return trainer
+
+
+def load(
+    cfg: settings.Train,
+    policy: "Policy",
+    env: "Env",
+    learner: "Learner",
+    device: torch.device,
+    rank: int,
+) -> checkpoint.Checkpoint | None:
+    """Returns the checkpoint that a run continues from, or starts from the weights of, once the
+    policy has them; None for a new run.
+    """
+    if not (start := cfg.resume or cfg.init):
+        return None
+    path = folders.find(start)
+    loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, rank)
+    restore.load_weights(policy, loaded, env)
+    if cfg.init:
+        restore.load_wrappers(env, loaded, is_frozen=False)
+    if cfg.resume:
+        state = loaded.state or {}
+        with state_errors(loaded.path):
+            if check_state := getattr(learner, "check_state", None):
+                check_state(state["learner"])  # before anything is written
+    if rank == 0 and policy.critic is not None and agent_file.is_agent_file(path):
+        console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
+    return loaded
 
 
 def check_population(cfg: settings.Train, learner: "Learner") -> None:

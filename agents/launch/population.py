@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import gc
-import math
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,10 +22,10 @@ from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, compare, finishing, gpu, rank_checks, signals
 from megastep.agents.launch.watch import Team
 from megastep.agents.population import decisions
-from megastep.agents.population.population import Learnt, Population, Turns, hosted
+from megastep.agents.population.population import AgentParts, Population, Streams, hosted
 from megastep.agents.runs import folders, populations, provenance
 from megastep.agents.training import curves
-from megastep.agents.training.progress import progress_of
+from megastep.agents.training.callbacks import Progress
 from megastep.settings import closest
 
 if TYPE_CHECKING:
@@ -130,7 +129,7 @@ def make(
     rank.
     """
     chosen, trainers, members = cfg.population, [], hosted(cfg.population.size)
-    turns, homes = Turns(len(members), device), None
+    streams, homes = Streams(len(members), device), None
     if cfg.geometry.name.startswith("megastep."):  # another's may draw from global generators
         homes = factory.homes(cfg.env, cfg.geometry, "training")
     for i, member in enumerate(members):
@@ -139,21 +138,19 @@ def make(
             own = again.with_more(settings.changed(own, resume=str(checkpoints[member])))
         folder = populations.folder_of(root, member)
         folder.mkdir(exist_ok=True)
-        with turns.of(i):
+        with streams.of(i):
             trainer = make_trainer(
                 *(own, folder, device),
                 make_evaluator=in_training.Evaluator,
-                leader=trainers[0] if trainers else None,
                 n_members=1 if trainers else len(members),
                 homes=homes,
                 ranks=ONE,
             )
         check_score(chosen.score, trainer)
-        trainer.checkpoint_seconds = math.inf
         folders.write_config(folder, trainer.saver.config["train"])
         provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, [])
         trainers.append(trainer)
-    turns.wait()
+    streams.wait()
     repeated = None
     if cfg.rerun:
         repeated = populations.samples_of_generations(Path(cfg.rerun) / populations.FILE)
@@ -161,9 +158,9 @@ def make(
     if len(members) < chosen.size:
         env = trainers[0].env
         policy = factory.make_policy(cfg.agent, env, cfg.seed, cfg.agent.critic)
-        visitor = Learnt(policy, factory.make_learner(cfg.learner, policy, cfg.seed))
+        visitor = AgentParts(policy, factory.make_learner(cfg.learner, policy, cfg.seed))
     return Population(
-        *(trainers, turns, root, cfg.seed, chosen.every, chosen.vary),
+        *(trainers, streams, root, cfg.seed, chosen.every, chosen.vary),
         *(chosen.exploit, chosen.explore, chosen.score, cfg.checkpoints.seconds),
         *(chosen.size, visitor, repeated),
     )
@@ -171,7 +168,7 @@ def make(
 
 def check_score(score: str, trainer: "Trainer") -> None:
     """Raises ConfigErrors if a trainer's reports have nothing of this name."""
-    known = [populations.RUNNING, populations.EVALUATED, *trainer.stats_names]
+    known = [populations.RUNNING, populations.EVALUATED, *trainer.episodes.names]
     if score not in known:
         text = f"{score} is no mean over episodes here; {closest(score, known)}"
         raise ConfigErrors([("population.score", text)])
@@ -181,7 +178,7 @@ def _train(cfg, root, population) -> None:
     """Trains the members and turns what may happen into a sentence."""
     progress = console.Progress()
     if population.rank == 0:
-        population.leader.on_log = lambda trainer: progress.show(*progress_of(trainer))
+        population.leader.callbacks.insert(-1, Progress(progress.show))
     hint = functools.partial(folders.to_continue, root)
     try:
         with (

@@ -5,8 +5,8 @@ import functools
 import itertools
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from megastep import engine
 from megastep.agents import console, factory, package
@@ -38,11 +38,9 @@ from megastep.agents.launch import (
 from megastep.agents.launch.watch import Team
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training import curves
-from megastep.agents.training.progress import progress_of
+from megastep.agents.training.budget import reaches
+from megastep.agents.training.callbacks import Progress
 from megastep.agents.training.trainer import Trainer
-
-if TYPE_CHECKING:
-    pass
 
 
 def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
@@ -87,9 +85,6 @@ def train_here(cfg: settings.Train, team: Team | None) -> Path:
     device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
     progress = console.Progress()
 
-    def show(trainer) -> None:
-        progress.show(*progress_of(trainer))
-
     if cfg.resume == again.AUTO:
         start = together(lambda: again.automatic(cfg))
         if start.is_done:
@@ -114,7 +109,9 @@ def train_here(cfg: settings.Train, team: Team | None) -> Path:
                 trainer = together(
                     env_failures.told(cfg.env, folder, rank=process_group.rank())(
                         lambda: make_trainer(
-                            cfg, folder, device, token, show, in_training.Evaluator
+                            *(cfg, folder, device, token),
+                            callbacks=[Progress(progress.show)],
+                            make_evaluator=in_training.Evaluator,
                         )
                     )
                 )
@@ -163,8 +160,6 @@ def train_here(cfg: settings.Train, team: Team | None) -> Path:
             if is_first:
                 with process_group.unhurried():
                     curves.plot_curves(folder)
-        if trainer.profiler and trainer.profiler.path:
-            console.say(f"Profile: {trainer.profiler.path}, and a trace beside it")
         # all ranks stop if one got a signal or could not save a checkpoint
         ends = process_group.gather_objects((numbers[:1], trainer.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
@@ -175,7 +170,7 @@ def train_here(cfg: settings.Train, team: Team | None) -> Path:
         if unsaved := next((error for _, error in ends if error), None):
             raise UserError(unsaved)
         nonfinite, hint = trainer.nonfinite_guard.value, trainer.nonfinite_guard.hint
-        result, samples = result_of(trainer), trainer.samples
+        result, samples = result_of(trainer, cfg.evaluation.stop), trainer.samples
         del trainer, saved  # frees GPU memory for the evaluation
         finishing.finish(cfg, folder, samples)
         if nonfinite and nonfinite.is_from_env:
@@ -188,13 +183,13 @@ def train_here(cfg: settings.Train, team: Team | None) -> Path:
     return folder
 
 
-def result_of(trainer: Trainer) -> str:
+def result_of(trainer: Trainer, stop: Mapping[str, float]) -> str:
     """Returns what a run came to: samples, seconds, and the return of its last episodes."""
     text = f"Trained {trainer.samples:,} samples in {console.duration(trainer.clock.seconds)}"
-    if trainer.is_reached:
+    if reaches(trainer.evaluation, stop):
         goals = ", ".join(
             f"{name} {trainer.evaluation[name]:.4g} (evaluation.stop.{name}={goal:g})"
-            for name, goal in trainer.stop.items()
+            for name, goal in stop.items()
         )
         return f"{text}, when an evaluation had {goals}"
     latest = trainer.latest_stats

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -28,8 +28,11 @@ from megastep.agents.distributed.process_group import (
     rank,
     unhurried,
 )
+from megastep.agents.distributed.ranks import world
 from megastep.agents.population import decisions
 from megastep.agents.runs import json_lines, populations
+from megastep.agents.training.callbacks import Evaluations
+from megastep.agents.training.episode_stats import MIN_EPISODES
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
 
@@ -46,7 +49,7 @@ T = TypeVar("T")
 N_PREPARING = {"cpu": 1, "cuda": 3}
 
 
-class Learnt(NamedTuple):
+class AgentParts(NamedTuple):
     """What a member has learnt: its policy, its learner, and what wrappers of its environment have
     learnt, if anything.
     """
@@ -61,7 +64,7 @@ def hosted(size: int) -> range:
     return range(rank(), size, n_ranks())
 
 
-class Turns:
+class Streams:
     """What the members of one process each have for themselves: a stream of the GPU, and the global
     generators, from which code of the user's may draw.
     """
@@ -130,9 +133,8 @@ class Population:
     A member that diverges goes on without learning, and copies another at the next generation.
 
     Args:
-        trainers: of the members that this rank hosts, whose `checkpoint_seconds` are infinite. All
-            but the first have it as their `leader`.
-        turns: in which they were made.
+        trainers: of the members that this rank hosts. All do the updates that the first plans.
+        streams: in which they were made.
         folder: where `population.jsonl` is written.
         seed: that decisions are drawn with.
         every: samples of each member from one generation to the next. A generation is at the first
@@ -140,7 +142,7 @@ class Population:
         vary: the settings that differ, by key, and what they may be.
         exploit, explore: as for `decisions.decide`.
         score: what members are ranked by: "running", the return of their last report; "evaluated",
-            that of their last evaluation; or another of the last report's `Trainer.stats_names`.
+            that of their last evaluation; or another of the last report's `Episodes.names`.
         checkpoint_seconds: seconds between two checkpoints of all members.
         size: members on all ranks; None: as many as there are trainers.
         visitor: with several ranks, holds what a member of another one has learnt.
@@ -156,7 +158,7 @@ class Population:
     def __init__(
         self,
         trainers: Sequence[Trainer],
-        turns: Turns,
+        streams: Streams,
         folder: Path,
         seed: int,
         every: int,
@@ -166,10 +168,10 @@ class Population:
         score: str = "running",
         checkpoint_seconds: float = 30.0,
         size: int | None = None,
-        visitor: Learnt | None = None,
+        visitor: AgentParts | None = None,
         repeated: Collection[int] | None = None,
     ):
-        self.trainers, self.turns, self.seed, self.every = [*trainers], turns, seed, every
+        self.trainers, self.streams, self.seed, self.every = [*trainers], streams, seed, every
         self.size, self.visitor = size or len(trainers), visitor
         self.members = hosted(self.size)
         self.rank, self.n_ranks = rank(), n_ranks()
@@ -184,6 +186,8 @@ class Population:
         self.samples_at_round = self.leader.samples_at_report
         for trainer in trainers:
             trainer.nonfinite_guard.tolerates_divergence = True
+        for trainer in self.trainers[1:]:
+            trainer.clock, trainer.timing.timer = self.leader.clock, None
         if generations:
             self._restore(generations)
         else:
@@ -213,7 +217,7 @@ class Population:
                 n + int(row.get("diverged", 0))
                 for n, row in zip(self.n_diverged, rows, strict=True)
             ]
-        self.turns.each(lambda i: self.trainers[i].set_settings(self.settings[self.members[i]]))
+        self.streams.each(lambda i: self.trainers[i].tuning.set(self.settings[self.members[i]]))
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Trains all members until the budget is spent, one of them ends, or `stop()` returns True,
@@ -224,38 +228,34 @@ class Population:
         """
 
         def ends() -> bool:
-            return stop() or any(one.is_stopped or one.is_reached for one in self.trainers)
+            return stop() or any(one.is_stopped for one in self.trainers)
 
-        # the leader asks for all
-        rounds, n_rounds = [one.rounds(ends) for one in self.trainers[:1]], 0
-        rounds += [one.rounds() for one in self.trainers[1:]]
+        leader, n_rounds = self.leader, 0
+        evaluates = any(isinstance(one, Evaluations) for one in leader.callbacks)
         try:
-            while self._is_round_left(rounds):
+            self.streams.each(lambda i: self.trainers[i].callbacks("on_start", self.trainers[i]))
+            while (plan := leader.plan(ends(), world())).goes_on:
+                # all updates are launched before the first report waits for its own
+                self.streams.each(lambda i: self.trainers[i].update(plan.lr_fraction))
+                if leader.updates % leader.log_every == 0:
+                    if evaluates:
+                        self.streams.wait()  # the clock pauses, and counts what is launched before
+                    self.streams.each(lambda i: self.trainers[i].report())
                 n_rounds += 1
                 # seconds count from the last of these on
-                if n_rounds <= N_PREPARING[self.turns.device.type]:
-                    self.turns.each(lambda i: self.trainers[i].start_clock())
+                if n_rounds <= N_PREPARING[self.streams.device.type]:
+                    self.streams.each(lambda i: self.trainers[i].start_clock())
                     self.saved_at = time.monotonic()
                 self._after_round()
+            self.streams.each(lambda i: self.trainers[i].finish())
         finally:
-            for one in rounds:
-                one.close()
+            for one in self.trainers:
+                with contextlib.suppress(Exception):  # the first error is the one to report
+                    one.wait_for_collector()
+                with unhurried():
+                    one.saver.wait()
             if self.lines is not None:
                 self.lines.close()
-
-    def _is_round_left(self, rounds: Sequence[Generator[None]]) -> bool:
-        """Has each member do an update; returns False when they have ended instead.
-
-        When reports are due, all updates are launched before the first report waits for its own.
-        """
-        is_reported = (self.leader.updates + 1) % self.leader.log_every == 0
-        for turn in range(1 + is_reported):
-            if turn and self.leader.evaluate_every is not None:
-                self.turns.wait()  # the clock pauses, and counts what is launched before
-            ended = self.turns.each(lambda i: next(rounds[i], StopIteration) is StopIteration)
-            if any(ended):
-                return False
-        return True
 
     def _after_round(self) -> None:
         leader, before, is_due = self.leader, self.samples_at_round, False
@@ -276,24 +276,24 @@ class Population:
 
     def meet(self) -> None:
         """Gives the members' opponents each other's policies, where they play in a league."""
-        updates, pool = self.leader.updates, self.leader.opponents
+        updates, pool = self.leader.updates, self.leader.episodes.opponents
         if pool is None or not pool.is_due(updates):
             return
-        self.turns.wait()
+        self.streams.wait()
         for member in range(self.size):
             learnt = self._of(pool.next_rival(member, self.size, updates), member)
             if learnt is not None:
-                own = self._trainer(member).opponents
+                own = self._trainer(member).episodes.opponents
                 assert own is not None
                 own.refresh_rival(learnt.policy, updates)
-        self.turns.wait()
+        self.streams.wait()
 
     def save(self) -> None:
         """Begins to save a checkpoint of each member, once all have the last one."""
         with unhurried():
             for trainer in self.trainers:
                 trainer.saver.wait()
-        self.turns.each(lambda i: self.trainers[i].save_checkpoint())
+        self.streams.each(lambda i: self.trainers[i].save())
         self.saved_at = time.monotonic()
 
     def take_over(self) -> None:
@@ -313,12 +313,12 @@ class Population:
             *(self.seed, self.generation, scores, self.settings, self.vary),
             *(self.exploit, self.explore),
         )
-        self.turns.wait()
+        self.streams.wait()
         for member in decisions.order(made, scores):
             self.copy(made[member].source, member)
             if member in self.members:
-                self._trainer(member).set_settings(made[member].settings)
-        self.turns.wait()
+                self._trainer(member).tuning.set(made[member].settings)
+        self.streams.wait()
         self.settings = [one.settings for one in made]
         self._write(scores, [one.source for one in made])
 
@@ -328,9 +328,10 @@ class Population:
             return -math.inf
         if self.score == populations.EVALUATED:
             return trainer.evaluation.get("return")
-        if self.score == populations.RUNNING or trainer.score is None:
-            return trainer.score
-        return trainer.reported_stats.get(f"episode/{self.score}")
+        metrics, name = trainer.metrics, self.score
+        if metrics.get("episode/window", 0) < MIN_EPISODES:
+            return None
+        return metrics.get(f"episode/{'return' if name == populations.RUNNING else name}")
 
     def gathered(self, values: Sequence[T]) -> list[T]:
         """Returns a value of each member, from those of the members that this rank hosts."""
@@ -354,7 +355,7 @@ class Population:
     def _trainer(self, member: int) -> Trainer:
         return self.trainers[self.members.index(member)]
 
-    def _of(self, source: int, target: int) -> Learnt | None:
+    def _of(self, source: int, target: int) -> AgentParts | None:
         """Returns what a member has learnt where another is hosted, None elsewhere. All ranks call
         it.
         """
@@ -363,7 +364,7 @@ class Population:
             trainer = self._trainer(source)
             trainer.wait_for_collector()
             wrappers = optional(trainer.env, "wrapper_state")()
-            learnt = Learnt(trainer.policy, trainer.learner, wrappers)
+            learnt = AgentParts(trainer.policy, trainer.learner, wrappers)
         if source % self.n_ranks == target % self.n_ranks:
             return learnt
         if learnt is not None:

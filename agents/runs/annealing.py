@@ -6,6 +6,7 @@ With `seconds=` the factors depend on the clock; the record lets `megastep rerun
 import contextlib
 from array import array
 from pathlib import Path
+from typing import Any
 
 from megastep.atomic_files import AppendedFile
 
@@ -42,6 +43,27 @@ class AnnealingRecord:
         n_bytes = min(n_updates, len(read(folder))) * array("d").itemsize
         self.file = AppendedFile(Path(folder) / FILE, n_bytes)
 
+    is_slow = True
+
+    def on_rollout(self, trainer: Any, rollout: object) -> None:
+        """Appends the factor of the update that a trainer begins."""
+        self.append(trainer.lr_fraction)
+
+    def on_report(self, trainer: object, metrics: object) -> None:
+        """Writes the appended factors, if the disk has room; else the next report tries again."""
+        with contextlib.suppress(OSError):
+            self.flush()
+
+    def may_save(self, trainer: object) -> bool:
+        """Flushes the factors to disk, which a checkpoint must not reach beyond. Returns whether
+        they are there.
+        """
+        try:
+            self.file.sync()
+        except OSError:
+            return False
+        return True
+
     def append(self, factor: float) -> None:
         """Appends the factor of an update, in memory until the next `flush`."""
         self.file.unwritten += array("d", [factor]).tobytes()
@@ -49,10 +71,6 @@ class AnnealingRecord:
     def flush(self) -> None:
         """Writes the appended factors."""
         self.file.flush()
-
-    def sync(self) -> None:
-        """Writes the appended factors and flushes them to disk."""
-        self.file.sync()
 
     def close(self) -> None:
         """Writes the appended factors, if the disk has room, and closes the file."""

@@ -1,4 +1,4 @@
-"""Hooks of a user's own into training.
+"""Objects that training calls at certain moments: its own parts, and those of users.
 
     class Stop:
         def on_report(self, trainer, metrics):
@@ -8,54 +8,223 @@
 `train.py callbacks=[my_module:Stop]`, or `megastep.train(callbacks=[Stop])`.
 """
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from megastep.agents import console
+from megastep.agents.distributed.drift import check_drift
+from megastep.agents.distributed.process_group import unhurried
 from megastep.agents.errors import UserError, shortened
+from megastep.agents.training.budget import reaches
+
+if TYPE_CHECKING:
+    from megastep.agents.networks.policy import Policy
+    from megastep.agents.training.trainer import Trainer
+    from megastep.agents.types import SaverLike
 
 #: The methods, and what each gets beside the trainer.
 HOOKS = {
     "on_start": "",
+    "on_collect": "",
     "on_rollout": "the rollout",
     "on_update": "the losses, tensors of shape ()",
-    "on_report": "the metrics, name -> number",
+    "on_measure": "the metrics of a report, name -> number, to which more may be added",
+    "on_report": "the metrics",
+    "may_save": "",
     "on_checkpoint": "",
     "on_end": "",
 }
 
 
-class Callbacks:
+class Callbacks(list[Any]):
     """Calls the methods that objects have, in the order of the objects.
 
     All ranks call them, each on objects of its own, so that what they change stays the same on all.
-
-    Args:
-        callbacks: objects with at least one method of `HOOKS`.
+    The other ranks wait without limit for an object with a true attribute `is_slow`.
 
     Raises:
-        ValueError: an object has none of them.
+        ValueError: an object has none of `HOOKS`.
     """
 
-    def __init__(self, callbacks: Sequence[object] = ()):
-        self.callbacks = [*callbacks]
-        for one in self.callbacks:
+    def __init__(self, callbacks: list[object]):
+        super().__init__(callbacks)
+        for one in self:
             if not any(hasattr(one, hook) for hook in HOOKS):
                 hooks = ", ".join(HOOKS)
                 raise ValueError(f"{type(one).__name__} is no callback: it has none of {hooks}")
 
-    def __call__(self, hook: str, *arguments: object) -> None:
-        """Calls a hook.
+    def __call__(self, hook: str, *arguments: object) -> list[object]:
+        """Calls a hook. Returns what the methods do.
 
         Raises:
-            UserError: naming the callback that raised an error.
+            UserError: naming the callback of a user's that raised an error.
         """
-        for one in self.callbacks:
+        results = []
+        for one in self:
             method: Callable | None = getattr(one, hook, None)
             if method is None:
                 continue
             try:
-                method(*arguments)
-            except UserError:
-                raise
+                with unhurried() if getattr(one, "is_slow", False) else contextlib.nullcontext():
+                    results.append(method(*arguments))
             except Exception as error:
+                if isinstance(error, UserError) or type(one).__module__.startswith("megastep."):
+                    raise
                 problem = f"{type(error).__name__}: {shortened(error, 300)}"
                 raise UserError(f"{type(one).__name__}.{hook} failed ({problem})") from error
+        return results
+
+    def all(self, hook: str, *arguments: object) -> bool:
+        """Calls a hook. Returns whether no method returned False."""
+        return False not in self(hook, *arguments)
+
+    def close(self) -> None:
+        """Calls `close` of those that have it."""
+        for one in self:
+            getattr(one, "close", lambda: None)()
+
+
+class DriftCheck:
+    """Checks in each report that all ranks have the same weights."""
+
+    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Raises DriftError if the weights differ."""
+        if trainer.ranks.n > 1:
+            check_drift(trainer.policy, trainer.learner_options.extra)
+
+
+class Losses:
+    """Reports what the last update returned, means over the ranks.
+
+    A loss that is NaN has no value, as no gradient step was taken; it is left out.
+    """
+
+    losses: Mapping[str, Any] = {}
+
+    def on_update(self, trainer: Trainer, losses: Mapping[str, Any]) -> None:
+        """Keeps the losses."""
+        self.losses = losses
+
+    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Adds the losses. Synchronises."""
+        device, values = trainer.env.device, [*self.losses.values()]
+        if values:
+            values = torch.stack([torch.as_tensor(one, device=device) for one in values]).tolist()
+        metrics |= trainer.ranks.mean(dict(zip(self.losses, values, strict=True)))
+
+
+class Evaluations:
+    """Evaluates the policy for some reports. A checkpoint follows, whose score is the return.
+
+    Args:
+        measure: returns numbers by name. Whatever it plays in is not the environment of the
+            training, and its time does not count.
+        every: (number, "samples" or "seconds"): evaluates for the first report after each so many.
+        stop: by name, the least that ends the run if all are reached.
+    """
+
+    def __init__(
+        self,
+        measure: Callable[[Policy], Mapping[str, float]],
+        every: tuple[float, str],
+        stop: Mapping[str, float],
+    ):
+        self.measure, self.every, self.stop = measure, every, stop
+        self.last = {"samples": 0.0, "seconds": 0.0}
+
+    def on_start(self, trainer: Trainer) -> None:
+        """Continues from the last report, or ends a run that has reached its end before."""
+        self.last = {"samples": trainer.samples_at_report, "seconds": trainer.clock.seconds}
+        if reaches(trainer.evaluation, self.stop):
+            trainer.end()
+
+    def on_update(self, trainer: Trainer, losses: object) -> None:
+        """Forgets the score: it was another policy's."""
+        trainer.score = None
+
+    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Evaluates if it is time to, which all ranks do at once.
+
+        Metrics:
+            eval/NAME: what an evaluation in training measured: `return`, `length`, and each metric
+                of the environment, means over episodes in unseen homes.
+        """
+        every, unit = self.every
+        now = {"samples": trainer.samples, "seconds": trainer.clock.seconds}
+        is_due = now[unit] // every > self.last[unit] // every
+        self.last, trainer.score = now, None
+        if not trainer.ranks.any(is_due):
+            return
+        with unhurried(), trainer.clock.paused():
+            measured = self.measure(trainer.policy)
+        trainer.evaluation = trainer.ranks.mean({**measured})
+        trainer.score, trainer.is_save_due = trainer.evaluation.get("return"), True
+        metrics |= {f"eval/{name}": value for name, value in trainer.evaluation.items()}
+
+    def on_report(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Ends the run if the evaluation of this report reaches `stop`."""
+        if trainer.is_save_due and reaches(trainer.evaluation, self.stop):
+            metrics["perf/seconds_to_stop"] = metrics["perf/seconds"]
+            trainer.end()
+
+
+class Snapshots:
+    """Saves what the policy acts with at the end of each of `n` equal parts of the budget, for
+    `evaluate.py ratings=true`.
+
+    Args:
+        saver: writes the snapshots.
+        n: their number.
+    """
+
+    is_slow = True
+
+    def __init__(self, saver: SaverLike, n: int):
+        self.saver, self.n, self.n_parts_done = saver, n, 0
+
+    def on_start(self, trainer: Trainer) -> None:
+        """Continues with the part that the run is in."""
+        self.n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
+
+    def on_update(self, trainer: Trainer, losses: object) -> None:
+        """Saves a snapshot if a part has ended."""
+        before = self.n_parts_done
+        self.on_start(trainer)
+        if self.n_parts_done > before:
+            self.saver(trainer.samples, trainer.run_state.of_policy(), None, False)
+            self.saver.wait()
+
+
+class Progress:
+    """Shows a line about the run with each report.
+
+    Args:
+        show: gets the fraction of the budget that is spent, None without one, and a few words.
+    """
+
+    def __init__(self, show: Callable[[float | None, list[str]], None]):
+        self.show = show
+
+    def on_report(self, trainer: Trainer, metrics: Mapping[str, Any]) -> None:
+        """Shows the line."""
+        left, latest = trainer.fraction_left, trainer.latest_stats
+        words = [f"{console.number(trainer.samples)} samples"]
+        if (rate := trainer.timing.rate) is not None:
+            words.append(f"{console.number(rate)}/s")
+        if "episode/return" in latest:
+            n_episodes = console.number(latest["episode/window"])
+            words.append(f"return {latest['episode/return']:.3g} of {n_episodes} episodes")
+            words += trainer.episodes.few_means(latest)
+            won = [(key.partition("episode/won/")[2], rate) for key, rate in latest.items()]
+            words += [f"won vs {opponent} {100 * rate:.0f} %" for opponent, rate in won if opponent]
+        if "return" in trainer.evaluation:
+            words.append(f"evaluated {trainer.evaluation['return']:.3g}")
+        is_limited = trainer.budget.is_limited
+        if is_limited and left < 1:
+            words.append(f"{console.duration(trainer.clock.seconds * left / (1 - left))} left")
+        self.show(1 - left if is_limited else None, words)

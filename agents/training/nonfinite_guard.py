@@ -17,6 +17,7 @@ from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.training.episode_stats import EpisodeStats
+    from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import Learner, RolloutLike
 
 #: Training stops after this many skipped updates in a row.
@@ -32,11 +33,11 @@ class NonFiniteGuard:
     Args:
         env: the environment.
         learner: its `check` is read. Without one, only metrics are checked.
-        make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,
-            such as `repeat.hint`. Called on rank 0.
         ranks: those that train the policy.
 
     Attributes:
+        make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,
+            such as `repeat.hint`. Called on rank 0.
         value: the first NaN or infinity of the run, or None.
         hint: how to reproduce it, or "".
         tolerates_divergence: a policy that diverged is noted in `has_diverged`, and raises nothing,
@@ -46,18 +47,24 @@ class NonFiniteGuard:
 
     tolerates_divergence = has_diverged = False
 
-    def __init__(
-        self,
-        env: Env,
-        learner: Learner,
-        make_hint: Callable[[NonFiniteValue], str],
-        ranks: Ranks = ONE,
-    ):
-        self.ranks = ranks
-        self.learner, self.make_hint = learner, make_hint
+    def __init__(self, env: Env, learner: Learner, ranks: Ranks = ONE):
+        self.learner, self.ranks = learner, ranks
+        self.make_hint: Callable[[NonFiniteValue], str] = lambda value: ""
         self.n_agents = optional(env, "n_agents")
         self.nonfinite_check = with_defaults(learner, LearnerOptions).check
         self.value, self.hint = None, ""
+
+    def on_measure(self, trainer: Trainer, metrics: object) -> None:
+        """Warns of metrics of episodes."""
+        self.warn_of_metrics(trainer.episodes.stats, trainer.rollout)
+
+    def on_report(self, trainer: Trainer, metrics: object) -> None:
+        """Checks the last update, once it is reported."""
+        self.check(trainer.rollout)
+
+    def may_save(self, trainer: Trainer) -> bool:
+        """Returns whether the last update was applied, or the policy is about to be replaced."""
+        return self.tolerates_divergence or self.check(trainer.rollout)
 
     def check(self, rollout: RolloutLike) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.

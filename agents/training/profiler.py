@@ -40,6 +40,26 @@ class Profiler:
         self.path, self.n_begun = None, 0
         self._profile, self._timer, self._range = None, PhaseTimer(device), None
 
+    is_slow = True
+
+    def on_collect(self, trainer: object) -> None:
+        """Begins an update, and its first phase."""
+        self.start(PHASES[0])
+
+    def on_rollout(self, trainer: object, rollout: object) -> None:
+        """Begins the second phase."""
+        self.start(PHASES[1])
+
+    def on_update(self, trainer: object, losses: object) -> None:
+        """Begins the last phase."""
+        self.start(PHASES[2])
+
+    def close(self) -> None:
+        """Writes the profile, and says where it is."""
+        self.finish()
+        if self.path is not None:
+            console.say(f"Profile: {self.path}, and a trace beside it")
+
     def start(self, phase: str) -> None:
         """Ends the current phase and starts another. An update begins with the first phase."""
         with self._tolerating():

@@ -22,7 +22,12 @@ FOLDER = "nonfinite"
 CHANGEABLE = "samples", "seconds", "device", "ranks"
 
 
-def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
+def hint(
+    trainer: Trainer,
+    record: annealing.AnnealingRecord,
+    is_resumed: bool,
+    value: NonFiniteValue,
+) -> str:
     """Returns how to reproduce the first NaN or infinity of a run, as the rest of a sentence.
 
     Resuming from the last checkpoint reproduces it bit for bit, so that checkpoint is kept, in a
@@ -31,8 +36,9 @@ def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
 
     Args:
         trainer: rank 0's trainer, before it saves another checkpoint.
-        value: the first NaN or infinity.
+        record: the run's.
         is_resumed: this process resumed the run.
+        value: the first NaN or infinity.
     """
     saver = trainer.saver
     saver.wait()
@@ -46,7 +52,7 @@ def hint(trainer: Trainer, value: NonFiniteValue, is_resumed: bool) -> str:
         if whole and not reason:
             changed = _changed(whole[-1], saver.config["train"])
             if "seconds" not in changed or trainer.budget.anneal != "seconds":
-                path = _keep(whole[-1], run, trainer)
+                path = _keep(whole[-1], run, record)
                 words = [f"{key}={'null' if now is None else now}" for key, now in changed.items()]
                 return f". To reproduce it: {' '.join([folders.resume_command(path), *words])}"
             reason = "seconds= has changed since the last one, and with it the learning rate"
@@ -72,14 +78,13 @@ def _changed(path: Path, config: Config) -> Config:
     return {key: config[key] for key in CHANGEABLE if config[key] != before.get(key)}
 
 
-def _keep(path, run, trainer) -> Path:
+def _keep(path, run, record) -> Path:
     """Creates a run folder with the checkpoint and the annealing record. Returns the folder."""
     kept = folders.make(run / FOLDER)
     try:
         shutil.copytree(path, kept / "checkpoints" / path.name, copy_function=_link)
-        if trainer.annealing_record is not None:
-            trainer.annealing_record.flush()
-            shutil.copy2(run / annealing.FILE, kept)
+        record.flush()
+        shutil.copy2(run / annealing.FILE, kept)
     except OSError:
         shutil.rmtree(kept, ignore_errors=True)
         raise

@@ -5,48 +5,33 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING
 
-from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
+from megastep.agents.training.budget import evaluation_in
+from megastep.agents.types import CollectorOptions, with_defaults
 from megastep.env_state import EnvState
-from megastep.types import Env, optional
+from megastep.types import optional
 
 if TYPE_CHECKING:
-    from megastep.agents.networks.policy import Policy
-    from megastep.agents.training.curriculum import Curriculum
-    from megastep.agents.training.episode_stats import EpisodeStats
-    from megastep.agents.types import CollectorLike, Learner, StateDict
+    from megastep.agents.training.trainer import Trainer
+    from megastep.agents.types import StateDict
 
 
 class RunState:
-    """The state of a run, except for the trainer's counters.
+    """The state of a run: what trains, and the trainer's counters.
 
     Args:
-        env: the environment, after `reset()`.
-        policy: the policy that trains.
-        learner: the learner; its replay buffer is included.
-        collect: the learner's collector.
-        episode_stats: episode statistics.
-        curriculum: the curriculum, if any.
+        trainer: whose collector has reset the environment.
     """
 
-    def __init__(
-        self,
-        env: Env,
-        policy: Policy,
-        learner: Learner,
-        collect: CollectorLike,
-        episode_stats: EpisodeStats,
-        curriculum: Curriculum | None = None,
-    ):
-        self.policy, self.learner = policy, learner
-        self.collect = with_defaults(collect, CollectorOptions)
-        self.episode_stats, self.opponents = episode_stats, optional(env, "opponent_pool")
-        self.curriculum = curriculum
+    def __init__(self, trainer: Trainer):
+        self.trainer = trainer
+        self.collect = with_defaults(trainer.collect, CollectorOptions)
+        self.opponents = optional(trainer.env, "opponent_pool")
         if self.opponents is None:
-            self.env_state = EnvState(env)
+            self.env_state = EnvState(trainer.env)
         else:
             self.env_state = EnvState(self.opponents.env, self.opponents.scripted)
-        self.replay_buffer = with_defaults(learner, LearnerOptions).replay_buffer
-        self.has_named_unreachable, self.collector_name = False, type(collect).__name__
+        self.replay_buffer = trainer.learner_options.replay_buffer
+        self.has_named_unreachable = False
 
     @property
     def is_resumable(self) -> bool:
@@ -57,31 +42,38 @@ class RunState:
         """Returns why checkpoints do not hold everything, as a clause; None if they do."""
         if not self.is_resumable:
             return f"they do not hold {type(self.env_state.env).__name__}"
-        if not hasattr(self.collect, "state_dict"):
-            return f"{type(self.collect).__name__} has no state_dict"
+        if not hasattr(self.trainer.collect, "state_dict"):
+            return f"{type(self.trainer.collect).__name__} has no state_dict"
         names = self.env_state.unreachable()
         return f"they cannot hold {', '.join(names)} of the environment" if names else None
 
     def state_dict(self, has_episodes: bool = True) -> StateDict:
-        """Returns the state as dicts of tensors and plain values.
+        """Returns the state as dicts of tensors and plain values, once no collector steps.
 
         Most tensors are not copies, so copy them before the environment or the learner steps.
 
         Args:
             has_episodes: includes the environment, if it is `resumable`, and the actor state.
         """
+        trainer = self.trainer
+        trainer.wait_for_collector()
         parts = dict(
+            samples=trainer.samples,
+            updates=trainer.updates,
+            seconds=trainer.clock.seconds,
+            samples_at_report=trainer.samples_at_report,
+            **{f"eval/{name}": value for name, value in trainer.evaluation.items()},
             **self.of_policy(),
-            learner=self.learner.state_dict(),
-            episode_stats=self.episode_stats.state_dict(),
+            learner=trainer.learner.state_dict(),
+            episode_stats=trainer.episodes.stats.state_dict(),
         )
         if has_episodes and self.is_resumable:
             parts["env"] = self.env_state.state_dict()
             parts["collector"] = self.collect.state_dict()
         if self.opponents is not None:
             parts["opponents"] = self.opponents.state_dict()
-        if self.curriculum is not None:
-            parts["curriculum"] = self.curriculum.state_dict()
+        if trainer.curriculum is not None:
+            parts["curriculum"] = trainer.curriculum.state_dict()
         if self.replay_buffer is not None:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
@@ -91,38 +83,43 @@ class RunState:
         learnt, if anything.
         """
         wrappers = optional(self.env_state.env, "wrapper_state")()
-        return dict(policy=self.policy.state_dict(), **({"wrappers": wrappers} if wrappers else {}))
+        return dict(
+            policy=self.trainer.policy.state_dict(), **({"wrappers": wrappers} if wrappers else {})
+        )
 
-    def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> list[str]:
-        """Restores a `state_dict`.
+    def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> None:
+        """Restores a `state_dict`. `trainer.lost` gets a clause for each part that could not be
+        restored and starts anew.
 
         Args:
             state: from `state_dict`.
             is_new_rank: True if the saved run did not have this rank: `state` is rank 0's, without
                 episodes, and this rank keeps its own generators.
-
-        Returns:
-            A clause for each part that could not be restored and starts anew. The run continues bit
-            for bit if there are none.
         """
+        trainer = self.trainer
+        trainer.samples, trainer.updates = state["samples"], state["updates"]
+        trainer.clock.seconds_before = state["seconds"]
+        trainer.samples_at_report = state["samples_at_report"]
+        trainer.evaluation = evaluation_in(state)
+        trainer.updates_at_checkpoint = trainer.updates_at_report = trainer.updates
         if is_new_rank:
             state = self._of_new_rank(state)
-        self.policy.load_state_dict(state["policy"])
-        self.learner.load_state_dict(state["learner"])
+        trainer.policy.load_state_dict(state["policy"])
+        trainer.learner.load_state_dict(state["learner"])
         lost = self._load_episodes(state)
         if self.opponents is not None:
             of_episodes = {"lanes"} if lost else set()
             parts = state["opponents"].items()
             self.opponents.load_state_dict({k: v for k, v in parts if k not in of_episodes})
-        if self.curriculum is not None:
+        if trainer.curriculum is not None:
             parts = state["curriculum"]
-            self.curriculum.load_state_dict(parts if not lost else parts | {"lanes": None})
+            trainer.curriculum.load_state_dict(parts if not lost else parts | {"lanes": None})
         if self.replay_buffer is not None:
             if "replay" in state:
                 self.replay_buffer.load_state_dict(state["replay"])
             else:
                 lost.append("the replay buffer was not saved and starts empty")
-        return ["added ranks start new episodes"] if is_new_rank else lost
+        trainer.lost = ["added ranks start new episodes"] if is_new_rank else lost
 
     def _of_new_rank(self, state) -> StateDict:
         """Returns rank 0's state with this rank's generators, and with no episodes since the last
@@ -139,7 +136,9 @@ class RunState:
         if "env" not in state:
             lost.append("environments were not saved, so new episodes start")
         elif not state["collector"]:
-            lost.append(f"{self.collector_name} has no state_dict, so new episodes start")
+            lost.append(
+                f"{type(self.trainer.collect).__name__} has no state_dict, so new episodes start"
+            )
         else:
             try:
                 self.env_state.load_state_dict(state["env"])
@@ -153,12 +152,12 @@ class RunState:
             }
         else:
             self.collect.load_state_dict(state["collector"])
-        self.episode_stats.load_state_dict(state["episode_stats"])
+        self.trainer.episodes.stats.load_state_dict(state["episode_stats"])
         return lost
 
     def warn_of_unreachable(self) -> None:
         """Warns once of environment state that checkpoints cannot hold."""
-        if self.has_named_unreachable or not self.is_resumable:
+        if self.has_named_unreachable or not self.is_resumable or self.trainer.ranks.rank > 0:
             return
         if names := self.env_state.unreachable():
             self.has_named_unreachable = True

@@ -41,17 +41,17 @@ def _costs(device, n_envs, words, folder):
     running = make_trainer(cfg, folder, device)
     waits, writes, costs = [], [], []
     for _ in range(3):
-        _update(running)  # the first ones compile and capture
+        running.update()  # the first ones compile and capture
     for _ in range(N_SAVES + 1):
         began = time.perf_counter()
-        _update(running)
+        running.update()
         _synchronise(device)
         saves = time.perf_counter()
-        running.save_checkpoint()
+        running.save()
         waits.append(time.perf_counter() - saves)
         n_updates = 1
         while running.saver.is_writing or n_updates < 3:
-            _update(running)
+            running.update()
             _synchronise(device)
             n_updates += 1
         with_checkpoint = time.perf_counter() - began
@@ -61,7 +61,7 @@ def _costs(device, n_envs, words, folder):
         writes.append(running.saver.seconds)
         began = time.perf_counter()
         for _ in range(n_updates):
-            _update(running)
+            running.update()
             _synchronise(device)
         costs.append(with_checkpoint - (time.perf_counter() - began))
     n_bytes = sum(path.stat().st_size for path in (folder / "checkpoints").glob("*/*"))
@@ -75,11 +75,6 @@ def _costs(device, n_envs, words, folder):
     yield measurement(f"{title}: written and verified after", "ms", [1e3 * s for s in writes[1:]])
     share = [100 * seconds / INTERVAL for seconds in costs[1:]]
     yield measurement(f"{title}: share of training, one every 30 s", "%", share)
-
-
-def _update(running):
-    running.rollout = running.collect()
-    running.update()
 
 
 def _synchronise(device):

@@ -44,7 +44,6 @@ def copies(device: torch.device) -> Iterator[dict]:
                 folder = Path(parent, name)
                 folder.mkdir()
                 trainer = make_trainer(cfg, folder, device)
-                trainer.rollout = trainer.collect()
                 trainer.update()  # the optimizer has a state from here on
                 trainers.append(trainer)
             source, target = (trainer.learner for trainer in trainers)

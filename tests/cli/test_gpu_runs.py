@@ -88,13 +88,13 @@ def test_rollouts_differ_after_resume(stopped, trainers):
     """A captured call advances the hidden state and the generator."""
     collected = []
 
-    def store(self, losses, real=Trainer.log):
-        real(self, losses)
+    def store(self, real=Trainer.report):
+        real(self)
         rollout = self.rollout
         collected.append((rollout.actions.clone(), rollout.state.cell.clone()))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "log", store)
+        patch.setattr(Trainer, "report", store)
         assert train.main([f"resume={stopped}", f"samples={2 * STOPPED}"]) == 0
     assert is_captured(trainers[0])
     assert len(collected) == 6

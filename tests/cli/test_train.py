@@ -29,7 +29,8 @@ from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.runs.folders import locked
 from megastep.agents.training import loggers
 from megastep.agents.training.budget import Budget
-from megastep.agents.training.progress import few_means, progress_of
+from megastep.agents.training.callbacks import Progress
+from megastep.agents.training.episodes import Episodes
 from megastep.agents.training.trainer import Trainer
 from megastep.settings import MAX_ENVS
 from tests.helpers import faults, tiny
@@ -389,16 +390,16 @@ def test_out_of_memory_while_training(here, monkeypatch, capsys, error):
 
 
 def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
-    real, full = Trainer.log, contextlib.ExitStack()
+    real, full = Trainer.report, contextlib.ExitStack()
 
-    def report(self, losses):
-        real(self, losses)
+    def report(self):
+        real(self)
         if self.updates == 2:
             self.saver.wait()  # the first checkpoint is written
             full.enter_context(faults.full_disk(8000))
 
     with full, monkeypatch.context() as patch:
-        patch.setattr(Trainer, "log", report)
+        patch.setattr(Trainer, "report", report)
         code = train.main(
             [*TINY, f"samples={5 * UPDATE}", "checkpoints.seconds=1e-9", "folder=run"]
         )
@@ -488,14 +489,14 @@ def test_finish(here, capsys):
     ],
 )
 def test_long_run_leaks_nothing(here, monkeypatch, early, late):
-    real, seen = Trainer.log, {}
+    real, seen = Trainer.report, {}
 
-    def report(self, losses):
-        real(self, losses)
+    def report(self):
+        real(self)
         pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
         seen[self.updates] = pages * 4096 / 1e6, len(os.listdir("/proc/self/fd"))
 
-    monkeypatch.setattr(Trainer, "log", report)
+    monkeypatch.setattr(Trainer, "report", report)
     train.run(configured(f"samples={late * UPDATE}", "checkpoints.seconds=0.5"))
     grown = seen[late][0] - seen[early][0]
     # a checkpoint that is being written has a file open
@@ -506,23 +507,27 @@ def test_long_run_leaks_nothing(here, monkeypatch, early, late):
 def test_progress_metrics():
     latest = {"episode/return/leader": 12.345, "episode/return/follower": 2.0}
     latest |= {"episode/coverage": 0.8371, "episode/length": 9.0}
-    shown = few_means(latest, ["coverage"], ("leader", "follower", "follower"))
-    assert shown == ["leader 12.3", "follower 2", "coverage 0.837"]
-    assert few_means({}, ["coverage"], ()) == []
-    assert few_means(latest, ["coverage", *"abcd"], ()) == []
+    episodes = Episodes.__new__(Episodes)
+    episodes.stats = SimpleNamespace(metrics=["coverage"], groups=("leader", "follower"))
+    assert episodes.few_means(latest) == ["leader 12.3", "follower 2", "coverage 0.837"]
+    assert episodes.few_means({}) == []
+    episodes.stats.metrics += "abcd"
+    assert episodes.few_means(latest) == []
 
 
 def test_progress_says_how_many_episodes_a_return_is_of():
     running = SimpleNamespace(
         samples=2_000_000,
-        samples_per_second=1e6,
+        timing=SimpleNamespace(rate=1e6),
         fraction_left=1.0,
         latest_stats={"episode/return": 26.34, "episode/window": 1312, "episode/won/past": 0.6},
-        episode_stats=SimpleNamespace(metrics=(), groups=()),
+        episodes=SimpleNamespace(few_means=lambda latest: []),
         budget=Budget(),
-        evaluate_every=None,
+        evaluation={},
     )
-    fraction, words = progress_of(running)
+    shown = []
+    Progress(lambda *line: shown.append(line)).on_report(running, {})
+    ((fraction, words),) = shown
     assert fraction is None
     assert words == ["2M samples", "1M/s", "return 26.3 of 1.31k episodes", "won vs past 60 %"]
 

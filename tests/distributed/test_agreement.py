@@ -61,8 +61,8 @@ def others(monkeypatch):
             said.append(value)
             return [*values[:rank], value, *values[rank:]]
 
-        for name in "exchange", "gather_objects":
-            monkeypatch.setattr(agreement, name, gathered)
+        monkeypatch.setattr(process_group, "exchange", gathered)
+        monkeypatch.setattr(agreement, "gather_objects", gathered)
         monkeypatch.setattr(agreement, "n_ranks", lambda: 1 + len(values))
         monkeypatch.setattr(agreement, "rank", lambda: rank)
         monkeypatch.setattr(agreement, "rank_label", lambda: f"rank {rank} on here")
@@ -72,19 +72,19 @@ def others(monkeypatch):
 
 
 def test_one_process_follows_its_own_plan():
-    assert agree(GOES_ON, False, False) == GOES_ON
-    assert not agree(GOES_ON, True, False).goes_on
-    assert not agree(GOES_ON._replace(saves=True), False, True).saves
+    assert agree(GOES_ON, False, False, ONE) == GOES_ON
+    assert not agree(GOES_ON, True, False, ONE).goes_on
+    assert not agree(GOES_ON._replace(saves=True), False, True, ONE).saves
 
 
 def test_clock_of_rank_0_decides_unless_a_rank_has_a_signal_or_a_slow_disk(others):
     others([[True, True, 0.5, False, False]], rank=1)
-    assert agree(Plan(False, False, 0.25), False, False) == Plan(True, True, 0.5)
+    assert agree(Plan(False, False, 0.25), False, False, Ranks(1, 2)) == Plan(True, True, 0.5)
     saving = GOES_ON._replace(saves=True)
     others([[1, 1, 0.9, 0, 0], [1, 1, 0.9, 1, 0]])
-    assert agree(saving, False, False) == saving._replace(goes_on=False)
+    assert agree(saving, False, False, Ranks(0, 3)) == saving._replace(goes_on=False)
     others([[1, 1, 0.9, 0, 0], [1, 1, 0.9, 0, 1]])
-    assert agree(saving, False, False) == GOES_ON
+    assert agree(saving, False, False, Ranks(0, 3)) == GOES_ON
 
 
 def failing(error):

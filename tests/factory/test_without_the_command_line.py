@@ -17,7 +17,6 @@ from megastep.agents.evaluation import playing, statistics
 from megastep.agents.factory import settings
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training.budget import Budget
-from megastep.agents.training.loggers import NoLogger
 from megastep.agents.training.trainer import Trainer
 
 homes = geometries.sample("box", 4)
@@ -31,7 +30,7 @@ chosen = settings.kind_of("learner", name)(name=name, n_steps=4, n_minibatches=2
 policy = factory.make_policy(settings.Agent(width=16), env, critic="plain")
 learner = factory.make_learner(chosen, policy)
 saver = Saver(Path("checkpoints"), {})
-trainer = Trainer(env, policy, learner, NoLogger(), saver, Budget(samples=64))
+trainer = Trainer(env, policy, learner, Budget(samples=64), saver=saver)
 trainer.train()
 assert trainer.samples == 64 and [*Path("checkpoints").glob("step_64")]
 

@@ -31,16 +31,16 @@ from megastep.agents.distributed import drift
 from megastep.agents.launch import watch
 from megastep.agents.training import trainer
 
-log, watch.PERIOD = trainer.Trainer.log, 0.5
+report, watch.PERIOD = trainer.Trainer.report, 0.5
 
-def log_and_tell(self, losses):
-    log(self, losses)
+def report_and_note(self):
+    report(self)
     sums = drift.checksums(self.policy.parameters()).tolist()
     with open(f"sums-{os.environ['RANK']}", "a") as file:
         print(self.updates, *sums, file=file)
     watch.LOST_SECONDS, watch.SILENT_SECONDS = 5.0, 9.0
 
-trainer.Trainer.log = log_and_tell
+trainer.Trainer.report = report_and_note
 sys.exit(train.main(sys.argv[1:]))
 """
 

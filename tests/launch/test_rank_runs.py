@@ -26,8 +26,8 @@ def trained(*words):
     """Trains in this rank. Returns what it learnt, and a copy of its state."""
     trainers, make_trainer = [], launch_train.make_trainer
 
-    def remember(*arguments):
-        trainers.append(make_trainer(*arguments))
+    def remember(*arguments, **options):
+        trainers.append(make_trainer(*arguments, **options))
         return trainers[-1]
 
     launch_train.make_trainer = remember
@@ -36,13 +36,13 @@ def trained(*words):
     finally:
         launch_train.make_trainer = make_trainer
     (trainer,) = trainers
-    state = trainer.state_dict()
+    state = trainer.run_state.state_dict()
     return dict(
         policy=state["policy"],
         optimizer=state["learner"]["optimizer"],
         actions=trainer.rollout.actions,
         generators=[state["learner"][name] for name in ("generator", "policy_generator")],
-        n=(trainer.samples, trainer.updates, trainer.episode_stats.windows),
+        n=(trainer.samples, trainer.updates, trainer.episodes.stats.windows),
         parts=trainer.saver.rank_files.rank,
     )
 

@@ -91,7 +91,7 @@ def test_members_have_the_bits_of_runs_alone(here, device):
 
 def test_all_members_are_launched_before_a_report_waits(here, monkeypatch):
     events = []
-    for name in ("update", "log"):
+    for name in ("update", "report"):
         method = getattr(Trainer, name)
 
         def noted(*arguments, name=name, method=method):
@@ -101,7 +101,7 @@ def test_all_members_are_launched_before_a_report_waits(here, monkeypatch):
         monkeypatch.setattr(Trainer, name, noted)
     run(*POPULATION, "samples=1024", "population.every=1e9")
     groups = {(name, len([*group])) for name, group in itertools.groupby(events)}
-    assert groups == {("update", 6), ("log", 3)}
+    assert groups == {("update", 6), ("report", 3)}
 
 
 def own_homes(n=2, split="training", seed=1):
@@ -171,7 +171,7 @@ def test_killed_and_interrupted_population_has_the_same_bits(here, monkeypatch, 
             return save(self)
         for trainer in self.trainers:
             trainer.saver.wait()
-        self.trainers[0].save_checkpoint()
+        self.trainers[0].save()
         self.trainers[0].saver.wait()
         raise Killed
 

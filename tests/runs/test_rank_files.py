@@ -124,16 +124,16 @@ def test_one_process_writes_the_files_that_it_always_has(folder):
 def test_new_rank_has_rank_0s_optimizer_and_its_own_generators(tmp_path):
     first = make_trainer(tmp_path, samples=3 * UPDATE)
     first.train()
-    saved = first.state_dict(has_episodes=False)
+    saved = first.run_state.state_dict(has_episodes=False)
     saved["episode_stats"]["sums"] += 1
     new = make_trainer(tmp_path / "new")
     own = new.learner.state_dict()["generator"]
-    new.load_state_dict(saved, is_new_rank=True)
+    new.run_state.load_state_dict(saved, is_new_rank=True)
     assert new.lost == ["added ranks start new episodes"]
     now, then = new.learner.state_dict(), saved["learner"]
     assert now["generator"] == own and now["generator"].keys() != then["generator"].keys()
     assert str(now["optimizer"]) == str(then["optimizer"]) and now["optimizer"]
-    assert not new.episode_stats.sums.any() and new.samples == 3 * UPDATE
+    assert not new.episodes.stats.sums.any() and new.samples == 3 * UPDATE
 
 
 def test_resume_names_another_number_of_ranks():

@@ -192,7 +192,10 @@ def trainer_of(folder, env, samples, seed=1, **options):
     if options:
         env = Opponents(env, policy, seed=seed, **options)
     learner = PPO(policy, n_steps=4, n_minibatches=2, lr=1e-2, seed=seed)
-    return Trainer(env, policy, learner, Rows(), Saver(folder, {}), Budget(samples))
+    rows, saver = Rows(), Saver(folder, {})
+    trainer = Trainer(env, policy, learner, Budget(samples), saver=saver, callbacks=[rows])
+    trainer.rows = rows
+    return trainer
 
 
 class Rigged(Matrix):
@@ -229,7 +232,6 @@ def test_update_does_not_depend_on_opponents_rewards(tmp_path, other):
         run = trainer_of(tmp_path, env, 0, past=0.5, bot=0.25, scripted=High(), snapshots=2)
         env.mask, env.other = run.env.learners, reward
         for _ in range(3):
-            run.rollout = run.collect()
             run.update()
         weights.append(copied(run.policy))
     assert same(*weights)
@@ -276,7 +278,6 @@ def test_nonfinite_number_is_named_by_its_lane_in_the_environment(tmp_path):
     lane = int(run.env.learners.nonzero()[-1, 0])
     env.mask = torch.ones(32, dtype=torch.bool)
     env.scored = lambda reward: reward.index_fill(0, torch.tensor(lane), torch.nan)
-    run.rollout = run.collect()
     run.update()
     with pytest.warns(
         UserWarning, match=rf"reward of lane {lane} \(environment {lane // 2}\) was nan"
@@ -298,7 +299,7 @@ def test_policy_learns_to_beat_its_opponents(tmp_path, options):
     assert (run.rollout.actions == 2).float().mean() > 0.95
     (kind,) = run.env.matchups
     key = f"episode/won/{kind}"
-    won = [row[key] for row in run.logger if key in row]
+    won = [row[key] for row in run.rows if key in row]
     assert won[0] < 0.9 and max(won) > 0.95
 
 
@@ -463,7 +464,7 @@ def test_means_by_role_and_matchup(tmp_path):
     env = Matrix(16, roles=("left", "right"))
     run = trainer_of(tmp_path, env, 4 * 4 * 20, past=0.5, bot=0.25, scripted=High(), snapshots=2)
     run.train()
-    row = run.logger[0]
+    row = run.rows[0]
     for name in ("left", "right", "now", "past", "bot"):
         assert row[f"episode/points/{name}"] == row[f"episode/return/{name}"]
     assert row["episode/return/bot"] == -1, "the bot always chooses the highest number"

@@ -164,7 +164,7 @@ def test_snapshots_act_with_their_current_weights(here, trainers, device):
     assert not torch.equal(played[0][0], played[1][0]), "the generator advances"
     assert not torch.equal(played[0][1], played[1][1]), "the hidden state advances"
     # change the weights in place: the first snapshot only moves up, the second only down
-    for up, snapshot in zip((50.0, -50.0), trainer.opponents.snapshots, strict=True):
+    for up, snapshot in zip((50.0, -50.0), trainer.episodes.opponents.snapshots, strict=True):
         snapshot.output.linear.weight.data.zero_()
         snapshot.output.linear.bias.data.copy_(torch.tensor([-90.0, up, -up]))
     for _ in range(4):

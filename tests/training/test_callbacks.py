@@ -49,17 +49,10 @@ def test_hooks_are_called_in_order(here):
     CALLS.clear()
     assert run(Noted) == 0
     names = [name for name, *_ in CALLS]
-    update = ["on_rollout", "on_update"]
-    report = ["on_report"]
-    assert names == [
-        "on_start",
-        *4 * update,
-        *report,
-        *2 * update,
-        *report,
-        "on_checkpoint",
-        "on_end",
-    ]
+    update = ["on_collect", "on_rollout", "on_update"]
+    report = ["on_measure", "on_report"]
+    end = ["on_checkpoint", "on_end"]
+    assert names == ["on_start", *4 * update, *report, *2 * update, *report, *end]
     assert [n for name, n, _ in CALLS if name == "on_update"] == [1, 2, 3, 4, 5, 6]
     reports = [others[0] for name, _, others in CALLS if name == "on_report"]
     assert [report["samples"] for report in reports] == [128, 192] and "loss/value" in reports[0]
@@ -99,7 +92,7 @@ def test_a_callback_that_raises_is_named_and_what_was_learnt_is_saved(here, caps
 
 def test_what_is_no_callback_is_refused(here, capsys):
     assert run(Nothing) == 2
-    assert "Nothing is no callback: it has none of on_start, on_rollout" in capsys.readouterr().err
+    assert "Nothing is no callback: it has none of on_start, on_collect" in capsys.readouterr().err
     assert not [*here.glob("run/checkpoints/*")]
     assert train.main([*TINY, "callbacks=[nowhere:Stop]"]) == 2
     assert "callbacks: nowhere:Stop cannot be imported" in capsys.readouterr().err

@@ -34,7 +34,7 @@ def with_tensorboard(folder):
 def test_files_and_tensorboard_hold_what_was_written(tmp_path):
     run_loggers = with_tensorboard(tmp_path)
     metrics = {"loss/value": 0.25, "episode/count": 3, "bad": float("nan"), "anneal": "never"}
-    run_loggers.write(64, metrics, {"perf/rate": 1e6})
+    run_loggers.write(64, {**metrics, "perf/rate": 1e6})
     run_loggers.close()
     (row,) = json_lines.read(tmp_path / "metrics.jsonl")
     assert row == {"samples": 64, **metrics, "bad": None}
@@ -48,12 +48,12 @@ def test_files_and_tensorboard_hold_what_was_written(tmp_path):
 def test_resumed_run_replaces_lines_after_its_checkpoint(tmp_path):
     run_loggers = Loggers(tmp_path)
     for step in (10, 20, 30):
-        run_loggers.write(step, {"x": step}, {})
+        run_loggers.write(step, {"x": step})
     run_loggers.close()
     with open(tmp_path / "metrics.jsonl", "a") as file:
         file.write('{"samples": 40, "x"')  # a line cut short by a kill
     run_loggers = Loggers(tmp_path, step=20)
-    run_loggers.write(30, {"x": -1}, {})
+    run_loggers.write(30, {"x": -1})
     run_loggers.close()
     assert [row["x"] for row in json_lines.read(tmp_path / "metrics.jsonl")] == [10, 20, -1]
 
@@ -63,7 +63,7 @@ def test_tensorboard_has_the_points_of_the_lines_after_two_resumes(tmp_path):
         others = {"tensorboard": lambda saved=saved: TensorBoard(tmp_path, saved)}
         run_loggers = Loggers(tmp_path, saved, others)
         for step in range(10 * first + 10, last + 1, 10):
-            run_loggers.write(step, {"x": step + saved / 100}, {"rate": 1.0})
+            run_loggers.write(step, {"x": step + saved / 100, "perf/rate": 1.0})
         run_loggers.close()
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -72,7 +72,7 @@ def test_tensorboard_has_the_points_of_the_lines_after_two_resumes(tmp_path):
     assert [row["samples"] for row in rows] == [10, 20, 30, 40, 50, 60, 70]
     points = [(event.step, pytest.approx(event.value)) for event in events.Scalars("x")]
     assert [(row["samples"], row["x"]) for row in rows] == points
-    assert [event.step for event in events.Scalars("rate")] == [row["samples"] for row in rows]
+    assert [event.step for event in events.Scalars("perf/rate")] == [row["samples"] for row in rows]
 
 
 def lines(n, **values):
@@ -105,7 +105,7 @@ def test_damaged_line_is_named_and_skipped(tmp_path, damage):
     assert caught[0].filename == __file__, "the line that reads is the one that is shown"
     with pytest.warns(UserWarning, match="line 3"):
         run_loggers = Loggers(tmp_path, step=3)
-    run_loggers.write(9, {}, {})
+    run_loggers.write(9, {})
     run_loggers.close()
     assert [row["samples"] for row in json_lines.read(path)] == [0, 1, 3, 9]
 
@@ -117,7 +117,7 @@ def test_last_line_cut_short_causes_no_warning(tmp_path):
     assert [row["samples"] for row in json_lines.read(path)] == [0, 1]
     path.write_bytes(lines(3)[:-1])  # only its newline is missing
     run_loggers = Loggers(tmp_path, step=9)
-    run_loggers.write(9, {}, {})
+    run_loggers.write(9, {})
     run_loggers.close()
     assert [row["samples"] for row in json_lines.read(path)] == [0, 1, 2, 9]
 
@@ -190,9 +190,9 @@ def test_csv_of_a_resumed_run_has_no_row_after_its_checkpoint(tmp_path, cut):
 
 def test_csv_that_fails_is_dropped_and_keeps_what_it_has(tmp_path):
     run_loggers = Loggers(tmp_path, others={"csv": lambda: CSV(tmp_path, 0)})
-    run_loggers.write(1, {"x": 1}, {})
+    run_loggers.write(1, {"x": 1})
     with faults.full_disk(0), pytest.warns(UserWarning, match="File too large") as warnings:
-        run_loggers.write(2, {"y": 2}, {})
+        run_loggers.write(2, {"y": 2})
     assert str(warnings[-1].message).startswith("logger=csv failed and is dropped (")
     assert table(tmp_path) == [["samples", "x"], ["1", "1"]]
 
@@ -204,7 +204,7 @@ def test_wandb_that_is_not_installed_is_named_with_the_cure(tmp_path, monkeypatc
     faults.not_installed(monkeypatch, "wandb")
     with pytest.warns(UserWarning, match="logger=wandb skipped: .*pip install wandb$"):
         run_loggers = with_wandb(tmp_path)
-    run_loggers.write(1, {"x": 1}, {})
+    run_loggers.write(1, {"x": 1})
     run_loggers.close()
     assert json_lines.read(tmp_path / "metrics.jsonl") == [{"samples": 1, "x": 1}]
 
@@ -242,8 +242,8 @@ def with_wandb(folder, step=0):
 def test_wandb_logs_metrics_and_perf(tmp_path, monkeypatch):
     logged = fake_wandb(monkeypatch)
     run_loggers = with_wandb(tmp_path)
-    run_loggers.write(5, {"a": 1}, {"b": 2})
-    assert logged == [(5, {"samples": 5, "a": 1, "b": 2})]
+    run_loggers.write(5, {"a": 1, "perf/b": 2})
+    assert logged == [(5, {"samples": 5, "a": 1, "perf/b": 2})]
 
 
 def test_resumed_run_continues_its_wandb_run(tmp_path, monkeypatch):
@@ -316,7 +316,7 @@ def test_wandb_failure_is_one_warning(tmp_path, monkeypatch, fault, message):
     with pytest.warns(UserWarning, match=message) as warnings:
         run_loggers = with_wandb(tmp_path)
         for step in range(3):
-            run_loggers.write(step, {"x": step}, {})
+            run_loggers.write(step, {"x": step})
         run_loggers.close()
     assert len(warnings) == 1
     assert len(json_lines.read(tmp_path / "metrics.jsonl")) == 3
@@ -325,17 +325,17 @@ def test_wandb_failure_is_one_warning(tmp_path, monkeypatch, fault, message):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_full_disk_is_one_warning_per_file_and_loses_no_line(tmp_path):
     run_loggers = with_tensorboard(tmp_path)
-    run_loggers.write(1, {"x": 1}, {"y": 2})
+    run_loggers.write(1, {"x": 1, "perf/y": 2})
     size = (tmp_path / "metrics.jsonl").stat().st_size
     with pytest.warns(UserWarning, match="File too large") as warnings:
         with faults.full_disk(size + 5):  # space for part of a line
-            run_loggers.write(2, {"x": 1}, {"y": 2})
-            run_loggers.write(3, {"x": 1}, {"y": 2})
+            run_loggers.write(2, {"x": 1, "perf/y": 2})
+            run_loggers.write(3, {"x": 1, "perf/y": 2})
     names = sorted(str(w.message).split(" ")[0].rpartition("/")[2] for w in warnings)
     if "logger=tensorboard" in names:  # its thread may hit the full disk, too
         names.remove("logger=tensorboard")
     assert names == ["metrics.jsonl", "perf.jsonl"]
-    run_loggers.write(4, {"x": 1}, {"y": 2})
+    run_loggers.write(4, {"x": 1, "perf/y": 2})
     run_loggers.close()
     for name in ("metrics.jsonl", "perf.jsonl"):
         assert [row["samples"] for row in json_lines.read(tmp_path / name)] == [1, 2, 3, 4]

@@ -55,7 +55,6 @@ def test_nan_of_another_rank_is_told_by_rank_0(tmp_path, one_by_one, recwarn):
     trainers = []
     for rank, faults in ((1, {("reward", 2, 3): torch.nan}), (0, {})):
         run = make_trainer(tmp_path, faults, ranks=one_by_one(rank))
-        run.rollout = run.collect()
         run.update()
         assert not run.nonfinite_guard.check(run.rollout)
         trainers.append(run)
@@ -70,7 +69,6 @@ def test_all_ranks_end_with_the_same_sentence(tmp_path, one_by_one):
     for rank, faults in ((1, always("reward", 2, torch.nan)), (0, {})):
         run = make_trainer(tmp_path, faults, ranks=one_by_one(rank))
         for _ in range(MAX_SKIPPED):
-            run.rollout = run.collect()
             run.update()
         told = pytest.warns(UserWarning) if rank == 0 else contextlib.nullcontext()
         with told, pytest.raises(nonfinite_guard.NonFiniteError) as caught:
@@ -84,12 +82,11 @@ def test_all_ranks_end_with_the_same_sentence(tmp_path, one_by_one):
 def test_metric_of_another_rank_is_named_once(tmp_path, one_by_one, recwarn):
     for rank in (1, 0):
         run = make_trainer(tmp_path, env=Pairs({}), ranks=one_by_one(rank))
-        run.rollout = run.collect()
-        run.episode_stats.bad_lanes[0] = 2 if rank else 6
-        run.nonfinite_guard.warn_of_metrics(run.episode_stats, run.rollout)
+        run.episodes.stats.bad_lanes[0] = 2 if rank else 6
+        run.nonfinite_guard.warn_of_metrics(run.episodes.stats, run.rollout)
     (warning,) = recwarn
     assert "metrics.age of lane 2 (environment 1) (rank 1 on there)" in str(warning.message)
-    assert run.episode_stats.named == {"age"}
+    assert run.episodes.stats.named == {"age"}
 
 
 class Three(Ranks):

@@ -15,13 +15,17 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import checkpoint
+from megastep.agents.runs.annealing import AnnealingRecord
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import performance
 from megastep.agents.training.budget import Budget
+from megastep.agents.training.callbacks import Evaluations
+from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
-from megastep.agents.training.trainer import MAX_AHEAD, Trainer
-from megastep.agents.types import CollectorOptions, with_defaults
+from megastep.agents.training.performance import MAX_AHEAD
+from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
+from megastep.atomic_files import AppendedFile
 from tests.helpers.logged import Rows
 from tests.helpers.synchronisation import no_synchronisation
 from tests.helpers.weights import copied, same
@@ -84,13 +88,18 @@ class Pairs(Numbers):
         return arrdict(world, truncated=ends, learns=torch.arange(B) < 4, metrics=arrdict(age=age))
 
 
-def make_trainer(folder, faults=(), samples=None, every=1, lr=1e-3, env=None, **options):
+def make_trainer(
+    folder, faults=(), samples=None, every=1, lr=1e-3, env=None, callbacks=(), **options
+):
     """A trainer in `Numbers` that saves into a folder."""
     env = env or Numbers(faults)
     policy = Policy(env.obs_space, env.action_space, width=8)
     learner = PPO(policy, n_steps=T, n_minibatches=2, lr=lr)
-    saver, budget = Saver(folder, {}), Budget(samples)
-    return Trainer(env, policy, learner, Rows(), saver, budget, log_every=every, **options)
+    callbacks = [*callbacks, rows := Rows()]
+    options |= {"saver": Saver(folder, {}), "callbacks": callbacks, "log_every": every}
+    trainer = Trainer(env, policy, learner, Budget(samples), **options)
+    trainer.rows = rows
+    return trainer
 
 
 def always(name, lane, value, n=1000):
@@ -101,13 +110,13 @@ def test_trainer_collects_updates_logs_and_saves(tmp_path):
     run = make_trainer(tmp_path, samples=5 * UPDATE, every=2)
     run.train()
     # the last report is of the update since the second
-    assert [row["samples"] for row in run.logger] == [2 * UPDATE, 4 * UPDATE, 5 * UPDATE]
-    assert [row["updates"] for row in run.logger] == [2, 4, 5]
+    assert [row["samples"] for row in run.rows] == [2 * UPDATE, 4 * UPDATE, 5 * UPDATE]
+    assert [row["updates"] for row in run.rows] == [2, 4, 5]
     assert run.env.steps == 5 * T and run.env.n_checks == 3
     assert checkpoint.load_latest(tmp_path).step == 5 * UPDATE
     # episodes of 7 steps and one for the reset: the first ends in step 7, the second in step 15
-    assert [row["episode/count"] for row in run.logger] == [B, B, 0]
-    assert [row["episode/return"] for row in run.logger] == [7, 7, 7]
+    assert [row["episode/count"] for row in run.rows] == [B, B, 0]
+    assert [row["episode/return"] for row in run.rows] == [7, 7, 7]
     assert run.score is None and run.fraction_left == 0
 
 
@@ -115,10 +124,10 @@ def test_score_waits_for_100_episodes(tmp_path):
     """Six episodes of 8 steps end at a time: 96 after 128 steps, 102 after 136."""
     run = make_trainer(tmp_path, samples=33 * UPDATE, every=1)
     run.train()
-    assert run.logger[-1]["episode/window"] == 96 and run.score is None
+    assert run.rows[-1]["episode/window"] == 96 and run.score is None
     run.budget = Budget(34 * UPDATE)
     run.train()
-    assert run.logger[-1]["episode/window"] == 102 and run.score == 7
+    assert run.rows[-1]["episode/window"] == 102 and run.score == 7
 
 
 def test_cut_first_episodes_are_no_statistics(tmp_path):
@@ -127,9 +136,10 @@ def test_cut_first_episodes_are_no_statistics(tmp_path):
             self.age = torch.arange(B)  # a first episode of 7 to 2 steps
 
     assert make_trainer(tmp_path, env=Desynced()).env.age.tolist() == [0] * B
-    run = make_trainer(tmp_path, samples=4 * UPDATE, every=4, env=Desynced(), desync=True)
+    run = make_trainer(tmp_path, samples=4 * UPDATE, every=4, env=Desynced())
+    run.episodes.begin(run, desync=True)
     run.train()
-    (row,) = run.logger
+    (row,) = run.rows
     # 16 steps: lane i is truncated at step 7 - i and, one step for the reset later, at 15 - i
     assert (row["episode/count"], row["episode/length"], row["episode/return"]) == (B, 7, 7)
 
@@ -137,7 +147,16 @@ def test_cut_first_episodes_are_no_statistics(tmp_path):
 def test_seconds_of_each_phase_and_the_rest_add_up(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(performance.time, "perf_counter", lambda: now[0])
-    run, perf = make_trainer(tmp_path, samples=5 * UPDATE, every=2), []
+    perf = []
+
+    class Slow:
+        def on_update(self, trainer, losses):
+            now[0] += 1
+
+        def on_report(self, trainer, metrics):
+            perf.append(metrics)
+
+    run = make_trainer(tmp_path, samples=5 * UPDATE, every=2, callbacks=[Slow()])
     collect, update = run.collect, run.learner.update
 
     def taking(seconds, function):
@@ -148,13 +167,11 @@ def test_seconds_of_each_phase_and_the_rest_add_up(tmp_path, monkeypatch):
         return call
 
     run.collect, run.learner.update = taking(3, collect), taking(5, update)
-    run.snapshot_saver = taking(1, lambda trainer: None)
-    run.logger.write = lambda samples, metrics, row: perf.append(row)
     run.train()
     phases = [{name: row[f"perf/{name}"] for name in ("collect", "update", "rest")} for row in perf]
     # the first update compiles, so the first report counts from its end
     assert phases == [
-        {"collect": 3, "update": 5, "rest": 2},
+        {"collect": 3, "update": 5, "rest": 1},
         {"collect": 6, "update": 10, "rest": 2},
         {"collect": 3, "update": 5, "rest": 1},
     ]
@@ -181,7 +198,7 @@ def test_the_host_is_at_most_some_updates_ahead_of_a_gpu(tmp_path, monkeypatch):
             event.is_reached = True
 
     run = make_trainer(tmp_path, samples=40 * UPDATE, every=100)
-    run.timer.device, run.timer._now = torch.device("cuda"), Event
+    run.timing.timer.device, run.timing.timer._now = torch.device("cuda"), Event
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: reach())
     monkeypatch.setattr(performance.time, "sleep", lambda seconds: reach(1))
     collect = run.collect
@@ -230,7 +247,7 @@ def test_loss_without_a_gradient_step_is_left_out(tmp_path):
     run = make_trainer(tmp_path, always("reward", 2, torch.nan, n=5), samples=2 * UPDATE)
     with pytest.warns(UserWarning, match="reward of lane 2"):
         run.train()
-    first, second = run.logger
+    first, second = run.rows
     assert "loss/value" not in first and first["loss/skipped_steps"] == 2
     assert second["loss/value"] > 0
 
@@ -249,11 +266,13 @@ def test_failed_saves_are_one_warning_also_where_the_run_folder_is_gone(tmp_path
 
 
 def test_losses_may_be_numbers_or_none_at_all(tmp_path):
-    run = make_trainer(tmp_path)
-    run.update()
-    for losses in {"loss/a": 0.5, "loss/b": torch.tensor(2), "loss/c": 3}, {}:
-        run.log(losses)
-    first, second = run.logger
+    run, losses = (
+        make_trainer(tmp_path, samples=2 * UPDATE),
+        iter([{"loss/a": 0.5, "loss/b": torch.tensor(2), "loss/c": 3}, {}]),
+    )
+    run.learner.update = lambda rollout: next(losses)
+    run.train()
+    first, second = run.rows
     assert [first[f"loss/{name}"] for name in "abc"] == [0.5, 2, 3]
     assert not any(name.startswith("loss/") for name in second)
 
@@ -261,7 +280,7 @@ def test_losses_may_be_numbers_or_none_at_all(tmp_path):
 def test_metrics_are_logged_by_name_and_role_for_lanes_that_learn(tmp_path):
     run = make_trainer(tmp_path, samples=2 * UPDATE, every=2, env=Pairs())
     run.train()
-    (row,) = run.logger
+    (row,) = run.rows
     assert row["episode/count"] == 4 and row["episode/age"] == 75
     assert row["episode/return"] == 7.5
     assert (row["episode/age/leader"], row["episode/age/follower"]) == (70, 80)
@@ -294,7 +313,6 @@ def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
             return collect.state_dict()
 
     run.collect = AsyncCollector()
-    run.collector_options = with_defaults(run.collect, CollectorOptions)
     run.env.check = lambda: order.append("check")
     run.train()
     reported = ["wait", "check"]
@@ -304,7 +322,7 @@ def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
 def test_trainer_stops_on_request(tmp_path):
     run = make_trainer(tmp_path, every=5)
     run.train(lambda: run.updates == 2)
-    assert [row["updates"] for row in run.logger] == [2], "what was not reported yet is reported"
+    assert [row["updates"] for row in run.rows] == [2], "what was not reported yet is reported"
     assert run.samples == checkpoint.load_latest(tmp_path).step == 2 * UPDATE
 
 
@@ -312,7 +330,7 @@ def test_resumed_trainer_continues_and_does_not_save_again(tmp_path):
     first = make_trainer(tmp_path, samples=2 * UPDATE)
     first.train()
     second = make_trainer(tmp_path / "second", samples=2 * UPDATE, lr=0.5)
-    second.load_state_dict(checkpoint.load_latest(tmp_path).state)
+    second.run_state.load_state_dict(checkpoint.load_latest(tmp_path).state)
     assert same(copied(second.policy), copied(first.policy))
     assert (second.samples, second.updates) == (2 * UPDATE, 2)
     assert second.clock.seconds == pytest.approx(first.clock.seconds, abs=1)
@@ -323,20 +341,29 @@ def test_resumed_trainer_continues_and_does_not_save_again(tmp_path):
 def test_state_of_another_environment_begins_new_episodes_and_says_so(tmp_path):
     first, second = (make_trainer(tmp_path) for _ in range(2))
     for _ in range(3):  # 12 steps: an episode ended after 7
-        first.rollout = first.collect()
         first.update()
-    state = first.state_dict()
+    state = first.run_state.state_dict()
     state["env"] = {}
-    second.load_state_dict(state)
+    second.run_state.load_state_dict(state)
     assert [lost.endswith("new episodes start") for lost in second.lost] == [True]
-    assert first.episode_stats.returns.all() and not second.episode_stats.returns.any()
-    assert second.episode_stats.pop()["episode/count"] == B, "finished ones still count"
+    assert first.episodes.stats.returns.all() and not second.episodes.stats.returns.any()
+    assert second.episodes.stats.pop()["episode/count"] == B, "finished ones still count"
 
 
 @pytest.mark.parametrize("seconds, steps", [(0.9, [1, 2, 3, 4]), (1.0, [4])])
 def test_slow_disk_delays_checkpoints_of_a_second_or_more(tmp_path, seconds, steps):
     """An update takes two seconds, and the disk is never done."""
-    run, saved = make_trainer(tmp_path, samples=4 * UPDATE, checkpoint_seconds=seconds), []
+    saved = []
+
+    class Clock:
+        def on_start(self, trainer):
+            trainer.clock.seconds += 2
+
+        def on_update(self, trainer, losses):
+            trainer.clock.seconds += 2
+
+    options = {"checkpoint_seconds": seconds, "callbacks": [Clock()]}
+    run = make_trainer(tmp_path, samples=4 * UPDATE, **options)
 
     class SlowDisk(Saver):
         is_writing = True
@@ -344,25 +371,24 @@ def test_slow_disk_delays_checkpoints_of_a_second_or_more(tmp_path, seconds, ste
         def __call__(self, step, *_):
             saved.append(step // UPDATE)
 
-    # snapshots are thought of before the first update, and after each
     run.saver = SlowDisk(tmp_path, {})
     run.clock = SimpleNamespace(seconds=-2.0, is_running=True, paused=contextlib.nullcontext)
-    run.snapshot_saver = lambda trainer: setattr(run.clock, "seconds", run.clock.seconds + 2)
     run.train()
     assert saved == steps
 
 
-@pytest.mark.parametrize("file", ["logger", "annealing_record"])
-def test_checkpoint_reaches_no_further_than_the_files_on_disk(tmp_path, file):
-    def full_disk():
+@pytest.mark.parametrize("of", ["metrics", "annealing"])
+def test_checkpoint_reaches_no_further_than_the_files_on_disk(tmp_path, monkeypatch, of):
+    def full_disk(file):
         raise OSError(28, "full")
 
-    run = make_trainer(tmp_path)
-    setattr(run, file, SimpleNamespace(sync=full_disk))
+    writer = Loggers(tmp_path) if of == "metrics" else AnnealingRecord(tmp_path)
+    run = make_trainer(tmp_path / "checkpoints", callbacks=[writer])
+    monkeypatch.setattr(AppendedFile, "sync", full_disk)
     for options in ({}, {"is_last": True}):  # the last one is worth more than the files
-        run.save_checkpoint(**options)
+        run.save(**options)
         run.saver.wait()
-        assert len(checkpoint.list_checkpoints(tmp_path)) == len(options)
+        assert len(checkpoint.list_checkpoints(tmp_path / "checkpoints")) == len(options)
 
 
 def test_budget_ends_at_the_nearer_limit():
@@ -391,10 +417,8 @@ def test_recorded_factors_replace_the_clocks():
 def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_path, name, value):
     step, lane = 6, 3  # in the second rollout
     run = make_trainer(tmp_path, {(name, step, lane): value}, samples=8 * UPDATE)
-    run.collect()
     run.update()
     before = copied(run.policy), [m.clone() for m in run.learner.optimizer.means]
-    run.collect()
     run.update()
     assert same(copied(run.policy), before[0])
     assert all(map(torch.equal, run.learner.optimizer.means, before[1]))
@@ -404,11 +428,11 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
     assert (first.name, first.lane, first.step) == (name, lane, step)
     assert first.is_from_env
     assert not same(copied(run.policy), before[0])
-    skipped = [row["loss/skipped_steps"] for row in run.logger]
+    skipped = [row["loss/skipped_steps"] for row in run.rows]
     assert skipped == [0] * 6  # of the third and later updates
     state = checkpoint.load_latest(tmp_path).state
     assert nonfinite.nonfinite_leaf([state[name] for name in ("policy", "learner")]) is None
-    returns = [row["episode/return"] for row in run.logger if row["episode/count"]]
+    returns = [row["episode/return"] for row in run.rows if row["episode/count"]]
     assert all(0 < r <= 7 for r in returns)
 
 
@@ -431,7 +455,7 @@ def test_nonfinite_metric_is_named_once_and_left_out(tmp_path, bad):
     loaded = checkpoint.load_latest(tmp_path).state
     assert loaded["samples"] == 50 * UPDATE
     assert nonfinite.nonfinite_leaf(loaded["episode_stats"]) is None
-    row = [row for row in run.logger if "episode/age" in row][-1]
+    row = [row for row in run.rows if "episode/age" in row][-1]
     assert (row["episode/age/leader"], row["episode/age/follower"]) == (70, 80)
     n_followers = row["episode/window/follower"]
     n_leaders = row["episode/window/leader"] / 2  # those of lane 0
@@ -442,7 +466,7 @@ def test_nonfinite_metric_is_named_once_and_left_out(tmp_path, bad):
 @pytest.mark.parametrize("part", ["env", "obs", "episode_stats"])
 def test_what_is_not_learnt_may_be_nonfinite_in_a_checkpoint(tmp_path, part):
     run = make_trainer(tmp_path)
-    state = {**run.state_dict(), part: {"x": torch.tensor([torch.inf, torch.nan])}}
+    state = {**run.run_state.state_dict(), part: {"x": torch.tensor([torch.inf, torch.nan])}}
     run.saver(UPDATE, state)
     run.saver.wait()
     assert checkpoint.load_latest(tmp_path).state[part]["x"].isnan().any()
@@ -475,8 +499,8 @@ def test_nonfinite_gradients_end_the_run_with_advice(tmp_path):
     with pytest.raises(NonFiniteError, match=r"\(gradients\).*learning rate smaller than 0.25"):
         run.train()
     assert run.updates == MAX_SKIPPED
-    assert [row["loss/skipped_steps"] for row in run.logger] == [2] * MAX_SKIPPED
-    assert nonfinite.nonfinite_leaf(run.state_dict()) is None
+    assert [row["loss/skipped_steps"] for row in run.rows] == [2] * MAX_SKIPPED
+    assert nonfinite.nonfinite_leaf(run.run_state.state_dict()) is None
 
 
 def test_finite_gradient_restarts_the_count_of_skipped_updates(tmp_path):
@@ -513,7 +537,7 @@ def test_nonfinite_state_is_never_saved(tmp_path, path, leaf):
     leaf(run).fill_(torch.inf)
     run.updates += 1
     with pytest.raises(NonFiniteError, match=f"{path} is not finite"):
-        run.save_checkpoint()
+        run.save()
     assert [path.name for path in checkpoint.list_checkpoints(tmp_path)] == [f"step_{UPDATE}"]
 
 
@@ -555,30 +579,34 @@ def test_reports_have_what_the_evaluator_measures(tmp_path):
         seen.append(policy)
         return {"answer": 42.0, "unknown": torch.nan}
 
-    run = make_trainer(tmp_path, samples=2 * T * B, evaluator=evaluator)
+    evaluations = Evaluations(evaluator, (1, "samples"), {})
+    run = make_trainer(tmp_path, samples=2 * T * B, callbacks=[evaluations])
     run.train()
     assert seen == [run.policy] * 2
-    assert all(row["eval/answer"] == 42 and "eval/unknown" not in row for row in run.logger)
+    assert all(row["eval/answer"] == 42 and "eval/unknown" not in row for row in run.rows)
 
 
 def test_a_graph_counts_episodes_only_where_rollouts_keep_their_memory(tmp_path):
-    run, by_graph = make_trainer(tmp_path), []
+    by_graph = []
+
+    class Changing:
+        def on_rollout(self, trainer, rollout):
+            if trainer.updates == 2:
+                rollout.reward = rollout.reward.clone()
+            if trainer.updates == 3:
+                rollout.reward = trainer.episodes.counted_tensors[0]
+            if trainer.updates == 5:
+                trainer.rollout = SimpleNamespace(**vars(rollout), reset=rollout.reset)
+                trainer.learner.update = lambda rollout: {}
+
+    run = make_trainer(tmp_path, callbacks=[Changing()])
 
     def graph(rollout):  # stands for the CUDA graph, which reads the memory of the first update
         by_graph.append(run.updates)
-        return run._count_episodes(rollout)
+        return run.episodes.count(rollout)
 
-    run.count_episodes = graph
-    for update in range(6):
-        run.rollout = run.collect()
-        kept = run.rollout
-        if update == 2:
-            run.rollout.reward = run.rollout.reward.clone()  # as a callback may
-        if update == 3:
-            run.rollout.reward = run.counted_tensors[0]
-        if update == 5:
-            run.rollout = SimpleNamespace(**vars(kept), reset=kept.reset)  # a user's own
-            run.learner.update = lambda rollout: {}
+    run.episodes.graph = graph
+    for _ in range(6):
         run.update()
-    assert by_graph == [0, 1, 3, 4]
-    assert run.episode_stats.pop()["episode/count"] > 0
+    assert by_graph == [1, 2, 4, 5]
+    assert run.episodes.stats.pop()["episode/count"] > 0

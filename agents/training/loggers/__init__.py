@@ -10,9 +10,13 @@ says what it needs.
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from megastep.agents.runs.json_lines import JsonLines, truncate_after
 from megastep.agents.types import Logger, RunResult
+
+if TYPE_CHECKING:
+    from megastep.agents.training.trainer import Trainer
 
 
 class LoggerError(RuntimeError):
@@ -58,29 +62,40 @@ class Loggers:
             except Exception as error:
                 warnings.warn(f"logger={name} skipped: {first_line(error)}", stacklevel=2)
 
-    def write(
-        self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]
-    ) -> None:
+    is_slow = True
+
+    def on_report(self, trainer: "Trainer", metrics: Mapping[str, float | str]) -> None:
+        """Writes a report."""
+        self.write(trainer.samples, metrics)
+
+    def write(self, step: int, metrics: Mapping[str, float | str]) -> None:
         """Writes one report after `step` environment steps.
 
         Args:
-            metrics: name -> number or string, determined by the seed. None: only `perf` is written.
-            perf: name -> number, such as times and rates.
+            metrics: name -> number or string. The seed determines all but those of `perf/`.
         """
-        if metrics is not None:
-            self._call_lines(self.metrics, "write", step, metrics)
+        values = {name: x for name, x in metrics.items() if name != "samples"}
+        perf = {name: x for name, x in values.items() if name.startswith("perf/")}
+        of_seed = {name: x for name, x in values.items() if name not in perf}
+        self._call_lines(self.metrics, "write", step, of_seed)
         self._call_lines(self.perf, "write", step, perf)
-        self._call_others("write", step, {**(metrics or {}), **perf})
+        self._call_others("write", step, {**of_seed, **perf})
+
+    def may_save(self, trainer: object) -> bool:
+        """Flushes the metrics to disk, which a checkpoint must not reach beyond. Returns whether
+        they are there.
+        """
+        try:
+            self.metrics.file.sync()
+        except OSError:
+            return False
+        return True
 
     def finish(self, step: int, result: RunResult) -> None:
         """Gives the result of the run to all loggers that have a method `finish`."""
         for name in [name for name in self.others if not hasattr(self.others[name], "finish")]:
             self.others.pop(name).close()
         self._call_others("finish", step, result)
-
-    def sync(self) -> None:
-        """Flushes the metrics to disk. Raises OSError if they cannot be written."""
-        self.metrics.file.sync()
 
     def close(self) -> None:
         """Closes the files and every logger."""
@@ -105,21 +120,6 @@ class Loggers:
                 del self.others[name]
                 text = f"logger={name} failed and is dropped ({first_line(error)})"
                 warnings.warn(text, stacklevel=3)
-
-
-class NoLogger:
-    """Writes nothing, as on ranks other than 0."""
-
-    def write(
-        self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]
-    ) -> None:
-        """Does nothing."""
-
-    def sync(self) -> None:
-        """Does nothing."""
-
-    def close(self) -> None:
-        """Does nothing."""
 
 
 def first_line(error: Exception) -> str:

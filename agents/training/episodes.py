@@ -1,0 +1,123 @@
+"""What training does with the episodes of each rollout: counts them, and gives the curriculum and
+the opponents their share.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
+from megastep.agents.storage.rollout import Rollout
+from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
+from megastep.types import optional
+
+if TYPE_CHECKING:
+    from megastep.agents.training.trainer import Trainer
+
+
+class Episodes:
+    """Counts the episodes of a training, on a GPU as a CUDA graph.
+
+    Args:
+        trainer: whose environment has been reset.
+
+    Attributes:
+        stats: the statistics.
+        opponents: those of the environment, or None.
+    """
+
+    def __init__(self, trainer: Trainer):
+        self.opponents = optional(trainer.env, "opponent_pool")
+        device = torch.device(trainer.env.device)
+        self.graph = CudaGraphUpdate(self.count, device, graph=True)
+        self.counted_tensors: list[torch.Tensor | None] = []
+        self.begin(trainer)
+
+    def begin(
+        self, trainer: Trainer, sources: Sequence[str] | None = None, desync: bool = False
+    ) -> None:
+        """Begins to count, before the first update.
+
+        Args:
+            sources: the name of the source of each layout of the environment, whose episodes have
+                statistics of their own; None for none.
+            desync: starts the first episodes at random ages, so that not all lanes end theirs at
+                the same time, if the environment has a method `desync()`. Statistics leave these
+                episodes out.
+        """
+        env, rollout = trainer.env, trainer.rollout
+        allocate_layouts = getattr(trainer.collect, "allocate_layouts", None)
+        if optional(env, "layout") is None or not allocate_layouts:
+            sources = None
+        elif sources:
+            allocate_layouts()
+        if desync := desync and optional(env, "desync") is not None:
+            optional(env, "desync")()
+        groups = lane_groups(env, rollout.learners)
+        self.stats = EpisodeStats(
+            rollout.n_lanes, env.device, tuple(rollout.metrics), groups, desync, sources
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """The means over episodes that reports may have, without `episode/`."""
+        kinds = [] if self.opponents is None else [*self.opponents.matchups]
+        return [*self.stats.names, *(f"won/{kind}" for kind in kinds if kind != "now")]
+
+    def few_means(self, latest: dict[str, float]) -> list[str]:
+        """The returns of groups of lanes, and metrics, if they are few enough for one line."""
+        names = {group: f"episode/return/{group}" for group in self.stats.groups}
+        names |= {name: f"episode/{name}" for name in self.stats.metrics}
+        shown = [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
+        return shown if len(names) <= 4 else []
+
+    def on_update(self, trainer: Trainer, losses: object) -> None:
+        """Counts the episodes of the rollout, and has curriculum and opponents learn from it."""
+        rollout = trainer.rollout
+        (self.graph if self._keeps_tensors(rollout) else self.count)(rollout)
+        if trainer.curriculum is not None:
+            trainer.curriculum.update(rollout)
+        if self.opponents is not None:
+            self.opponents.refresh_snapshots(trainer.policy, trainer.updates)
+
+    def _keeps_tensors(self, rollout) -> bool:
+        """Returns whether a rollout is in the memory that it was in at the first update, as a CUDA
+        graph wants it. A user's own rollout may replace its tensors, and so may a callback.
+        """
+        if type(rollout) is not Rollout:
+            return False
+        names = "reward", "starts", "terminal", "truncated", "learns", "layouts"
+        tensors = [getattr(rollout, name) for name in names] + [*rollout.metrics.values()]
+        self.counted_tensors = self.counted_tensors or tensors
+        return all(map(operator.is_, tensors, self.counted_tensors))
+
+    def count(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Counts the episodes of a rollout. Returns nothing in a dict, as an update would."""
+        self.stats.add(
+            rollout.reward,
+            rollout.reset,
+            rollout.terminal | rollout.truncated,
+            rollout.learns[:-1],
+            rollout.metrics,
+            rollout.layouts if self.stats.sources else None,
+        )
+        return {}
+
+    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Adds the statistics since the last report. Synchronises."""
+        stats = self.stats.pop(trainer.ranks.sum)
+        if self.opponents is not None:
+            stats |= self.opponents.pop_win_rates(trainer.ranks.sum)
+        if trainer.curriculum is not None:
+            stats |= trainer.ranks.mean(trainer.curriculum.stats())
+        if (n_restarts := optional(trainer.env, "pop_restarts")()) is not None:
+            n_restarts = torch.tensor([n_restarts], device=trainer.env.device)
+            stats["episode/restarts"] = int(trainer.ranks.sum(n_restarts))
+        trainer.latest_stats |= stats
+        metrics |= stats
+        if stats.get("episode/window", 0) >= MIN_EPISODES:
+            trainer.score = stats["episode/return"]
