@@ -18,13 +18,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.types import Quote, QuotedString
-
-from megastep.agents import console
-from megastep.agents.cli import compose, scripts
 from megastep.agents.errors import ConfigErrors, UserError
-from megastep.agents.factory import components, settings
+from megastep.agents.factory import components
 from megastep.agents.launch import signals
 from megastep.agents.reports import runs as reported
 from megastep.agents.runs import folders
@@ -40,8 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Run", "evaluate", "load", "make", "record", "runs", "train"]
 
-#: Keys whose dict is a group of keys; any other dict is a value.
-GROUPS = (*settings.IMPORTED, "agent", "opponents", "finish")
 #: Settings of `make` that are not the environment's.
 OF_MAKE = ("env", "geometry", "split", "seed", "device")
 
@@ -159,8 +152,8 @@ def make(env: object, privileged: bool = False, **settings_of_env: object) -> "E
         key if key.partition(".")[0] in OF_MAKE else f"env.{key}": value
         for key, value in settings_of_env.items()
     }
-    cfg = _settings(scripts.RECORD, {"env": env, "split": "training", **arguments})
-    geometry = cfg.geometry or settings.kind_of("geometry", components.HOMES)(name=components.HOMES)
+    cfg = _settings("record", {"env": env, "split": "training", **arguments})
+    geometry = cfg.geometry or components.settings_for("geometry", components.HOMES)
     device, homes = factory.make_device(cfg.device), factory.homes(cfg.env, geometry, cfg.split)
     if device.type == "cpu":
         factory.share_threads(1)
@@ -183,7 +176,7 @@ def train(**settings: object) -> Run | None:
     from megastep.agents.launch import train as launch_train  # with PyTorch
 
     with rank.joined(), _interrupts():
-        cfg = rank.together(lambda: _settings(scripts.TRAIN, settings))
+        cfg = rank.together(lambda: _settings("train", settings))
         folder = launch_train.run(cfg)
     return None if folder is None else Run(folder)
 
@@ -208,7 +201,7 @@ def evaluate(
         played = playing.first_episodes(_played(env), run, **cast(dict, settings))
         return statistics.summaries(played, optional(env, "roles"))
     given = {} if env is None else {"env": env}
-    cfg = _settings(scripts.EVALUATE, {"run": run, **given, **settings})
+    cfg = _settings("evaluate", {"run": run, **given, **settings})
     with _interrupts():
         return json.loads(evaluate_run.run(cfg).with_suffix(".json").read_text())["rows"]
 
@@ -238,7 +231,7 @@ def record(
         return recording.film(_played(env), run, options.pop("file"), **options)
     given = {"run": run, "env": env}
     given = {key: value for key, value in given.items() if value is not None}
-    cfg = _settings(scripts.RECORD, given | settings)
+    cfg = _settings("record", given | settings)
     with _interrupts():
         return recording.Film(filming.run(cfg))
 
@@ -257,79 +250,42 @@ def runs() -> list[Run]:
     return [Run(path) for path in folders.known()]
 
 
-# ---- Keyword arguments as words ----
+# ---- Keyword arguments as settings ----
 
 
-def words_of(arguments: Mapping[str, object]) -> list[str]:
-    """Returns keyword arguments as words of a command line.
-
-    Raises:
-        UserError: a value has no words, such as an object.
-    """
-    words = []
-    for key, value in arguments.items():
-        if key in GROUPS and isinstance(value, Mapping):
-            # the name first, which decides what other keys there are
-            inside = dict(sorted(value.items(), key=lambda item: item[0] != "name"))
-            name = {key: inside.pop("name")} if "name" in inside else {}
-            words += words_of(name | {f"{key}.{k}": v for k, v in inside.items()})
-        elif key.startswith("logger.") and isinstance(value, Mapping):
-            words += words_of({f"{key}.{k}": v for k, v in value.items()})
-        else:
-            is_member = key in settings.IMPORTED and isinstance(value, (str, list, tuple))
-            words.append(f"{key}={_text(value, key, is_member)}")
-    return words
-
-
-def _text(value, key, is_member=False) -> str:
-    """Returns a value in Hydra's grammar.
+def _plain(value, key) -> Any:
+    """Returns an argument as files have it.
 
     Args:
         key: that errors name.
-        is_member: it names members of a group, which take no quotes.
     """
-    value = getattr(value, "path", value) if isinstance(value, Run) else value
+    value = value.path if isinstance(value, Run) else value
     value = os.fspath(value) if isinstance(value, os.PathLike) else value
     if inspect.isclass(value) or inspect.isfunction(value):
-        return _path_of(value, key)
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return value if is_member else QuotedString(value, Quote.double).with_quotes()
+        if "<" in value.__qualname__:
+            problem = f"{value.__qualname__} has no import path; define it at the top of a module"
+            raise ConfigErrors([(key, problem)])
+        return f"{value.__module__}:{value.__qualname__}"
+    if value is None or isinstance(value, (bool, str)):
+        return value
     if isinstance(value, Mapping):
-        return f"{{{','.join(f'{name}:{_text(part, key)}' for name, part in value.items())}}}"
+        return {name: _plain(part, f"{key}.{name}") for name, part in value.items()}
     if isinstance(value, Sequence):
-        return f"[{','.join(_text(part, key, is_member) for part in value)}]"
+        return [_plain(part, key) for part in value]
     if isinstance(value, numbers.Integral):
-        return str(int(value))
+        return int(value)
     if isinstance(value, numbers.Real):
-        return repr(float(value))
-    problem = f"{type(value).__name__} has no words; use numbers, texts, lists, dicts, or a class"
+        return float(value)
+    problem = f"{type(value).__name__} is no setting; use numbers, texts, lists, dicts, or a class"
     raise ConfigErrors([(key, problem)])
 
 
-def _path_of(value, key) -> str:
-    if "<" in value.__qualname__:
-        problem = f"{value.__qualname__} has no import path; define it at the top of a module"
-        raise ConfigErrors([(key, problem)])
-    return f"{value.__module__}:{value.__qualname__}"
+def _settings(name: str, arguments: Mapping[str, object]) -> Any:
+    """Returns the settings of a command that its words would give, ready to run."""
+    from megastep.agents.cli import command  # with Hydra
 
-
-def _settings(script: scripts.Script, arguments: Mapping[str, object]) -> Any:
-    """Returns the settings of a script that its words would give, ready to run."""
-    before = GlobalHydra.instance().hydra  # of a program of the user's
-    try:
-        composer = compose.Composer(script)
-        cfg = composer.settings([script.reword(word) for word in words_of(arguments)])
-        if composer.note:
-            console.say(composer.note)
-    finally:
-        GlobalHydra.instance().clear()
-        GlobalHydra.instance().hydra = before
-    script.ready(cfg)
-    return cfg
+    plain = {key: _plain(value, key) for key, value in arguments.items()}
+    return command.settings_from(name, plain)
 
 
 # ---- Policies, and signals ----

@@ -5,8 +5,9 @@
     @checked
     def __init__(self, n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128): ...
 
-The command line makes a dataclass of the same arguments with `settings_of`. Types are strict: true
-is not an integer, "3" is not a number, and numbers are finite, but for those of users' classes.
+The command line makes a dataclass of the same arguments with `settings_of`. True is not an integer,
+"3" is not a number, and numbers are finite, but for those of users' classes. In settings, a list
+may stand for a tuple and 1e6 for an integer, as files and command lines have them.
 """
 
 import dataclasses
@@ -15,7 +16,9 @@ import functools
 import inspect
 import math
 import numbers
+import types
 import typing
+from collections import abc
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -30,14 +33,12 @@ if TYPE_CHECKING:
 __all__ = [
     "MAX_ENVS",
     "AtMost",
-    "arguments_of",
     "checked",
     "closest",
     "frozen",
     "located",
     "parameters_of",
     "sentence",
-    "settings_class",
     "settings_of",
 ]
 
@@ -46,9 +47,8 @@ F = TypeVar("F", bound=Callable)
 
 #: 2**26 copies of the smallest environment fill the largest GPU there is; more is a typing error.
 MAX_ENVS = 2**26
-CONFIG = pydantic.ConfigDict(
-    strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
-)
+#: Types whose arguments are annotations of their own.
+CONTAINERS = (list, tuple, dict, set, frozenset, abc.Sequence, abc.Mapping)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,10 +58,45 @@ class AtMost:
     key: str
 
 
-def _frozen(**config) -> Callable[[type], type]:
-    return pydantic.dataclasses.dataclass(
-        frozen=True, kw_only=True, config=pydantic.ConfigDict(**{**CONFIG, **config})
+def _whole(value) -> object:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _strict(hint) -> Any:
+    """Returns an annotation that takes no other type for a number, a word or a boolean, while a
+    list may stand for a tuple and 1e6 for an integer.
+    """
+    origin, options = typing.get_origin(hint), typing.get_args(hint)
+    if hint is int:
+        return Annotated[int, pydantic.Strict(), pydantic.BeforeValidator(_whole)]
+    if hint in (float, bool, str):
+        return Annotated[hint, pydantic.Strict()]
+    if origin is Annotated:
+        return Annotated[(_strict(options[0]), *hint.__metadata__)]
+    if origin in (typing.Union, types.UnionType):
+        return typing.Union[tuple(map(_strict, options))]  # noqa: UP007, of any number of types
+    if origin in CONTAINERS and options:
+        return origin[tuple(one if one is ... else _strict(one) for one in options)]
+    return hint
+
+
+def _frozen(kind: type, is_finite=True, is_strict=False) -> Any:
+    """Makes a frozen dataclass of a class.
+
+    Args:
+        is_strict: no value is converted, as where a function gets the same ones.
+    """
+    if not is_strict:
+        hints = typing.get_type_hints(kind, include_extras=True)
+        own = inspect.get_annotations(kind)
+        kind.__annotations__ = {name: _strict(hints[name]) for name in own}
+    config = pydantic.ConfigDict(
+        strict=is_strict,
+        extra="forbid",
+        allow_inf_nan=not is_finite,
+        arbitrary_types_allowed=True,
     )
+    return pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=config)(kind)
 
 
 if TYPE_CHECKING:
@@ -71,7 +106,7 @@ if TYPE_CHECKING:
 
 else:
     #: Class decorator: a frozen dataclass whose fields are checked against their annotations.
-    frozen = _frozen()
+    frozen = _frozen
 
 
 # the expected type, by the first part of pydantic's name of the error
@@ -99,30 +134,10 @@ def settings_of(
     reserved: Sequence[str] = (),
     missing: Mapping | None = None,
     is_finite: bool = True,
+    is_strict: bool = False,
     **more,
 ) -> type:
     """Returns a frozen dataclass of the arguments of a class or function: types, bounds, defaults.
-
-    Takes the arguments of `arguments_of`, and `is_finite`: whether infinity and NaN are refused.
-
-    Raises:
-        ValueError: if an annotation cannot be read, or an argument has the name of a field of
-            `more`.
-    """
-    try:
-        return settings_class(*arguments_of(constructor, reserved, missing, **more), is_finite)
-    except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
-        raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
-
-
-def arguments_of(
-    constructor: Callable,
-    reserved: Sequence[str] = (),
-    missing: Mapping | None = None,
-    **more,
-) -> tuple[str, dict[str, tuple]]:
-    """Returns the name of a class or function, and its arguments: {name: (type, default)}, or
-    (type,) without a default.
 
     An argument without an annotation has the type of its default.
 
@@ -130,21 +145,30 @@ def arguments_of(
         constructor: the class or function, with the arguments of `parameters_of`.
         reserved: arguments to leave out.
         missing: defaults for arguments that may have none.
+        is_finite: infinity and NaN are refused.
+        is_strict: no value is converted: a list is no tuple.
         more: fields to add: a type, or (type, default).
+
+    Raises:
+        ValueError: if an annotation cannot be read, or an argument has the name of a field of
+            `more`.
     """
     fields = {name: f if isinstance(f, tuple) else (f,) for name, f in more.items()}
-    for function, arguments in _signatures(constructor):
-        hints = typing.get_type_hints(function, include_extras=True)
-        for name, argument in arguments.items():
-            if name in reserved or (name in fields and name not in more):
-                continue
-            if name in more:
-                raise ValueError(f"none of its arguments can be called {name}")
-            default = argument.default
-            if default is inspect.Parameter.empty:
-                default = (missing or {}).get(name, default)
-            fields[name] = _field(hints.get(name), default)
-    return constructor.__name__, fields
+    try:
+        for function, arguments in _signatures(constructor):
+            hints = typing.get_type_hints(function, include_extras=True)
+            for name, argument in arguments.items():
+                if name in reserved or (name in fields and name not in more):
+                    continue
+                if name in more:
+                    raise ValueError(f"none of its arguments can be called {name}")
+                default = argument.default
+                if default is inspect.Parameter.empty:
+                    default = (missing or {}).get(name, default)
+                fields[name] = _field(hints.get(name), default)
+        return _frozen(_class(constructor.__name__, fields), is_finite, is_strict)
+    except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
+        raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
 
 
 def parameters_of(constructor: Callable) -> dict[str, inspect.Parameter]:
@@ -176,20 +200,15 @@ def _signatures(constructor) -> Iterator[tuple[Callable, dict[str, inspect.Param
             return
 
 
-def settings_class(name: str, fields: Mapping[str, tuple], is_finite: bool = True) -> type:
-    """Returns a frozen dataclass of what `arguments_of` returned."""
-    return (frozen if is_finite else _frozen(allow_inf_nan=True))(_class(name, fields))
-
-
 def _field(hint, default) -> tuple:
     """Returns (type,) or (type, default) of an argument."""
     if inspect.isclass(hint) and getattr(hint, "_is_protocol", False):
         hint = Annotated[Any, pydantic.AfterValidator(functools.partial(_has_members, hint))]
     if default is inspect.Parameter.empty:
         return (Any if hint is None else hint,)
-    if hint is None:
-        hint = Any if default is None else type(default)
-    return hint, default
+    if default is None:
+        return (Any if hint is None else hint | None), None
+    return (type(default) if hint is None else hint), default
 
 
 def _has_members(protocol, value) -> object:
@@ -229,7 +248,7 @@ def checked(function: F) -> F:
         ValueError: naming every argument that is wrong, and what is allowed.
     """
     signature = inspect.signature(function)
-    settings = functools.cache(functools.partial(settings_of, function, ("self",)))
+    settings = functools.cache(lambda: settings_of(function, ("self",), is_strict=True))
 
     @functools.wraps(function)
     def wrapped(*args, **kwargs) -> object:

@@ -304,7 +304,7 @@ def settings_of(group: str, member: str = "") -> list[Setting]:
         member: what chooses the component, such as ppo.
     """
     name = SINGLE.get(group) or components.members(group)[member]
-    kind = settings.kind_of(group, name)
+    kind = components.kind_of(group, name)
     meanings = described(import_object(name), "Args")
     prefix = f"logger.{member}" if group == "logger" else group
     gpu, cpu = (configured(group, member, device).get(group) or {} for device in ("cuda", "cpu"))
@@ -329,7 +329,7 @@ def settings_of_script(script: str) -> list[Setting]:
     file = f"{script}.yaml"
     comments = _comments((package.CONFIGS / file).read_text())
     gpu, cpu = (dict(check.leaves(_merged(file, device))) for device in ("cuda", "cpu"))
-    groups = {*components.ARGUMENTS}
+    groups = {*components.GROUPS}
     rows = []
     for key, field in check.fields_of(SCRIPTS[script], {}):
         if key.split(".")[0] not in groups and not dataclasses.is_dataclass(field.annotation):
@@ -376,12 +376,10 @@ def _laid(trees: Iterable[dict[str, Any]]) -> dict[str, Any]:
 def _merged(file, device):
     """Returns the content of a file of configs/, with the blocks of a device and of its learner."""
     group, _, member = file.removesuffix(".yaml").rpartition("/")
-    text, before = (package.CONFIGS / file).read_text(), dict(blocks.applied)
+    text = (package.CONFIGS / file).read_text()
     tree = OmegaConf.to_container(OmegaConf.create(text))
-    blocks.apply(device, member if group == "learner" else "ppo")
-    content = blocks.merged(tree)
-    blocks.applied.clear()
-    blocks.applied.update(before)
+    applied = blocks.blocks_of(device, member if group == "learner" else "ppo")
+    content = blocks.merged(tree, applied)
     defaults = content.pop("defaults", []) if group else []
     bases = [one for one in defaults if isinstance(one, str)]
     if group and "@package _global_" not in text:
@@ -457,7 +455,7 @@ def _word(hint, names):
 
 def unexplained() -> list[str]:
     """Returns the settings without a meaning."""
-    members = {group: components.members(group) for group in settings.IMPORTED}
+    members = {group: components.members(group) for group in components.CHOSEN}
     pairs = [(group, m) for group, all_ in members.items() for m in all_ if all_[m] != "none"]
     pairs += [(group, "") for group in SINGLE]
     rows = [row for pair in pairs for row in settings_of(*pair)]

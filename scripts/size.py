@@ -18,7 +18,12 @@ KERNELS = "*.h", "*.cu", "*.cpp"
 #: Commands whose way from the settings to the first rollout is measured.
 COMMANDS = {
     "explorer": ["env=explorer", "geometry=box"],
-    "deathmatch": ["experiment=deathmatch", "geometry=box", "env.n_envs=16", "snapshots=0"],
+    "deathmatch": [
+        "experiment=deathmatch",
+        "geometry=box",
+        "env.n_envs=16",
+        "checkpoints.snapshots=0",
+    ],
     "gymnasium": ["env=gymnasium", "env.id=CartPole-v1", "env.n_envs=8"],
 }
 WAYS = {
@@ -114,11 +119,11 @@ class SecondUpdate:
 
 def train(words: list[str], way: Way | None = None) -> None:
     """Trains on the CPU as a command says; a way begins with its checked settings."""
-    from megastep.agents.cli import compose, scripts
-    from megastep.agents.cli.train import run
+    from megastep.agents.cli import compose
+    from megastep.agents.cli.train import COMMAND, run
 
     ends = "device=cpu", "finish.evaluate=false", "finish.record=false"
-    cfg = compose.Composer(scripts.TRAIN).settings([*words, *ends])
+    cfg = compose.Composer(COMMAND).settings([*words, *ends])
     if way is not None:
         way.begin()
     run(cfg)

@@ -80,7 +80,7 @@ def composed_once():
         if [Path(folder).resolve() for folder in folders] != [CONFIGS]:
             return method(loader, *arguments, **options)
         name = JobRuntime.instance().get("name")
-        key = str((method, name, arguments, options, blocks.applied))
+        key = str((method, name, arguments, options, blocks.BlockSource.blocks))
         if key not in cached:
             cached[key] = pickle.dumps(method(loader, *arguments, **options))
         return pickle.loads(cached[key])  # in a tenth of the time of copy.deepcopy

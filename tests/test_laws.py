@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as arrays
 
 from megastep import arrdict, geometries
 from megastep.agents.algorithms import returns
-from megastep.agents.cli import scripts
+from megastep.agents.cli import train
 from megastep.agents.cli.compose import Composer, own
 from megastep.agents.errors import UserError
 from megastep.agents.factory.check import leaves
@@ -273,7 +273,7 @@ ATOMS += ["${seed}", "${oc.decode:1}", "${", "x.y", "1_0", "0x1", "auto", "minim
 
 @functools.cache
 def composer():
-    return Composer(scripts.TRAIN)
+    return Composer(train.COMMAND)
 
 
 @functools.cache

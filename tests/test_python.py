@@ -8,11 +8,13 @@ import subprocess
 import sys
 import warnings
 
+import numpy as np
 import pytest
 import torch
 
 import megastep
 from megastep.agents import api
+from megastep.agents.cli import command, compose
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.launch import signals
 from megastep.agents.networks.policy import Policy
@@ -38,8 +40,8 @@ class Rover(megastep.envs.Minimal):
     """An environment of the user's."""
 
 
-def words_of(command):
-    script, *words = shlex.split(command.removeprefix("python "), comments=True)
+def words_of(line):
+    script, *words = shlex.split(line.removeprefix("python "), comments=True)
     return script.removesuffix(".py"), words
 
 
@@ -47,28 +49,28 @@ def test_every_command_of_the_readme_has_a_row():
     blocks = re.findall(r"```\n(python .*?)```", (ROOT / "README.md").read_text(), re.S)
     commands = [words_of(line) for block in blocks for line in block.splitlines()]
     assert len(commands) == 9
-    assert commands == [words_of(command) for command, _ in ROWS]
+    assert commands == [words_of(typed) for typed, _ in ROWS]
 
 
-@pytest.mark.parametrize("command, line", ROWS)
-def test_a_line_of_python_has_the_settings_of_its_command(command, line, monkeypatch):
+@pytest.mark.parametrize("typed, line", ROWS)
+def test_a_line_of_python_has_the_settings_of_its_command(typed, line, monkeypatch):
     made = []
 
-    def take(script, arguments):
-        made.append((script, [script.reword(word) for word in api.words_of(arguments)]))
+    def take(name, arguments):
+        made.append((name, arguments))
         raise KeyboardInterrupt  # instead of a training
 
     monkeypatch.setattr(api, "_settings", take)
     with pytest.raises(KeyboardInterrupt):
         eval(line)
-    ((script, words),) = made
-    name, typed = words_of(command)
-    assert script.name == name
+    ((name, arguments),) = made
+    script, typed = words_of(typed)
+    assert name == script
     if "resume=latest" in typed:  # there is no run here
-        typed, words = ([w for w in ws if not w.startswith("resume=")] for ws in (typed, words))
-        assert [w.replace('"', "") for w in words] == typed
+        assert {f"{key}={value}" for key, value in arguments.items()} == {*typed}
     else:
-        assert tiny.settings(*words, script=name) == tiny.settings(*typed, script=name)
+        expected = tiny.settings(*typed, script=name)
+        assert compose.settings_from(tiny.load(name), arguments) == expected
 
 
 def test_a_run_from_training_to_film(here, capsys):
@@ -108,7 +110,7 @@ def test_errors_are_those_of_the_command_line_and_nothing_is_written(here):
     assert unknown.value.errors == [("env", "'explorr' is unknown; did you mean explorer?")]
     with pytest.raises(UserError, match="run folder nor a pretrained agent"):
         megastep.load("explorer_anywere")
-    with pytest.raises(UserError, match="learner.lr: object has no words"):
+    with pytest.raises(UserError, match="learner.lr: object is no setting"):
         megastep.train(learner={"lr": object()})
     with pytest.raises(UserError, match="has no import path"):
         megastep.train(env=type("Local", (), {"__qualname__": "f.<locals>.Local"}))
@@ -117,32 +119,17 @@ def test_errors_are_those_of_the_command_line_and_nothing_is_written(here):
     assert not any(here.iterdir())
 
 
-@pytest.mark.parametrize(
-    "value, text",
-    [
-        (None, "null"),
-        (True, "true"),
-        (1, "1"),
-        (3e-4, "0.0003"),
-        (float("inf"), "inf"),
-        ("true", '"true"'),
-        ('a "b" \\', r'"a \"b\" \\"'),
-        ([1, "a"], '[1,"a"]'),
-        ({"x": [None]}, "{x:[null]}"),
-    ],
-)
-def test_a_value_has_the_words_that_mean_it(value, text):
-    assert api.words_of({"folder": value}) == [f"folder={text}"]
-    (override,) = tiny.Composer(tiny.SCRIPTS["train"]).parse([f"folder={text}"])
-    assert override.value() == value or getattr(override.value(), "text", None) == value
+@pytest.mark.parametrize("value", ["true", 'a "b" \\', None, "1"])
+def test_a_value_means_itself_and_is_no_grammar(value):
+    chosen = command.settings_from("train", {"folder": value, "device": "cpu"})
+    assert chosen.folder == value
 
 
-def test_classes_and_groups_as_words():
-    assert api.words_of({"env": {"res": 8, "name": Rover}, "logger": ["csv", "tensorboard"]}) == [
-        f"env={__name__}:Rover",
-        "env.res=8",
-        "logger=[csv,tensorboard]",
-    ]
+def test_classes_and_groups_as_arguments():
+    chosen = {"env": {"res": 8, "name": Rover}, "logger": ["csv", "tensorboard"]}
+    cfg = api._settings("train", {**chosen, "learner.lr": np.float32(0.5), "device": "cpu"})
+    assert (cfg.env.name, cfg.env.res) == (f"{__name__}:Rover", 8)
+    assert {*cfg.logger} == {"csv", "tensorboard"} and cfg.learner.lr == 0.5
     env = megastep.make(Rover, n_envs=2, geometry="box", device="cpu")
     assert type(env).__name__ == "Rover" and env.n_envs == 2
 

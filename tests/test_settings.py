@@ -183,7 +183,6 @@ class Shelf:
         shape=(2, 3),
         limit: float = None,
         pick=max,
-        pairs=[(1, 2)],  # noqa: B006, an argument of a stranger's
         gain: float = math.inf,
         n: int = 1,
     ): ...
@@ -228,9 +227,9 @@ def test_annotations_decide_where_they_can():
     assert repr(values) == "(1000, 2.0, {0: 1.0}, [1.0], (1.0, 2))"
     assert messages(kind, more={0: 1}) == {"more": "expected a word, got 0"}
     assert messages(kind, prices={"a": 1})["prices"].startswith("expected an integer")
-    assert messages(kind, cap=[b"x"]) == {
-        "cap": "[b'x'] cannot be kept in a checkpoint; use numbers, words and lists"
-    }
+    assert messages(kind, cap=[max])["cap"].endswith(
+        "cannot be kept in a checkpoint; use numbers, words and lists"
+    )
 
 
 @pytest.mark.parametrize("text", ['{"$float": [1]}', '{"$dict": 3}', '{"$dict": [[[1], 2]]}', "{"])

@@ -6,42 +6,74 @@
       learner:
         gamma: 0.98
 
-A block is merged as Hydra loads its file, so that a later file wins over the blocks of an earlier
-one. A learner of a user has the blocks of the built-in learner that it derives from, if of any.
+A block is merged as Hydra reads its file, through a source of files that is one of its plugins, so
+a later file wins over the blocks of an earlier one. A learner of a user has the blocks of the
+built-in learner that it derives from, if of any.
 """
 
-import functools
-import os
-from collections.abc import Callable
+from collections.abc import Mapping
 from contextlib import suppress
 from types import NoneType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core import plugins
-from hydra.plugins.config_source import ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from megastep.agents.cli import config_files
-from megastep.agents.factory import check, components, settings
+from megastep.agents.factory import check, components
 from megastep.agents.launch import gpu
 from megastep.imports import import_object
 
 if TYPE_CHECKING:
     from hydra.plugins.config_source import ConfigResult
 
-#: The names of blocks, the last of which wins, and whether they are laid over their files.
-applied: dict[str, bool] = {}
+
+class BlockSource(FileConfigSource):
+    """Hydra's source of files, which merges the blocks that apply into them."""
+
+    #: The names of blocks, the last of which wins, and whether they apply.
+    blocks: ClassVar[dict[str, bool]] = {}
+
+    @staticmethod
+    def scheme() -> str:
+        return "blocks"
+
+    def load_config(self, config_path: str) -> "ConfigResult":
+        result = super().load_config(config_path)
+        if OmegaConf.is_dict(result.config) and any(name in result.config for name in self.blocks):
+            result.config = OmegaConf.create(merged(plain(result.config), self.blocks))
+        return result
 
 
-def apply(device: object, learner: object) -> None:
-    """Has Hydra lay the blocks of a device, and of a learner as `built_in` takes it, over the files
-    that it loads from here on. Values of other types are told when the settings are checked.
+class Folders(SearchPathPlugin):
+    """Has Hydra read the files of our folder, and of the one given by --config-dir beside it, with
+    their blocks.
+    """
+
+    main, beside = "", ""
+
+    def manipulate_search_path(self, search_path) -> None:
+        for entry in search_path.get_path():
+            if entry.path.removeprefix("file://") == self.main:
+                entry.path = f"blocks://{self.main}"
+                if self.beside:
+                    search_path.append("command-line", f"blocks://{self.beside}")
+                break
+
+
+plugins.Plugins.instance().register(BlockSource)
+plugins.Plugins.instance().register(Folders)
+
+
+def blocks_of(device: object, learner: object) -> dict[str, bool]:
+    """Returns the names of blocks, and whether they apply on a device, and with a learner as
+    `built_in` takes it. Values of other types are errors when the settings are checked.
     """
     is_cpu = device == "cpu" or (device == "auto" and not gpu.is_available())
     name = built_in(str(learner))
     learners = {one: one == name for one in components.members("learner")}
-    applied.clear()
-    applied.update({"cpu": is_cpu, "gpu": not is_cpu, **learners})
+    return {"cpu": is_cpu, "gpu": not is_cpu, **learners}
 
 
 def built_in(learner: str) -> str | None:
@@ -51,52 +83,27 @@ def built_in(learner: str) -> str | None:
     names = {path: name for name, path in components.members("learner").items()}
     paths = [learner]
     if ":" in learner and learner not in names:
-        with suppress(ValueError):  # which is told when the settings are checked
+        with suppress(ValueError):  # which is an error when the settings are checked
             bases = getattr(import_object(learner), "__mro__", ())
             paths = [f"{base.__module__}:{base.__qualname__}" for base in bases]
     known = [names[path] for path in paths if path in names]
     return learner if learner in names.values() else next(iter(known), None)
 
 
-def merged(tree: check.Tree) -> check.Tree:
+def merged(tree: check.Tree, blocks: Mapping[str, bool]) -> check.Tree:
     """Returns what a file holds with its blocks merged into it."""
-    blocks = [name for name in applied if isinstance(tree.get(name, False), (dict, NoneType))]
-    content = {key: value for key, value in tree.items() if key not in blocks}
-    layers = [merged(tree[name] or {}) for name in blocks if applied[name]]
-    for layer in layers:
-        content = _laid(content, layer)
+    own = [name for name in blocks if isinstance(tree.get(name, False), (dict, NoneType))]
+    content = {key: value for key, value in tree.items() if key not in own}
+    for layer in [merged(tree[name] or {}, blocks) for name in own if blocks[name]]:
+        content = _over(content, layer)
     return content
 
 
-def fit(config: DictConfig, learner: str | None) -> None:
-    """Takes what only built-in learners have from the settings of a user's learner, which has the
-    file of one.
-
-    Args:
-        learner: import path, None for `config.learner.name`.
-    """
-    if own := _fields(learner or OmegaConf.select(config, "learner.name")):
-        built_in = components.built_in().items()
-        ours = {key for (group, _), (_, keys) in built_in if group == "learner" for key in keys}
-        for key in ours & {*config.learner} - {*own}:
-            del config.learner[key]
-
-
-def note(config: DictConfig, typed: list[str]) -> str:
-    """Returns a sentence on what a user's learner has from files; "" if it has nothing."""
-    name = OmegaConf.select(config, "learner.name")
-    values = check.leaves(plain(config.learner)) if _fields(name) else ()
-    typed = [*typed, "learner.name"]
-    taken = [f"{key}={value}" for key, value in values if f"learner.{key}" not in typed]
-    if not taken:
-        return ""
-    sources, base = [], built_in(name)
-    if base:
-        sources.append(f"{'the CPU' * applied['cpu'] or 'the'} values of {base}")
-    if recipe := config.hydra.runtime.choices.get("experiment"):
-        sources.append(f"experiment={recipe}")
-    sources = " and ".join(sources) or "configuration files"
-    return f"learner={name} takes {', '.join(taken)} from {sources}"
+def _over(below, above) -> Any:
+    """Returns one value over another: nested dicts key by key."""
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return above
+    return below | {key: _over(below.get(key), value) for key, value in above.items()}
 
 
 def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
@@ -104,35 +111,20 @@ def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
     return cast(check.Tree, OmegaConf.to_container(config, resolve=resolve))
 
 
-def _fields(learner) -> dict | None:
-    # of the settings of a user's learner; None if it is built in, or cannot be used, which is told
-    # when the settings are checked
-    if isinstance(learner, str) and ("learner", learner) not in components.built_in():
-        with suppress(ValueError):
-            return settings.kind_of("learner", learner).__pydantic_fields__
+def leave_out_others(config: DictConfig, learner: str | None) -> None:
+    """Takes what only built-in learners have from the settings of a user's learner, which has the
+    file of one.
 
-
-def _laid(below, above) -> Any:
-    # one value over another: nested dicts key by key
-    if not (isinstance(below, dict) and isinstance(above, dict)):
-        return above
-    return below | {key: _laid(below.get(key), value) for key, value in above.items()}
-
-
-def _with_blocks(load_config) -> Callable:
-    @functools.wraps(load_config)
-    def load(source, config_path) -> "ConfigResult":
-        if source.scheme() == "file":
-            path = os.path.join(source.path, f"{config_path.removesuffix('.yaml')}.yaml")
-            if os.path.exists(path):  # Hydra tells of those that do not
-                config_files.check(path)
-        result = load_config(source, config_path)
-        if OmegaConf.is_dict(result.config) and any(name in result.config for name in applied):
-            result.config = OmegaConf.create(merged(plain(result.config)))
-        return result
-
-    return load
-
-
-for _source in cast("list[type[ConfigSource]]", plugins.Plugins.instance().discover(ConfigSource)):
-    _source.load_config = _with_blocks(_source.load_config)
+    Args:
+        learner: import path, None for `config.learner.name`.
+    """
+    name = learner or OmegaConf.select(config, "learner.name")
+    known = components.members("learner").values()
+    if not isinstance(name, str) or name in known:
+        return
+    with suppress(ValueError):  # it cannot be used, which is an error when settings are checked
+        own = components.kind_of("learner", name).__pydantic_fields__
+        kinds = [components.kind_of("learner", path) for path in known]
+        ours = {key for kind in kinds for key in kind.__pydantic_fields__}
+        for key in ours & {*config.learner} - {*own}:
+            del config.learner[key]

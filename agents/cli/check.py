@@ -4,8 +4,9 @@ from collections import Counter
 from pathlib import Path
 
 from megastep.agents import console
-from megastep.agents.cli import plain_words
+from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError, user_errors
+from megastep.settings import frozen
 
 HELP = """Checks the floor plans of an .npz file: that each is closed, every room can be reached,
 lights are indoors, and no two walls are the same or cross.
@@ -14,17 +15,16 @@ lights are indoors, and no two walls are the same or cross.
 SHOWN = 20  # plans whose errors are printed
 
 
-def main(words: list[str]) -> int:
-    """Checks the file that the words of a command line name. Returns the exit code."""
-    if not words or words[0] in ("-h", "--help"):
-        console.say(HELP)
-        return 0 if words else 2
-    given = plain_words.parse(words, {"path": False})
-    if "path" not in given:
-        raise UserError("path is missing; path=plans.npz names the file")
+@frozen
+class Check:
+    path: str
+
+
+def run(cfg: Check) -> None:
+    """Checks the floor plans of a file. Raises UserError if there are errors."""
     from megastep.geometries import checks, files, imported
 
-    path = Path(given["path"][0])
+    path = Path(cfg.path)
     is_database = path.resolve().parent == imported.folder().resolve()
     with user_errors():
         plans = imported.load(path) if is_database else files.load(path)
@@ -37,4 +37,7 @@ def main(words: list[str]) -> int:
         counts = ", ".join(f"{n} times {sentence!r}" for sentence, n in kinds.most_common())
         raise UserError(f"{len(errors):,} of {len(plans):,} geometries have errors: {counts}")
     console.say(f"{len(plans):,} geometries, {sum(len(g.walls) for g in plans):,} walls: no errors")
-    return 0
+
+
+COMMAND = Command("check", Check, HELP)
+main = COMMAND.main

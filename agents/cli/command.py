@@ -1,23 +1,21 @@
-"""Runs a script from a command line: options, help, exit codes."""
+"""Runs a command: options, help, exit codes."""
 
 import argparse
 import contextlib
-import os
+import dataclasses
+import importlib
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Any
 
-import hydra
-from hydra.types import RunMode
-from omegaconf import OmegaConf
-
 from megastep.agents import console, package
-from megastep.agents.cli import compose, scripts, sweeps
-from megastep.agents.errors import user_errors
+from megastep.agents.errors import ConfigErrors, user_errors
 from megastep.agents.factory import check
 from megastep.agents.launch import endings, gpu, rank
+from megastep.agents.runs import folders, populations
 
-#: Hydra's options: their names, and argparse's arguments.
+#: Options of commands that files configure, which are Hydra's: names, and argparse's arguments.
 OPTIONS = {
     "-m --multirun": {
         "action": "store_true",
@@ -29,7 +27,7 @@ OPTIONS = {
         "choices": ("job", "hydra", "all"),
         "help": "print the composed configuration and stop; hydra, all: with Hydra's part of it",
     },
-    "--resolve": {"action": "store_true", "help": "with --cfg: print interpolated values"},
+    "--resolve": {"action": "store_true", "help": "with --cfg hydra: print interpolated values"},
     "-p --package": {"metavar": "KEY", "help": "with --cfg: print a part, such as env"},
     "-cd --config-dir": {"metavar": "DIR", "help": "groups and files of your own beside ours"},
     "-cn --config-name": {"metavar": "FILE", "help": "another file than the script's own"},
@@ -43,26 +41,52 @@ OPTIONS = {
         "action": "store_true",
         "help": 'tab completion: eval "$({command} -sc install=bash)"',
     },
-    "-h --help": {"action": "store_true", "help": "print this and stop"},
     "--hydra-help": {"action": "store_true", "help": "print Hydra's own help and stop"},
-    "-r --run": {"action": "store_true", "help": argparse.SUPPRESS},
+}
+#: Options of every command.
+COMMON = {
+    "-h --help": {"action": "store_true", "help": "print this and stop"},
     "--version": {"action": "store_true", "help": "print the versions and stop"},
     "overrides": {"nargs": "*", "help": argparse.SUPPRESS},
 }
 
 
-def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
-    """Parses, composes, checks and runs. Returns the exit code."""
-    warnings.showwarning, arguments = console.warn, sys.argv[:]
-    words = sys.argv[1:] if argv is None else argv
-    try:
-        words = [script.reword(without_dashes(word)) for word in words]
-        ending = endings.ending_of(lambda: _run(script, words))
-    finally:
-        sys.argv[:] = arguments
-    if ending.text:
-        console.say(f"{package.command(script.name)}: {ending.text}", sys.stderr)
-    return ending.code
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A command of the package. Its module, `agents/cli/NAME.py`, has `run(cfg)`.
+
+    Attributes:
+        name: of the command, its module, and the file of its configuration.
+        kind: the dataclass of its settings.
+        help: the head of --help.
+        has_files: files in configs/ configure it.
+        prepare: changes the composed tree before it is checked, given the typed keys.
+        ready: raises UserError for checked settings that cannot be run here.
+        has_ranks: torchrun may start it.
+    """
+
+    name: str
+    kind: type
+    help: str
+    has_files: bool = False
+    prepare: Callable[[check.Tree, list[str]], check.Tree] = lambda tree, typed: tree
+    ready: Callable[[Any], None] = lambda cfg: None
+    has_ranks: bool = False
+
+    def run(self, cfg: Any) -> Any:
+        return importlib.import_module(f"megastep.agents.cli.{self.name}").run(cfg)
+
+    def main(self, words: list[str] | None = None) -> int:
+        """Runs the command with words, by default those of this process. Returns the exit code."""
+        warnings.showwarning, arguments = console.warn, sys.argv[:]
+        words = sys.argv[1:] if words is None else words
+        try:
+            ending = endings.ending_of(lambda: _run(self, [*map(without_dashes, words)]))
+        finally:
+            sys.argv[:] = arguments
+        if ending.text:
+            console.say(f"{package.command(self.name)}: {ending.text}", sys.stderr)
+        return ending.code
 
 
 def without_dashes(word: str) -> str:
@@ -75,77 +99,110 @@ def without_dashes(word: str) -> str:
     return word.removeprefix("--") if is_key else word
 
 
-def _run(script: scripts.Script, argv: list[str]) -> int:
-    command = package.command(script.name, "python ")
+def _run(command: Command, argv: list[str]) -> int:
+    script = package.command(command.name, "python ")
     parser = argparse.ArgumentParser(
-        package.command(script.name),
-        f"{command} [-m] [key=value ...]",
-        script.help,
+        package.command(command.name),
+        f"{script} {'[-m] ' * command.has_files}[key=value ...]",
+        command.help,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         add_help=False,
         allow_abbrev=False,
     )
-    for names, arguments in OPTIONS.items():
-        arguments = arguments | {"help": arguments["help"].replace("{command}", command)}
+    for names, arguments in {**(OPTIONS if command.has_files else {}), **COMMON}.items():
+        arguments = arguments | {"help": arguments["help"].replace("{command}", script)}
         parser.add_argument(*names.split(), **arguments)
     options = parser.parse_intermixed_args(argv)
+    is_needed = any(field.is_required() for field in command.kind.__pydantic_fields__.values())
     if options.version:
-        console.say(f"{package.version()}, Hydra {hydra.__version__}")
-        return 0
+        console.say(package.version())
+    elif command.has_files:
+        return _run_composed(command, options, argv, parser)
+    elif options.help or (is_needed and not argv):
+        console.say(parser.format_help().rstrip())
+        return 0 if options.help else 2
+    else:
+        from megastep.agents.cli import words
+
+        return command.run(words.plain_settings(command, options.overrides)) or 0
+    return 0
+
+
+def _run_composed(command, options, argv, parser) -> int:
+    """Runs a command that files configure. Returns the exit code."""
+    from megastep.agents.cli import compose, sweeps
+
     composer = compose.Composer(
-        script, options.config_name, options.config_dir, options.config_path
+        command, options.config_name, options.config_dir, options.config_path
     )
-    flags = [one for one in argv if one not in (*options.overrides, "-m", "--multirun")]
     words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
+    flags = [one for one in argv if one not in (*options.overrides, "-m", "--multirun")]
     if options.help:
         parser.epilog = "groups, chosen with group=member:" + "".join(
             f"\n  {name:<11} {', '.join(members)}" for name, members in composer.groups().items()
         )
         console.say(parser.format_help().rstrip())
     elif options.shell_completion:
-        line = f"{os.environ.get('COMP_LINE', '')}|"  # whose last word is to be completed
-        config, errors = composer.config(composer.parse(w for w in line.split()[:-1] if "=" in w))
-        if not errors:  # nothing completes what follows words that are wrong
-            tree = compose.own(config)
-            keys = [f"{key}=null" for key, _ in check.fields_of(script.kind, tree)]
-            _show(composer, OmegaConf.merge(OmegaConf.from_dotlist(keys), tree), flags + words)
-    elif options.cfg:
+        with user_errors(kinds=compose.HYDRA_ERRORS):
+            composer.complete(flags, words)
+    elif options.cfg == "job":
         for i, job in enumerate(
             sweeps.jobs_of(composer, words)[0] if options.multirun else [words]
         ):
             print("---\n" * (i > 0), end="", flush=True)
-            _show(composer, check.as_tree(composer.settings(job)), flags + job)
-    elif options.info or options.hydra_help:
+            print(composer.shown(job, options.package), end="", flush=True)
+    elif options.cfg or options.info or options.hydra_help:
         with user_errors(kinds=compose.HYDRA_ERRORS):
             composer.call_hydra(flags + words)
-    elif options.multirun or "hydra.mode=MULTIRUN" in words:
+    elif options.multirun:
         return sweeps.sweep(composer, words)
     else:
         if "device=cpu" not in words:
             gpu.start_driver()  # beside composing
-        with contextlib.nullcontext() if script is scripts.RECORD else rank.joined() as team:
-            settings, config = rank.together(lambda: _checked(composer, words))
-            if config.hydra.mode == RunMode.MULTIRUN:
-                return sweeps.sweep(composer, words)
-            if team is None and (settings.device != "auto" or gpu.is_available()):
-                gpu.wake(settings.device)  # beside the imports of what runs
-            if composer.note:
-                console.say(composer.note)
-            script.run(settings)
+        with rank.joined() if command.has_ranks else contextlib.nullcontext() as team:
+            cfg = rank.together(lambda: _ready(composer, words))
+            if team is None and (cfg.device != "auto" or gpu.is_available()):
+                gpu.wake(cfg.device)  # beside the imports of what runs
+            command.run(cfg)
     return 0
 
 
-def _checked(composer: compose.Composer, words: list[str]) -> tuple:
-    """Returns settings that can be run, and the configuration they are from."""
-    settings, config = composer.compose(words)
-    if config.hydra.mode != RunMode.MULTIRUN:
-        composer.script.ready(settings)
-    return settings, config
+def _ready(composer, words) -> Any:
+    """Returns settings that can be run."""
+    cfg = composer.settings(words)
+    composer.command.ready(cfg)
+    return cfg
 
 
-def _show(composer: compose.Composer, tree: Any, arguments: list[str]) -> None:
-    """Has Hydra show or complete a configuration that has every key there is."""
-    node = {"defaults": [composer.name, "_self_"], **tree}
-    compose.STORE.store(name="every-key", node=node)
-    with user_errors(kinds=(OSError, ValueError, *compose.HYDRA_ERRORS)):
-        composer.call_hydra([*arguments, "--config-name=every-key"])
+def load(name: str) -> Command:
+    """Returns the command of this name."""
+    return importlib.import_module(f"megastep.agents.cli.{name}").COMMAND
+
+
+def settings_from(name: str, arguments: dict[str, Any]) -> Any:
+    """Returns the settings of a command from keyword arguments, ready to run.
+
+    Raises:
+        UserError: with everything that is wrong.
+    """
+    from megastep.agents.cli import compose
+
+    command = load(name)
+    cfg = compose.settings_from(command, arguments)
+    command.ready(cfg)
+    return cfg
+
+
+def with_member(tree: check.Tree, key: str) -> check.Tree:
+    """Returns the tree with the folder of a population's member at a key, in place of the
+    population's folder there and `member`. Raises ConfigErrors if there is no such member.
+    """
+    run, member = tree.get(key), tree.get("member")
+    if member is None or not isinstance(run, str):
+        return tree
+    root = folders.find(run, None)
+    if not populations.is_root(root):
+        raise ConfigErrors([("member", f"is of a population, and {run} is a single run")])
+    if member != "best" and type(member) is not int:
+        raise ConfigErrors([("member", f"{member!r} is neither a number nor best")])
+    return tree | {key: str(populations.member(root, member)), "member": None}

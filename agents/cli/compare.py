@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from megastep.agents import console
-from megastep.agents.cli import plain_words
-from megastep.agents.errors import UserError
+from megastep.agents.cli.command import Command
+from megastep.agents.factory import settings
+from megastep.settings import frozen
 
 HELP = """Draws a metric of several runs over samples: a line for all runs that differ only in
 their seeds, with a 95 % interval. Prints interquartile means; writes the numbers beside the plot.
@@ -14,18 +15,20 @@ their seeds, with a 95 % interval. Prints interquartile means; writes the number
   megastep compare run=[A,B] file=plot.svg          .pdf, .svg or .png, and plot.csv"""
 
 
-def main(words: list[str]) -> int:
-    """Draws what the words of a command line ask for. Returns the exit code."""
-    if not words or words[0] in ("-h", "--help"):
-        console.say(HELP)
-        return 0 if words else 2
-    given = plain_words.parse(words, {"run": True, "metric": False, "file": False})
-    if "run" not in given:
-        raise UserError("run is missing; run=[A,B] names runs, run=SWEEP all jobs of a sweep")
+@frozen
+class Compare:
+    run: settings.Names
+    metric: str = "episode/return"
+    file: str = "compare.pdf"
+
+
+def run(cfg: Compare) -> None:
+    """Draws a metric of several runs."""
     from megastep.agents.reports import compare, runs  # with PyTorch
 
-    (metric,) = given.get("metric", ["episode/return"])
-    (file,) = given.get("file", ["compare.pdf"])
-    path = compare.write(runs.expanded(given["run"]), Path(file), metric)
+    path = compare.write(runs.expanded([*cfg.run]), Path(cfg.file), cfg.metric)
     console.say(f"Plot: {path}, with its numbers in {path.with_suffix('.csv').name}")
-    return 0
+
+
+COMMAND = Command("compare", Compare, HELP)
+main = COMMAND.main

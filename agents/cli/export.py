@@ -1,12 +1,14 @@
 """megastep export run=RUN format=onnx: a trained agent for other runtimes, or in one file."""
 
 from pathlib import Path
+from typing import Literal
 
 from megastep.agents import console
-from megastep.agents.cli import plain_words, scripts
+from megastep.agents.cli.command import Command, with_member
 from megastep.agents.errors import UserError, user_errors
+from megastep.agents.factory import settings
 from megastep.agents.runs import folders
-from megastep.settings import closest
+from megastep.settings import closest, frozen
 
 HELP = """Writes a trained agent for use elsewhere.
 
@@ -27,24 +29,18 @@ FORMATS = {
 }
 
 
-def main(words: list[str]) -> int:
-    """Exports as the words of a command line ask for. Returns the exit code."""
-    if not words or words[0] in ("-h", "--help"):
-        console.say(HELP)
-        return 0 if words else 2
-    given = plain_words.parse(
-        words, {"run": False, "format": False, "file": False, "member": False}
-    )
-    for key, cure in {"run": "latest takes the newest run", "format": ", ".join(FORMATS)}.items():
-        if key not in given:
-            raise UserError(f"{key} is missing; {key}={cure}")
-    run = given["run"][0]
-    if "member" in given:
-        which = given["member"][0]
-        member = int(which) if which.isdecimal() else which
-        run = scripts.with_member({"run": run, "member": member}, "run")["run"]
-    export(run, given["format"][0], *given.get("file", ()))
-    return 0
+@frozen
+class Export:
+    run: str
+    format: Literal["onnx", "torch", "safetensors", "hub"]
+    file: str | None = None
+    member: settings.Member = None
+
+
+def run(cfg: Export) -> None:
+    """Writes an agent for another runtime."""
+    chosen = with_member({"run": cfg.run, "member": cfg.member}, "run")["run"]
+    export(chosen, cfg.format, cfg.file)
 
 
 def export(run: str, kind: str, file: str | None = None) -> Path:
@@ -95,3 +91,7 @@ def export(run: str, kind: str, file: str | None = None) -> Path:
         f"by at most {found.difference:.1g}"
     )
     return path
+
+
+COMMAND = Command("export", Export, HELP)
+main = COMMAND.main

@@ -5,12 +5,14 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import Field
 
 from megastep.agents import console, package
-from megastep.agents.cli import plain_words
+from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError, user_errors
-from megastep.settings import closest
+from megastep.settings import frozen
 
 HELP = """Imports floor plans.
 
@@ -55,69 +57,64 @@ DATABASES = {
     ),
 }
 MAX_LINES = 1_000  # of a report's lists
+#: The keys that a source has, beside `source` and `path`.
 KEYS = {
-    **dict.fromkeys(DATABASES, ("source", "path", "licence", "per", "entrances")),
-    "svg": ("source", "path", "file", "scale", "walls", "doors"),
-    "map": ("source", "path", "file", "metres_per_pixel"),
+    **dict.fromkeys(DATABASES, ("licence", "per", "entrances")),
+    "svg": ("file", "scale", "walls", "doors"),
+    "map": ("file", "metres_per_pixel"),
 }
-CHOICES = {"licence": ("accept",), "per": ("floor", "file"), "entrances": ("sealed", "open")}
 NEEDED = ("shapely", "defusedxml", "svgelements", "skimage")
 
 
-def main(words: list[str]) -> int:
-    """Imports what the words of a command line name. Returns the exit code."""
-    if not words or words[0] in ("-h", "--help"):
-        console.say(HELP)
-        return 0 if words else 2
-    every = {key: False for keys in KEYS.values() for key in keys}
-    given = {key: values[0] for key, values in plain_words.parse(words, every).items()}
-    for key in ("source", "path"):
-        if key not in given:
-            raise UserError(f"{key} is missing; megastep import --help says more")
-    source = given["source"]
-    for key, allowed in {"source": tuple(KEYS), **CHOICES}.items():
-        if key in given and given[key] not in allowed:
-            raise UserError(f"{key}={given[key]} is unknown; {closest(given[key], allowed)}")
-    if unused := [key for key in given if key not in KEYS[source]]:
-        raise UserError(f"source={source} has no {unused[0]}; it has {', '.join(KEYS[source])}")
+Metres = Annotated[float, Field(gt=0, lt=1e6)]
+
+
+@frozen
+class Import:
+    source: Literal["cubicasa", "houseexpo", "svg", "map"]
+    path: str
+    file: str | None = None
+    scale: Metres | None = None
+    walls: str | None = None
+    doors: str | None = None
+    metres_per_pixel: Metres | None = None
+    licence: Literal["accept"] | None = None
+    per: Literal["floor", "file"] | None = None
+    entrances: Literal["sealed", "open"] | None = None
+
+
+def run(cfg: Import) -> None:
+    """Imports floor plans."""
+    keys = KEYS[cfg.source]
+    for key, value in vars(cfg).items():
+        if value is not None and key not in ("source", "path", *keys):
+            raise UserError(f"source={cfg.source} has no {key}; it has {', '.join(keys)}")
     if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
         raise UserError(
             f"importing needs {', '.join(missing)}; pip install {package.DISTRIBUTION}[plans]"
         )
-    return _import_database(given) if source in DATABASES else _import_own(given)
+    (_import_database if cfg.source in DATABASES else _import_own)(cfg)
 
 
-def _metres(given, key) -> float | None:
-    """Returns a length that is given as a word, None if it is not."""
-    try:
-        value = float(given[key]) if key in given else None
-    except ValueError:
-        value = -1.0
-    if value is not None and not 0 < value < 1e6:
-        raise UserError(f"{key}={given[key]} is no number of metres above 0")
-    return value
-
-
-def _import_own(given) -> int:
+def _import_own(cfg) -> None:
     """Imports one drawing or map."""
-    path = Path(given["path"])
+    path = Path(cfg.path)
     if not path.is_file():
         raise UserError(f"path={path} does not exist, or is no file")
-    file = Path(given.get("file", f"{path.stem}.npz"))
+    file = Path(cfg.file or f"{path.stem}.npz")
     if file.suffix != ".npz":
         raise UserError(f"file={file} must end with .npz")
-    scale, resolution = _metres(given, "scale"), _metres(given, "metres_per_pixel")
     from megastep.geometries import files
     from megastep.geometries.plans import imports, sheets
 
     with user_errors(f"{path} is no floor plan: "):
-        if given["source"] == "svg":
-            if scale is None:
+        if cfg.source == "svg":
+            if cfg.scale is None:
                 raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
-            marks = {key: given[key] for key in ("walls", "doors") if key in given}
-            own = imports.own_svg(path, scale, **marks)
+            marks = {key: getattr(cfg, key) for key in ("walls", "doors") if getattr(cfg, key)}
+            own = imports.own_svg(path, cfg.scale, **marks)
         else:
-            own = imports.own_map(path, resolution)
+            own = imports.own_map(path, cfg.metres_per_pixel)
     with user_errors(f"{file} cannot be written: "):
         files.save(file, [own.geometry])
         sheet = file.with_name(f"{file.stem}-sheet.png")
@@ -130,7 +127,6 @@ def _import_own(given) -> int:
         f"the drawing beside the result: {sheet}\n"
         f"use: geometry=files geometry.path={file}"
     )
-    return 0
 
 
 def _confirm(source, licence) -> None:
@@ -149,16 +145,15 @@ def _confirm(source, licence) -> None:
         raise UserError("the licence is not confirmed, so nothing is imported")
 
 
-def _import_database(given) -> int:
-    source, path, start = given["source"], Path(given["path"]), time.monotonic()
+def _import_database(cfg) -> None:
+    source, path, start = cfg.source, Path(cfg.path), time.monotonic()
     if not path.exists():
         raise UserError(f"path={path} does not exist")
-    _confirm(source, given.get("licence"))
+    _confirm(source, cfg.licence)
     from megastep.geometries import imported
     from megastep.geometries.plans import imports, sheets
 
-    is_sealed = given.get("entrances") != "open"
-    options = imports.Options(source, given.get("per", "floor"), is_sealed)
+    options = imports.Options(source, cfg.per or "floor", cfg.entrances != "open")
     with user_errors(f"{imported.folder()} cannot be written: ", (OSError,)):
         imported.folder().mkdir(parents=True, exist_ok=True)
         imported.probe()
@@ -184,7 +179,6 @@ def _import_database(given) -> int:
         f"contact sheet: {sheet}\n"
         f"use: geometry={source}; {console.duration(time.monotonic() - start)}"
     )
-    return 0
 
 
 def _report(source, path, plans, geometries, file, digest) -> str:
@@ -219,3 +213,7 @@ def _report(source, path, plans, geometries, file, digest) -> str:
         *warnings[:MAX_LINES],
     ]
     return console.visible("\n".join(lines)) + "\n"
+
+
+COMMAND = Command("import", Import, HELP)
+main = COMMAND.main

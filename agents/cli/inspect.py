@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents import console
+from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError
 from megastep.agents.runs import agent_file, checkpoint, folders
+from megastep.settings import frozen
 
 if TYPE_CHECKING:
     import torch
@@ -20,14 +22,14 @@ HELP = """Verifies a run's checkpoints and prints what is in them.
   megastep inspect RUN     a run folder, one of its checkpoints, latest, or a pretrained agent"""
 
 
-def main(words: list[str]) -> int:
-    """Inspects the run named by the words of a command line. Returns the exit code: 1 if one of its
-    checkpoints is damaged.
-    """
-    if len(words) != 1 or words[0] in ("-h", "--help"):
-        console.say(HELP)
-        return 0 if words in (["-h"], ["--help"]) else 2
-    path = folders.find(words[0])
+@frozen
+class Inspect:
+    run: str
+
+
+def run(cfg: Inspect) -> int:
+    """Inspects a run. Returns the exit code: 1 if one of its checkpoints is damaged."""
+    path = folders.find(cfg.run)
     if agent_file.is_agent_file(path):
         return _inspect([path], _lines_of_agent)
     if folders.checkpoints_of(path) == path:
@@ -116,3 +118,7 @@ def _tensors(tree, path="") -> "Iterator[tuple[str, torch.Tensor]]":
         pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
         for key, part in pairs:
             yield from _tensors(part, f"{path}.{key}".replace("..", "."))
+
+
+COMMAND = Command("inspect", Inspect, HELP)
+main = COMMAND.main

@@ -1,13 +1,26 @@
 """The command that films a trained policy. `record --help` lists the choices."""
 
-import functools
 from pathlib import Path
 
-from megastep.agents.cli import command, scripts
+from megastep.agents.cli import evaluate
+from megastep.agents.cli.command import Command
 from megastep.agents.factory import settings
 
-#: Runs the command with words of a command line, by default this process's.
-main = functools.partial(command.run_command, scripts.RECORD)
+HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
+
+The most common words:
+  run=RUN          a run folder, one of its checkpoints, latest, or a pretrained agent
+  env=explorer     random actions in an environment, without a run
+  steps=400        frames
+  against=RUN      its duel with another run's agent, a bot, or an import path, in one home
+  home=3           another of the unseen homes; split=training: one it was trained in
+  homes=[1,2,3,4]  several homes in a grid
+  worst=3          the worst episodes of the run's newest evaluation, as they were; episode=12: one
+  runs=[A,B]       several runs side by side, in one home from the same spawn
+  theme=dark       also title=, dpi=200, speed=2, trail=0, axes=true
+  file=out.mp4     this file, overwritten if it exists; out.gif: the same as a GIF; out.png, out.svg
+                   or out.pdf: the last frame only. Otherwise video.mp4 in the run folder, or
+                   video-2.mp4, ... if there is one"""
 
 
 def run(cfg: settings.Record) -> Path:
@@ -15,3 +28,8 @@ def run(cfg: settings.Record) -> Path:
     from megastep.agents.evaluation import filming  # with PyTorch
 
     return filming.run(cfg)
+
+
+COMMAND = Command("record", settings.Record, HELP, True, evaluate.prepare, evaluate.ready)
+#: Runs the command with words of a command line, by default this process's.
+main = COMMAND.main

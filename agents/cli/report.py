@@ -3,8 +3,10 @@
 from pathlib import Path
 
 from megastep.agents import console
-from megastep.agents.cli import plain_words
+from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError
+from megastep.agents.factory import settings
+from megastep.settings import frozen
 
 HELP = """Writes a report that opens in a browser, from one file without a server.
 
@@ -14,22 +16,25 @@ HELP = """Writes a report that opens in a browser, from one file without a serve
   megastep report run=RUN file=x.html    into this file, overwritten if it exists"""
 
 
-def main(words: list[str]) -> int:
-    """Writes the report that the words of a command line ask for. Returns the exit code."""
-    if not words or words[0] in ("-h", "--help"):
-        console.say(HELP)
-        return 0 if words else 2
-    given = plain_words.parse(words, {"run": True, "file": False})
-    if "run" not in given:
-        raise UserError("run is missing; run=latest takes the newest run, run=[A,B] several")
+@frozen
+class Report:
+    run: settings.Names
+    file: str | None = None
+
+
+def run(cfg: Report) -> None:
+    """Writes the report of a run, or of several."""
     from megastep.agents.reports import report, runs  # with PyTorch
 
-    paths = runs.expanded(given["run"])
+    paths = runs.expanded([*cfg.run])
     folder = paths[0] if len(paths) == 1 else Path()
-    if len(paths) > 1 and len(given["run"]) == 1:
-        folder = Path(given["run"][0])  # of a sweep
-    file = Path(given["file"][0]) if "file" in given else folder / "report.html"
+    if len(paths) > 1 and len(cfg.run) == 1:
+        folder = Path(cfg.run[0])  # of a sweep
+    file = folder / "report.html" if cfg.file is None else Path(cfg.file)
     if file.suffix != ".html":
         raise UserError(f"file={file} is no page; its name ends with .html")
     console.say(f"Report: {report.write(paths, file)}")
-    return 0
+
+
+COMMAND = Command("report", Report, HELP)
+main = COMMAND.main

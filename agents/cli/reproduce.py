@@ -15,11 +15,16 @@ from typing import NamedTuple
 import yaml
 
 from megastep.agents import console, package
+from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.runs import json_lines
 from megastep.atomic_files import write_atomically
-from megastep.settings import closest
+from megastep.settings import closest, frozen
 
+HELP = """Makes results of docs/lab again.
+
+  megastep reproduce          lists them
+  megastep reproduce ROW      trains and evaluates one, and compares"""
 #: The rows; its head says what they consist of.
 FILE = Path(__file__).with_name("reproductions.yaml")
 #: Threads of rows for a CPU: as many as the stated results were made with.
@@ -106,20 +111,22 @@ def _results(row: dict) -> Iterator[Result]:
             yield Result(result["page"], result["line"], result.get("evaluate", ""), metric, text)
 
 
-def main(words: Sequence[str]) -> int:
-    """Runs the command. Returns the exit code: 1 if a result differs from what is stated."""
+@frozen
+class Reproduce:
+    row: str | None = None
+
+
+def run(cfg: Reproduce) -> int:
+    """Lists the rows, or reproduces one. Returns the exit code: 1 if a result differs from what is
+    stated.
+    """
     rows = read()
-    if words and words[0] in ("-sc", "--shell-completion"):
-        start = os.environ.get("COMP_LINE", "").split(" ")[-1]
-        console.say(" ".join(name for name in rows if name.startswith(start)))
-        return 0
-    if not words or words[0] in ("-h", "--help"):
+    if cfg.row is None:
         console.say(listing(rows.values()))
         return 0
-    if len(words) > 1 or words[0] not in rows:
-        unknown = f"{words[0]!r} is unknown; {closest(words[0], rows)}"
-        raise UserError("takes the name of one row" if words[1:] else unknown)
-    return reproduce(rows[words[0]])
+    if cfg.row not in rows:
+        raise UserError(f"{cfg.row!r} is unknown; {closest(cfg.row, rows)}")
+    return reproduce(rows[cfg.row])
 
 
 def listing(rows: Iterable[Row]) -> str:
@@ -147,7 +154,7 @@ def reproduce(row: Row) -> int:
     Raises:
         UserError: the row needs a GPU and there is none.
     """
-    from megastep.agents.cli import command, scripts
+    from megastep.agents.cli import evaluate, train
     from megastep.agents.launch import gpu
     from megastep.agents.runs import folders
 
@@ -161,12 +168,12 @@ def reproduce(row: Row) -> int:
     device = f"device={row.device}"
     finish = "finish.evaluate=false", "finish.record=false"
     words = [*row.train.split(), *finish, device, f"folder={folder}"]
-    if code := command.run_command(scripts.TRAIN, words):
+    if code := train.main(words):
         return code
     found = []
-    for evaluate, group in itertools.groupby(row.results, lambda result: result.evaluate):
-        words = [f"run={folder}", device, "baseline=false", *evaluate.split()]
-        if code := command.run_command(scripts.EVALUATE, words):
+    for more, group in itertools.groupby(row.results, lambda result: result.evaluate):
+        words = [f"run={folder}", device, "baseline=false", *more.split()]
+        if code := evaluate.main(words):
             return code
         tables = (folder / "evaluations").glob("*.json")
         newest = max(tables, key=lambda path: path.stat().st_mtime_ns)
@@ -253,3 +260,7 @@ def compare_bits(known: Sequence[dict], here: dict, digest: str) -> tuple[bool |
         for one in known
     )
     return None, f"metrics.jsonl differs from the recorded one, of another machine: {others}"
+
+
+COMMAND = Command("reproduce", Reproduce, HELP)
+main = COMMAND.main

@@ -8,6 +8,7 @@ worker of joblib's is the parent of: if a worker is killed, joblib kills all oth
 import contextlib
 import csv
 import dataclasses
+import importlib
 import io
 import itertools
 import json
@@ -33,8 +34,8 @@ from omegaconf import OmegaConf
 
 from megastep import workers
 from megastep.agents import console, package
-from megastep.agents.cli import scripts
-from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
+from megastep.agents.cli.compose import Composer
+from megastep.agents.cli.words import key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu_slots, rank, signals
@@ -115,8 +116,6 @@ def sweep(composer: Composer, words: list[str]) -> int:
     _, jobs, config = jobs_of(composer, words)
     gpu_slots.check(jobs, config)
     folder = Path(config.sweep.dir)
-    if UNDECODED.search(str(folder.absolute())):  # which the settings of jobs hold as text
-        raise UserError(f"{str(folder.absolute())!r} {NO_TEXT}")
     is_new = not folder.exists()
     with user_errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
@@ -124,7 +123,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
         folder.mkdir(parents=True, exist_ok=True)
     options = SEARCH if config.runtime.choices["hydra/sweeper"] == "optuna" else {}
     options = options | {
-        "hydra.job.name": composer.script.name,
+        "hydra.job.name": composer.command.name,
         "hydra.sweep.dir": json.dumps(str(folder), ensure_ascii=False),
         "hydra.job.config.override_dirname.exclude_keys": json.dumps(
             [key for key, override in overrides.items() if not override.is_sweep_override()]
@@ -185,7 +184,7 @@ def new_job(composer: Composer, folder: Path) -> "Job":
     """Returns what Hydra is to call for the jobs of a sweep."""
     records = folder.absolute() / ".jobs" / uuid.uuid4().hex[:8]
     records.mkdir(parents=True)
-    source = composer.script.name, composer.name, composer.folder, composer.main
+    source = composer.command.name, composer.name, composer.folder, composer.main
     return Job(source, str(folder.absolute()), str(records), os.getpid(), os.getcwd())
 
 
@@ -241,11 +240,11 @@ class Job:
         """Runs a job in a process of its own. Returns what became of it."""
         read, write = os.pipe()  # which closes when that process ends, however it does
         job = json.dumps([dataclasses.asdict(self), row, words])
-        command = [sys.executable, "-c", APART, str(write), job]
+        arguments = [sys.executable, "-c", APART, str(write), job]
         workers.end_with_parent(self.process)
         with open(read, "rb") as pipe:
             with open(write, "wb"):
-                subprocess.run(command, pass_fds=[write], check=True)
+                subprocess.run(arguments, pass_fds=[write], check=True)
             with workers.terminal_signals_blocked():
                 pipe.read()
         if not self.path(f"{row['number']}.json").exists():  # it could not even say that it began
@@ -282,8 +281,6 @@ class Job:
                 with signals.interrupting():
                     composer = self.composer()
                     cfg = composer.settings(words)
-                    if composer.note:
-                        console.say(composer.note)
                     cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
                     if is_again:  # not for evaluations, which begin again
                         cfg = settings.changed(cfg, resume=AUTO)
@@ -294,7 +291,7 @@ class Job:
                     }
                     cfg = settings.changed(cfg, logger=getattr(cfg, "logger", {}) | grouped)
                     with gpu_slots.taken(cfg) as cfg:
-                        result = scripts.SCRIPTS[self.source[0]].run(cfg)
+                        result = composer.command.run(cfg)
                     row |= {"state": DONE, **(scores.outcome(result) if result else {})}
             except signals.Interrupted as stop:
                 row["state"] = f"interrupted: {stop.args[1]}"
@@ -313,7 +310,8 @@ class Job:
         return row
 
     def composer(self) -> Composer:
-        return Composer(scripts.SCRIPTS[self.source[0]], *self.source[1:])
+        module = importlib.import_module(f"megastep.agents.cli.{self.source[0]}")
+        return Composer(module.COMMAND, *self.source[1:])
 
     def path(self, name: str) -> Path:
         return Path(self.records, name)

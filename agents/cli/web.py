@@ -1,11 +1,15 @@
 """megastep web run=RUN: a page that plays a trained agent in a browser, from one file."""
 
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from megastep.agents import console
-from megastep.agents.cli import plain_words
+from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.runs import folders
+from megastep.settings import frozen
 
 HELP = """Writes a page that plays a trained agent in a browser, from one file without a server.
 
@@ -19,24 +23,19 @@ The page has keys to play, pause and step, and to drive an agent yourself. docs/
 put it on a site of your own."""
 
 
-def main(words: list[str]) -> int:
-    """Writes the page that the words of a command line ask for. Returns the exit code."""
-    if not words or words[0] in ("-h", "--help"):
-        console.say(HELP)
-        return 0 if words else 2
-    keys = {"run": False, "against": False, "homes": True, "seed": False, "file": False}
-    given = plain_words.parse(words, keys)
-    if "run" not in given:
-        raise UserError("run is missing; run=latest takes the newest run")
-    run = given["run"][0]
-    write(
-        run,
-        *given.get("against", [None]),
-        homes=[_number("homes", text) for text in given["homes"]] if "homes" in given else None,
-        seed=_number("seed", given.get("seed", ["1"])[0]),
-        file=given["file"][0] if "file" in given else None,
-    )
-    return 0
+@frozen
+class Web:
+    run: str
+    against: str | None = None
+    homes: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    file: str | None = None
+
+
+def run(cfg: Web) -> None:
+    """Writes the page of an agent."""
+    homes = None if cfg.homes is None else [*cfg.homes]
+    write(cfg.run, cfg.against, homes, cfg.seed, cfg.file)
 
 
 def write(
@@ -71,7 +70,5 @@ def write(
     return path
 
 
-def _number(key: str, text: str) -> int:
-    if not text.isdecimal() or int(text) >= 2**32:
-        raise UserError(f"{key}: {text!r} is no number from 0 to 4,294,967,295")
-    return int(text)
+COMMAND = Command("web", Web, HELP)
+main = COMMAND.main

@@ -35,7 +35,7 @@ def run(cfg: settings.Record) -> Path:
         folder = folders.folder_of(runs[0].path)
     if cfg.against is not None:
         env_settings = settings.changed(env_settings, **eval_env.FOR_TWO)
-    geometry = geometry or settings.kind_of("geometry", components.HOMES)(name=components.HOMES)
+    geometry = geometry or components.settings_for("geometry", components.HOMES)
     homes = factory.homes(env_settings, geometry, cfg.split)
     env_settings = settings.changed(env_settings, n_envs=1)
     shown = []

@@ -128,7 +128,7 @@ def tables_of(folder: Path, step: int, has_homes: bool = True) -> list[dict]:
 
 def options_of(geometry: dict) -> list[str]:
     """Returns the words of a command line for those options of a suite that are not its own."""
-    own = vars(settings.kind_of("geometry", components.SUITE)(name=components.SUITE))
+    own = vars(components.settings_for("geometry", components.SUITE))
     return [
         "'geometry.{}={}'".format(key, json.dumps(value).replace('"', ""))
         for key, value in geometry.items()

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from pydantic_core import PydanticSerializationError, to_jsonable_python
 
 from megastep.agents.errors import ConfigErrors
-from megastep.agents.factory import components, settings
+from megastep.agents.factory import components
 from megastep.settings import sentence
 
 Tree = dict[str, Any]
@@ -23,19 +23,17 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
     """Returns the settings of dataclass `kind` from nested dicts.
 
     Args:
-        kind: a dataclass of `settings`.
-        tree: nested dicts as YAML gives them; 1e6 counts as an integer.
+        kind: a dataclass, such as `settings.Train`.
+        tree: nested dicts as YAML gives them; 1e6 counts as an integer, a list as a tuple.
         names: more names to suggest for a mistyped key, such as groups.
 
     Raises:
         ConfigErrors: with everything that is wrong.
     """
-    fields, errors = dict(fields_of(kind, tree)), {}
     try:
-        chosen = settings.as_typed(kind, tree)
-        as_tree(chosen)
-        return chosen
+        chosen = components.adapter(kind).validate_python(tree)
     except ValidationError as error:
+        fields, errors = dict(fields_of(kind, tree)), {}
         for line in error.errors():
             path = [str(part) for part in line["loc"]]
             if line["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
@@ -48,52 +46,31 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
                 text = sentence(line, field, line["input"]) if field else line["msg"]
             errors.setdefault(".".join(path) or "configuration", text)
         raise ConfigErrors(errors.items()) from None
+    as_tree(chosen)
+    return chosen
 
 
 def as_tree(chosen: Any, prefix: str = "") -> Tree:
     """The inverse of `check`: strings, numbers, true, false, None, lists and nested dicts.
 
-    Leaves out defaults that only the constructor can give, such as functions, or None where the
-    annotation is `float`.
+    Leaves out defaults that only the constructor can give, such as functions.
 
     Args:
         prefix: of the keys in errors.
 
     Raises:
-        ConfigErrors: other values that would come back changed.
+        ConfigErrors: other values that no file can hold.
     """
-    kind, tree = type(chosen), {}
-    fields = kind.__pydantic_fields__
-    for name in fields:
-        with contextlib.suppress(PydanticSerializationError):
-            tree[name] = _plain(getattr(chosen, name), f"{prefix}{name}.")
-    while True:
+    tree = {}
+    for name, field in type(chosen).__pydantic_fields__.items():
+        value = getattr(chosen, name)
         try:
-            again = settings.as_typed(kind, tree)
-            pairs = {n: (getattr(again, n), getattr(chosen, n)) for n in fields}
-            changed = [n for n in fields if not _are_equal(*pairs[n], fields[n].annotation)]
-        except ValidationError as error:
-            changed = [*dict.fromkeys(str(line["loc"][0]) for line in error.errors())]
-        if not changed:
-            return tree
-        for name in changed:
-            field, value = fields[name], getattr(chosen, name)
-            default = field.default_factory() if field.default_factory else field.default
-            if name not in tree or repr(default) != repr(value):
+            tree[name] = _plain(value, f"{prefix}{name}.")
+        except PydanticSerializationError:
+            if value is not field.get_default(call_default_factory=True):
                 text = f"{value!r} cannot be kept in a checkpoint; use numbers, words and lists"
-                raise ConfigErrors([(prefix + name, text)])
-            del tree[name]
-
-
-def _are_equal(one, other, annotation) -> bool:
-    """Returns whether two values are equal and of equal types. A list is a tuple where the
-    annotation takes both.
-    """
-    if dataclasses.is_dataclass(other):
-        return repr(as_tree(one)) == repr(as_tree(other))
-    if annotation is not Any and isinstance(other, tuple):
-        one, other = [*one], [*other]
-    return repr(one) == repr(other)
+                raise ConfigErrors([(prefix + name, text)]) from None
+    return tree
 
 
 def _plain(value, prefix="") -> Any:
@@ -121,9 +98,10 @@ def fields_of(kind: type, tree: object, prefix: str = "") -> Iterator[tuple[str,
             yield from ((key, field) for key in members)
         for key, member in members.items():
             below = field.annotation
-            if name in settings.IMPORTED:
+            if name in components.GROUPS:
                 with contextlib.suppress(KeyError, TypeError, ValueError):
-                    below = settings.kind_of(name, str(member["name"]))
+                    path = components.SINGLE.get(name) or str(member["name"])
+                    below = components.kind_of(name, path)
             if isinstance(below, type) and dataclasses.is_dataclass(below):
                 yield from fields_of(below, member, f"{key}.")
 
@@ -177,7 +155,7 @@ def _unknown(path: list[str], keys: list[str]) -> str:
     group, leaf = path[0], path[-1]
     if group in MOVED:
         return f"is now called {MOVED[group]}"
-    for member, name in components.members(group).items() if group in settings.IMPORTED else ():
-        if path[1:] == [leaf] and leaf in settings.kind_of(group, name).__pydantic_fields__:
+    for member, name in components.members(group).items() if group in components.CHOSEN else ():
+        if path[1:] == [leaf] and leaf in components.kind_of(group, name).__pydantic_fields__:
             return f"no such key here; {group}={member} has it"
     return f"no such key; {closest_key('.'.join(path), keys)}"

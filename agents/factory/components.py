@@ -1,36 +1,21 @@
-"""The arguments of the components of megastep, known without importing them.
-
-Settings are arguments of constructors, whose modules import PyTorch: that takes seconds, in which a
-typing error should long have been named. So all arguments are read once and cached on disk under a
-hash of the sources.
+"""The components that settings choose: the members of groups, and their settings, which are the
+arguments of their constructors. A module is imported once a member of it is chosen.
 """
 
 import functools
-import hashlib
 import importlib
 import inspect
-import pickle
-import pkgutil
-import sys
-from collections.abc import Iterator
+import re
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-import pydantic
 import yaml
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 import megastep
-from megastep import cache
 from megastep.agents import package
 from megastep.imports import import_object
-from megastep.settings import arguments_of, parameters_of
-
-
-def _wrappers(value: object) -> object:
-    """Checks names and settings of wrappers. Raises ValueError naming what is wrong."""
-    return import_object("megastep.agents.factory.settings:checked_wrappers")(value)
-
+from megastep.settings import closest, frozen, parameters_of, sentence, settings_of
 
 POLICY = "megastep.agents.networks.policy:Policy"
 #: Floor plans unless geometry= says otherwise.
@@ -40,112 +25,196 @@ MIXED = "megastep.geometries.sources:mixed"
 CHECK_PARTS = "megastep.geometries.sources:check_parts"
 SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
-#: Where components are found without a file in configs/.
-ENVS, SOURCES = "megastep.envs", "megastep.geometries.sources"
-WRAPPERS = "megastep.wrappers"
-LEARNERS, LOGGERS = "megastep.agents.algorithms", "megastep.agents.training.loggers"
-#: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
-#: are passed by megastep, `missing` are defaults, and the others are settings beside them.
-ARGUMENTS = {
-    "env": dict(
-        # wrappers of a package are the environment's own argument, those of megastep are not
-        reserved=("geometries", "seed", "device", "privileged", "films", "wrappers"),
-        missing={"n_envs": 128},
-        name=str,
-        wrappers=(Annotated[tuple, BeforeValidator(_wrappers)], ()),
-    ),
-    "wrapper": dict(reserved=("env", "seed"), name=str),
-    "geometry": dict(reserved=("split",), missing={"n": 512, "seed": 1}, name=str),
-    "learner": dict(
-        reserved=("policy", "seed", "graph"),
-        name=str,
-        # what lr falls to 0 over; auto: samples if given, else seconds if given
-        anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
-    ),
-    "curriculum": dict(reserved=("env", "learner", "rollout", "sources"), name=str),
-    "logger": dict(reserved=("folder", "step", "run_name", "config"), name=str),
-    "agent": dict(reserved=("obs_space", "action_space", "privileged_space", "seed")),
-    "opponents": dict(
-        reserved=("env", "policy", "scripted", "seed"),
-        bot_class=(str | None, None),  # None: the environment's own
-    ),
-}
-#: Number of versions of the sources whose arguments stay in the cache.
-VERSIONS = 8
+#: Returns pydantic's adapter of a dataclass of settings.
+adapter = functools.cache(TypeAdapter)
 
 
-class Components(NamedTuple):
-    """The components of megastep.
+def _wrappers(value: object) -> tuple[object, ...]:
+    """Returns the wrappers of an environment, names and dicts of `name` and settings.
+
+    Raises:
+        ValueError: naming what is wrong.
+    """
+    items = [value] if isinstance(value, (str, dict)) else value
+    if not isinstance(items, (list, tuple)):
+        raise ValueError(f"expected a list of wrappers, got {value!r}")
+    for item in items:
+        name, known = item.get("name") if isinstance(item, dict) else item, members("wrapper")
+        if not isinstance(name, str):
+            raise ValueError(f"a wrapper is a name or {{name: ..., setting: ...}}, got {item!r}")
+        if ":" not in name and name not in known:
+            raise ValueError(f"{name!r} is no wrapper; {closest(name, known)}, or module:Class")
+        if name in known or isinstance(item, dict):
+            wrapper_settings(item)
+    return tuple(items)
+
+
+def wrapper_settings(item: "str | dict") -> Any:
+    """Returns the settings of a wrapper, with the import path of its class as `name`.
+
+    Raises:
+        ValueError: they are not those of the class.
+    """
+    tree = {"name": item} if isinstance(item, str) else dict(item)
+    label = tree["name"]
+    tree["name"] = members("wrapper").get(label, label)
+    kind = kind_of("wrapper", tree["name"])
+    try:
+        return adapter(kind).validate_python(tree)
+    except ValidationError as error:
+        line, fields = error.errors()[0], kind.__pydantic_fields__
+        key = str(line["loc"][0])
+        if key not in fields:
+            hint = closest(key, fields.keys() - {"name"})
+            raise ValueError(f"{label} has no setting {key!r}; {hint}") from None
+        text = sentence(line, fields[key], line["input"])
+        raise ValueError(f"{label}: {key}: {text}") from None
+
+
+class Group(NamedTuple):
+    """How the arguments of a group's members become settings.
 
     Attributes:
-        arguments: what `arguments_of` returns of each, by (group, import path).
-        takers: import paths of the environments that take floor plans.
-        members: {group: {name: import path}} of those that need no file in configs/.
+        reserved: arguments that megastep passes.
+        needed: {argument: meaning} of what a member must take.
+        missing: defaults of arguments that may have none.
+        more: settings beside the arguments.
+        methods: that a class must have.
+        where: the folder of its modules, or the module of its functions, relative to megastep's.
+        first: the first argument of its members, which others there do not have.
     """
 
-    arguments: dict[tuple[str, str], tuple[str, dict[str, tuple]]]
-    takers: set[str]
-    members: dict[str, dict[str, str]]
+    reserved: tuple[str, ...] = ()
+    needed: dict[str, str] = {}
+    missing: dict[str, Any] = {}
+    more: dict[str, Any] = {"name": str}
+    methods: tuple[str, ...] = ()
+    where: str | None = None
+    first: str | None = None
 
 
-def built_in() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
-    """Returns what `arguments_of` returns of each component, by (group, import path)."""
-    return cached().arguments
-
-
-def takes_geometries(env: str) -> bool:
-    """Returns whether the environment of an import path takes floor plans."""
-    return env in cached().takers if ("env", env) in built_in() else _takes_geometries(env)
-
-
-def members(group: str) -> dict[str, str]:
-    """Returns {member: its `name`} of a group's components, with a file in configs/ or without."""
-    return cached().members.get(group, {}) | _files(group)
-
-
-@functools.cache
-def cached() -> Components:
-    """Returns what `read` does, from the cache on disk if no source has changed."""
-    content, _ = cache.fetch(f"arguments-{_sources()}", lambda: pickle.dumps(tuple(read())))
-    cache.prune("arguments-", VERSIONS)
-    return Components(*pickle.loads(content))
-
-
-def read() -> Components:
-    """Imports every component of megastep."""
-    envs, sources, wrappers = map(importlib.import_module, (ENVS, SOURCES, WRAPPERS))
-    found = {
-        "env": {name: f"{ENVS}.{name}:{kind.__name__}" for name, kind in envs.ENVS.items()},
-        "geometry": {name: f"{SOURCES}:{name}" for name in sources.__all__},
-        "learner": {k: v for k, v in _classes(LEARNERS) if hasattr(import_object(v), "collector")},
-        "logger": dict(_classes(LOGGERS)),
-        "wrapper": {
-            name: f"{WRAPPERS}:{kind.__name__}" for name, kind in wrappers.WRAPPERS.items()
+GROUPS = {
+    "env": Group(
+        # wrappers of a package are the environment's own argument, those of megastep are not
+        reserved=("geometries", "seed", "device", "privileged", "films", "wrappers"),
+        needed={"n_envs": "the number of environments"},
+        missing={"n_envs": 128},
+        more={"name": str, "wrappers": (Annotated[tuple, BeforeValidator(_wrappers)], ())},
+        where="envs",
+    ),
+    "geometry": Group(
+        reserved=("split",),
+        needed={"n": "the number of geometries", "split": "its split", "seed": "an integer"},
+        missing={"n": 512, "seed": 1},
+        where="geometries/sources.py",
+        first="n",
+    ),
+    "learner": Group(
+        reserved=("policy", "seed", "graph"),
+        needed={"policy": "the policy to improve"},
+        # what lr falls to 0 over; auto: samples if given, else seconds if given
+        more={
+            "name": str,
+            "anneal": (Literal["auto", "never", "samples", "seconds"], "auto"),
         },
-    }
-    names = [("agent", POLICY), ("opponents", OPPONENTS)]
-    for group in ARGUMENTS:
-        paths = {*found.get(group, {}).values(), *_files(group).values()}
-        names += [(group, path) for path in paths if path.startswith("megastep.")]
-    arguments = {
-        (group, name): arguments_of(import_object(name), **ARGUMENTS[group])
-        for group, name in names
-    }
-    takers = {name for group, name in names if group == "env" and _takes_geometries(name)}
-    return Components(arguments, takers, found)
+        where="agents/algorithms",
+        first="policy",
+    ),
+    "curriculum": Group(
+        reserved=("env", "learner", "rollout", "sources"),
+        needed={"env": "the environment", "rollout": "the rollout"},
+    ),
+    "logger": Group(
+        reserved=("folder", "step", "run_name", "config"),
+        methods=("write", "close"),
+        where="agents/training/loggers",
+    ),
+    "wrapper": Group(reserved=("env", "seed"), needed={"env": "the environment inside"}),
+    "agent": Group(reserved=("obs_space", "action_space", "privileged_space", "seed"), more={}),
+    "opponents": Group(
+        reserved=("env", "policy", "scripted", "seed"),
+        more={"bot_class": (str | None, None)},  # None: the environment's own
+    ),
+}
+#: Groups whose member has `name`, the import path of a class or function, and decides which
+#: settings there are.
+CHOSEN = ("env", "geometry", "learner", "curriculum", "logger")
 
 
-def _classes(package: str) -> Iterator[tuple[str, str]]:
-    """Yields (file, import path) of the classes that have the name of their file, in lower case."""
-    for file in pkgutil.iter_modules(importlib.import_module(package).__path__):
-        module = importlib.import_module(f"{package}.{file.name}")
-        for name, value in vars(module).items():
-            if inspect.isclass(value) and name.lower() == file.name:
-                yield file.name, f"{package}.{file.name}:{name}"
+#: The only member of a group.
+SINGLE = {"agent": POLICY, "opponents": OPPONENTS}
+
+
+@frozen
+class NoCurriculum:
+    """Every home is drawn alike."""
+
+    name: str
 
 
 @functools.cache
-def _files(group: str) -> dict[str, str]:
+def kind_of(group: str, name: str) -> type:
+    """Returns the dataclass of the settings of a group's member, by the member's `name`.
+
+    Raises:
+        ValueError: if nothing can be imported under this name, or it takes other arguments.
+    """
+    if (group, name) == ("curriculum", "none"):
+        return NoCurriculum
+    constructor, spec = import_object(name), GROUPS[group]
+    try:
+        taken = parameters_of(constructor)
+        if missing := [f"{k}, {text}" for k, text in spec.needed.items() if k not in taken]:
+            raise ValueError(f"it has no argument {missing[0]}")
+        methods = spec.methods if inspect.isclass(constructor) else ()
+        if absent := [method for method in methods if not hasattr(constructor, method)]:
+            raise ValueError(f"it has no method {absent[0]}")
+        is_finite = name.startswith("megastep.")
+        return settings_of(constructor, spec.reserved, spec.missing, is_finite, **spec.more)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name} cannot be used: {error}") from error
+
+
+def settings_for(group: str, name: str | None = None, **values: Any) -> Any:
+    """Returns the settings of a group's member: `name`, its import path, but for the agent and the
+    opponents; and those that differ from its defaults.
+    """
+    kind = kind_of(group, name or SINGLE[group])
+    return kind(**values) if name is None else kind(name=name, **values)
+
+
+@functools.cache
+def members(group: str) -> dict[str, str]:
+    """Returns {member: its `name`} of a group: those that have a module of that name, and
+    those that a file in configs/ names.
+    """
+    if group == "wrapper":
+        wrappers = importlib.import_module("megastep.wrappers").WRAPPERS  # with PyTorch
+        return {label: f"megastep.wrappers:{kind.__name__}" for label, kind in wrappers.items()}
+    return {**_modules(GROUPS[group]), **_files(group)}
+
+
+def _modules(group) -> dict[str, str]:
+    """Returns the members in a group's modules, which are read and not imported."""
+    if group.where is None:
+        return {}
+    path, found = Path(megastep.__file__).parent / group.where, {}
+    module = f"megastep.{group.where.removesuffix('.py').replace('/', '.')}"
+    if path.is_file():
+        functions = re.findall(rf"^def ([a-z]\w*)\(\s*{group.first}\b", path.read_text(), re.M)
+        return {name: f"{module}:{name}" for name in functions}
+    for file in sorted([*path.glob("[a-z]*.py"), *path.glob("[a-z]*/__init__.py")]):
+        stem = file.parent.name if file.name == "__init__.py" else file.stem
+        text = file.read_text()
+        # a class that is called like its module, but for capitals
+        name = rf"^(?:class|from [\w.]+ import) ({stem.replace('_', '')})\b"
+        match = re.search(name, text, re.I | re.M)
+        if match and (not group.first or re.search(rf"self,\s*{group.first}\b", text)):
+            found[stem] = f"{module}.{stem}:{match[1]}"
+    return found
+
+
+def _files(group) -> dict[str, str]:
     """Returns {member: its `name`} of the files of a group that name a component."""
     trees = {
         path.stem: yaml.safe_load(path.read_text()) or {}
@@ -155,16 +224,7 @@ def _files(group: str) -> dict[str, str]:
     return {member: tree["name"] for member, tree in trees.items() if "name" in tree}
 
 
-def _takes_geometries(env) -> bool:
+@functools.cache
+def takes_geometries(env: str) -> bool:
+    """Returns whether the environment of an import path takes floor plans."""
     return "geometries" in parameters_of(import_object(env))
-
-
-def _sources() -> str:
-    """A hash of whatever decides how arguments are read and stored."""
-    folders = Path(megastep.__file__).parent, package.CONFIGS.parent
-    files = {path for folder in folders for path in folder.rglob("*.py")}
-    files = sorted(files | {*package.CONFIGS.glob("*/*.yaml")})
-    digest = hashlib.sha256(f"{sys.version} {pydantic.VERSION}".encode())
-    for path in files:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:32]

@@ -12,7 +12,7 @@ import torch
 from megastep import contract, engine, scene, spaces, types
 from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
-from megastep.agents.factory import check
+from megastep.agents.factory import check, components
 from megastep.agents.factory.settings import (
     Agent,
     Curriculum,
@@ -24,8 +24,6 @@ from megastep.agents.factory.settings import (
     changed,
     env_name,
     label,
-    takes_geometries,
-    wrapper_settings,
 )
 from megastep.agents.generator import stream_seed
 from megastep.agents.hardware import make_device as make_device
@@ -125,7 +123,7 @@ def _wrappers_of(settings, taken) -> tuple[list[str], list]:
         kind = import_object(name) if ":" in name else Wrapper
         is_ours = inspect.isclass(kind) and issubclass(kind, Wrapper)
         if is_ours:
-            outside.append(wrapper_settings(item))
+            outside.append(components.wrapper_settings(item))
         elif "wrappers" not in taken:
             raise ValueError(
                 f"env.wrappers: {name} is no megastep.wrappers.Wrapper, and "
@@ -143,7 +141,7 @@ def _wrappers_of(settings, taken) -> tuple[list[str], list]:
 
 def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
     """Returns the different geometries of a split, in order; none if `env` takes no geometries."""
-    if not takes_geometries(env):
+    if not components.takes_geometries(env.name):
         return []
     return [*{id(home): home for home in construct(geometry, split=split)}.values()]
 
@@ -152,7 +150,7 @@ def typed_or(geometry: Geometry, typed: Geometry | None, env: Env) -> Geometry:
     """Returns the geometry that was typed, else the other. UserError if `env` takes none."""
     if typed is None:
         return geometry
-    if not takes_geometries(env):
+    if not components.takes_geometries(env.name):
         raise UserError(
             f"{env_name(env)} takes no floor plans, so it cannot be played in "
             f"geometry={label(typed.name)}; leave geometry out"

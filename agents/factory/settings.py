@@ -8,36 +8,19 @@ import copy
 import dataclasses
 import functools
 import inspect
-import json
 import operator
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from megastep.agents.factory import components
 from megastep.agents.population.variation import Variation
 from megastep.imports import import_object
 from megastep.schedules import Scheduled
-from megastep.settings import (
-    AtMost,
-    closest,
-    frozen,
-    located,
-    parameters_of,
-    sentence,
-    settings_class,
-    settings_of,
-)
+from megastep.settings import AtMost, closest, frozen, located
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -94,9 +77,6 @@ def quantity(text: object, kind: str) -> object:
     return int(total) if total.is_integer() else total
 
 
-Callback = Annotated[str, AfterValidator(_callback)]
-
-
 def _every(given: int | float | str) -> int | str:
     """Returns a number of samples, or text such as `60s`."""
     seconds, samples = (cast("float | str", quantity(given, kind)) for kind in UNITS)
@@ -117,78 +97,22 @@ def every(value: float | str) -> tuple[float, str]:
     return (float(value[:-1]), "seconds") if isinstance(value, str) else (value, "samples")
 
 
-Above0 = Annotated[float, Field(gt=0)]
+Seconds = Annotated[
+    float, Field(gt=0), BeforeValidator(functools.partial(quantity, kind="seconds"))
+]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]
-Samples = Annotated[int, Field(ge=1, le=10**18)]
+Samples = Annotated[
+    int, Field(ge=1, le=10**18), BeforeValidator(functools.partial(quantity, kind="samples"))
+]
+#: Names, of which a single one needs no brackets.
+Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 Split = Literal["training", "test", "all"]
+Member = int | Literal["best"] | None
 FILMS = ".mp4", ".gif", ".png", ".svg", ".pdf"  # endings of what record.py can write
 
 
 # ---- Groups ----
-
-
-@frozen
-class NoCurriculum:
-    """Every home is drawn alike."""
-
-    name: str
-
-
-#: Groups of configs/ whose member has `name`, the import path of a class or function, and decides
-#: which settings there are: its arguments. Those it must have, with what each means.
-IMPORTED = {
-    "env": {"n_envs": "the number of environments"},
-    "geometry": {"n": "the number of geometries", "split": "its split", "seed": "an integer"},
-    "learner": {"policy": "the policy to improve"},
-    "curriculum": {"env": "the environment", "rollout": "the rollout"},
-    "logger": {},
-}
-#: Methods of a group's classes.
-METHODS = {"logger": ("write", "close")}
-
-
-@functools.cache
-def kind_of(group: str, name: str) -> type:
-    """Returns the dataclass of the settings of a group's member, by the member's `name`.
-
-    Raises:
-        ValueError: if nothing can be imported under this name, or it takes other arguments.
-    """
-    if (group, name) == ("curriculum", "none"):
-        return NoCurriculum
-    if (group, name) in components.built_in():
-        return settings_class(*components.built_in()[group, name])
-    constructor, spec = import_object(name), components.ARGUMENTS[group]
-    try:
-        taken = parameters_of(constructor)
-        needed = IMPORTED.get(group, {"env": "the environment inside"})
-        if missing := [f"{k}, {text}" for k, text in needed.items() if k not in taken]:
-            raise ValueError(f"it has no argument {missing[0]}")
-        methods = METHODS.get(group, ()) if inspect.isclass(constructor) else ()
-        if absent := [method for method in methods if not hasattr(constructor, method)]:
-            raise ValueError(f"it has no method {absent[0]}")
-        return settings_of(constructor, is_finite=False, **spec)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{name} cannot be used: {error}") from error
-
-
-def as_typed(kind: type[T], tree: object) -> T:
-    """Returns the settings of a dataclass from nested dicts. A value keeps the type that it was
-    typed with, unless an annotation asks for another: 1e6 counts as an integer, a list as a tuple.
-
-    Raises:
-        ValidationError: of pydantic.
-    """
-    adapter = TypeAdapter(kind)
-    whole = json.loads(
-        json.dumps(tree, skipkeys=True, default=repr),  # bytes of a file, which `as_tree` refuses
-        parse_float=lambda text: int(float(text)) if float(text).is_integer() else float(text),
-    )
-    # in strict mode pydantic takes lists for tuples and strings for paths in JSON alone, whose keys
-    # are strings; otherwise it keeps keys, and takes "3" and true for numbers
-    adapter.validate_json(json.dumps(whole))
-    return adapter.validate_python(tree, strict=False)
 
 
 def _group(group: str) -> object:
@@ -199,57 +123,12 @@ def _group(group: str) -> object:
             return value
         if not isinstance(value, dict):
             raise ValueError(f"is a group of keys, got {value!r}")
-        if "name" not in value:
+        name = components.SINGLE.get(group) or value.get("name")
+        if name is None:
             raise ValueError(f"its keys need a member: give {group}= as well")
-        return as_typed(kind_of(group, str(value["name"])), value)
+        return components.adapter(components.kind_of(group, str(name))).validate_python(value)
 
     return Annotated[Any, BeforeValidator(settings)]
-
-
-def checked_wrappers(value: object) -> tuple[object, ...]:
-    """Returns the wrappers of an environment, names and dicts of `name` and settings, checked as
-    far as no package is imported.
-
-    Raises:
-        ValueError: naming what is wrong.
-    """
-    items = [value] if isinstance(value, (str, dict)) else value
-    if not isinstance(items, (list, tuple)):
-        raise ValueError(f"expected a list of wrappers, got {value!r}")
-    for item in items:
-        name = item.get("name") if isinstance(item, dict) else item
-        known = components.members("wrapper")
-        if not isinstance(name, str):
-            raise ValueError(f"a wrapper is a name or {{name: ..., setting: ...}}, got {item!r}")
-        if ":" not in name and name not in known:
-            raise ValueError(f"{name!r} is no wrapper; {closest(name, known)}, or module:Class")
-        if name in known or isinstance(item, dict):
-            wrapper_settings(item)
-    return tuple(items)
-
-
-def wrapper_settings(item: "str | dict") -> object:
-    """Returns the settings of a wrapper, with the import path of its class as `name`.
-
-    Raises:
-        ValueError: they are not those of the class.
-    """
-    tree = {"name": item} if isinstance(item, str) else dict(item)
-    label = tree["name"]
-    tree["name"] = components.members("wrapper").get(label, label)
-    kind = kind_of("wrapper", tree["name"])
-    try:
-        return as_typed(kind, tree)
-    except ValidationError as error:
-        (line, *_) = error.errors()
-        key = str(line["loc"][0])
-        fields = kind.__pydantic_fields__
-        if key not in fields:
-            raise ValueError(
-                f"{label} has no setting {key!r}; {closest(key, fields.keys() - {'name'})}"
-            ) from None
-        text = sentence(line, fields[key], line["input"])
-        raise ValueError(f"{label}: {key}: {text}") from None
 
 
 def changed(settings: T, **changes: object) -> T:
@@ -264,17 +143,12 @@ def changed(settings: T, **changes: object) -> T:
     return result
 
 
-def takes_geometries(env: "Env") -> bool:
-    """Returns True if the class of an environment's settings takes floor plans."""
-    return components.takes_geometries(env.name)
-
-
 def ignored_geometry(env: "Env | None", typed: list[str]) -> list[tuple[str, str]]:
     """Returns [(key, sentence)] of the first typed key that chooses a geometry, if the environment
     takes none. `env` may be None, that of a run.
     """
     keys = [key for key in typed if key.split(".")[0] == "geometry"]
-    if not keys or env is None or takes_geometries(env):
+    if not keys or env is None or components.takes_geometries(env.name):
         return []
     return [(keys[0], f"env={env_name(env)} takes no floor plans; leave geometry out")]
 
@@ -293,28 +167,24 @@ def env_name(env: "Env") -> str:
 
 def run_name(cfg: "Train") -> str:
     """What the folder of a run is called after the time, from its settings."""
-    geometry = [label(cfg.geometry.name)] if takes_geometries(cfg.env) else []
+    geometry = [label(cfg.geometry.name)] if components.takes_geometries(cfg.env.name) else []
     return "-".join([env_name(cfg.env), *geometry, str(cfg.seed)])
-
-
-def loggers() -> dict[str, str]:
-    """Returns the import paths of megastep's loggers by label."""
-    return components.members("logger")
 
 
 def _chosen_loggers(tree) -> dict:
     """Returns nested dicts of loggers by label. Raises for keys of loggers that were not chosen."""
     if not isinstance(tree, dict):
         raise ValueError(f"is a group of keys, got {tree!r}")
-    errors, known = [], loggers()
+    errors, known = [], components.members("logger")
     for key, value in tree.items():
         if dataclasses.is_dataclass(value) or (isinstance(value, dict) and "name" in value):
             continue
-        owners = [one for one, path in known.items() if key in _own_settings(path)]
+        kinds = {one: components.kind_of("logger", path) for one, path in known.items()}
+        owners = [one for one, kind in kinds.items() if key in kind.__pydantic_fields__]
         text = f"no such key or logger; {closest(key, known)}"
         if key in known:
             text = f"is not chosen; add logger={key}, or logger=[tensorboard,{key}] for both"
-        elif owners:
+        elif owners and key != "name":
             text = f"no such key; did you mean logger.{owners[0]}.{key}?"
         errors.append((key, text))
     if errors:
@@ -322,29 +192,19 @@ def _chosen_loggers(tree) -> dict:
     return tree
 
 
-def _own_settings(logger) -> set[str]:
-    return kind_of("logger", logger).__pydantic_fields__.keys() - {"name"}
-
-
 if TYPE_CHECKING:
 
-    class Member:
+    class Component:
         """The settings of a group's member: its import path, and what its constructor takes."""
 
         name: str
 
         def __getattr__(self, key: str) -> Any: ...
 
-    Env = Geometry = Learner = Curriculum = Logger = Member
-
-    class Agent(Member): ...
-
-    class Opposition(Member): ...
-
+    Env = Geometry = Learner = Curriculum = Logger = Agent = Opponents = Component
 else:
-    Env, Geometry, Learner, Curriculum, Logger = map(_group, IMPORTED)
-    Agent = kind_of("agent", components.POLICY)
-    Opposition = kind_of("opponents", components.OPPONENTS)
+    Env, Geometry, Learner, Curriculum, Logger = map(_group, components.CHOSEN)
+    Agent, Opponents = map(_group, components.SINGLE)
 #: {label: settings}, such as {"wandb": ...}
 Loggers = Annotated[dict[str, Logger], BeforeValidator(_chosen_loggers)]
 
@@ -366,47 +226,40 @@ def missing_sources(tree: "Config") -> list[tuple[str, str]]:
     return []
 
 
-def too_large(group: Any, tree: object) -> Iterator[tuple[str, str]]:
-    """Yields (key, sentence) of settings of a group that exceed another setting, see `AtMost`."""
-    for name, field in group.__pydantic_fields__.items():
-        for limit in (extra for extra in field.metadata if isinstance(extra, AtMost)):
-            value, most = getattr(group, name), operator.attrgetter(limit.key)(tree)
-            if value > most:
-                yield name, f"{value} is more than {limit.key}={most}"
+def _fields(cfg: "Train") -> Iterator[tuple[str, Any, Any]]:
+    """Yields (key, field, value) of the settings of the learner and the environment."""
+    for prefix, part in (("learner", cfg.learner), ("env", cfg.env)):
+        for name, field in part.__pydantic_fields__.items():
+            yield f"{prefix}.{name}", field, getattr(part, name)
+
+
+def _bounds(field) -> Scheduled | None:
+    """Returns the bounds of a setting that may be a schedule, None of any other."""
+    return next((extra for extra in field.metadata if isinstance(extra, Scheduled)), None)
 
 
 def schedules_of(cfg: "Train") -> list[str]:
     """Returns the keys of settings that have a schedule."""
-    parts: list = [("learner.", cfg.learner), ("env.", cfg.env)]
-    own = (item for item in cfg.env.wrappers if isinstance(item, dict))
-    parts += [("env.wrappers", wrapper_settings(item)) for item in own]
-    return [
-        key if key == "env.wrappers" else f"{key}{name}"
-        for key, part in parts
-        for name, field in part.__pydantic_fields__.items()
-        if any(isinstance(extra, Scheduled) for extra in field.metadata)
-        and not isinstance(getattr(part, name), float)
-    ]
+    fields = [*_fields(cfg)]
+    for item in cfg.env.wrappers:
+        if isinstance(item, dict):
+            wrapper = components.wrapper_settings(item)
+            fields += [
+                ("env.wrappers", field, getattr(wrapper, name))
+                for name, field in wrapper.__pydantic_fields__.items()
+            ]
+    return [k for k, field, value in fields if _bounds(field) and not isinstance(value, float)]
 
 
 def variable(cfg: "Train") -> dict[str, Scheduled]:
     """Returns the bounds of the settings that may vary between the members of a population, by key:
     those that may be schedules.
     """
-    parts: list = [("learner.", cfg.learner), ("env.", cfg.env)]
-    return {
-        f"{prefix}{name}": extra
-        for prefix, part in parts
-        for name, field in part.__pydantic_fields__.items()
-        for extra in field.metadata
-        if isinstance(extra, Scheduled)
-    }
+    return {key: bounds for key, field, _ in _fields(cfg) if (bounds := _bounds(field))}
 
 
-def population_errors(cfg: "Train") -> dict[str, object]:
-    """Returns {dotted key: sentence} of what is wrong with a population, false for what is not."""
-    chosen, bounds = cfg.population, variable(cfg)
-    errors: dict[str, object] = {}
+def _population_conflicts(cfg: "Train") -> Iterator[tuple[str, str]]:
+    chosen, bounds, is_many = cfg.population, variable(cfg), cfg.population.size > 1
     for key, one in chosen.vary.items():
         problem = one.problem()
         if key not in bounds:
@@ -422,33 +275,29 @@ def population_errors(cfg: "Train") -> dict[str, object]:
             except ValueError as error:
                 problem = str(error)
         if problem:
-            errors["population.vary"] = f"{key} {problem}"
-    unit = None if cfg.evaluation.every is None else every(cfg.evaluation.every)[1]
-    is_many = chosen.size > 1
-    return errors | {
-        "population.size": not is_many
-        and chosen.vary
-        and "is 1, and population.vary needs several members: population.size=8",
-        "population.score": is_many
-        and chosen.score == "evaluated"
-        and unit != "samples"
-        and "is evaluated, which needs evaluations every so many samples: evaluation.every=10M",
-        "population.schedule": chosen.schedule is not None
-        and (
-            (is_many and "is of a single agent, and cannot be combined with population.size")
-            or (
-                not os.path.isfile(chosen.schedule)
-                and f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
-            )
-        ),
-        "ranks": is_many
-        and isinstance(cfg.ranks, int)
-        and cfg.ranks > chosen.size
-        and f"{cfg.ranks} is more than population.size={chosen.size}; each rank needs a member",
-        "resume": is_many
-        and cfg.resume == "auto"
-        and "cannot be auto for a population yet; give resume=RUN, its folder",
-    }
+            yield "population.vary", f"{key} {problem}"
+            break
+    if chosen.schedule is not None:
+        if is_many:
+            text = "is of a single agent, and cannot be combined with population.size"
+            yield "population.schedule", text
+        elif not os.path.isfile(chosen.schedule):
+            text = f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
+            yield "population.schedule", text
+    if not is_many:
+        if chosen.vary:
+            text = "is 1, and population.vary needs several members: population.size=8"
+            yield "population.size", text
+        return
+    is_in_samples = cfg.evaluation.every is not None and not isinstance(cfg.evaluation.every, str)
+    if chosen.score == "evaluated" and not is_in_samples:
+        text = "is evaluated, which needs evaluations every so many samples: evaluation.every=10M"
+        yield "population.score", text
+    if isinstance(cfg.ranks, int) and cfg.ranks > chosen.size:
+        text = f"is more than population.size={chosen.size}; each rank needs a member"
+        yield "ranks", f"{cfg.ranks} {text}"
+    if cfg.resume == "auto":
+        yield "resume", "cannot be auto for a population yet; give resume=RUN, its folder"
 
 
 def changes_lr(learner: "Learner") -> bool:
@@ -468,13 +317,13 @@ class Common:
     device: Annotated[str, AfterValidator(_device)]
     trust: bool = False  # import what checkpoints that others made name
 
-    def errors(self) -> Mapping[str, object]:
-        # {dotted key: sentence} of settings that contradict each other, false for those that do not
-        return {}
+    def conflicts(self) -> Iterator[tuple[str, str]]:
+        """Yields (dotted key, sentence) of settings that contradict each other."""
+        yield from ()
 
     @model_validator(mode="after")
     def _agree(self) -> "Self":
-        if errors := [(key, str(text)) for key, text in self.errors().items() if text]:
+        if errors := [*self.conflicts()]:
             raise located(errors)
         return self
 
@@ -513,7 +362,7 @@ class Evaluation:
 class Checkpoints:
     """When checkpoints are saved, and how many are kept."""
 
-    seconds: Above0 = 30.0
+    seconds: Seconds = 30.0
     keep: Annotated[int, Field(ge=2, le=1000)] = 2
     replay_every: Count = 20
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
@@ -537,17 +386,21 @@ class Population:
 class Train(Common):
     env: Env
     geometry: Geometry
-    agent: Agent = Agent()
+    agent: Agent = dataclasses.field(
+        default_factory=functools.partial(components.settings_for, "agent")
+    )
     learner: Learner
-    curriculum: Curriculum = cast("Curriculum", NoCurriculum(name="none"))
-    opponents: Opposition = Opposition()
+    curriculum: Curriculum = cast("Curriculum", components.NoCurriculum(name="none"))
+    opponents: Opponents = dataclasses.field(
+        default_factory=functools.partial(components.settings_for, "opponents")
+    )
     population: Population = Population()
     logger: Loggers = dataclasses.field(default_factory=dict)
     finish: Finish
     samples: Samples | None
-    seconds: Above0 | None
+    seconds: Seconds | None
     more_samples: Samples | None = None
-    more_seconds: Above0 | None = None
+    more_seconds: Seconds | None = None
     logging: Logging = Logging()
     evaluation: Evaluation = Evaluation()
     checkpoints: Checkpoints = Checkpoints()
@@ -562,68 +415,52 @@ class Train(Common):
     resume: str | None
     rerun: str | None = None
     init: str | None
-    member: int | Literal["best"] | None = None
+    member: Member = None
 
-    def errors(self) -> dict[str, object]:
-        over = self.learner.anneal
-        lag, env = getattr(self.learner, "lag", 0), self.env
-        has_curriculum = self.curriculum.name != "none"
-        opponents = self.opponents
-        is_async = lag and (opponents.past or opponents.bot or opponents.league)
-        is_member = self.population.size > 1
+    def conflicts(self) -> Iterator[tuple[str, str]]:
+        env, learner, over = self.env, self.learner, self.learner.anneal
+        lag = getattr(learner, "lag", 0)
         # classes of users are asked when they are made
         draws = getattr(env, "resample", not env.name.startswith("megastep."))
-        cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
-        return {
-            "curriculum": has_curriculum
-            and (lag or not draws)
-            and (
-                "the homes to draw change with every update, so nothing can be collected ahead of "
-                "it; use learner.lag=0"
-                if lag
-                else f"env={env_name(env)} draws no home for each episode; {cure}"
-            ),
-            **{f"learner.{name}": text for name, text in too_large(self.learner, self)},
-            "opponents.league": opponents.league
-            and not is_member
-            and "are other members of a population, which needs population.size=2 or more",
-            "learner.lag": is_async
-            and "opponents change with every update, so nothing can be collected ahead of it; use "
-            "learner.lag=0, or no opponents",
-            "learner.anneal": over in ("samples", "seconds")
-            and (
-                (
-                    getattr(self, over) is None
-                    and f"is {over}, and no {over}= is given for the learning rate to fall over"
-                )
-                or (
-                    changes_lr(self.learner)
-                    and f"is {over}, but learner.lr is a schedule or follows learner.desired_kl; "
-                    "leave learner.anneal out"
-                )
-            ),
-            **{
-                key: "is a schedule over the budget; give samples= or seconds="
-                for key in schedules_of(self)
-                if (self.samples, self.seconds, self.rerun, self.resume) == (None,) * 4
-            },
-            **{
-                f"more_{name}": self.resume is None
-                and getattr(self, f"more_{name}") is not None
-                and f"extends a resumed run; give resume=RUN, or {name}= for a new run"
-                for name in ("samples", "seconds")
-            },
-            **population_errors(self),
-            "member": self.member is not None
-            and self.init is None
-            and "is of a population whose weights start a run; give init=RUN",
-            "evaluation.stop": bool(self.evaluation.stop)
-            and self.evaluation.every is None
-            and "needs evaluations in training to reach it: give evaluation.every=60s, or samples",
-            "checkpoints.snapshots": self.checkpoints.snapshots
-            and not (self.samples or self.seconds or self.more_samples or self.more_seconds)
-            and "are spread over the budget; give samples= or seconds=",
-        }
+        if self.curriculum.name != "none" and lag:
+            text = "the homes to draw change with every update, so nothing can be collected ahead"
+            yield "curriculum", f"{text} of it; use learner.lag=0"
+        elif self.curriculum.name != "none" and not draws:
+            cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
+            yield "curriculum", f"env={env_name(env)} draws no home for each episode; {cure}"
+        for key, field, value in _fields(self):
+            for limit in (extra for extra in field.metadata if isinstance(extra, AtMost)):
+                if value > (most := operator.attrgetter(limit.key)(self)):
+                    yield key, f"{value} is more than {limit.key}={most}"
+        if self.opponents.league and self.population.size == 1:
+            text = "are other members of a population, which needs population.size=2 or more"
+            yield "opponents.league", text
+        if lag and (self.opponents.past or self.opponents.bot or self.opponents.league):
+            text = "opponents change with every update, so nothing can be collected ahead of it"
+            yield "learner.lag", f"{text}; use learner.lag=0, or no opponents"
+        if over in ("samples", "seconds") and getattr(self, over) is None:
+            text = f"is {over}, and no {over}= is given for the learning rate to fall over"
+            yield "learner.anneal", text
+        elif over in ("samples", "seconds") and changes_lr(learner):
+            text = "but learner.lr is a schedule or follows learner.desired_kl"
+            yield "learner.anneal", f"is {over}, {text}; leave learner.anneal out"
+        if (self.samples, self.seconds, self.rerun, self.resume) == (None,) * 4:
+            for key in dict.fromkeys(schedules_of(self)):
+                yield key, "is a schedule over the budget; give samples= or seconds="
+        for name in ("samples", "seconds"):
+            if self.resume is None and getattr(self, f"more_{name}") is not None:
+                text = f"extends a resumed run; give resume=RUN, or {name}= for a new run"
+                yield f"more_{name}", text
+        yield from _population_conflicts(self)
+        if self.member is not None and self.init is None:
+            yield "member", "is of a population whose weights start a run; give init=RUN"
+        if self.evaluation.stop and self.evaluation.every is None:
+            text = "needs evaluations in training to reach it: give evaluation.every=60s, or 1M"
+            yield "evaluation.stop", text
+        budgets = self.samples, self.seconds, self.more_samples, self.more_seconds
+        if self.checkpoints.snapshots and not any(budgets):
+            text = "are spread over the budget; give samples= or seconds="
+            yield "checkpoints.snapshots", text
 
 
 @frozen
@@ -636,7 +473,9 @@ class Trained:
     env: Env
     geometry: Geometry
     agent: Agent
-    opponents: Opposition = Opposition()
+    opponents: Opponents = dataclasses.field(
+        default_factory=functools.partial(components.settings_for, "opponents")
+    )
 
 
 @frozen
@@ -647,7 +486,7 @@ class Played(Common):
     geometry: Geometry | None = None
     split: Split
     greedy: bool
-    member: int | Literal["best"] | None = None
+    member: Member = None
 
 
 def _given(run: T | None) -> T:
@@ -670,7 +509,7 @@ class Evaluate(Played):
     episodes: Count
     max_steps: Count | None = None  # None: the environment's own limit
     baseline: Annotated[tuple[str, ...], BeforeValidator(_players)]
-    against: tuple[str, ...] | None = None
+    against: Names | None = None
     ratings: bool = False
 
 
@@ -695,35 +534,27 @@ class Record(Played):
     trail: Annotated[int, Field(ge=0, le=10_000)] = 60
     axes: bool = False
 
-    def errors(self) -> dict[str, object]:
+    def conflicts(self) -> Iterator[tuple[str, str]]:
         has_run, has_env = self.run is not None or self.runs is not None, self.env is not None
         stored = [name for name in ("worst", "episode") if getattr(self, name) is not None]
-        of_stored = {
-            name: getattr(self, name) is not None
-            and f"cannot be combined with {stored[0]}, whose evaluation has its own"
-            for name in ("geometry", "homes", "against", "env")
-            if stored
-        }
-        return {
-            **{
-                name: self.run is None and "needs run=, whose newest evaluation it is about"
-                for name in stored
-            },
-            "run": not (has_run or has_env)
-            and "is missing; without a run, env=explorer records random actions",
-            "runs": self.runs is not None
-            and (
-                (self.run is not None and "cannot be combined with run; list all runs in runs")
-                or (self.homes is not None and "cannot be combined with homes; choose one home=")
-            ),
-            "env": has_run and has_env and "cannot be combined with run, which has its own",
-            "file": self.file is not None
-            and not self.file.endswith(FILMS)
-            and f"{self.file!r} is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or "
-            ".pdf",
-            "against": self.against is not None
-            and self.run is None
-            and "needs run=, the agent that plays against it",
-            **({"episode": "cannot be combined with worst"} if len(stored) == 2 else {}),
-            **{name: text for name, text in of_stored.items() if text},
-        }
+        if not (has_run or has_env):
+            yield "run", "is missing; without a run, env=explorer records random actions"
+        if has_run and has_env and not stored:
+            yield "env", "cannot be combined with run, which has its own"
+        if self.runs is not None and self.run is not None:
+            yield "runs", "cannot be combined with run; list all runs in runs"
+        elif self.runs is not None and self.homes is not None:
+            yield "runs", "cannot be combined with homes; choose one home="
+        if self.file is not None and not self.file.endswith(FILMS):
+            text = "is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or .pdf"
+            yield "file", f"{self.file!r} {text}"
+        if self.against is not None and self.run is None:
+            yield "against", "needs run=, the agent that plays against it"
+        if len(stored) == 2:
+            yield "episode", "cannot be combined with worst"
+        for name in stored:
+            if self.run is None:
+                yield name, "needs run=, whose newest evaluation it is about"
+        for name in ("geometry", "homes", "against", "env") if stored else ():
+            if getattr(self, name) is not None:
+                yield name, f"cannot be combined with {stored[0]}, whose evaluation has its own"

@@ -62,12 +62,12 @@ def load_with_env(name: str, device: str = "auto", **options: bool) -> "tuple[Po
         options: further arguments of the environment, such as `films=True`.
     """
     from megastep.agents import factory  # which a policy alone does not need
-    from megastep.agents.factory import settings
+    from megastep.agents.factory import components
 
     where = make_device(device)
     loaded = folders.load_checkpoint(folders.find(name), False, where)
     trained = factory.config_of(loaded)
-    geometry = settings.kind_of("geometry", _HOMES)(name=_HOMES, n=_N_HOMES)
+    geometry = components.settings_for("geometry", _HOMES, n=_N_HOMES)
     homes = factory.homes(trained.env, geometry, "test")
     env = factory.make_sample(trained.env, homes, seed=trained.seed, device=where, **options)
     restore.load_wrappers(env, loaded)

@@ -10,7 +10,7 @@ import numpy as np
 from megastep.agents import factory
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.evaluation.statistics import SCORES
-from megastep.agents.factory import check, settings
+from megastep.agents.factory import check, components
 from megastep.agents.reports import runs
 from megastep.agents.runs import folders
 from megastep.agents.runs.typed_json import loads
@@ -76,7 +76,7 @@ def plans_of(run: runs.Run, table: Mapping) -> list:
     if geometry is None:
         kept = trained.geometry
     else:
-        kind = settings.kind_of("geometry", str(geometry["name"]))
+        kind = components.kind_of("geometry", str(geometry["name"]))
         kept = check.check(kind, geometry)
     return factory.homes(trained.env, kept, str(chosen["split"]))
 

@@ -10,7 +10,7 @@ import torch
 from timing import measurement
 
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.scripts import TRAIN
+from megastep.agents.cli.train import COMMAND
 from megastep.agents.factory.trainer import make_trainer
 
 #: Environments, and the settings with which so many fit beside what trains.
@@ -37,7 +37,7 @@ def checkpoints(device: torch.device) -> Iterator[dict]:
 
 def _costs(device, n_envs, words, folder):
     words = ["env=explorer", f"env.n_envs={n_envs}", f"device={device}", *words]
-    cfg = Composer(TRAIN).settings([*words, "samples=1e12", "env.resample=true"])
+    cfg = Composer(COMMAND).settings([*words, "samples=1e12", "env.resample=true"])
     running = make_trainer(cfg, folder, device)
     waits, writes, costs = [], [], []
     for _ in range(3):

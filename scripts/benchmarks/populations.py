@@ -11,7 +11,7 @@ from timing import measurement, seconds_per_call
 from training import rates, trained
 
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.scripts import TRAIN
+from megastep.agents.cli.train import COMMAND
 from megastep.agents.factory.trainer import make_trainer
 
 #: (members, lanes of each, lanes of the run beside them)
@@ -40,7 +40,7 @@ def copies(device: torch.device) -> Iterator[dict]:
         with tempfile.TemporaryDirectory() as parent:
             for name in ("source", "target"):
                 words = "env=explorer", "env.n_envs=64", f"agent.width={width}", f"device={device}"
-                cfg = Composer(TRAIN).settings([*words, "samples=1e12"])
+                cfg = Composer(COMMAND).settings([*words, "samples=1e12"])
                 folder = Path(parent, name)
                 folder.mkdir()
                 trainer = make_trainer(cfg, folder, device)

@@ -16,7 +16,7 @@ import pytest
 
 from megastep.agents import package
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.factory.settings import kind_of
+from megastep.agents.factory.components import kind_of
 from megastep.agents.runs import checkpoint, folders
 from tests.helpers import tiny
 

@@ -10,7 +10,8 @@ import pytest
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import check
-from megastep.agents.factory.settings import Train, kind_of
+from megastep.agents.factory.components import kind_of
+from megastep.agents.factory.settings import Train
 from megastep.agents.runs import checkpoint, trust
 from tests.helpers.tiny import TINY, changed, settings
 

@@ -8,7 +8,7 @@ import types
 
 import pytest
 
-from megastep.agents.cli import scripts, train
+from megastep.agents.cli import train
 from megastep.agents.launch import gpu
 from megastep.agents.runs import checkpoint
 from tests.helpers.tiny import TINY, settings
@@ -136,7 +136,7 @@ def test_resumed_run_wakes_its_own_gpu_alone(installed, monkeypatch, tmp_path):
     config = {"train": as_tree(settings(*TINY)) | {"device": "cuda:3"}, "spaces": {}}
     checkpoint.save(tmp_path / "run/checkpoints", 32, dict(samples=32, seconds=1.0), config)
     driver, ran = installed(Driver()), []
-    monkeypatch.setattr(scripts.Script, "run", lambda script, cfg: ran.append(cfg.device))
+    monkeypatch.setattr(train, "run", lambda cfg: ran.append(cfg.device))
     assert train.main([f"resume={tmp_path / 'run'}"]) == 0
     assert ran == ["cuda:3"] and contexts(driver) == [3]
 

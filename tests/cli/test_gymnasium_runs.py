@@ -5,8 +5,8 @@ import json
 import pytest
 
 from megastep.agents.cli import evaluate, sweeps, train
+from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.scripts import SCRIPTS
 from megastep.agents.runs import json_lines
 from tests.helpers import tiny
 
@@ -30,7 +30,7 @@ def test_settings():
     words = ["env.id=minigrid:MiniGrid-Empty-5x5-v0", "env.kwargs.size=9", "env.wrappers=[a.b:C]"]
     env = tiny.settings("env=gymnasium", *words).env
     assert (env.id, env.kwargs, env.wrappers) == (words[0][7:], {"size": 9}, ("a.b:C",))
-    composer = Composer(SCRIPTS["train"])
+    composer = Composer(load("train"))
     jobs, *_ = sweeps.jobs_of(composer, ["env=gymnasium", "env.id=CartPole-v1,ALE/Pong-v5"])
     assert [composer.settings(job).env.id for job in jobs] == ["CartPole-v1", "ALE/Pong-v5"]
 

@@ -5,8 +5,8 @@ import textwrap
 import pytest
 
 from megastep.agents.cli import blocks, evaluate, sweeps, train
+from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.scripts import TRAIN
 from megastep.agents.errors import ConfigErrors
 from tests.helpers import tiny
 
@@ -36,7 +36,7 @@ def here(tmp_path, monkeypatch):
 
 def composed(*words):
     """Returns the settings of words, with files of conf/ beside ours."""
-    return Composer(TRAIN, folder="conf").settings(words)
+    return Composer(load("train"), folder="conf").settings(words)
 
 
 RECIPE = """\
@@ -176,23 +176,8 @@ def test_another_class_has_values_of_the_arguments_that_it_takes(own):
         "n_steps": 104,
         "anneal": "auto",
     }
-    composer = Composer(TRAIN)
-    composer.settings([*words, "learner.lr=0.5"])
-    assert composer.note == (f"learner={own}:A2C takes n_steps=104 from experiment=popgym")
-    composer.settings(words[1:])
-    assert composer.note == ""
     with pytest.raises(ConfigErrors, match="learner.clip: no such key here; learner=ppo has it"):
-        composer.settings([*words, "learner.clip=0.1"])
-
-
-def test_training_says_what_a_class_takes(own, capsys):
-    words = *tiny.TINY[:4], "agent.width=8", "samples=32", "device=cpu"
-    assert train.main([f"learner={own}:A2C", *words]) == 2
-    out, err = capsys.readouterr()
-    assert " takes " not in out and err.endswith("made with lr=0.0007\n")
-    assert train.main([f"learner={own}:MyPPO", *words, "dry_run=true"]) == 0
-    text = f"learner={own}:MyPPO takes lr=0.003, gamma=0.98, entropy_coef=0.02 from the CPU values"
-    assert f"{text} of ppo\n" in capsys.readouterr().out
+        tiny.settings(*words, "learner.clip=0.1")
 
 
 def test_a_class_may_fix_an_argument(own, capsys):
@@ -209,6 +194,6 @@ def test_an_environment_passes_arguments_on(own):
 
 
 def test_jobs_of_a_sweep_have_the_blocks_of_their_learners(own):
-    composer = Composer(TRAIN)
+    composer = Composer(load("train"))
     _, jobs, _ = sweeps.jobs_of(composer, [f"learner=ppo,r2d2,{own}:MyR2D2"])
     assert [cfg.learner.lr for cfg in jobs] == [3e-3, 5e-4, 5e-4]

@@ -12,8 +12,9 @@ import time
 
 import pytest
 
-from megastep.agents.cli import scripts
+from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
+from megastep.agents.cli.words import typed_word
 from megastep.agents.errors import UserError
 from megastep.agents.runs import folders
 from megastep.agents.runs.folders import locked
@@ -52,8 +53,8 @@ def test_resume_command_is_quoted(name):
         stdout=subprocess.PIPE,
     )
     python, script, override = typed.stdout.splitlines()
-    composer = Composer(scripts.TRAIN)
-    config, errors = composer.config(composer.parse([override]))
+    composer = Composer(load("train"))
+    config, errors = composer.config([*map(typed_word, composer.parse([override]))])
     assert (python, script, errors) == ("python", "train.py", [])
     assert config["resume"] == name
 

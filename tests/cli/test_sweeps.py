@@ -20,10 +20,11 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import evaluate, scripts, sweeps, train
+from megastep.agents.cli import evaluate, sweeps, train
+from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import ConfigErrors
-from megastep.agents.factory.settings import kind_of
+from megastep.agents.factory.components import kind_of
 from megastep.agents.launch import gpu_slots
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import folders, scores
@@ -151,15 +152,6 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
         assert message in capsys.readouterr().err
         left = {path.name for path in here.rglob("*")} - {"payer.py", "__pycache__"}
         assert not {name for name in left if not name.startswith("payer.")}, words
-
-
-def test_folder_that_is_no_text(here, monkeypatch, capsys):
-    (here / "r\udcff").mkdir()
-    monkeypatch.syspath_prepend(here)
-    monkeypatch.chdir(here / "r\udcff")
-    assert train.main([*SHORT, "-m", "seed=1,2"]) == 2
-    (sentence,) = capsys.readouterr().err.splitlines()
-    assert "is not valid text in this locale" in sentence and not any((here / "r\udcff").iterdir())
 
 
 def test_table_stands_while_jobs_run(here, monkeypatch):
@@ -360,7 +352,7 @@ def test_kill_9(here, victim):
 
 def test_values_are_those_of_the_device_where_the_job_runs(here, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    job = sweeps.new_job(Composer(scripts.TRAIN), here)
+    job = sweeps.new_job(Composer(load("train")), here)
     job = cloudpickle.loads(cloudpickle.dumps(job))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for words, n_envs in ((["seed=1"], 4096), (["seed=1", "device=cpu"], 256)):
@@ -381,7 +373,7 @@ def gpus(here, monkeypatch):
 
     def settings(number, *words):
         monkeypatch.setattr(torch.cuda, "device_count", lambda: number)
-        return Composer(scripts.TRAIN).settings(words)
+        return Composer(load("train")).settings(words)
 
     settings.current = current
     return settings
@@ -461,7 +453,7 @@ def test_slurm_jobs_are_given_their_gpus_elsewhere(gpus):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     gpus(0)  # of the login node
     words = [*SLURM, "ranks=2", "seed=1,2", "hydra.launcher.gpus_per_node=3"]
-    _, jobs, hydra = sweeps.jobs_of(Composer(scripts.TRAIN), words)
+    _, jobs, hydra = sweeps.jobs_of(Composer(load("train")), words)
     gpu_slots.check(jobs, hydra)
 
 
@@ -580,5 +572,5 @@ def test_shell_completion(monkeypatch, capsys, line, expected):
 
 def test_loggers_are_swept():
     words = ["logger=csv,[csv,tensorboard],none"]
-    _, jobs, _ = sweeps.jobs_of(Composer(scripts.TRAIN), words)
+    _, jobs, _ = sweeps.jobs_of(Composer(load("train")), words)
     assert [[*job.logger] for job in jobs] == [["csv"], ["csv", "tensorboard"], []]

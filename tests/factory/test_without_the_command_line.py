@@ -14,7 +14,7 @@ from pathlib import Path
 from megastep import geometries, recording
 from megastep.agents import factory, pretrained
 from megastep.agents.evaluation import playing, statistics
-from megastep.agents.factory import settings
+from megastep.agents.factory import components
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.trainer import Trainer
@@ -26,8 +26,8 @@ env = pretrained.make_env("explorer_anywhere", homes, n_envs=4, device="cpu")
 assert row["lanes"] == 4
 
 name = "megastep.agents.algorithms.ppo:PPO"
-chosen = settings.kind_of("learner", name)(name=name, n_steps=4, n_minibatches=2, lr=1e-3)
-policy = factory.make_policy(settings.Agent(width=16), env, critic="plain")
+chosen = components.settings_for("learner", name, n_steps=4, n_minibatches=2, lr=1e-3)
+policy = factory.make_policy(components.settings_for("agent", width=16), env, critic="plain")
 learner = factory.make_learner(chosen, policy)
 saver = Saver(Path("checkpoints"), {})
 trainer = Trainer(env, policy, learner, Budget(samples=64), saver=saver)

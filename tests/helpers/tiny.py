@@ -2,8 +2,8 @@
 
 import copy
 
+from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.scripts import SCRIPTS
 
 TINY = [
     "env=minimal",
@@ -33,7 +33,7 @@ UPDATE_ON_GPU = 64 * 8
 
 def settings(*words, script="train"):
     """Returns the settings that a script makes of words."""
-    return Composer(SCRIPTS[script]).settings(words)
+    return Composer(load(script)).settings(words)
 
 
 def changed(tree, key, value):

@@ -1,0 +1,124 @@
+"""key=value words in Hydra's grammar, or keyword arguments, as settings."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from hydra.core.override_parser import overrides_parser, types
+from hydra.errors import HydraException
+
+from megastep.agents.errors import ConfigErrors, shortened
+from megastep.agents.factory import check
+
+if TYPE_CHECKING:
+    from hydra.core.config_loader import ConfigLoader
+
+    from megastep.agents.cli.command import Command
+
+#: An element of a value with = in it, as folders of sweeps have, and what quotes it.
+WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
+
+
+class Typed(NamedTuple):
+    """A setting that was given.
+
+    Attributes:
+        word: how Hydra's grammar has it, where it chooses a member of a group.
+    """
+
+    key: str
+    value: Any
+    word: str
+    is_delete: bool = False
+    is_added: bool = False
+
+
+def parse(
+    words: Iterable[str],
+    lists: Iterable[str],
+    cure: Callable[[str], str],
+    loader: "ConfigLoader | None" = None,
+) -> list[types.Override]:
+    """Returns words as Hydra's grammar reads them.
+
+    Args:
+        lists: keys whose values are lists, also without brackets: run=a,b.
+        cure: what is said of a word without `=`.
+        loader: Hydra's, for glob().
+
+    Raises:
+        ConfigErrors: with all unreadable words.
+    """
+    parser = overrides_parser.OverridesParser.create(loader)
+    overrides: list[types.Override] = []
+    errors = []
+    for word in words:
+        key, _, value = word.partition("=")
+        if "=" not in word and not word.startswith("~"):
+            errors.append((shortened(word or "''"), cure(word)))
+            continue
+        if key in lists and "," in value and not value.startswith(("[", '"', "'")):
+            word = f"{key}=[{value}]"
+        texts = (word, f"{key}={WITH_EQUALS.sub(QUOTED, value)}") if key else ()
+        for text in texts:
+            with suppress(HydraException, ValueError, RecursionError):
+                overrides += parser.parse_overrides([text])
+                break
+        else:
+            text = "cannot be read; write key=value, and quote blanks: 'key=\"a b\"'"
+            errors.append((shortened(word), text))
+    if errors:
+        raise ConfigErrors(errors)
+    return overrides
+
+
+def lists_of(kind: type) -> list[str]:
+    """Returns the keys of settings that are lists."""
+    fields = kind.__pydantic_fields__.items()
+    return [name for name, field in fields if "tuple" in repr(field.annotation)]
+
+
+def key_of(override: types.Override) -> str:
+    """The key or group@package of a word, without the sign before it."""
+    return override.get_key_element().lstrip("+~")
+
+
+def typed_word(override: types.Override) -> Typed:
+    """Returns the setting of a word."""
+    is_added = override.is_add() or override.is_force_add()
+    word = str(override.input_line)
+    return Typed(key_of(override), override.value(), word, override.is_delete(), is_added)
+
+
+def plain_settings(command: "Command", words: list[str]) -> Any:
+    """Returns the settings of a command that no file configures. A word without `=` is the value of
+    its first key.
+    """
+    kind = command.kind
+    first = next(iter(kind.__pydantic_fields__))
+    words = [word if "=" in word else f"{first}={word}" for word in words]
+    overrides = parse(words, lists_of(kind), str)
+    keys = [key_of(one) for one in overrides]
+    errors = [(key, "is given twice") for key in {*keys} if keys.count(key) > 1]
+    errors += [(key_of(one), "takes one value") for one in overrides if one.is_sweep_override()]
+    if errors:
+        raise ConfigErrors(errors)
+    return check.check(kind, {key_of(one): one.value() for one in overrides})
+
+
+def typed_of(arguments: Mapping[str, Any]) -> list[Typed]:
+    """Returns settings from keyword arguments: plain values, dotted keys, and dicts of a group's
+    keys.
+    """
+    typed = []
+    for key, value in arguments.items():
+        if isinstance(value, Mapping) and "." not in key:
+            # the name decides what other keys there are
+            name = {key: value["name"]} if "name" in value else {}
+            rest = {f"{key}.{inner}": one for inner, one in value.items() if inner != "name"}
+            typed += typed_of(name | rest)
+        else:
+            text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
+            typed.append(Typed(key, value, f"{key}={'null' if value is None else text}"))
+    return typed
