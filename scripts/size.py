@@ -24,11 +24,6 @@ COMMANDS = {
         "env.n_envs=16",
         "checkpoints.snapshots=0",
     ],
-        "experiment=deathmatch",
-        "geometry=box",
-        "env.n_envs=16",
-        "checkpoints.snapshots=0",
-    ],
     "gymnasium": ["env=gymnasium", "env.id=CartPole-v1", "env.n_envs=8"],
 }
 WAYS = {
