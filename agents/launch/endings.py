@@ -1,13 +1,11 @@
 """How a script ends, an exit code and one sentence, and how the ranks of a run say so."""
 
-import contextlib
-import hmac
 import json
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import NamedTuple, cast
 
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
@@ -16,15 +14,10 @@ from megastep.agents.launch import signals
 from megastep.agents.runs import checkpoint, folders, populations
 from megastep.atomic_files import write_atomically
 
-if TYPE_CHECKING:
-    from torch.distributed import Store  # pyright: ignore[reportPrivateImportUsage]
-
 #: Environment variable with the job folder, set for ranks that `launcher` started.
 JOB = "MEGASTEP_JOB"
 #: Files of the job folder: settings; how the ranks ended; the run folder's path.
 SETTINGS, ENDING, RUN = "settings.json", "ending.json", "run"
-#: The file of a run folder with the token of its start, and the store's key with folder and token.
-STARTED, KEY = ".started", "run"
 #: Exit code if a rank was killed, hangs or cannot be reached.
 LOST = 3
 
@@ -98,19 +91,3 @@ def hint(folder: Path | None) -> str:
     if folder is None or not all(checkpoint.list_checkpoints(run / "checkpoints") for run in runs):
         return "Nothing was saved yet"
     return f"Its last checkpoint is intact. To continue: {folders.resume_command(folder)}"
-
-
-def proven_folder(store: "Store") -> Path | None:
-    """Returns the run folder in the ranks' store if it is this user's and holds the token that is
-    beside it there, else None: anyone who reaches the store can write another path.
-    """
-    if not store.check([KEY]):
-        return None
-    with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
-        folder, token = json.loads(store.get(KEY))
-        path = Path(folder) / STARTED
-        content = path.read_bytes()
-        is_ours = {os.stat(one).st_uid for one in (folder, path)} == {os.geteuid()}
-        if is_ours and hmac.compare_digest(content, token.encode()) and len(token) == 64:
-            return Path(folder)
-    return None

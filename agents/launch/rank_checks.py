@@ -17,16 +17,14 @@ import numpy as np
 import torch
 
 from megastep.agents import factory, package
-from megastep.agents.distributed import environment, process_group
+from megastep.agents.distributed import process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
 from megastep.agents.distributed.drift import first_difference, ranks_named
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import check, settings
-from megastep.agents.launch.endings import STARTED
 from megastep.agents.launch.watch import Team
 from megastep.agents.runs import checkpoint, folders, populations, provenance
 from megastep.agents.training.trainer import Trainer
-from megastep.atomic_files import write_atomically
 
 #: Seconds within which a file of rank 0 must be visible on the other machines.
 SHARED_SECONDS = 10.0
@@ -92,25 +90,22 @@ def digest(homes: Iterable[dict]) -> str:
 
 
 def check_shared(folder: Path) -> str:
-    """Checks that all ranks see the run folder of rank 0, by a file with a random token.
+    """Checks that all ranks see the run folder of rank 0.
 
     Returns:
-        The token of this start, the same on all ranks.
+        A random name of this start, the same on all ranks.
 
     Raises:
         UserError: on all ranks, if one of them does not see the folder.
     """
-    token, path = from_rank_0(secrets.token_hex), folder / STARTED
-    if environment.rank_info() is None:
-        return token
+    name = from_rank_0(secrets.token_hex)
+    if process_group.n_ranks() == 1:
+        return name
+    path = folder / f".ranks-{name}"
 
-    def is_seen() -> bool:
-        # a network file system looks for new files once it lists their folder
-        return folder.is_dir() and STARTED in os.listdir(folder) and path.read_text() == token
-
-    def wait_for_token() -> None:
+    def wait_for_file() -> None:
         deadline = time.monotonic() + SHARED_SECONDS
-        while not is_seen():
+        while not (folder.is_dir() and path.name in os.listdir(folder)):
             if time.monotonic() > deadline:
                 raise UserError(
                     f"The run folder {folder.absolute()} of rank 0 is not here; start all ranks "
@@ -119,9 +114,13 @@ def check_shared(folder: Path) -> str:
             time.sleep(0.1)
 
     with user_errors(folders.CANNOT.format(folder)):
-        from_rank_0(lambda: write_atomically(path, token.encode()))
-        together(wait_for_token)
-    return token
+        from_rank_0(path.touch)
+    try:
+        together(wait_for_file)
+    finally:
+        if process_group.rank() == 0:
+            path.unlink(missing_ok=True)
+    return name
 
 
 def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:

@@ -183,20 +183,16 @@ class Team:
         return [number for number, key in enumerate(self.keys) if not self.store.check([key])]
 
     def set_folder(self, folder: Path) -> None:
-        """Publishes the run folder, which holds the token of this start, to restarted ranks and to
-        the launcher.
-        """
+        """Publishes the run folder to restarted ranks and to the launcher."""
         self.folder = folder
         if self.rank == 0:
-            with contextlib.suppress(OSError):  # without a token, a restart begins another run
-                token = (folder / endings.STARTED).read_text()
-                self._job.set(endings.KEY, json.dumps([str(folder), token]))
+            self._job.set("folder", str(folder))
             if self.is_ours:
                 Path(os.environ[endings.JOB], endings.RUN).write_text(str(folder))
 
     def earlier_folder(self) -> Path | None:
         """Returns the run folder of an earlier attempt, if the ranks were restarted."""
-        return endings.proven_folder(self._job)
+        return Path(self._job.get("folder").decode()) if self._job.check(["folder"]) else None
 
     def claim(self) -> bool:
         """Returns True on the first rank that calls this: it reports the error, the others end."""
@@ -224,13 +220,6 @@ class Team:
         self._wakes.set()
         if self._thread.is_alive():
             self._thread.join(seconds + CALL_SECONDS)
-
-    def finish(self) -> None:
-        """Leaves the finished run, and removes the token by which restarted ranks would find it."""
-        if self.rank == 0 and self.folder is not None:
-            with contextlib.suppress(OSError):
-                (self.folder / endings.STARTED).unlink()
-        self.leave()
 
     # ---- In threads of the watch ----
 

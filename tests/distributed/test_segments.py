@@ -35,12 +35,6 @@ class Noise:
         return self.graph.output.clone()
 
 
-def test_without_a_recording_it_is_called_at_once():
-    calls = []
-    segments.between_graphs(lambda: calls.append(1))
-    assert calls == [1]
-
-
 @pytest.mark.cuda
 @pytest.mark.parametrize("n_splits", [0, 1, 3])
 def test_replays_have_the_bits_of_calls(n_splits):

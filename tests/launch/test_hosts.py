@@ -266,22 +266,6 @@ def test_restart_heals(here, hosts):
 
 
 @pytest.mark.nightly
-def test_hosts_with_different_commits(here, hosts):
-    """The second host's git names another commit."""
-    first, second = here / "first", here / "second"
-    for folder in first, second:
-        folder.mkdir()
-    (second / "git").write_text(f"#!/bin/sh\necho {'0123' * 10}\n")
-    (second / "git").chmod(0o755)
-    hosts.run(1, "mount", "--bind", str(second), str(first))
-    with training(hosts, here, *TINY, PATH=f"{first}:{os.environ['PATH']}") as processes:
-        endings = finished(processes)
-    text = "train.py: The ranks differ: the commit of the checkout is "
-    assert all(code for code, *_ in endings) and not (here / "run").exists()
-    assert sum(error.count(text) for *_, error in endings) == 1
-
-
-@pytest.mark.nightly
 def test_rank_that_does_not_start_is_named(here, hosts):
     """Its host's torchrun has started it, and it ends, or hangs, before it can say so."""
     (here / "late.py").write_text(LATE)
