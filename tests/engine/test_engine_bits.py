@@ -1,6 +1,5 @@
 """CPU and GPU, and any number of CPU threads, agree on every bit."""
 
-import functools
 import math
 from types import SimpleNamespace
 
@@ -8,10 +7,9 @@ import pytest
 import torch
 
 from megastep import cuda, engine, scene, toys
-from megastep.engine import devices, operations, rendering
+from megastep.engine import operations, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
-from megastep.ragged import Ragged
 from tests.helpers.cuda_on_cpu import ORDERS
 from tests.helpers.texels import seen_of
 
@@ -141,16 +139,6 @@ def test_choice_of_kernel_on_an_h200(monkeypatch, n_envs, n_agents, res, subsamp
     assert rendering._kernel(scenery, res, subsample) == kernel
 
 
-def test_threads_that_a_gpu_runs_at_once(monkeypatch):
-    """On an H200, and on a smaller GPU."""
-    for n_threads in 2048, 1536:
-        gpu = SimpleNamespace(multi_processor_count=10, max_threads_per_multi_processor=n_threads)
-        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device, gpu=gpu: gpu)
-        count = functools.partial(devices.n_resident_threads.__wrapped__, torch.device("cuda"))
-        assert (count(), count(18), count(32)) == (10 * n_threads, 11_520, 10 * n_threads)
-    assert devices.n_resident_threads(torch.device("cpu"), 18) == 0
-
-
 def test_threads_of_an_environment_on_an_h200(monkeypatch):
     room = {18: 132 * 18 * 64, None: 132 * 2048}
     monkeypatch.setattr(operations, "n_resident_threads", lambda device, n=None: room[n])
@@ -170,43 +158,6 @@ def test_cpu_and_gpu_agree_on_angles_that_no_int_holds():
         engine.update_agent_geometry(c.scenery, c.agents)
         lines.append(c.scenery.agent_lines.cpu())
     assert not any(differing(*([each] for each in lines)))
-
-
-def light_of_large_agents(device):
-    """Light on agents of 80 texels, in homes of 0 to 70 lights."""
-    random = torch.Generator().manual_seed(2)
-    widths = torch.tensor([0, 1, 33, 70])
-    lights = 8 * torch.rand((int(widths.sum()), 3), generator=random)
-    lights[:, 2] = 0.02
-    ends = 8 * torch.rand((len(widths), 100, 1, 2), generator=random)
-    walls = ends + 2 * torch.rand((len(widths), 100, 2, 2), generator=random) - 1
-    model = torch.as_tensor(scene.agent_model(0.6))
-    model_texels = torch.full((2 * len(model),), 10)
-    layouts = engine.Layouts(
-        Ragged(walls.flatten(0, 1), torch.full((len(widths),), 100)),
-        Ragged(torch.ones((walls.shape[0] * 100, 3)), torch.ones(walls.shape[0] * 100).long()),
-        Ragged(lights, widths),
-        torch.ones((len(widths), int(model_texels.sum()), 3)),
-        device,
-    )
-    layout = torch.arange(64) % len(widths)
-    c = cuda.Core(engine.Scenery.of_layouts(2, layouts, model, model_texels, layout))
-    c.agents.positions[:] = (8 * torch.rand((64, 2, 2), generator=random)).to(device)
-    engine.update_agent_geometry(c.scenery, c.agents)
-    return c.scenery.agent_light.cpu()
-
-
-def test_large_agents_are_partly_lit():
-    """So that the test below compares more than full shadow and full light."""
-    light = light_of_large_agents("cpu").view(64, 2, 80)
-    assert (light.amax(-1) - light.amin(-1) > 0.02).float().mean() > 0.4
-    assert light.max() < 1 and light[::4].max() == light.min()
-
-
-@pytest.mark.cuda
-def test_cpu_and_gpu_agree_on_many_lights_and_texels():
-    light = [light_of_large_agents(device) for device in ("cpu", "cuda")]
-    assert not any(differing(*([each] for each in light)))
 
 
 @pytest.mark.cuda

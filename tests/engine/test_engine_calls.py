@@ -40,30 +40,12 @@ def test_max_depth(device):
         assert abs(float(o.depth[0, 0, 31]) - expected) < 5e-4
 
 
-def test_observe_computes_colours_and_depth_by_default():
-    core = box("cpu")
-    fields = engine.observe(core.scenery, core.agents)._asdict()
-    assert {name for name, tensor in fields.items() if tensor is not None} == {"rgb", "depth"}
-
-
 def test_wall_of_the_tutorial(device):
     core = box(device)
     core.agents.velocity[:] = torch.tensor([1000.0, 0.0])
     p = cuda.physics(core.scenery, core.agents)
     assert torch.allclose(core.agents.positions.cpu(), torch.tensor([5.8649, 3.0]), atol=1e-3)
     assert not core.agents.velocity.any() and bool((p.progress < 1).all())
-
-
-@pytest.mark.parametrize("speed", [1.0, 10.0, 1000.0])
-def test_no_agent_leaves_a_closed_box(speed, device):
-    core = cuda.Core(scene.scenery([toys.box()], n_agents=1, n_envs=512, device=device))
-    core.agents.positions[:] = 3.5
-    random = torch.Generator().manual_seed(2)
-    for _ in range(200):
-        core.agents.velocity.copy_(speed * torch.randn((512, 1, 2), generator=random))
-        cuda.physics(core.scenery, core.agents)
-    clearance = torch.minimum(core.agents.positions - 1, 6 - core.agents.positions).amin()
-    assert float(clearance) >= engine.AGENT_RADIUS, "cameras stay on their side of the wall"
 
 
 def test_two_cores_are_independent(device):
@@ -108,19 +90,6 @@ def test_uniform_draws_for_masked_lanes_only(device):
     assert counts.tolist() == [6, 5, 6] and (out[1] == -1).all() and (out[::2] >= 0).all()
 
 
-def test_both_words_of_a_seed_matter(device):
-    draws = [
-        engine.uniform(
-            torch.zeros(1, dtype=torch.int32, device=device),
-            torch.ones(1, dtype=torch.bool, device=device),
-            seed,
-            torch.zeros((1, 4), device=device),
-        )
-        for seed in (1, 2, 1 + (1 << 32))
-    ]
-    assert len(torch.cat(draws).unique(dim=0)) == 3
-
-
 def test_actions_damp_and_add_their_move(device):
     core = box(device)
     core.agents.angles[:] = 90.0  # ahead is +y, left is -x
@@ -154,14 +123,6 @@ def test_continuous_actions_add_weighted_moves(device):
     engine.physics(core.scenery, agents, weights.to(device), moves.to(device), damping=0.25)
     torch.testing.assert_close(agents.velocity.cpu(), velocity, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(agents.angvelocity.cpu(), angvelocity, rtol=1e-5, atol=1e-5)
-
-
-def test_actions_replace_velocities_by_default(device):
-    core = box(device)
-    core.agents.velocity[:] = 3.0
-    moves, actions = torch.ones(1, 3, device=device), torch.zeros(2, 1, dtype=int, device=device)
-    engine.physics(core.scenery, core.agents, actions, moves)
-    assert torch.allclose(core.agents.velocity, torch.ones_like(core.agents.velocity))
 
 
 def test_spawn_changes_masked_agents_only(device):
@@ -199,14 +160,6 @@ def test_spawn_draws_layouts_by_cumulative_weights(device):
     assert set(expected) == {1, 2, 4, 5}
 
 
-def test_spawn_with_one_point_per_agent(device):
-    core = cuda.Core(scene.scenery([toys.box()], 2, 1, device=device))
-    points = torch.tensor([[[2.0, 2.0], [4.0, 4.0]]], device=device)
-    counts = torch.zeros((1, 2), dtype=torch.int32, device=device)
-    engine.spawn(core.scenery, core.agents, core.agent_full(True), points, counts, seed=1)
-    assert sorted(core.agents.positions[0].tolist()) == [[2, 2], [4, 4]]
-
-
 @pytest.mark.parametrize(
     "low, high, is_hidden", [(3.2, 3.8, True), (1.0, 3.52, False), (3.48, 6.0, False)]
 )
@@ -227,29 +180,6 @@ def test_hidden_spawn_is_behind_a_wall_that_hides_all_of_it(low, high, is_hidden
 # ---- Bad arguments ----
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [dict(res=0), dict(res=1025), dict(fov=180.0), dict(fov=0.0), dict(fps=0.0), dict(cameras=[])],
-    ids=str,
-)
-def test_bad_settings(settings):
-    with pytest.raises(ValueError, match="but"):
-        box("cpu", **settings)
-
-
-@pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
-def test_bad_radius(radius):
-    with pytest.raises(ValueError, match="radius .* above 0"):
-        engine.Agents(1, 1, radius=radius)
-
-
-@pytest.mark.parametrize("max_depth", [0.0, -1.0, math.nan])
-def test_bad_max_depth(max_depth):
-    core = box("cpu")
-    with pytest.raises(ValueError, match="max_depth .* above 0"):
-        engine.observe(core.scenery, core.agents, max_depth=max_depth)
-
-
 def test_actions_and_moves_come_together():
     core, actions = box("cpu"), torch.zeros((2, 1), dtype=torch.int64)
     with pytest.raises(TypeError, match="moves"):
@@ -267,28 +197,6 @@ def test_nonfinite_position_is_named(device):
     core.agents.positions[:] = 3.0
     cuda.render(core.scenery, core.agents)
     engine.check(core.agents)
-
-
-@pytest.mark.parametrize(
-    "broken, description",
-    [
-        (lambda good: good.double(), r"a torch.float64 tensor of shape \(2, 1, 2\)"),
-        (lambda good: good[:1].clone(), r"a torch.float32 tensor of shape \(1, 1, 2\)"),
-        (lambda good: torch.stack([good, good], -1)[..., 0], "a non-contiguous torch.float32"),
-        (lambda good: None, "None was given"),
-    ],
-    ids=["dtype", "shape", "not contiguous", "None"],
-)
-def test_wrong_tensors_are_named(broken, description):
-    core = box("cpu")
-    good = core.agents.positions
-    core.agents.positions = broken(good)
-    with pytest.raises(
-        (TypeError, ValueError), match=f"agents.positions must be .*but {description}"
-    ):
-        cuda.render(core.scenery, core.agents)
-    core.agents.positions = good.clone()
-    cuda.render(core.scenery, core.agents)
 
 
 def test_agents_are_checked_for_each_scenery():

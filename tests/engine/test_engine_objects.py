@@ -1,10 +1,5 @@
 """Objects in the engine: drawn and collided with as in a twin in float64; equal bits on a GPU."""
 
-import hashlib
-import json
-import struct
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -13,8 +8,6 @@ from megastep import engine, scene
 from megastep.capture import state_tree
 from megastep.geometries import toys
 from megastep.geometries.sources import homes
-from megastep.kernels.build import compile
-from megastep.kernels.build.launch import ENGINE
 from megastep.modules.spawning import cached_points
 from tests.helpers import twin
 from tests.helpers.cuda_on_cpu import ORDERS
@@ -22,7 +15,6 @@ from tests.helpers.cuda_on_cpu import ORDERS
 N, A, RES = 6, 3, 64
 SHAPES = ("disc", "disc", "crate", "door", "crate", "disc")
 PALETTE = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.2, 0.3, 0.9]])
-MACHINE_CODE = Path(__file__).parents[1] / "data" / "machine_code.json"
 
 
 def world(device="cpu", n_agents=A, lit=False, seed=1, n_envs=N):
@@ -130,15 +122,6 @@ def test_cameras_see_objects_as_the_twin_does(lit):
         texture = scenery.textures[at] * scenery.baked[at][:, None]
         if not (first <= line < first + len(own)) or lines[line].any():
             torch.testing.assert_close(lit_texture, texture)
-
-
-def test_observations_are_means_of_rays_with_objects():
-    scenery, agents = world()
-    view = engine.render(scenery, agents)
-    seen = engine.observe(scenery, agents, subsample=4, centre_line=True)
-    mean = view.screen.view(N, A, RES // 4, 4, 3).mean(3).transpose(2, 3)
-    torch.testing.assert_close(seen.rgb.float(), mean, rtol=1e-3, atol=1e-3)
-    assert torch.equal(seen.centre_line, view.indices[..., RES // 2])
 
 
 def test_agents_stop_at_solid_objects_as_in_the_twin():
@@ -323,12 +306,6 @@ def test_bad_arguments_are_named(arguments, message):
         engine.Objects(**dict(n_envs=1, shapes=["disc"], palette=PALETTE) | arguments)
 
 
-def test_more_objects_than_errors_can_name_are_refused(monkeypatch):
-    monkeypatch.setattr(torch, "zeros", pytest.fail)  # it would take 20 GB
-    with pytest.raises(ValueError, match=r"n_envs \* len\(shapes\) must be an integer from 1 to"):
-        engine.Objects(2**31 // ENGINE.constants["OBJECT_ERROR_KINDS"] + 1, ["disc"], PALETTE)
-
-
 def test_replaced_tensors_are_refused():
     scenery, _ = world()
     with pytest.raises(AttributeError):
@@ -337,35 +314,3 @@ def test_replaced_tensors_are_refused():
         scenery.objects.records = torch.zeros(3)
     with pytest.raises(AttributeError):
         scenery.objects = engine.Objects(N, ["disc"], PALETTE)
-
-
-def sections(cubin):
-    """{name: bytes} of an ELF file's sections."""
-    (offset,), (size, number, names) = (
-        struct.unpack_from("<Q", cubin, 0x28),
-        struct.unpack_from("<3H", cubin, 0x3A),
-    )
-    headers = [struct.unpack_from("<IIQQQQIIQQ", cubin, offset + i * size) for i in range(number)]
-    text = cubin[headers[names][4] :][: headers[names][5]]
-    kept = [h for h in headers if h[1] != 8]  # which has no bytes
-    return {text[h[0] : text.index(b"\0", h[0])].decode(): cubin[h[4] : h[4] + h[5]] for h in kept}
-
-
-def test_other_kernels_are_the_same_machine_code():
-    """As before there were objects. The record has a row for each NVRTC it was made with."""
-    nvrtc = pytest.importorskip("cuda.bindings.nvrtc")
-    try:
-        version = ".".join(map(str, nvrtc.nvrtcVersion()[1:]))
-    except Exception as error:  # of whatever kind: the package is there, its library is not
-        pytest.skip(f"NVRTC cannot be loaded: {error}")
-    record = json.loads(MACHINE_CODE.read_text())
-    if version not in record:
-        pytest.skip(f"there is no record of NVRTC {version}")
-    flags = [*engine.rendering.ENGINE.cuda_flags, "--gpu-architecture=sm_90"]
-    cubin = compile._build_cuda(engine.rendering.ENGINE.sources(".h", ".cu"), flags)
-    found = {
-        name[6:]: hashlib.sha256(code).hexdigest()
-        for name, code in sections(cubin).items()
-        if name.startswith(".text.")
-    }
-    assert {name: found[name] for name in record[version]} == record[version]

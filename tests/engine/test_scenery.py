@@ -1,16 +1,12 @@
 """Scenery: views by environment, what is writable and what is read-only, shared layouts."""
 
-import copy
-
 import numpy as np
 import pytest
 import torch
 
 from megastep import core, engine, scene, toys
-from megastep.engine import scenery as scenery_module
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
-from megastep.read_only import ReadOnlyTensor
 from tests.helpers import random_scenery
 
 VIEWS = "lines", "lights", "textures", "baked"
@@ -89,12 +85,6 @@ def test_views_join_agents_and_layouts(make, name):
     assert [piece.tolist() for piece in view[::-2]] == [part.tolist() for part in parts[::-2]]
 
 
-def test_views_are_computed_when_read(shared):
-    before = shared.lines[0]
-    image(shared)
-    assert not torch.equal(before, shared.lines[0])
-
-
 @pytest.mark.parametrize("index", [6, -7])
 def test_environment_out_of_range(shared, index):
     with pytest.raises(IndexError, match=f"index {index} is out of range"):
@@ -114,33 +104,16 @@ def statements():
 
     return {
         "vals[:]": lambda view: view.vals.__setitem__(slice(None), 1),
-        "vals[...]": lambda view: view.vals.__setitem__(..., 0),
-        "vals[mask]": lambda view: view.vals.__setitem__(view.vals > 0, 0),
         "vals.mul_": lambda view: view.vals.mul_(2),
         "vals +=": lambda view: add(view.vals),
-        "vals[0] +=": lambda view: add(view.vals[0]),
-        "vals.copy_": lambda view: view.vals.copy_(torch.zeros_like(view.vals)),
-        "vals.view": lambda view: view.vals.view(-1).zero_(),
         "vals.data": lambda view: view.vals.data.zero_(),
-        "vals.data =": lambda view: setattr(view.vals, "data", torch.zeros(1)),
         "vals.resize_": lambda view: view.vals.resize_(0),
-        "vals.set_": lambda view: view.vals.set_(torch.zeros(1)),
         "vals.numpy()": lambda view: view.vals.numpy().fill(0),
-        "np.asarray": lambda view: np.asarray(view.vals).fill(0),
         "out=": lambda view: torch.add(view.vals, 1, out=view.vals),
-        "foreach": lambda view: torch._foreach_add_([view.vals], 1.0),
-        "init": lambda view: torch.nn.init.zeros_(view.vals),
         "[0][:]": lambda view: view[0].__setitem__(slice(None), 0),
-        "[-1].fill_": lambda view: view[-1].fill_(0),
         "[1:3].vals": lambda view: view[1:3].vals.zero_(),
-        "[1:3][0]": lambda view: view[1:3][0].zero_(),
-        "unbind": lambda view: view.vals.unbind(0)[0].zero_(),
-        "split": lambda view: view.vals.split(1)[0].zero_(),
         "torchify": lambda view: view.torchify().vals.zero_(),
-        "cpu": lambda view: view.cpu().vals.zero_(),
         "widths": lambda view: view.widths.zero_(),
-        "starts": lambda view: view.starts.zero_(),
-        "ends": lambda view: view.ends.zero_(),
         "inverse": lambda view: view.inverse.zero_(),
     }
 
@@ -150,38 +123,6 @@ def statements():
 def test_writing_into_a_view_raises(shared, name, statement):
     with pytest.raises(ValueError, match=rf"scenery.{name} is a read-only|read-only"):
         statements()[statement](getattr(shared, name))
-
-
-@pytest.mark.parametrize("name", VIEWS)
-def test_replacing_a_view_or_its_vals_raises(shared, name):
-    view = getattr(shared, name)
-    with pytest.raises(AttributeError):
-        setattr(shared, name, view)
-    for attribute in ("vals", "widths", "starts", "ends", "inverse"):
-        getattr(view, attribute)
-        with pytest.raises(AttributeError, match=f"{attribute} of a JoinedRagged"):
-            setattr(view, attribute, torch.zeros(1))
-
-
-@pytest.mark.parametrize("name", VIEWS)
-def test_copies_of_a_view_are_writable(shared, name):
-    view = getattr(shared, name)
-    before = view.vals.clone()
-    view.clone().vals.zero_()
-    view.vals.clone().zero_()
-    view.numpyify().vals[:] = 0
-    copy.deepcopy(view).vals.zero_()
-    (view.vals * 1).zero_()
-    assert torch.equal(getattr(shared, name).vals, before)
-
-
-def test_results_from_read_only_tensors_are_plain(shared):
-    vals = shared.textures.vals
-    for other in (vals + 1, vals.half(), torch.cat([vals, vals]), vals.sum(), vals.clone()):
-        assert type(other) is torch.Tensor
-    assert isinstance(vals[:1], ReadOnlyTensor) and isinstance(vals.detach(), ReadOnlyTensor)
-    assert type(torch.zeros_like(vals).copy_(vals)) is torch.Tensor
-    assert vals.shape == torch.Size(vals.shape) and type(vals.shape) is torch.Size
 
 
 def test_writes_to_a_layout_reach_all_its_environments(shared):
@@ -205,14 +146,6 @@ def test_bake_after_moving_lights_and_walls(shared):
     assert (image(shared) != darker).any()
 
 
-def test_exchanged_memory_is_read(shared):
-    image(shared)
-    lights = shared.layouts.lights.vals
-    lights.data = lights * torch.tensor([1.0, 1.0, 0.0])
-    engine.bake(shared)
-    assert (shared.layouts.baked.vals == 0.1).all(), "ambient light alone"
-
-
 def test_bounding_boxes_are_updated_in_place(shared):
     layouts, address = shared.layouts, shared.layouts.boxes.data_ptr()
     before = layouts.boxes.clone()
@@ -232,35 +165,6 @@ def test_boxes_hold_32_walls_of_one_layout():
         assert len(groups) == starts[d + 1] - starts[d] == 3
         for box, walls in zip(layouts.boxes[starts[d] :], groups):
             assert box.tolist() == [*walls.amin((0, 1)).tolist(), *walls.amax((0, 1)).tolist()]
-
-
-@pytest.mark.parametrize("n_walls, n_boxes", [(0, 0), (1, 1), (31, 1), (32, 1), (33, 2), (64, 2)])
-def test_number_of_boxes(n_walls, n_boxes):
-    walls = Ragged(torch.rand(n_walls, 2, 2), [n_walls])
-    texels, lights = Ragged(torch.rand(n_walls, 3), [1] * n_walls), Ragged(torch.rand(0, 3), [0])
-    layouts = Layouts(walls, texels, lights, torch.rand(1, 8, 3), "cpu")
-    assert layouts.box_starts.tolist() == [0, n_boxes] and len(layouts.boxes) == n_boxes
-
-
-TABLES = "wall_starts", "texel_starts", "light_starts", "box_starts", "boxes"
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_tables_of_layouts_are_read_only(shared, name):
-    with pytest.raises(ValueError, match=f"{name} (is|are) read-only"):
-        getattr(shared.layouts, name)[0] = 10**6
-
-
-@pytest.mark.parametrize("name", ["lines", "textures", "baked", "lights"])
-def test_widths_of_layouts_are_read_only(shared, name):
-    with pytest.raises(ValueError, match=f"{name}.widths is read-only.*: make another Scenery"):
-        getattr(shared.layouts, name).widths[0] = 10**6
-
-
-@pytest.mark.parametrize("name", ["model", "model_texels"])
-def test_model_is_read_only(shared, name):
-    with pytest.raises(ValueError, match=f"{name} is read-only.*: make another Scenery"):
-        getattr(shared, name)[0] = 7
 
 
 def attributes(thing):
@@ -314,14 +218,6 @@ def test_agents_texture_widths_must_be_equal():
         Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
 
 
-def test_walls_need_a_texel():
-    good = parts()
-    widths = good["textures"].widths.clone()
-    widths[-2:] += torch.tensor([widths[-1], -widths[-1]])
-    with pytest.raises(ValueError, match="textures must have at least one texel per wall"):
-        Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
-
-
 def test_lines_must_start_with_the_agents():
     good = parts()
     with pytest.raises(ValueError, match="lines .* 1600 lines of its 200"):
@@ -337,11 +233,6 @@ def test_scenery_from_the_parts_of_another():
         assert torch.equal(getattr(other, name).vals, getattr(good, name).vals), name
     other.layouts.lights.vals.zero_()
     assert good.lights.vals.any(), "memory of its own"
-
-
-def test_tables_beyond_32_bits_are_refused():
-    with pytest.raises(ValueError, match="at most 2,147,483,647 .* but 2147483648 were given"):
-        scenery_module._starts("texel_starts", torch.tensor([2**31 - 1, 1]))
 
 
 # ---- Which environment starts with which layout ----

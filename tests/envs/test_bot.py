@@ -12,32 +12,14 @@ from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.pong import Tracker
 from megastep.geometries import sample
 from tests.helpers import bot_twin
-from tests.helpers.bot_twin import FORWARD, LEFT, NOTHING, RIGHT
+from tests.helpers.bot_twin import NOTHING
 from tests.helpers.synchronisation import no_synchronisation
-
-AHEAD = (2.0, 3.5, 0.0)
 
 
 def ring(device, *poses, **settings):
     """An environment with agents at (x, y, degrees) in a box from 1 to 6, and its first world."""
     ring = Ring(device, *poses, **settings)
     return ring.env, ring.step()
-
-
-def first_actions(device, *poses):
-    env, world = ring(device, *poses)
-    decision, _ = Bot()(world, Bot().initial(len(poses), env.device))
-    return decision.actions[:, 0].tolist()
-
-
-@pytest.mark.parametrize("other, action", [((4.0, 4.3), LEFT), ((4.0, 2.7), RIGHT)])
-def test_turns_to_an_agent_in_view(other, action, device):
-    assert first_actions(device, AHEAD, (*other, 0.0))[0] == action
-
-
-@pytest.mark.parametrize("metres, action", [(3.5, FORWARD), (2.0, NOTHING)])
-def test_approaches_a_distant_agent(metres, action, device):
-    assert first_actions(device, AHEAD, (2.0 + metres, 3.5, 0.0))[0] == action
 
 
 @pytest.mark.parametrize("bearing", [25, -25, 8, 0])
@@ -55,54 +37,6 @@ def test_keeps_a_target_at_the_centre(bearing, device):
         world = env.step(decision)
         hits += float(world.reward[0])
     assert hits > 30
-
-
-def test_looks_round_then_walks_and_avoids_walls(device):
-    """The first looks at a wall one metre away, the second down the room; none sees the other."""
-    env, world = ring(device, (1.9, 3.5, 180.0), (2.4, 3.5, 0.0))
-    bot = Bot()
-    state = bot.initial(2, env.device)
-    state["lost"] -= 20
-    looking, _ = bot(world, state)
-    assert looking.actions.flatten().tolist() == [LEFT, LEFT]
-    state["lost"] += 40
-    walking, _ = bot(world, state)
-    assert walking.actions.flatten().tolist() == [LEFT, FORWARD]
-
-
-def test_turns_to_the_wider_side_when_stopped(device):
-    """It was pushed but did not move. The wider side is to the right."""
-    env, world = ring(device, (3.0, 5.0, 0.0), (2.0, 2.0, 180.0))
-    bot = Bot()
-    state = bot.initial(2, env.device)
-    state["lost"] += 40
-    state["pushed"].fill_(True)
-    decision, state = bot(world, state)
-    assert decision.actions[0] == RIGHT and state.around[0] > 5 and not state.pushed[0]
-
-
-def test_reset_clears_the_state(device):
-    env, world = ring(device, AHEAD, (2.5, 3.5, 0.0))
-    bot = Bot()
-    state = bot.initial(2, env.device)
-    state["lost"] += 7
-    state["pushed"].fill_(True)
-    _, state = bot(arrdict.arrdict(world, reset=torch.ones_like(world.reset)), state)
-    assert state.lost.tolist() == [0, bot.initial(1).lost.item()], "one sees the other"
-    assert not state.around.any()
-
-
-def test_acts_on_observations_alone_and_lane_by_lane():
-    env = envs.Deathmatch(8, sample("homes", 8), device="cpu", limit=30)
-    bot, world = Bot(), env.reset()
-    state, halves = bot.initial(32), [bot.initial(16), bot.initial(16)]
-    for _ in range(60):
-        decision, state = bot(world, state)
-        for i, part in enumerate((slice(0, 16), slice(16, 32))):
-            seen = arrdict.arrdict(obs=world.obs[part], reset=world.reset[part])
-            decision_of_half, halves[i] = bot(seen, halves[i], sample=False)
-            assert torch.equal(decision_of_half.actions, decision.actions[part])
-        world = env.step(decision)
 
 
 def test_other_observations_are_refused():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import arrdict, contract, core, engine, envs, modules, plotting, scene, toys
+from megastep import arrdict, contract, core, engine, envs, modules, scene, toys
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine.rendering import Observation
 from megastep.envs.deathmatch.deathmatch_step import actions_of_live, deathmatch_step
@@ -149,29 +149,6 @@ def test_actions_of_ended_lanes_are_nothing(device):
         actions_of_live(actions[:3], ended)
 
 
-def test_optional_outputs_are_left_out():
-    scenery = scene.scenery([toys.box()], 2, 1, device="cpu")
-    agents = core.Core(scenery).agents
-    state = torch.ones(2), torch.zeros((4, 2)), torch.zeros(2, dtype=torch.int32)
-    view = engine.observe(scenery, agents, centre_line=True)
-    out = deathmatch_step(scenery, agents, view, *state, torch.zeros(2, dtype=torch.bool))
-    assert out.privileged is None and view.agent_ray is None
-    with pytest.raises(TypeError, match=r"view.agent_ray"):
-        deathmatch_step(
-            scenery, agents, view, *state, torch.zeros(2, dtype=torch.bool), aim_reward=1.0
-        )
-
-
-@pytest.mark.parametrize("n_agents, message", [(1, "2 to 16 .* not 1"), (17, "2 to 16 .* not 17")])
-def test_step_takes_two_to_sixteen_agents(n_agents, message):
-    scenery = scene.scenery([toys.box()], n_agents, 1, device="cpu")
-    agents, n = core.Core(scenery).agents, n_agents
-    view = engine.observe(scenery, agents, centre_line=True)
-    state = torch.ones(n), torch.zeros((4, n)), torch.zeros(n, dtype=torch.int32)
-    with pytest.raises(ValueError, match=message):
-        deathmatch_step(scenery, agents, view, *state, torch.zeros(n, dtype=torch.bool))
-
-
 # ---- engine.observe's agent_ray ----
 
 
@@ -187,14 +164,6 @@ def test_agent_ray_is_the_closest_to_the_centre(n_agents, res, device):
         hits = [r for r in range(res) if row[r]]
         assert ray == min(hits, key=lambda r: (abs(r - res // 2), r), default=-1)
     assert n_agents == 1 or (rays >= 0).any()
-
-
-def test_agent_ray_prefers_the_left_of_equals(device):
-    c = core.Core(scene.scenery([toys.box()], 3, 1, device=device), res=63, fov=70)
-    c.agents.positions[0] = torch.tensor([(2.0, 3.5), (4.0, 3.0), (4.0, 4.0)])
-    ray = engine.observe(c.scenery, c.agents, agent_ray=True).agent_ray[0, 0]
-    shown = engine.render(c.scenery, c.agents).indices[0, 0]
-    assert ray < 31 and shown[ray] // 8 == 2 and shown[62 - ray] // 8 == 1
 
 
 # ---- Hidden spawns ----
@@ -258,33 +227,6 @@ def has_hidden_point(c, spawner, e, a):
     return any(not any(is_visible(walls, eye, at, RADIUS) for eye in eyes) for at in points)
 
 
-def test_hidden_spawn_in_an_empty_room_is_the_furthest(device):
-    c = core.Core(scene.scenery([toys.box()], 3, 20, device=device))
-    spawner = modules.RandomSpawns([toys.box()], c, hidden=True)
-    spawner(c.agent_full(True))
-    mask = c.agent_full(False)
-    mask[:, 1] = True
-    spawner(mask)
-    points = spawner.points[0].view(3, -1, 2)[1]
-    others = c.agents.positions[:, [0, 2]]
-    gaps = (points[None, :, None] - others[:, None]).norm(dim=-1).amin(-1)
-    distances = (c.agents.positions[:, 1, None] - others).norm(dim=-1).amin(-1)
-    torch.testing.assert_close(distances, gaps.amax(-1))
-
-
-def test_hidden_spawns_draw_once(device):
-    """An agent alone in its home spawns where it would have spawned anyway."""
-    runs = []
-    for hidden in (False, True):
-        homes = sample("bench", 4)
-        c = core.Core(scene.scenery(homes, 1, 8, device=device))
-        spawner = modules.RandomSpawns(homes, c, hidden=hidden, resample=True)
-        for _ in range(3):
-            spawner(c.agent_full(True))
-        runs.append([c.agents.positions, c.agents.angles, spawner.counts, c.scenery.layout])
-    assert contract.same(dict(enumerate(runs[0])), dict(enumerate(runs[1])))
-
-
 # ---- The rules, by hand ----
 
 
@@ -344,14 +286,6 @@ def test_walls_block_hits(device):
         assert Ring(device, west, east, geometry=geometry).step().reward.tolist() == reward
 
 
-@pytest.mark.parametrize("degrees, hits", [(1.9, True), (2.6, False), (-1.9, True), (-2.6, False)])
-def test_the_centre_of_the_view_is_one_ray(degrees, hits, device):
-    """Seen from the side, an agent is 0.15 m wide: at two metres, half of it spans 2.15 degrees."""
-    (x, y, _), other = AMBUSH
-    world = Ring(device, (x, y, degrees), other).step()
-    assert world.reward.tolist() == ([1, -1] if hits else [0, 0])
-
-
 def test_ten_hits_kill_and_the_next_step_respawns(device):
     ring = Ring(device, *AMBUSH)
     world = ring.step(9)
@@ -367,13 +301,6 @@ def test_ten_hits_kill_and_the_next_step_respawns(device):
     assert ring.env.core.agents.positions[0, 0].tolist() == [2, 3.5], "the other stays"
 
 
-def test_kills_are_reported_where_the_killers_episode_ends(device):
-    world = Ring(device, *AMBUSH, limit=20).step(20)
-    assert world.truncated.tolist() == [True, False]
-    kills, deaths, damage, accuracy = (float(world.metrics[name][0]) for name in METRICS)
-    assert kills >= 1 and deaths == 0 and damage >= 1 - 1e-6 and accuracy >= 0.5
-
-
 def test_kill_reward_is_shared(device):
     """Two agents look at the one between them, which has health for four hits: two steps."""
     settings = dict(damage=0.25, hit_reward=0, wound_cost=0, kill_reward=8, death_cost=3)
@@ -382,12 +309,6 @@ def test_kill_reward_is_shared(device):
     world = ring.step()
     assert world.reward.tolist() == [4, -3, 4] and world.terminal.tolist() == [False, True, False]
     assert ring.env.tally[:3, [0, 2]].T.tolist() == 2 * [[0.5, 0.5, 2]]
-
-
-def test_a_dying_agent_still_hits(device):
-    ring = Ring(device, (2, 3.5, 0), (4, 3.5, 180), damage=1, kill_reward=2, death_cost=5)
-    world = ring.step()
-    assert world.terminal.all() and world.reward.tolist() == 2 * [1 - 1 + 2 - 5]
 
 
 def test_first_observation_neither_hits_nor_is_hit(device):
@@ -403,12 +324,6 @@ def test_first_observation_neither_hits_nor_is_hit(device):
     ring.env.spawner = spawner
     assert ring.step().terminal.tolist() == [False, True], "but at the next step"
     assert torch.equal(counts, ring.env.spawner.counts)
-
-
-def test_damage_is_capped_by_health(device):
-    ring = Ring(device, *AMBUSH, damage=0.7)
-    ring.step(2)
-    assert ring.env.tally[1].tolist() == pytest.approx([1, 0])
 
 
 def test_drain_and_recovery_are_per_second(device):
@@ -429,36 +344,6 @@ def test_drain_and_recovery_are_per_second(device):
     assert ring.health == [1, 1], "and never more than all"
 
 
-def test_health_per_hit(device):
-    ring = Ring(device, *AMBUSH, health_per_hit=0.05, drain=1.0)
-    ring.step(3)
-    assert ring.health == pytest.approx([1 - 3 * 0.1 + 3 * 0.05, 1 - 3 * 0.1 - 3 * 0.1])
-
-
-@pytest.mark.parametrize("ahead, left", [(2, 0.5), (2, -0.5), (3, 1.5), (1, 0)])
-def test_aim_reward_falls_from_centre_to_edge(ahead, left, device):
-    """Aim is measured to the part of the other agent that is closest to the centre."""
-    settings = dict(aim_reward=1, hit_reward=0, wound_cost=0)
-    ring = turned(device, (2, 3.5, 0), (2 + ahead, 3.5 + left, 0), **settings)
-    nearest = max(abs(left) - 0.075, 0) / (ahead + 0.0375 * np.sign(left * left))
-    expected = max(1 - nearest / np.tan(np.radians(35)), 0)
-    slack = 2 / 512 + 0.075 / ahead / 2  # a ray, and which of its corners is nearest
-    world = ring.step()
-    assert float(world.reward[0]) == pytest.approx(expected, abs=slack) and world.reward[1] == 0
-
-
-def test_aim_in_the_first_of_three_rays(device):
-    """It points 25 degrees to the left, and is a third of the view's width from the centre."""
-    settings = dict(res=3, subsample=1, hit_reward=0, wound_cost=0, aim_reward=3)
-    ring = turned(device, (2, 3.5, 0), (4, 4.43, 0), **settings)
-    assert ring.step().reward.tolist() == pytest.approx([1, 0])
-
-
-def test_aim_reward_needs_an_agent_in_view(device):
-    ring = turned(device, (2, 2, 180), (5, 5, 0), aim_reward=1)
-    assert ring.step().reward.tolist() == [0, 0]
-
-
 def test_watching_a_target_is_paid_once_and_taken_back(device):
     settings = dict(aim_reward=1, hit_reward=0, wound_cost=0)
     pose, other = (2, 3.5, 0), (4, 3.8, 0)
@@ -467,17 +352,6 @@ def test_watching_a_target_is_paid_once_and_taken_back(device):
     assert 0.5 < rewards[0] < 0.9 and rewards[1:] == [0, 0, 0]
     ring.place((2, 3.5, 180), other)
     assert ring.step().reward[0].item() == -rewards[0]
-
-
-def test_first_observation_of_a_target_pays_nothing(device):
-    ring = Ring(device, *AMBUSH, aim_reward=1, damage=0, limit=2)
-    for _ in range(3):
-        ring.step(2)  # the episodes end
-        assert ring.env.ended.all()
-        ring.env.spawner = lambda ended: ring.place(*AMBUSH)
-        world = ring.step()
-        assert world.reset.all() and world.reward.tolist() == [0, 0]
-        assert ring.env.tally[3].tolist() == [1, 0]
 
 
 def test_search_reward_counts_newly_seen_texels(device):
@@ -568,11 +442,6 @@ def test_sound_by_hand(device):
     assert ring.step().obs.sound.tolist() == [[[0, 0, 0]]] * 2
 
 
-def test_without_hearing_nothing_is_heard(device):
-    world = Ring(device, *AMBUSH).step()
-    assert "sound" not in world.obs and "sound" not in envs.Deathmatch(1, device=device).obs_space
-
-
 def test_privileged_observation_by_hand(device):
     ring = Ring(device, (2, 3.5, 0), (4, 4.5, 90), privileged=True)
     ring.env.health.copy_(torch.tensor([0.75, 0.5]))
@@ -600,65 +469,7 @@ def test_agents_and_walls_differ_in_colour(device):
     assert weakest[is_agent & lit].max() < 0.12 < weakest[~is_agent & lit].min()
 
 
-def test_sixteen_agents_have_sixteen_colours():
-    textures = scene.scenery([toys.box()], 16, 1, device="cpu").layouts.agent_textures[0]
-    bodies = {tuple(colours.tolist()) for colours in textures.view(16, -1, 3).flatten(0, 1)}
-    assert len(bodies) == 16 + 1, "and one for all fronts"
-
-
-@pytest.mark.parametrize("n_agents", [2, 16])
-def test_display_draws_every_agent(n_agents, monkeypatch):
-    written, levels = [], []
-    text = plotting.Area.text
-    monkeypatch.setattr(
-        plotting.Area,
-        "text",
-        lambda self, at, w, *a, **k: (written.append(w), text(self, at, w, *a, **k)),
-    )
-    monkeypatch.setattr(plotting, "plot_level", lambda _, level: levels.append(float(level)))
-    env = envs.Deathmatch(2, [toys.box()], n_agents=n_agents, device="cpu")
-    env.reset()
-    env.health[n_agents:] = torch.linspace(0, 1, n_agents)
-    figure = env.display(1)
-    assert written.count("rgb") == written.count("depth") == n_agents
-    assert [written.count(str(agent)) for agent in range(n_agents)] == n_agents * [3]
-    assert levels == pytest.approx(torch.linspace(0, 1, n_agents).tolist())
-    assert plotting.rasterise(figure).std() > 5
-
-
 # ---- Bad settings ----
-
-
-@pytest.mark.parametrize("n_agents", [0, 1, 17, 200])
-def test_n_agents_out_of_range(n_agents):
-    with pytest.raises(ValueError, match=rf"n_agents: {n_agents} .*2 to 16"):
-        envs.Deathmatch(1, [toys.box()], n_agents=n_agents, device="cpu")
-
-
-@pytest.mark.parametrize(
-    "words, message",
-    [
-        (["env.n_agents=0"], "env.n_agents: 0 "),
-        (["env.n_agents=200"], "env.n_agents: 200 "),
-        (["env.damage=2"], "env.damage: 2 "),
-        (["env.agents=4"], "env.n_agents"),
-    ],
-)
-def test_bad_settings_exit_with_a_message(words, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert train.main(["env=deathmatch", "samples=100", "device=cpu", *words]) == 2
-    error = capsys.readouterr().err
-    assert message in error and "Traceback" not in error and not list(tmp_path.iterdir())
-
-
-def test_too_many_agents_for_a_home(tmp_path, monkeypatch, capsys):
-    """A room of one metre."""
-    monkeypatch.chdir(tmp_path)
-    np.savez("small.npz", **{f"0/{k}": v for k, v in toys.box(1).items()})
-    words = ["env=deathmatch", "env.n_agents=16", "geometry=files", "geometry.path=small.npz"]
-    assert train.main([*words, "samples=100", "device=cpu"]) == 2
-    error = capsys.readouterr().err
-    assert "16 agents" in error and "Traceback" not in error
 
 
 # ---- Learning ----

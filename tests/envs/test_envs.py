@@ -77,13 +77,6 @@ def test_few_environments_are_spread_over_all_homes(name):
     assert [round(float(np.ptp(lines[..., 0].numpy()))) for lines in walls] == [4, 6, 8]
 
 
-@pytest.mark.parametrize("cls", envs.ENVS.values())
-def test_docstrings_have_the_same_sections(cls):
-    titles = ["Observation", "Actions", "Reward", "Episode end", "Metrics", "Args"]
-    lines = inspect.getdoc(cls).splitlines()
-    assert [line[:-1] for line in lines if line[:-1] in titles and line.endswith(":")] == titles
-
-
 def idle(env):
     """The decision of action 0, or of numbers of 0, in every lane."""
     shape = env.n_envs * env.n_agents, *env.action_space.shape
@@ -374,11 +367,6 @@ def test_step_launches_few_small_operations(name, max_launches):
     assert launches.count <= max_launches
 
 
-def test_envs_holds_the_modules_that_have_an_environment():
-    assert set(envs.ENVS) >= {"minimal", "explorer", "deathmatch", "pointgoal", "pong"}
-    assert "common" not in envs.ENVS and envs.ENVS["explorer"] is envs.Explorer
-
-
 @pytest.mark.parametrize("name", FIRST)
 def test_display_draws_the_current_state(name, monkeypatch):
     env = make(name)
@@ -393,34 +381,6 @@ def test_display_draws_the_current_state(name, monkeypatch):
     expected = type(env).plot_state(arrdict.numpyify(env.state(3)))
     assert (plotting.rasterise(figure) == plotting.rasterise(expected)).all()
     assert written[0].startswith("step 0")
-
-
-@pytest.mark.parametrize("name", ["explorer", "pointgoal"])
-def test_drawn_views_end_at_the_walls(name):
-    env = make(name)
-    env.reset()
-    distances = engine.render(env.core.scenery, env.core.agents).distances[3].numpy()
-    drawn = env.state(3).core.distances.numpy()
-    np.testing.assert_allclose(drawn.ravel(), distances.ravel(), atol=5e-3)
-
-
-@pytest.mark.parametrize("name", ["explorer", "pointgoal"])
-def test_checks_the_memory_of_bitmaps_and_observations(name, monkeypatch):
-    checked = []
-    monkeypatch.setattr(engine, "fit", lambda n, bytes_each, *_: checked.append(n * bytes_each))
-    env = make(name, res=64, cameras=[0, 180])
-    images = env.reset().obs
-    needed = images.rgb.nbytes + images.d.nbytes
-    if name == "explorer":
-        needed += env.seen.nbytes
-    assert needed <= sum(checked[-2:]) and checked[-1] < 1.5 * needed
-
-
-def test_explorer_counts_the_texels_of_its_bitmap():
-    env = make("explorer")
-    contract.rollout(env, 10, check=False)
-    state = env.state(3)
-    assert int(state.seen.sum()) == int(state.n_seen) == int(env.n_seen[3])
 
 
 def test_explorer_without_metrics_is_the_same_otherwise():
@@ -449,16 +409,6 @@ def test_explorer_resamples_homes_at_resets_only(device):
 
 
 # ---- Minimal ----
-
-
-def test_minimal_lifespans_lie_between_shortest_and_longest():
-    env = envs.Minimal(64, device="cpu", shortest=3, longest=5)
-    truncated = torch.stack([world.truncated for world in contract.rollout(env, 30)])
-    lifespans = set()
-    for lane in truncated.T:
-        ends = lane.nonzero().flatten()
-        lifespans |= set((ends.diff() - 1).tolist())  # less the step to the first observation
-    assert lifespans == {3, 4, 5}
 
 
 def test_minimal_moves_one_metre_per_step():

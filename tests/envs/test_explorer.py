@@ -159,12 +159,6 @@ def counts_of(c, seen, visible):
     return (64 * out.unseen.square()).round().int().view(3, 16)
 
 
-def test_one_wall_on_each_side(device):
-    c, _, seen, visible = square(device)
-    counts = counts_of(c, seen, visible)
-    assert counts[0, [AHEAD, LEFT, BEHIND, RIGHT]].tolist() == 4 * [32] and counts.sum() == 128
-
-
 @pytest.mark.parametrize(
     "angle, sector", [(0, AHEAD), (90, RIGHT), (180, BEHIND), (-90, LEFT), (-60, 3), (45, 14)]
 )
@@ -177,28 +171,6 @@ def test_sectors_follow_the_heading(angle, sector, device):
     seen.fill_(-1)[..., east] = 0
     counts = counts_of(c, seen, visible)
     assert counts[0, sector] == counts.sum() == 32
-
-
-@pytest.mark.parametrize("metres, band", [(0.7, 0), (1.49, 0), (1.51, 1), (3.99, 1), (4.01, 2)])
-def test_bands_end_at_1_5_and_4_metres(metres, band, device):
-    c, east, seen, visible = square(device)
-    c.agents.positions[..., 0] = 2.6 - metres
-    visible.zero_()[:, east] = -1
-    counts = counts_of(c, seen, visible)
-    assert counts[band, AHEAD] == counts.sum() == 32
-
-
-def test_only_visible_unseen_texels_count(device):
-    c, _, seen, visible = square(device)
-    assert counts_of(c, seen.fill_(0b0011), visible.fill_(0b0110)).sum() == 4
-    assert not counts_of(c, seen, visible.zero_()).any()
-    assert not counts_of(c, seen.fill_(-1), visible.fill_(-1)).any()
-
-
-def test_explorers_visible_texels():
-    env = explorer("cpu")
-    expected = modules.visible_texels(env.core.scenery, env.spawner.points)
-    assert torch.equal(env.visible, expected)
 
 
 # ---- TexelRuns by hand ----

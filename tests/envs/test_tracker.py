@@ -40,11 +40,6 @@ def test_moves_whole_cells_at_its_mean_speed(device):
     assert moved.unfold(0, 8, 1).sum(-1).max() == 2, "in 8 steps, at a quarter of a cell per step"
 
 
-def test_stays_when_its_speed_is_zero():
-    env = envs.Pong(8, device="cpu", self_play=True)
-    assert not play(env, 50, Tracker(tracker_speed=0.0)).any()
-
-
 def test_other_observations_are_refused():
     env = envs.Minimal(2, device="cpu", res=8)
     with pytest.raises(ValueError, match="features or the pixels of Pong"):

@@ -4,7 +4,6 @@ Workers import this module, so without PyTorch.
 """
 
 import os
-import time
 
 import gymnasium
 import numpy as np
@@ -64,11 +63,6 @@ class Exits(Odd):
 class CloseFails(Odd):
     def close(self):
         raise RuntimeError("viewer already gone")
-
-
-class CloseHangs(Odd):
-    def close(self):
-        time.sleep(60)
 
 
 class Scores(Odd):

@@ -137,14 +137,6 @@ def test_nvrtc_reports_file_and_line():
         nvrtc(broken)
 
 
-def test_import_builds_nothing(tmp_path):
-    status, _, err = run(
-        "import megastep.envs, megastep.cuda, megastep.modules, megastep.recording",
-        tmp_path / "cache",
-    )
-    assert status == 0 and not (tmp_path / "cache").exists(), err
-
-
 def test_no_compiler(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "/nonexistent")
     with pytest.raises(compile.EngineError, match="CXX=/nonexistent.*or set CXX") as error:
@@ -186,17 +178,6 @@ def test_missing_cuda_bindings_are_named(monkeypatch):
     compile.bindings.cache_clear()
     with pytest.raises(compile.EngineError, match="pip install cuda-bindings"):
         compile.bindings()
-
-
-def test_missing_nvrtc_is_named(monkeypatch):
-    def absent():
-        raise RuntimeError("libnvrtc.so.12: cannot open shared object file")
-
-    nvrtc = SimpleNamespace(nvrtcVersion=absent)
-    monkeypatch.setattr(compile, "bindings", lambda: (None, nvrtc))
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))
-    with pytest.raises(compile.EngineError, match="NVRTC.*libnvrtc.so.12.*reinstall torch"):
-        compile.cuda.__wrapped__(ENGINE, 0)
 
 
 @pytest.mark.cuda
@@ -297,25 +278,6 @@ def test_without_early_starts_no_kernel_starts_early(monkeypatch):
         thread.join()
     copy()
     assert starts == [True, False, False, True]
-
-
-def test_a_gpu_launch_of_an_unknown_operation_is_named():
-    message = r"No \.cu file in .* defines the operation unifrom: "
-    with pytest.raises(compile.EngineError, match=message + r".*or run on a CPU \(device=cpu\)"):
-        launch.launch(ENGINE, "unifrom", GPU, 100, **UNIFORM)
-
-
-@pytest.mark.parametrize("shape", [0, launch.Blocks(0), launch.Blocks(3, 0)])
-def test_a_gpu_launch_without_threads_does_nothing(monkeypatch, shape):
-    monkeypatch.setattr(launch, "cuda", None)
-    launch.launch(ENGINE, "uniform", GPU, shape, **UNIFORM)
-
-
-@pytest.mark.parametrize("shape", [2**32, launch.Blocks(2**22, threads=1024)])
-def test_a_gpu_launch_of_too_many_threads_is_refused(monkeypatch, shape):
-    monkeypatch.setattr(launch, "cuda", None)
-    with pytest.raises(compile.EngineError, match="uniform needs 4,294,967,296 threads on cuda:0"):
-        launch.launch(ENGINE, "uniform", GPU, shape, **UNIFORM)
 
 
 @pytest.mark.cuda

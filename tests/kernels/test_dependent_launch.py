@@ -69,11 +69,6 @@ def test_every_kernel_of_ours_waits_first(library):
     assert library.early_operations == library.cuda_operations.keys() != set()
 
 
-def test_a_kernel_that_does_not_wait_does_not_start_early(relays):
-    assert relays.cuda_operations == dict(waits="RelayParams", careless="RelayParams")
-    assert relays.early_operations == {"waits"}
-
-
 @pytest.mark.parametrize(
     "body",
     [
@@ -122,12 +117,6 @@ def test_only_kernels_that_wait_are_launched_early(relays, monkeypatch, can_star
     assert configs["w"].numAttrs == len(configs["w"].attrs) == int(can_start_early)
     for attribute in configs["w"].attrs:
         assert attribute.id == 6 and attribute.value.programmaticStreamSerializationAllowed == 1
-
-
-@pytest.mark.parametrize("capability, can", [((8, 9), False), ((9, 0), True), ((12, 0), True)])
-def test_gpus_since_hopper_start_kernels_early(monkeypatch, capability, can):
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: capability)
-    assert launch._can_start_early.__wrapped__(0) == can
 
 
 def ptx(library):

@@ -5,7 +5,6 @@ import re
 import subprocess
 
 import pytest
-import torch
 
 from megastep.agents.algorithms.kernels import LIBRARY as ALGORITHMS
 from megastep.agents.networks.kernels.library import LIBRARY
@@ -212,18 +211,6 @@ def test_constants_have_the_compilers_values(library, tmp_path):
         assert read() == pytest.approx(number, rel=1e-7, abs=0), name
 
 
-def test_constants_between_other_lines_are_read():
-    text = """/* A comment
-    of two lines. */
-#ifndef CONSTANTS_H
-#define CONSTANTS_H
-    constexpr float SHARE = 0.25f;  // a comment
-constexpr int  LEAST=-3;
-#endif
-"""
-    assert headers.constants({"constants.h": text}) == dict(SHARE=0.25, LEAST=-3)
-
-
 @pytest.mark.parametrize(
     "line",
     [
@@ -277,10 +264,3 @@ def test_a_field_that_is_missing_or_unknown_is_named():
     for others in ({}, dict(n_lane=3)):
         with pytest.raises(TypeError, match="UniformParams needs the field 'key1'"):
             pack(**fields, **others)
-
-
-def test_a_tensor_stands_for_its_address_and_none_for_null():
-    tensor, pack = torch.zeros(3), ENGINE.params.UniformParams
-    numbers = dict(key0=1, key1=2, n_lanes=0, n_threads=1)
-    expected = pack(counts=tensor[1:].data_ptr(), mask=0, out=7, **numbers)
-    assert pack(counts=tensor[1:], mask=None, out=7, **numbers) == expected

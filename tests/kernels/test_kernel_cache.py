@@ -4,7 +4,6 @@ are real.
 
 import contextlib
 import ctypes
-import errno
 import hashlib
 import os
 import signal
@@ -102,12 +101,6 @@ def test_new_folder_is_private(fetch, tmp_path):
     assert fetch(tmp_path / "new") == (BODY, path, 0)
 
 
-def test_file_under_another_name_is_built_again(fetch, tmp_path):
-    _, path, _ = fetch(tmp_path)
-    path.rename(tmp_path / "other")
-    assert cache.intact(tmp_path / "other") is None
-
-
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "garbage", "missing"])
 def test_damaged_file_is_built_again(fetch, damage, tmp_path):
     _, path, _ = fetch(tmp_path)
@@ -139,30 +132,6 @@ def test_two_processes_build_at_once(built, quick, tmp_path):
 # ---- Folders that cannot be used ----
 
 
-def test_folder_that_cannot_be_made(fetch, tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.warns(UserWarning, match=f"{UNUSED}.*cannot be used"):
-        assert fetch(tmp_path / "file" / "cache") == (BODY, None, 1)
-    assert (tmp_path / "file").read_text() == "in the way"
-
-
-def test_full_folder(fetch, tmp_path):
-    with mounted(tmp_path / "full", "size=16k") as folder:
-        with pytest.warns(UserWarning, match=f"{UNUSED}.*No space left"):
-            assert fetch(folder) == (BODY, None, 1)
-        assert not list(folder.iterdir()), "no half-written file is left"
-
-
-def test_failed_write_leaves_nothing(fetch, tmp_path, monkeypatch):
-    def full(*args):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(cache.os, "replace", full)
-    with pytest.warns(UserWarning, match=f"{UNUSED}.*No space left"):
-        assert fetch(tmp_path) == (BODY, None, 1)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.slow
 def test_noexec_folder(built, quick, tmp_path):
     with mounted(tmp_path / "noexec", "size=4m,noexec") as folder:
@@ -179,61 +148,7 @@ def test_folder_writable_by_others(fetch, mode, tmp_path):
         assert fetch(tmp_path) == (BODY, None, 1)
 
 
-def test_folder_replaceable_by_others(fetch, tmp_path):
-    tmp_path.chmod(0o777)
-    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users can replace"):
-        assert fetch(tmp_path / "own") == (BODY, None, 1)
-    tmp_path.chmod(0o1777)  # sticky, as /tmp is: only owners may rename
-    assert fetch(tmp_path / "own")[1:] == (tmp_path / "own" / "name", 1)
-
-
-@root
-def test_folder_of_another_user(fetch, tmp_path):
-    os.chown(tmp_path, 12345, 12345)
-    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users can write"):
-        assert fetch(tmp_path) == (BODY, None, 1)
-
-
-def test_no_folder_to_load_from(tmp_path, monkeypatch):
-    def refuse(path):
-        raise OSError(f"{path}: failed to map segment from shared object")
-
-    monkeypatch.setattr(compile.ctypes, "CDLL", refuse)
-    with (
-        pytest.warns(UserWarning, match=UNUSED),
-        pytest.raises(compile.EngineError, match="cannot be loaded .* set MEGASTEP_CACHE") as error,
-    ):
-        compile._load("engine.so", BODY, tmp_path / "engine.so")
-    assert "\n" not in str(error.value)
-
-
-def test_no_room_to_build(monkeypatch):
-    def full(*args, **kwargs):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(compile.tempfile, "mkdtemp", full)
-    with pytest.raises(compile.EngineError, match="No space left on device.*set TMPDIR") as error:
-        compile._build_cpu(ENGINE, compile.compiler()[0])
-    assert "\n" not in str(error.value)
-
-
 # ---- Planted files ----
-
-
-@pytest.mark.parametrize("how", ["a group may write it", "all may write it"])
-def test_file_writable_by_others_is_built_again(fetch, how, tmp_path):
-    _, path, _ = fetch(tmp_path)
-    path.chmod(0o620 if how == "a group may write it" else 0o602)
-    assert fetch(tmp_path) == (BODY, path, 1)
-    assert path.stat().st_mode & 0o777 == 0o600
-
-
-@root
-def test_file_of_another_user_is_built_again(fetch, tmp_path):
-    _, path, _ = fetch(tmp_path)
-    os.chown(path, 12345, 12345)
-    assert fetch(tmp_path) == (BODY, path, 1)
-    assert path.stat().st_uid == 0
 
 
 @pytest.mark.slow
@@ -294,15 +209,6 @@ def test_ctrl_c_while_building_reaches_the_programs_handler(built, quick, tmp_pa
     handled = "import signal; signal.signal(signal.SIGINT, lambda *args: print('noted'))"
     status, out, err = interrupted(tmp_path, quick, handled + STEP)
     assert (status, out.split()) == (0, ["noted", built[1]]), err
-
-
-@pytest.mark.slow
-def test_ctrl_c_while_building_ends_a_program_without_handler(quick, tmp_path):
-    # Python's own handler, since signals are ignored in the background of a shell.
-    usual = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    status, out, err = interrupted(tmp_path, quick, usual + STEP)
-    assert status == -signal.SIGINT and "KeyboardInterrupt" in err and "EngineError" not in err
-    assert not out and not [*(tmp_path / "cache").glob("*")]
 
 
 @pytest.mark.parametrize(

@@ -74,18 +74,6 @@ def test_points_follow_environments_to_other_homes():
         assert (points[:, None] == free_points.points[layout]).all(-1).any(-1).all()
 
 
-@pytest.mark.parametrize("name", ["n_points", "per_env"])
-def test_numbers_below_one_are_refused(name):
-    with pytest.raises(ValueError, match=f"{name} must be an integer (of at least|from) 1"):
-        modules.FreePoints([toys.box()], core_of([toys.box()], 1), **{name: 0})
-
-
-def test_fewer_geometries_than_layouts_are_refused():
-    homes = [toys.box(3), toys.box(30)]
-    with pytest.raises(ValueError, match="one for each of its 2 layouts, but 1 were given"):
-        modules.FreePoints(homes[:1], core_of(homes, n_envs=2))
-
-
 @pytest.mark.cuda
 def test_points_are_the_same_on_a_gpu_without_synchronising():
     homes, mask = sample("homes", 5), torch.arange(24) % 3 > 0

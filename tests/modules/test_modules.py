@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import core, dotdict, engine, envs, modules, plotting, scene, toys
-from megastep.arrdict import numpyify
+from megastep import core, dotdict, engine, modules, scene, toys
 from megastep.geometries import sample
 from megastep.modules import spawning
 
@@ -110,28 +109,6 @@ def test_random_ages_are_uniform_below_the_limit():
     assert 0 <= modules.random_ages(largest, seed=1).min()
 
 
-def test_lifecycle_state_is_a_copy_of_one_environment():
-    c = core_of([toys.box()], n_agents=2, n_envs=3)
-    lifecycle = modules.Lifecycle(c, 7)
-    lifecycle(lifecycle.start_all())
-    lifecycle.ages.copy_(torch.arange(6))
-    state = lifecycle.state(2)
-    lifecycle.ages.zero_()
-    assert state.age.tolist() == [4, 5] and state.limit.tolist() == [7, 7]
-
-
-@pytest.mark.parametrize("limit", [0, -1, 2**31])
-def test_limit_out_of_range_is_refused(limit):
-    with pytest.raises(ValueError, match=f"limit .*from 1 to 2147483647, .*{limit}"):
-        modules.Lifecycle(core_of([toys.box()]), limit)
-
-
-@pytest.mark.parametrize("shortest, longest", [(0, 5), (6, 5)])
-def test_lifespans_out_of_order_are_refused(shortest, longest):
-    with pytest.raises(ValueError, match=f"shortest={shortest} and longest={longest}"):
-        modules.RandomLifespans(core_of([toys.box()]), shortest, longest)
-
-
 def test_counter_generator_draws_where_masked_and_repeats_by_seed():
     first, second, other = (modules.CounterGenerator(3, seed, "cpu") for seed in (1, 1, 2))
     everywhere = torch.ones(3, dtype=torch.bool)
@@ -191,13 +168,6 @@ def test_agents_that_spawn_together_never_overlap(width):
     assert len(c.agents.positions.flatten(0, 1).unique(dim=0)) > 10 * n, "always the same points"
 
 
-def test_every_agent_has_points_all_over_a_room():
-    c = core_of([toys.box()], 4, n_envs=1)
-    points = modules.RandomSpawns([toys.box()], c).points[0].view(4, 32, 2)
-    for of_agent in points:
-        assert np.ptp(of_agent.numpy(), 0).min() > 3.5
-
-
 def corner():
     """A room of one cell, nearly all of it too close to walls: 20 points of about 5,000 fit."""
     g = toys.box(1)
@@ -220,11 +190,6 @@ def test_spawn_points_of_single_agents_are_unchanged(geometries, n_spawns, diges
     assert hashlib.sha256(spawner.points.numpy().tobytes()).hexdigest()[:16] == digest
 
 
-def test_points_are_repeated_where_few_fit():
-    points = modules.RandomSpawns([corner()], core_of([corner()]), 64).points[0]
-    assert len(points.unique(dim=0)) == 20 and points.shape == (64, 2)
-
-
 @pytest.mark.parametrize(
     "n_agents, message", [(1, "no point .*0.16 m"), (9, "no room for 9 agents .*0.26 m")]
 )
@@ -235,17 +200,6 @@ def test_a_geometry_without_space_is_refused(n_agents, message):
     c = core_of([toys.box(1)], n_agents)
     with pytest.raises(ValueError, match=f"geometry 0 .*{message}"):
         modules.RandomSpawns([g], c)
-
-
-def test_too_many_spawn_points_are_refused():
-    c = core.Core(scene.scenery([toys.box()], 1, 1, device="cpu"))
-    with pytest.raises(ValueError, match="n_spawns must be .* to 1000000, but 2147483647 was"):
-        modules.RandomSpawns([toys.box()], c, n_spawns=2**31 - 1)
-
-
-def test_fewer_points_than_agents_are_refused():
-    with pytest.raises(ValueError, match="n_spawns=2 .*3 agents"):
-        modules.RandomSpawns([toys.box()], core_of([toys.box()], 3), n_spawns=2)
 
 
 def cached_points(folder):
@@ -271,49 +225,7 @@ def test_points_of_many_layouts_are_cached(tmp_path, monkeypatch):
     assert path.read_bytes() == body
 
 
-def test_cached_points_depend_on_homes_seed_and_number(tmp_path, monkeypatch):
-    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
-    homes = sample("bench", 40)
-    c = core_of(homes)
-    other_homes = [*homes[:-1], homes[0]]
-    points = modules.RandomSpawns(homes, c).points
-    other_points = [
-        modules.RandomSpawns(homes, c, seed=2).points,
-        modules.RandomSpawns(other_homes, c).points,
-    ]
-    modules.RandomSpawns(homes, c, 64)
-    assert len(cached_points(tmp_path)) == 4
-    assert not any(torch.equal(points, other) for other in other_points)
-
-
-def test_the_cache_keeps_the_newest_points(tmp_path, monkeypatch):
-    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
-    monkeypatch.setattr(spawning, "MAX_FILES", 2)
-    homes = sample("bench", 32)
-    c = core_of(homes)
-    files = []
-    for seed in range(4):
-        modules.RandomSpawns(homes, c, seed=seed)
-        files.append({path.name for path in cached_points(tmp_path)})
-    assert [len(names) for names in files] == [1, 2, 2, 2]
-    assert not files[1] & files[3] and len(files[2] & files[3]) == 1
-
-
 # ---- Sensors ----
-
-
-def test_sensors_draw_their_states():
-    c = core_of([toys.box()], n_agents=2)
-    c.agents.positions[:] = 3.0
-    c.agents.angvelocity[:] = torch.tensor([[180.0, 0.0]])
-    for sensor, name in ((modules.RGB(c), "rgb"), (modules.Depth(c), "depth")):
-        axes = sensor.plot_state(numpyify(sensor.state(0)))
-        assert [ax.get_title("left") for ax in axes[0]] == [f"{name} 0", f"{name} 1"]
-        assert np.asarray(axes[0, 1].images[0].get_array()).shape[:2] == (1, 8)
-    imu = modules.IMU(c)
-    bars = imu.plot_state(numpyify(imu.state(0))).patches
-    assert [bar.get_height() for bar in bars] == [0.5, 0, 0, 0, 0, 0]
-    plotting.rasterise(bars[0].figure)
 
 
 # ---- Wrong numbers of lanes ----
@@ -345,17 +257,6 @@ def test_wrong_masks_are_named(wrong):
         with pytest.raises((TypeError, ValueError), match=f"^{name} must be .* was given"):
             call()
     assert not lifecycle.ages.any(), "a refused step is not counted"
-
-
-@pytest.mark.parametrize("name", ["Minimal", "Explorer", "PointGoal", "Deathmatch", "Pong"])
-def test_wrong_actions_are_named(name):
-    homes = {} if name == "Pong" else dict(geometries=[toys.column()])
-    env = getattr(envs, name)(4, device="cpu", **homes)
-    right = torch.zeros_like(env.reset().reward, dtype=torch.int64)[:, None]
-    for wrong in (right[1:], torch.cat([right, right]), right.float(), right.to("meta"), None):
-        with pytest.raises((TypeError, ValueError), match="^actions must be .* was given"):
-            env.step(dict(actions=wrong))
-    env.step(dict(actions=right))
 
 
 def test_wrong_continuous_actions_are_named():

@@ -60,19 +60,6 @@ def test_visible_texels_match_observe_at_every_point(n_agents, device):
         assert 0.1 * n < int(visible[d].sum()) <= n and not visible[d, n:].any()
 
 
-def test_visible_texels_changes_no_state():
-    scenery = scene.scenery([toys.box(), toys.column()], 1, 4, device="cpu")
-    before = scenery.layout.clone(), scenery.agent_lines.clone()
-    modules.visible_texels(scenery, torch.full((2, 1, 2), 2.0))
-    assert torch.equal(scenery.layout, before[0]) and torch.equal(scenery.agent_lines, before[1])
-
-
-def test_visible_texels_needs_an_agent():
-    scenery = scene.scenery([toys.box()], 0, 1, device="cpu")
-    with pytest.raises(ValueError, match="scenery.n_agents must be .*1"):
-        modules.visible_texels(scenery, torch.full((1, 1, 2), 2.0))
-
-
 # ---- The cache ----
 
 
@@ -103,9 +90,3 @@ def test_visible_texels_of_many_homes_are_cached(folder, monkeypatch):
     modules.visible_texels(c.scenery, points)
     assert len(looks) == 2, "for other points, and for walls that moved"
     assert not torch.equal(other, first)
-
-
-def test_visible_texels_of_few_homes_are_not_cached(folder):
-    scenery = scene.scenery([toys.box(1.6), toys.column()], 1, device="cpu")
-    modules.visible_texels(scenery, torch.full((2, 1, 2), 1.5))
-    assert not list(folder.glob("visible-texels-*"))

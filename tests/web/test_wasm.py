@@ -6,7 +6,6 @@ import hashlib
 import io
 import itertools
 import json
-import re
 import shutil
 import subprocess
 import time
@@ -225,9 +224,3 @@ def test_a_browser_without_webassembly_gets_a_sentence(agent_page, tmp_path):
     with Browser(tmp_path) as browser:
         browser.send("Page.navigate", url=f"file://{tmp_path}/page.html")
         browser.until("document.getElementById('problem')?.textContent.includes('WebAssembly')")
-
-
-def test_pages_are_one_file_of_readable_source(agent_page):
-    source = (FOLDER / "page.js").read_text()
-    assert len(source.splitlines()) <= 400 and source in agent_page
-    assert not re.search(r"https?://|import |<link|src=", agent_page)
