@@ -50,23 +50,6 @@ def test_gamma_decode_inverts_gamma_encode(kind):
     assert (np.diff(gamma_encode(light)) > 0).all()
 
 
-def test_gamma_of_arrays_and_tensors_agree_and_keep_the_dtype():
-    light = np.linspace(-0.1, 1.5, 101, dtype=np.float32)
-    for f in (gamma_encode, gamma_decode):
-        assert f(light).dtype == np.float32 and f(torch.tensor(light)).dtype == torch.float32
-        assert np.abs(f(light) - f(torch.tensor(light)).numpy()).max() < 1e-6
-        assert f(torch.tensor(light).half()).dtype == torch.float16
-        assert (
-            f(np.array([0, 1])).tolist()
-            == f(torch.tensor([0, 1])).round(decimals=6).tolist()
-            == [0, 1]
-        )
-
-
-def test_core_exports_gamma_encode_and_decode():
-    assert core.gamma_encode is gamma_encode and core.gamma_decode is gamma_decode
-
-
 # ---- Images and strips ----
 
 
@@ -168,14 +151,6 @@ def test_panels_per_agent_and_rows_per_camera(words, monkeypatch):
     assert (colour_ahead, colour_behind) == (ahead, behind) and len(views) == 6
 
 
-def test_single_camera_has_no_label_and_single_agent_no_number(words):
-    c = core.Core(scene.scenery([toys.box()], 1, device="cpu"), res=8)
-    figure, plan, strips = plotting.panels(1)
-    core.Core.plot_state(numpyify(c.state(0)), plan)
-    modules.Depth.plot_state(modules.Depth(c).state(0).numpy(), strips, c.agents.yaws)
-    assert [text for _, text, _ in words] == ["", "1 m", "depth"]
-
-
 @pytest.mark.parametrize(
     ("shape", "transpose"),
     [((3, 1, 64), True), ((2, 64, 3), False), ((64,), False), ((64, 3), True)],
@@ -185,22 +160,7 @@ def test_bad_image_shapes_are_refused(shape, transpose):
         plotting.plot_images({"rgb": np.zeros(shape)}, transpose=transpose)
 
 
-@pytest.mark.parametrize("images", [{}, {"rgb": np.zeros((0, 3, 1, 8))}])
-def test_no_images_are_refused(images):
-    with pytest.raises(ValueError, match="no images"):
-        plotting.plot_images(images)
-
-
 # ---- Plans ----
-
-LINES = np.array([[[1, 1], [3, 1]], [[3, 1], [3, 5]]], np.float32)
-COLOURS = [np.array([[0.1, 0, 0], [0, 0.2, 0]]), np.array([[0, 0, 0.3]])]
-
-
-def test_texels_divide_their_lines():
-    segments = plotting.texel_segments(LINES, [2, 1])
-    assert np.allclose(segments, [[[1, 1], [2, 1]], [[2, 1], [3, 1]], [[3, 1], [3, 5]]])
-    assert len(plotting.texel_segments(np.zeros((0, 2, 2)), [])) == 0
 
 
 def test_walls_keep_their_hue_and_are_never_dark():
@@ -262,41 +222,10 @@ def test_what_is_seen_later_is_drawn_over_what_is_kept(theme):
     assert pixel(image, plan, (1.5, 1))[0] > 0.7
 
 
-def test_walls_without_a_room_stand_on_their_rectangle():
-    figure, plan, _ = plotting.panels()
-    plotting.plot_scenery(LINES, COLOURS, [[2, 3, 1]], ax=plan)
-    image = plotting.rasterise(figure)
-    assert np.allclose(pixel(image, plan, (2, 3)), rgb_of(plan.style.colours.floor), atol=0.003)
-
-
 def test_no_lines():
     figure, plan, _ = plotting.panels()
     assert plotting.plot_scenery(np.zeros((0, 2, 2)), [], ax=plan) is plan
     plotting.rasterise(figure)
-
-
-def test_lines_without_colours_are_refused(ax):
-    with pytest.raises(ValueError, match="2 lines and 1 arrays"):
-        plotting.plot_scenery(LINES, COLOURS[:1], ax=ax)
-
-
-def test_axes_show_everything_to_scale():
-    ax = plotting.plot_scenery(SQUARE, LIT, lights=np.array([[2.0, 3.0, 1.0]]))
-    ax.figure.canvas.draw()
-    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    assert ax.get_aspect() == 1 and left < 1 and right > 5 and bottom < 1 and top > 5
-    image = plotting.rasterise(ax.figure)
-    area = plotting.Area.on(ax)
-    assert area is plotting.Area.on(ax) and pixel(image, area, (3, 1))[1] < 0.05
-
-
-def test_axes_in_metres_are_drawn_if_asked_for():
-    with plotting.styled(axes=True):
-        _, plan, _ = plotting.panels()
-    plotting.plot_scenery(SQUARE, LIT, ax=plan)
-    assert plan.overlay().get_xlabel() == "x, m" and len(plan.overlay().get_xticks())
-    low, high = (plan.transform.transform(point) for point in ((1, 1), (5, 5)))
-    assert np.allclose(plan.overlay().transData.transform([(1, 1), (5, 5)]), [low, high], atol=1)
 
 
 def test_methods_of_axes_draw_over_an_area():
@@ -313,13 +242,6 @@ def test_view_reaches_each_hit_leftmost_ray_first():
     # and left of +y is -x.
     view = plotting.view_polygon((1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
     assert np.allclose(view, [[1, 1], [0, 3], [3, 5]])
-
-
-def test_view_without_distances_is_a_wedge():
-    rim = plotting.view_polygon((0, 0), 0, 60, reach=2.0)[1:]
-    assert np.allclose(np.linalg.norm(rim, axis=1), 2)
-    degrees = np.degrees(np.arctan2(rim[:, 1], rim[:, 0]))
-    assert 28 < degrees[0] < 30 and -30 < degrees[-1] < -28 and (np.diff(degrees) < 0).all()
 
 
 def test_agents_are_at_least_12_pixels_wide_in_their_colour():
@@ -346,17 +268,6 @@ def test_trails_fade_and_are_cut_where_nothing_is_known():
 # ---- Figures ----
 
 
-def test_panels_do_not_overlap_and_are_unknown_to_pyplot():
-    from matplotlib import pyplot
-
-    figure, plan, strips = plotting.panels(3, title="step 3")
-    assert pyplot.get_fignums() == [] and len(strips) == 3
-    bottoms = [ax.bbox.y0 for ax in (plan, *strips)]
-    tops = [ax.bbox.y1 for ax in (plan, *strips)]
-    assert all(top < bottom for top, bottom in zip(tops[1:], bottoms)) and bottoms[-1] > 0
-    assert tops[0] < 720 and plotting.rasterise(figure).shape == (720, 640, 3)
-
-
 def test_pictures_show_themselves_and_are_equal_files_each_time():
     with plotting.styled(dpi=50, title="Title"):
         figure, plan, _ = plotting.panels(title="step 3")
@@ -369,21 +280,6 @@ def test_pictures_show_themselves_and_are_equal_files_each_time():
         content = plotting.encoded(figure, ending)
         assert content.startswith(start) and content == plotting.encoded(figure, ending)
     assert b"step 3" in plotting.encoded(figure, "svg"), "text stays text"
-
-
-def test_theme_that_is_none():
-    with pytest.raises(ValueError, match="light or dark, but 'blue'"):
-        with plotting.styled(theme="blue"):
-            pass
-
-
-def test_rasterise_keeps_a_pyplot_figure_open():
-    from matplotlib import pyplot
-
-    figure = pyplot.figure(figsize=(2, 1), dpi=50, facecolor="r")
-    assert (plotting.rasterise(figure) == [255, 0, 0]).all()
-    assert plotting.rasterise(figure).shape == (50, 100, 3)
-    assert pyplot.fignum_exists(figure.number)
 
 
 def test_importing_the_simulator_and_training_imports_no_optional_package():

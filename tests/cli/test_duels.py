@@ -5,26 +5,21 @@ import json
 import math
 import re
 import xml.etree.ElementTree
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-import yaml
 
-from megastep import envs, recording, toys
-from megastep.agents import factory
+from megastep import recording
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.errors import UserError
 from megastep.agents.evaluation import duels, ratings
 from megastep.agents.evaluation.statistics import interval
 from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.arrdict import arrdict
-from megastep.envs.deathmatch import Bot
 from megastep.envs.pong import Tracker
 from tests.cli.test_train import configured
-from tests.helpers.games import Always, High, Matrix
+from tests.helpers.games import Always, Matrix
 
 # ---- Duels ----
 
@@ -57,15 +52,6 @@ def test_win_share_matches_independent_count(mortal):
     assert lower < win / (win + lose) < upper and upper - lower < 0.04
     (row,) = duels.summaries(played)
     assert row["won"] == mean and row["wins"] + row["losses"] == row["duels"] == 2000
-
-
-def test_unfinished_duel_is_a_draw():
-    played = duels.play(Matrix(4), Always(1), Always(1), max_steps=70)
-    assert (played.score == 0.5).all() and (played.lengths == 70).all()
-    (row,) = duels.summaries(played)
-    assert (row["draws"], row["wins"], row["losses"], row["won"]) == (4, 0, 0, 0.5)
-    cut = duels.play(Matrix(4, limit=3), Always(1), Always(1))
-    assert (cut.score == 0.5).all() and (cut.lengths == 3).all()
 
 
 def test_only_first_duel_counts():
@@ -121,27 +107,6 @@ def test_rows_by_role():
     assert (hunter["won"], hunter["lower"], hunter["upper"]) == expected
 
 
-def test_rows_by_source():
-    """Both duels in home 2, a maze, are won, and none of those in homes 0 and 1 is."""
-    played = arrdict(
-        score=torch.tensor([0.0, 0.5, 1, 0, 0, 1]),
-        lengths=torch.tensor([1.0, 2, 3, 4, 5, 6]),
-        slots=torch.tensor([0, 0, 0, 1, 1, 1]),
-        homes=torch.tensor([0, 1, 2, 0, 1, 2]),
-    )
-    _, homes, maze = duels.summaries(played, sources=["homes", "homes", "maze", "never played"])
-    assert (homes["source"], maze["source"]) == ("homes", "maze")
-    assert (homes["won"], homes["duels"], homes["homes"]) == (0.125, 4, 2)
-    assert (maze["won"], maze["wins"], maze["length"]) == (1, 2, 4.5)
-
-
-def test_duels_are_reproducible():
-    def scores(seed):
-        return duels.play(Matrix(64), Always(2, 0.9), Always(0, 0.9), seed).score.tolist()
-
-    assert scores(1) == scores(1) != scores(2)
-
-
 # ---- Mixed policies ----
 
 
@@ -175,21 +140,6 @@ def test_mixed_policy_lanes_and_hidden_states(split):
         assert state[str(i)].first[:, 0].tolist() == [10 * lane for lane in lanes]
 
 
-def test_mixed_policy_with_action_trees():
-    class Both:
-        def initial(self, n_lanes, device=None):
-            return arrdict()
-
-        def __call__(self, world, state, sample=True, generator=None):
-            n = len(world["reset"])
-            return arrdict(actions=arrdict(move=world["obs"], fire=torch.zeros(n, 1))), state
-
-    lineup = MixedPolicy([Both(), Both()], [torch.tensor([2, 0]), torch.tensor([1])])
-    world = arrdict(obs=torch.arange(3)[:, None], reset=torch.ones(3, dtype=torch.bool))
-    decision, _ = lineup(world, lineup.initial(3))
-    assert decision.actions.move[:, 0].tolist() == [0, 1, 2]
-
-
 # ---- Ratings ----
 
 
@@ -205,22 +155,6 @@ def test_ratings_match_the_model():
     means = [mean for mean, _ in ratings.rate(4, scores)]
     assert sorted(range(4), key=means.__getitem__) == [1, 2, 0, 3]
     assert np.diff(np.sort(means)) == pytest.approx([gap] * 3, abs=1)  # a standard deviation
-
-
-def test_ratings_depend_on_the_seed_alone():
-    scores = {(0, 1): [1.0, 0, 1, 1], (1, 2): [0.0, 1, 0, 0]}
-    assert ratings.rate(3, scores) == ratings.rate(3, scores) != ratings.rate(3, scores, seed=2)
-
-
-def test_ratings_of_draws():
-    table = ratings.rows(
-        [("a", 10), ("b", 20), ("c", None)], {(0, 1): [0.5] * 50, (1, 2): [1, 0.5]}
-    )
-    a, b, c = table
-    assert abs(ratings.rate(2, {(0, 1): [0.5] * 50})[0][0] - 25) < 1e-9
-    assert (a["won"], b["won"], c["won"]) == (0.5, 26.5 / 52, 0.25)
-    assert (a["duels"], b["duels"], c["duels"]) == (50, 52, 2)
-    assert c["rating"] < a["rating"]
 
 
 # ---- The scripts ----
@@ -350,18 +284,6 @@ def test_duel_needs_two_agents(here, capsys):
     assert "against: needs run=" in capsys.readouterr().err
 
 
-def test_environments_name_their_bot():
-    pong = envs.Pong(2, self_play=True, device="cpu")
-    chosen = SimpleNamespace(tracker_speed=0.25)
-    bot = factory.make_bot(None, chosen, pong)
-    assert isinstance(bot, Tracker) and bot.tracker_speed == 0.25
-    rooms = envs.Deathmatch(2, [toys.box()], device="cpu")
-    assert isinstance(factory.make_bot(None, SimpleNamespace(), rooms), Bot)
-    assert isinstance(factory.make_bot("tests.helpers.games:High", chosen, pong), High)
-    with pytest.raises(UserError, match="Matrix has no bot .* opponents.bot_class=module:Class"):
-        factory.make_bot(None, SimpleNamespace(), Matrix(2))
-
-
 def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
     """Pong has two lanes for the duel; the trained agent has the left one."""
     lone = [word for word in PONG if word != "env.self_play=true"]
@@ -374,11 +296,6 @@ def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
     assert record.main(["run=lone", "against=bot", "device=cpu"]) == 0
     ((env, both, *_),) = players
     assert env.n_agents == 2 and isinstance(both.policies[1], Tracker)
-
-
-def test_ratings_need_two_checkpoints(here, capsys):
-    assert evaluate.main(["run=b", "ratings=true", "device=cpu"]) == 2
-    assert "train with checkpoints.snapshots=8" in capsys.readouterr().err
 
 
 MATRIX = ["env=tests.helpers.games:Matrix", "env.n_envs=4", *PONG[3:], "samples=1", "folder=run"]
@@ -434,12 +351,3 @@ def test_worst_homes_of_duels():
     row = duels.worst_summary(played)
     assert (row["won"], row["losses"], row["duels"], row["homes"]) == (0, 2, 2, 1)
     assert row["length"] == 5 and row["lower"] == 0 < row["upper"]
-
-
-@pytest.mark.parametrize(
-    "word, names",
-    [("a,b,bot", ["a", "b", "bot"]), ("[a,b]", ["a", "b"]), ("a", ["a"]), ("null", None)],
-)
-def test_against_takes_a_list(capsys, word, names):
-    assert evaluate.main(["run=x", f"against={word}", "--cfg", "job"]) == 0
-    assert yaml.safe_load(capsys.readouterr().out)["against"] == names

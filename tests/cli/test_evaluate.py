@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import envs, scene, spaces
-from megastep.agents import factory
+from megastep import envs, spaces
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import evaluate_run as evaluation
@@ -151,33 +150,6 @@ def test_metrics_average_over_finished_episodes():
     assert shown["age"] == shown["age: 95 % interval"] == "none"
 
 
-def test_table_row_with_metrics():
-    env = Teams(20, False)
-    episodes = playing.first_episodes(env, RandomActions(env.action_space))
-    rows = [{"agent": "trained", **row} for row in statistics.summaries(episodes, env.roles)]
-    lower, upper = rows[2]["lower"], rows[2]["upper"]
-    assert tables.cells(rows[2]) == {
-        "agent": "trained: follower",
-        "return": "30.50",
-        "95 % interval": f"{lower:.2f} to {upper:.2f}",
-        "age": "30.5",
-        "age: 95 % interval": f"{lower:.3g} to {upper:.3g}",
-        "length": "30",
-        "episodes": "20",
-        "homes": "none",
-    }
-
-
-def test_random_actions_are_uniform():
-    space = {"move": spaces.MultiDiscrete(2, 7), "fire": spaces.MultiDiscrete(1, 2)}
-    policy = RandomActions(arrdict(space))
-    generator = torch.Generator().manual_seed(1)
-    decision, _ = policy(None, policy.initial(10_000, "cpu"), generator=generator)
-    assert decision.actions.move.shape == (10_000, 2) and decision.actions.fire.shape == (10_000, 1)
-    shares = torch.bincount(decision.actions.move.flatten(), minlength=7) / 20_000
-    assert shares.sub(1 / 7).abs().max() < 0.015  # six standard errors
-
-
 EXPLORER = [
     *("env=explorer", "env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1"),
     *("agent.width=8", "learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"),
@@ -234,36 +206,6 @@ def test_homes_of_first_episodes(resample):
     assert bool(episodes.done.all())
     assert torch.equal(episodes.homes.long(), env.last)
     assert torch.equal(env.layout, torch.arange(10) % 4) != resample
-
-
-def test_agents_of_one_environment_share_its_home():
-    class Pairs(Counting):
-        """Two agents in each of three environments."""
-
-        n_agents, layout = 2, torch.tensor([7, 8, 7])
-
-        def reset(self):
-            return Counting(6, False).reset()
-
-    env = Pairs(3, False)
-    episodes = playing.first_episodes(env, RandomActions(env.action_space), max_steps=0)
-    assert episodes.homes.tolist() == [7, 7, 8, 8, 7, 7]
-
-
-def test_lanes_of_one_home_are_one_sample():
-    homes = np.random.default_rng(1).normal(0, 1, 50)
-    alone = statistics.interval(homes, np.arange(50))
-    again = statistics.interval(np.repeat(homes, 20), np.repeat(np.arange(50), 20))
-    assert again == pytest.approx(alone)
-
-
-@pytest.mark.parametrize("groups", [None, np.zeros(400)])
-def test_interval_without_homes(groups):
-    """It is 1.96 standard errors to each side, within the bootstrap's noise."""
-    mean, lower, upper = statistics.interval([0.0, 1.0] * 200, groups)
-    error = 0.5 / 20
-    assert mean == 0.5 and upper - mean == pytest.approx(1.96 * error, rel=0.15)
-    assert mean - lower == pytest.approx(1.96 * error, rel=0.15)
 
 
 def test_interval_weighs_homes_by_lanes():
@@ -395,21 +337,6 @@ def test_worst_homes_by_hand():
     assert again.tolist() == [24, 108] and other_means["return"] == means["return"]
 
 
-def test_worst_homes_of_few_are_one():
-    columns = {"return": [3.0, 1, 2], "laps": [4, np.nan, np.inf]}
-    worst, means = statistics.worst_homes(columns, [0, 1, 2])
-    assert means["laps"] == {"mean": None, "lower": None, "upper": None}
-    assert worst.tolist() == [1]
-    assert (means["return"]["mean"], means["return"]["lower"]) == (1, 1)
-
-
-def test_a_row_is_scored_by_what_compares_between_homes():
-    row = {"return": 9.0, "metrics": {"coverage": {"mean": 0.5}, "laps": {"mean": 3}}}
-    assert statistics.score_of(row) == 0.5
-    assert statistics.score_of({"return": 9.0, "metrics": {"success": {"mean": None}}}) == 9
-    assert statistics.score_of({"won": 0.25}) == 0.25
-
-
 @pytest.fixture
 def explorer(here):
     """A run of an explorer."""
@@ -495,16 +422,6 @@ def test_environment_without_a_layout_is_warned_of(here, capsys):
     assert "layout" not in capsys.readouterr().err, "the box is one home"
 
 
-def test_few_episodes_are_spread_over_all_homes(trained, played, monkeypatch):
-    homes = sample("bench", 40)
-    monkeypatch.setattr(factory, "homes", lambda *_: homes)
-    evaluate.run(configured(run=str(trained), episodes=2, baseline=False))
-    ((env, _),) = played
-    layouts = env.core.scenery.layouts
-    expected = scene.scenery([homes[0], homes[20]], device="cpu").layouts
-    assert torch.equal(layouts.lines.vals, expected.lines.vals)
-
-
 def test_checkpoint_deleted_while_it_is_evaluated(trained, monkeypatch, tmp_path):
     """As a run that is training deletes it."""
     copy = shutil.copytree(trained, tmp_path / "copy", ignore=lambda *_: ["evaluations"])
@@ -520,14 +437,6 @@ def test_checkpoint_deleted_while_it_is_evaluated(trained, monkeypatch, tmp_path
     written = evaluate.run(configured(run=str(copy), baseline=False))
     assert written.parent == copy / "evaluations" and written.exists()
     assert json.loads(written.read_text())["checkpoint"] == str(deleted) and not deleted.exists()
-
-
-def test_unwritable_table(trained, monkeypatch, tmp_path):
-    copy = shutil.copytree(trained, tmp_path / "copy")
-    shutil.rmtree(copy / "evaluations", ignore_errors=True)
-    (copy / "evaluations").write_text("")
-    with pytest.raises(UserError, match="copy/evaluations cannot be written"):
-        evaluate.run(configured(run=str(copy), baseline=False))
 
 
 def test_evaluate_refuses_another_environment(trained, tmp_path):
@@ -566,9 +475,3 @@ def test_episodes_are_written_one_by_one(explorer):
     columns = result["episodes"]
     assert columns["return"] == [float(row["return"]) for row in rows]
     assert columns["source"] == ["homes"] * 24 if "source" in columns else True
-
-
-def test_duels_need_two_agents(explorer, capsys):
-    words = [f"run={explorer}", "against=random", "device=cpu", "episodes=2"]
-    assert evaluate.main(words) == 2
-    assert "A duel needs an environment with at least two agents" in capsys.readouterr().err

@@ -1,6 +1,5 @@
 """Evaluations and duels in CUDA graphs: as step by step, and what cannot be captured."""
 
-import collections
 import dataclasses
 import enum
 import math
@@ -45,26 +44,6 @@ def step_by_step(monkeypatch):
         return function
 
     return lambda: monkeypatch.setattr(playing, "capture_with", uncaptured)
-
-
-class Waiting:
-    """A policy that waits for the GPU in every step, which no CUDA graph can, but does not say so.
-
-    Args:
-        policy: chooses the actions.
-    """
-
-    capturable = True
-
-    def __init__(self, policy):
-        self.policy = policy
-
-    def initial(self, n_lanes, device=None):
-        return self.policy.initial(n_lanes, device)
-
-    def __call__(self, world, state, **options):
-        bool(world["reset"].any())
-        return self.policy(world, state, **options)
 
 
 def explorer():
@@ -126,16 +105,6 @@ def test_graphs_have_the_bits_of_single_steps(play, greedy, recorded, step_by_st
     assert isinstance(graph, Graph)
     step_by_step()
     assert_same_bits(captured, play(greedy))
-
-
-@pytest.mark.cuda
-def test_what_cannot_be_captured_is_evaluated_step_by_step(recorded, step_by_step):
-    with pytest.warns(UserWarning, match="without a CUDA graph, slower.*test_captured_evaluation"):
-        waited = episodes(wrapper=Waiting)
-    (function,) = recorded
-    assert not isinstance(function, Graph)
-    step_by_step()
-    assert_same_bits(waited, episodes())
 
 
 # ---- On a CPU, with environments and policies of others ----
@@ -268,18 +237,6 @@ class Silent(Own):
         return Silent.age % 5
 
 
-class Planned(Own):
-    """Plans six steps ahead, which do not divide the steps of a graph."""
-
-    def __init__(self):
-        self.plan = collections.deque()
-
-    def bias(self, world):
-        if not self.plan:
-            self.plan.extend(world["obs"][:, 0, 0] + i for i in range(6))
-        return self.plan.popleft()
-
-
 class Expanded(Own):
     def __init__(self):
         self.offset = torch.ones(1).expand(4)
@@ -399,14 +356,6 @@ def test_what_an_environment_keeps_outside_tensors_is_named(
     assert len(env.log) == len(other.log) and env.n == other.n
 
 
-def test_a_plan_that_fits_no_graph(on_cpu, recorded, step_by_step):
-    with pytest.warns(UserWarning, match="without a CUDA graph, slower"):
-        refused = walk_to_the_end(Walk(), Planned())
-    assert not isinstance(recorded[0], Graph)
-    step_by_step()
-    assert_same_bits(refused, walk_to_the_end(Walk(), Planned()))
-
-
 @pytest.mark.parametrize(
     "make",
     [
@@ -422,18 +371,3 @@ def test_what_a_graph_may_not_see_is_not_captured(make, on_cpu, recorded, step_b
     step_by_step()
     Silent.age = 0
     assert_same_bits(eager, walk_to_the_end(*make()))
-
-
-def test_steps_that_fill_no_graph():
-    """Every step is taken once, and none after all is over."""
-    for max_steps in (0, 1, 15, 16, 17, 63, 64, 65, 100, 1000):
-        taken, is_over = [], torch.zeros(3, dtype=torch.bool)
-
-        def step(world, state, taken=taken, is_over=is_over):
-            taken.append((world, state))
-            is_over[:] = len(taken) >= 200
-            return world + 1, state + 2
-
-        playing.step_until(is_over, step, 5, 7, None, (), (), max_steps)
-        n_taken = min(max_steps, 256)  # the first check after 200
-        assert taken == [(5 + n, 7 + 2 * n) for n in range(n_taken)]

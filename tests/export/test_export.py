@@ -97,21 +97,6 @@ def test_a_step_is_the_policys_greedy_one(kind):
     assert found.difference < 1e-4 and found.n_apart == 0 and found.largest > 0.2
 
 
-def test_ports_are_named_after_the_spaces():
-    _, _, step = made("lstm")
-    assert [port.name for port in step.inputs] == [
-        *("obs.rgb", "obs.self.imu", "obs.self.id", "reset", "state.0", "state.1")
-    ]
-    assert [port.name for port in step.outputs] == [
-        *("action.move", "action.say", "logits.move", "logits.say", "next_state.0", "next_state.1")
-    ]
-    assert step.inputs[2] == ("obs.self.id", (2,), "int64")
-    assert step.outputs[2] == ("logits.move", (2, 7), "float32")
-    assert [port.name for port in made("none")[2].outputs] == ["action", "logits"]
-    assert [port.name for port in made("none")[2].inputs] == ["obs", "mask", "reset"]
-    assert made("masked")[2].inputs[1] == ("mask.move", (2, 7), "bool")
-
-
 def test_comparisons_see_a_hidden_state_that_is_never_reset():
     policy, env, step = made("gru")
 
@@ -122,22 +107,6 @@ def test_comparisons_see_a_hidden_state_that_is_never_reset():
     found = runtimes.compare(step, never, policy, env, n_steps=100)
     with pytest.raises(UserError, match="acts otherwise than its policy"):
         runtimes.check(Path("x.onnx"), found)
-
-
-def test_comparisons_see_a_mask_that_is_not_used_and_a_number_that_is_none():
-    policy, env, step = made("masked")
-
-    def unmasked(inputs):
-        obs, mask, *others = inputs
-        return step(obs, torch.ones_like(mask), *others)
-
-    def broken(inputs):
-        return [leaf / 0 if leaf.is_floating_point() else leaf for leaf in step(*inputs)]
-
-    for run in unmasked, broken:
-        found = runtimes.compare(step, run, policy, env, n_steps=20)
-        with pytest.raises(UserError, match="acts otherwise than its policy"):
-            runtimes.check(Path("x.onnx"), found)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,6 @@ from scripts import check_homes, make_homes
 matplotlib.use("Agg")
 
 COMB = np.array([[[1, y], [4, y]] for y in np.arange(1.2, 4.3, 0.2)], np.float32)
-L_SHAPE = [(0, 0, 400, 600), (400, 0, 700, 250)]  # centimetres
 
 
 @pytest.fixture(scope="module")

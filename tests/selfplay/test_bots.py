@@ -21,7 +21,7 @@ from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.agents.selfplay.bots.seekers import Mapper, Oracle, Wanderer
 from megastep.agents.selfplay.bots.walker import Walker
 from megastep.arrdict import arrdict
-from megastep.geometries import memory_mazes, sample
+from megastep.geometries import sample
 from megastep.modules.spawning import distances
 from tests.helpers.games import Matrix
 
@@ -57,19 +57,6 @@ def test_walker_reaches_goals(settings, device):
     assert metrics.spl.mean() >= 0.9
 
 
-def test_walker_without_goals_walks_to_random_places(device):
-    env = envs.Deathmatch(8, DENSE, n_agents=2, device=device)
-    bot, metres = Walker(env), 0.0
-    world, state = env.reset(), bot.initial(16, device)
-    first = state["target"]
-    for _ in range(100):
-        decision, state = bot(world, state, generator=torch.Generator(device).manual_seed(1))
-        world = env.step(decision)
-        metres += env.core.agents.velocity.norm(dim=-1).mean() / env.fps
-    assert metres > 5  # in 10 s
-    assert (state["target"] != first).float().mean() > 0.5
-
-
 def test_explorer_sees_more_than_random_actions(device):
     env = envs.Explorer(16, HOMES, patience=10_000, device=device)
     seen = {}
@@ -77,20 +64,6 @@ def test_explorer_sees_more_than_random_actions(device):
         play(env, bot, 200)
         seen[name] = float(env.n_seen.float().mean())
     assert seen["explorer"] > 1.5 * seen["random"], seen
-
-
-def test_explorer_begins_anew_in_another_home(device):
-    """The floor seen is that of the episode, also where the next episode is in another home."""
-    env = envs.Explorer(8, [HOMES[0], DENSE[1]], patience=20, resample=True, device=device)
-    bot, world = Explorer(env), env.reset()
-    state = bot.initial(8, device)
-    for _ in range(600):
-        before = state["seen"].sum(1)
-        decision, state = bot(world, state)
-        if world.reset.any() and (before[world.reset] > 20).all():
-            break
-        world = env.step(decision)
-    assert (state["seen"].sum(1)[world.reset] < before[world.reset]).all()
 
 
 def test_hunter_turns_to_an_agent_and_kills_it(device):
@@ -116,41 +89,6 @@ def test_an_oracle_finds_an_object_every_few_seconds(device):
     env = envs.Memory(8, sample("memory_maze", 8, split="test"), device=device, res=8, subsample=1)
     play(env, Oracle(env), 150)
     assert env.found.float().mean() > 3 and env.found.min() > 0
-
-
-@pytest.mark.parametrize(
-    "maze, pose, velocity, goal",
-    [
-        pytest.param(4736, (3.94, 6.524, 146.26), (0.0, 0.0), (3.122, 3.81), id="at-a-corner"),
-        pytest.param(4627, (7.785, 5.572, 27.8), (0.24, 0.12), (5.967, 4.749), id="at-a-wall"),
-        pytest.param(4788, (9.277, 6.994, 30.3), (-0.19, 0.32), (2.289, 2.446), id="two-ways"),
-    ],
-)
-def test_an_oracle_neither_stands_nor_walks_to_and_fro(maze, pose, velocity, goal, device):
-    """Where none of its pushes brings it on, or two ways are about as long."""
-    mazes = [memory_mazes.generate(maze, size=15)]
-    env = envs.Memory(1, mazes, device=device, objects=2, res=8, subsample=1)
-    bot, world, agents = Oracle(env), env.reset(), env.core.agents
-    state = bot.initial(1, device)
-    agents.positions[0, 0] = torch.tensor(pose[:2])
-    agents.angles[0, 0] = pose[2]
-    agents.velocity[0, 0] = torch.tensor(velocity)
-    env.cue[0], env.objects.all.positions[0, 0] = 0, torch.tensor(goal)
-    for _ in range(200):
-        decision, state = bot(world, state)
-        world = env.step(decision)
-        if env.found.any():
-            break
-    assert env.found.any()
-
-
-def test_a_mapper_explores_until_it_has_found():
-    """In each of 24 mazes. Places that it took for seen, although it had not been there, made it
-    turn where it stood in every fifth maze.
-    """
-    env = envs.Memory(24, sample("memory_maze", 24, split="test"), device="cpu", res=8, subsample=1)
-    play(env, Mapper(env), 350)
-    assert env.found.min() > 0
 
 
 @pytest.mark.nightly
@@ -189,18 +127,6 @@ def test_bots_play_alike_in_some_lanes(device):
     for kind in (Explorer, Hunter):
         bot = kind(env)
         decision, state, world = play(env, bot, 20)
-        all_decided, _ = bot(world, state)
-        some = [part.map(lambda leaf: leaf[lanes]) for part in (world, state)]
-        some_decided, _ = bot.in_lanes(lanes)(*some)
-        assert (some_decided.actions == all_decided.actions[lanes]).all()
-
-
-def test_seekers_play_alike_in_some_lanes():
-    env = envs.Memory(6, sample("memory_maze", 3), device="cpu", res=8, subsample=1)
-    lanes = torch.tensor([5, 0, 3])
-    for kind in (Oracle, Mapper):
-        bot = kind(env)
-        decision, state, world = play(env, bot, 10)
         all_decided, _ = bot(world, state)
         some = [part.map(lambda leaf: leaf[lanes]) for part in (world, state)]
         some_decided, _ = bot.in_lanes(lanes)(*some)

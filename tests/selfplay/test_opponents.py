@@ -114,16 +114,6 @@ def test_opponents_satisfy_the_contract(n_agents):
     assert counts.sum() == env.n_opposed and counts.max() - counts.min() <= 3
 
 
-def test_actions_given_for_opponents_are_ignored():
-    env = make_opponents(bot=1.0, past=0.0)
-    env.reset()
-    decision = arrdict(actions=torch.ones(32, 1, dtype=torch.int64))
-    env.step(decision)
-    assert torch.equal(env.env.played[-1].flatten() == 1, env.learners)
-    assert (env.env.played[-1].flatten()[~env.learners] == 2).all()
-    assert (decision.actions == 1).all(), "the decision is not changed"
-
-
 def test_snapshots_act_in_their_own_lanes_with_their_own_hidden_state():
     """Of two snapshots, one always chooses 0 and the other always 1."""
     env = make_opponents(past=1.0, bot=0.0)
@@ -213,17 +203,6 @@ class Rigged(Matrix):
         return arrdict(world, learns=self.mask) if self.shows else world
 
 
-def test_policy_learner_and_opponents_draw_different_numbers_from_one_seed():
-    def draws(seed):
-        policy = policy_of(Matrix(16), seed)
-        parts = policy, PPO(policy, seed=seed), make_opponents(policy=policy, seed=seed)
-        return [
-            torch.rand(3, generator=part.generator.on(policy.device)).tolist() for part in parts
-        ]
-
-    assert draws(5) == draws(5) and len(set(map(tuple, draws(5) + draws(6)))) == 6
-
-
 @pytest.mark.parametrize("other", [0.0, 7.0, -1e6])
 def test_update_does_not_depend_on_opponents_rewards(tmp_path, other):
     weights = []
@@ -249,40 +228,6 @@ def test_lanes_with_learns_false_are_not_learned_from(shows):
         learner.update(learner.collector(env)())
         weights.append(copied(learner.policy))
     assert same(*weights) == shows
-
-
-def test_only_learning_lanes_are_stored_and_counted(tmp_path):
-    run = trainer_of(
-        tmp_path, Matrix(16), 3 * 4 * 20, past=0.5, bot=0.25, scripted=High(), snapshots=2
-    )
-    run.train()
-    assert run.rollout.n_lanes == 2 * 4 + 12 and run.samples == 3 * 4 * 20
-    stored = run.rollout.learners.nonzero()[:, 0]
-    slot = run.rollout.obs[0, :, 0].argmax(1)
-    assert torch.equal(slot, stored % 2)
-    played = torch.stack(run.env.env.played[-4:]).flatten(1)
-    assert torch.equal(run.rollout.actions[:, :, 0], played[:, stored])
-
-
-def test_without_opponents_every_lane_is_stored():
-    env = Matrix(4)
-    rollout = PPO(policy_of(env)).collector(env).rollout
-    assert rollout.learners is None and rollout.n_lanes == 8
-    world = env.reset()
-    assert rollout.select_lanes(world) is world and rollout.scatter_actions(world.obs) is world.obs
-
-
-def test_nonfinite_number_is_named_by_its_lane_in_the_environment(tmp_path):
-    env = Rigged(16)
-    run = trainer_of(tmp_path, env, 0, past=0.0, bot=1.0, scripted=High())
-    lane = int(run.env.learners.nonzero()[-1, 0])
-    env.mask = torch.ones(32, dtype=torch.bool)
-    env.scored = lambda reward: reward.index_fill(0, torch.tensor(lane), torch.nan)
-    run.update()
-    with pytest.warns(
-        UserWarning, match=rf"reward of lane {lane} \(environment {lane // 2}\) was nan"
-    ):
-        run.nonfinite_guard.check(run.rollout)
 
 
 @pytest.mark.parametrize(
@@ -330,30 +275,6 @@ def test_refresh_replaces_the_oldest_snapshot_in_place():
         for snapshot, weights in zip(pool.snapshots, expected, strict=True):
             assert same(snapshot.state_dict(), weights), updates
     assert addresses() == first_addresses
-
-
-def test_refresh_clears_the_hidden_state_of_that_snapshot_only():
-    env = Matrix(16)
-    policy = policy_of(env)
-    pool = make_opponents(env=env, policy=policy, every=1)
-    pool.reset()
-    pool.step(arrdict(actions=torch.zeros(32, 1, dtype=torch.int64)))
-    pool.refresh_snapshots(policy, 1)
-    assert not pool.hidden_state["0"].cell.any() and pool.hidden_state["1"].cell.any()
-
-
-def test_actor_is_the_policy_without_critic_and_gradients():
-    env = Matrix(4)
-    policy = policy_of(env, critic="asymmetric")
-    actor = policy.actor()
-    assert actor.critic is None and not any(p.requires_grad for p in actor.parameters())
-    assert all(p.requires_grad for p in policy.parameters()) and policy.critic is not None
-    world, generator = env.reset(), torch.Generator()
-    ours, theirs = (
-        player(world, player.initial(8), generator=generator.manual_seed(1))[0]
-        for player in (policy, actor)
-    )
-    assert torch.equal(ours.logits, theirs.logits) and torch.equal(ours.actions, theirs.actions)
 
 
 # ---- Wins ----
@@ -422,15 +343,6 @@ def test_win_rates_by_kind_of_opponent(mortal):
     assert win_rates["episode/won/bot"] == 0.0 and env.pop_win_rates() == {}
 
 
-def test_wins_are_decided_by_the_return_of_one_episode():
-    """Two games are lost and the third is won, although the sum over all three is negative."""
-    env = make_opponents(4, bot=1.0, past=0.0, scripted=Middle())
-    env.reset()
-    for action in (0, 0, 0, 0, 2):  # every second step is the reset after an end
-        env.step(arrdict(actions=torch.full((8, 1), action)))
-    assert env.pop_win_rates() == {"episode/won/bot": pytest.approx(1 / 3)}
-
-
 def test_reset_forgets_the_returns_of_unfinished_episodes():
     """The learning agents earn 9 or more in a step that ends nothing, and lose after a reset."""
     env = make_opponents(env=Rigged(4), bot=1.0, past=0.0, scripted=Middle())
@@ -458,14 +370,3 @@ def test_state_is_whole():
     assert same(other.snapshots[1].state_dict(), env.snapshots[1].state_dict())
     with pytest.raises(ValueError, match="have 2 snapshots, these have 3"):
         make_opponents(snapshots=3).load_state_dict(env.state_dict())
-
-
-def test_means_by_role_and_matchup(tmp_path):
-    env = Matrix(16, roles=("left", "right"))
-    run = trainer_of(tmp_path, env, 4 * 4 * 20, past=0.5, bot=0.25, scripted=High(), snapshots=2)
-    run.train()
-    row = run.rows[0]
-    for name in ("left", "right", "now", "past", "bot"):
-        assert row[f"episode/points/{name}"] == row[f"episode/return/{name}"]
-    assert row["episode/return/bot"] == -1, "the bot always chooses the highest number"
-    assert row["episode/return/now"] == pytest.approx(0, abs=1e-9)

@@ -77,37 +77,11 @@ def test_bot_gets_the_settings_its_constructor_takes(here):
     assert evaluate.main([f"run={folder}", "against=bot", "episodes=2", "device=cpu"]) == 0
 
 
-def test_run_without_opponents_has_none_of_their_state_or_metrics(here):
-    folder = train.run(configured(f"samples={2 * UPDATE}", tiny=[*PONG, "env.limit=5"]))
-    rows = json_lines.read(folder / "metrics.jsonl")
-    assert rows[-1]["samples"] == 2 * UPDATE and "episode/return/left" in rows[-1]
-    matchups = "/now", "/past", "/bot"
-    assert not any(name.endswith(matchups) or name.startswith("episode/won") for name in rows[-1])
-    assert "opponents" not in checkpoint.load_latest(folder / "checkpoints").state
-
-
 def test_init_weights_are_the_first_snapshots(here):
     first = train.run(configured(f"samples={UPDATE}", tiny=PONG))
     second = train.run(configured(f"init={first}", f"samples={OPPOSED_UPDATE}", tiny=OPPOSED))
     weights = checkpoint.load_latest(first / "checkpoints").state["policy"]
     assert all(same(snapshot, weights) for snapshot in saved_snapshots(second).values())
-
-
-def test_snapshot_works_with_init_and_not_with_resume(here, capsys):
-    folder = train.run(configured(f"samples={2 * UPDATE}", "checkpoints.snapshots=1", tiny=PONG))
-    snapshot = folder / "snapshots" / f"step_{2 * UPDATE}"
-    train.run(configured(f"init={snapshot}", f"samples={UPDATE}", tiny=PONG))
-    assert train.main([f"resume={snapshot}", "samples=1e6"]) == 2
-    error = capsys.readouterr().err
-    assert "is a snapshot" in error and "init=" in error
-
-
-def test_snapshots_of_a_resumed_run_are_spaced_over_its_new_budget(here):
-    """At the resume after four updates, half of the new budget of seven is spent."""
-    folder = train.run(configured(f"samples={4 * UPDATE}", "checkpoints.snapshots=2", tiny=PONG))
-    train.run(configured(f"resume={folder}", f"samples={7 * UPDATE}", tiny=[]))
-    names = {path.name for path in (folder / "snapshots").iterdir()}
-    assert names == {f"step_{n * UPDATE}" for n in (2, 4, 7)}
 
 
 class NeedsRgb(Always):
