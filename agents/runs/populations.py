@@ -2,14 +2,15 @@
 `population.jsonl`, with a line for each member of each generation.
 """
 
+import contextlib
 import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
 
-from megastep.agents.errors import UserError
-from megastep.agents.runs import checkpoint, json_lines, scores
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.runs import checkpoint, json_lines, scores, typed_json
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 FILE, PREFIX, KEY = "population.jsonl", "member-", "settings/"
 #: What `population.score` may be beside the name of an episode statistic.
 RUNNING, EVALUATED = "running", "evaluated"
+INIT = "init=RUN starts a new run from the best member's weights"
 
 
 def folder_of(root: Path, member: int) -> Path:
@@ -46,20 +48,18 @@ def score_of(folder: Path, ranked_by: str = RUNNING) -> float | None:
     return evaluated[-1] if evaluated else scores.mean(rows)
 
 
-def _ranked_by(root) -> str:
-    """Returns the `population.score` of a population."""
-    try:
-        config = yaml.safe_load((folder_of(root, 0) / "config.yaml").read_text("utf-8"))
-        return config["population"]["score"]
-    except (OSError, yaml.YAMLError, KeyError, TypeError):
-        return RUNNING
-
-
 def best(root: Path) -> int:
     """Returns the number of the member with the highest score, the first of equal ones."""
-    ranked_by = _ranked_by(root)
-    found = [score_of(folder, ranked_by) for folder in members(root)]
-    return max(range(len(found)), key=lambda n: (-1e400 if found[n] is None else found[n], -n))
+    ranked_by = RUNNING
+    with contextlib.suppress(OSError, yaml.YAMLError, KeyError, TypeError):
+        config = yaml.safe_load((folder_of(root, 0) / "config.yaml").read_text("utf-8"))
+        ranked_by = config["population"]["score"]
+    return _highest([score_of(folder, ranked_by) for folder in members(root)])
+
+
+def _highest(scores_of) -> int:
+    values = [-1e400 if score is None else score for score in scores_of]
+    return values.index(max(values))
 
 
 def member(root: Path, which: "int | str" = "best") -> Path:
@@ -88,51 +88,42 @@ def common_checkpoints(root: Path) -> list[Path]:
     for folder in members(root):
         paths = checkpoint.list_checkpoints(folder / "checkpoints")
         by_step.append({checkpoint.step_of(path): path for path in paths})
-    steps = set.intersection(*map(set, by_step))
-    for step in sorted(steps, reverse=True):
+    for step in sorted(set.intersection(*map(set, by_step)), reverse=True):
         paths = [paths[step] for paths in by_step]
         if all(map(checkpoint.is_intact, paths)):
             return paths
     raise UserError(
         f"{root} cannot be resumed: its members have no intact checkpoint after the same number "
-        "of samples; init=RUN starts a new run from the best member's weights"
+        f"of samples; {INIT}"
     )
 
 
 def read(path: Path) -> "list[list[Row]]":
     """Returns the rows of `population.jsonl`, a list for each generation, each in the order of
     members.
+
+    Raises:
+        UserError: the file cannot be read, or holds something else.
     """
-    rows = json_lines.read(path)
-    return [[*group] for _, group in itertools.groupby(rows, lambda row: row["generation"])]
+    with user_errors(f"{path} does not hold the generations of a population; {INIT}: "):
+        rows = json_lines.read(path)
+        typed_json.check(typed_json.Generations, rows)
+        return [[*group] for _, group in itertools.groupby(rows, lambda row: row["generation"])]
 
 
 def samples_of_generations(path: Path) -> set[int]:
-    """Returns the samples of each member after which it may have copied another.
-
-    Raises:
-        UserError: the file holds no generations.
-    """
-    try:
-        first, *others = read(path)
-        return {int(rows[0]["samples"]) for rows in others}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"{path} does not hold the generations of its population ({error}), so it cannot be "
-            "repeated; init=RUN starts a new run from the best member's weights"
-        ) from None
+    """Returns the samples of each member after which it may have copied another. Raises as `read`."""
+    return {rows[0]["samples"] for rows in read(path)[1:]}
 
 
 def first_copy(folder: Path) -> int | None:
     """Returns the generation in which a member first copied another; None if it never did, or if
     no file says so.
     """
-    try:
+    with contextlib.suppress(UserError, ValueError, IndexError):
         number = int(folder.name.removeprefix(PREFIX))
         rows = [rows[number] for rows in read(folder.parent / FILE)]
-        return next((int(row["generation"]) for row in rows if row["from"] != row["member"]), None)
-    except (OSError, ValueError, KeyError, IndexError, TypeError):
-        return None
+        return next((row["generation"] for row in rows if row["from"] != row["member"]), None)
 
 
 def settings_of(row: "Row") -> dict[str, float]:
@@ -144,30 +135,19 @@ def lineage(generations: "list[list[Row]]", member: int) -> list[int]:
     """Returns the ancestor of a member after each generation, up to itself after the last."""
     line = [member]
     for rows in reversed(generations[1:]):
-        line.append(int(rows[line[-1]]["from"]))
+        line.append(rows[line[-1]]["from"])
     return line[::-1]
 
 
 def schedule(path: Path) -> list[tuple[int, dict[str, float]]]:
     """Returns the settings of the best member and its ancestors over time: (samples, settings).
-
-    Raises:
-        UserError: the file holds no generations.
+    Raises as `read`.
     """
-    try:
-        generations = read(path)
-        scored = [row.get("score") for row in generations[-1]] if generations else []
-        if not scored:
-            raise ValueError("it has no generation")
-        at_end = [-1e400 if score is None else score for score in scored]
-        rows = generations[-1]
-        # who copies at the last generation is judged by the one that it copies
-        ends = [at_end[int(row["from"])] for row in rows]
-        line = lineage(generations, ends.index(max(ends)))
-        return [
-            (int(rows[n]["samples"]), settings_of(rows[n])) for rows, n in zip(generations, line)
-        ]
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise UserError(
-            f"{path} holds no settings over time ({error}); give the {FILE} of a population"
-        ) from None
+    generations = read(path)
+    if not generations:
+        raise UserError(f"{path} has no generation; give the {FILE} of a population")
+    last = generations[-1]
+    # who copies at the last generation is judged by the one that it copies
+    line = lineage(generations, _highest([last[row["from"]].get("score") for row in last]))
+    rows = [rows[n] for rows, n in zip(generations, line)]
+    return [(row["samples"], settings_of(row)) for row in rows]

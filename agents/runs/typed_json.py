@@ -89,6 +89,17 @@ class Row(_Model):
     samples: _Count
 
 
+class _Generation(_Model):
+    samples: _Count
+    generation: _Count
+    member: _Count
+    source: Annotated[_Count, Field(alias="from")]
+
+
+class Generations(pydantic.RootModel[list[_Generation]]):
+    """The lines of a population's members."""
+
+
 def dumps(value: Any, indent: int | None = None) -> str:
     """Returns nested dicts and lists of strings, numbers, true, false and None as text."""
     return json.dumps(encoded(value), indent=indent, allow_nan=False)
