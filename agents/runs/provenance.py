@@ -76,23 +76,15 @@ def commit(folder: Path) -> str | None:
     """Returns the commit of the git checkout at a folder, with `-dirty` if tracked files have
     changed; None without a checkout or git.
     """
-
-    def git(*words) -> str:
-        command = ["git", "-C", str(folder), *words]
-        # ignore a git hook's variables, if one starts this; take no lock in the user's checkout
-        env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
-        env["GIT_OPTIONAL_LOCKS"] = "0"
-        options: dict = dict(stdin=subprocess.DEVNULL, timeout=GIT_TIMEOUT, env=env)
-        result = subprocess.run(command, capture_output=True, check=True, text=True, **options)
-        return result.stdout.strip()
-
-    try:
-        # megastep may be installed inside another project's checkout
-        if Path(git("rev-parse", "--show-toplevel")).resolve() != folder.resolve():
-            return None
-        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-    except (OSError, ValueError, subprocess.SubprocessError):
+    # ignore a git hook's variables, if one starts this; take no lock in the user's checkout
+    env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
+    options: dict = dict(timeout=GIT_TIMEOUT, text=True, env={**env, "GIT_OPTIONAL_LOCKS": "0"})
+    options |= dict(stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    words = "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"
+    if not (folder / ".git").exists():  # megastep may be installed inside another's checkout
         return None
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        return subprocess.check_output(["git", "-C", str(folder), *words], **options).strip()
 
 
 def device_name(device: torch.device) -> str:
