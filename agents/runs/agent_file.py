@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from megastep.agents.types import Config, Row
 
 SUFFIX, FORMAT = ".safetensors", "2"
-#: The models of the texts in the header.
-MODELS = {
+#: The kinds of the texts in the header.
+KINDS = {
     "config": typed_json.Config,
     "facts": typed_json.Facts,
-    "tables": typed_json.Tables,
+    "tables": list[typed_json.Table],
     "wrappers": None,
 }
 #: The digest in a header. Texts in the header have their quotes escaped.
@@ -129,7 +129,7 @@ def read_metadata(path: Path) -> Row:
         if (version := texts.get("format")) == FORMAT:
             if (content := path.read_bytes()) != sealed(content):
                 raise ValueError("its bytes do not match their SHA-256")
-            return {name: typed_json.loads(texts[name], model) for name, model in MODELS.items()}
+            return {name: typed_json.loads(texts[name], kind) for name, kind in KINDS.items()}
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({shortened(error)})") from None
     except (safetensors.SafetensorError, ValueError, KeyError) as error:

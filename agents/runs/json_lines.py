@@ -66,7 +66,9 @@ def _intact_lines(path: Path) -> "list[tuple[Row, bytes]]":
     intact, damaged, lines = [], [], path.read_bytes().split(b"\n")
     for number, line in enumerate(lines, 1):
         try:
-            intact.append((typed_json.loads(line, typed_json.Row), line))
+            row = typed_json.loads(line, typed_json.Row)
+            typed_json.check(int, row.get("samples"))
+            intact.append((row, line))
         except ValueError:
             damaged.append(str(number))
     if damaged := [number for number in damaged if number != str(len(lines))]:

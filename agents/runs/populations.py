@@ -107,12 +107,12 @@ def read(path: Path) -> "list[list[Row]]":
     """
     with user_errors(f"{path} does not hold the generations of a population; {INIT}: "):
         rows = json_lines.read(path)
-        typed_json.check(typed_json.Generations, rows)
+        typed_json.check(list[typed_json.Generation], rows)
         return [[*group] for _, group in itertools.groupby(rows, lambda row: row["generation"])]
 
 
 def samples_of_generations(path: Path) -> set[int]:
-    """Returns the samples of each member after which it may have copied another. Raises as `read`."""
+    """Returns the samples of each member after which it may copy another. Raises as `read`."""
     return {rows[0]["samples"] for rows in read(path)[1:]}
 
 

@@ -1,4 +1,4 @@
-"""The reader of strings and numbers in the files of a run: JSON, checked against a pydantic model.
+"""The reader of strings and numbers in the files of a run: JSON, checked against types.
 
 The JSON can also hold infinity, NaN, and dicts with keys other than strings:
 
@@ -6,98 +6,78 @@ The JSON can also hold infinity, NaN, and dicts with keys other than strings:
     {"cap": {"$float": "inf"}, "prices": {"$dict": [[0, 1.0]]}}
 """
 
+import functools
 import json
 import math
 from typing import Annotated, Any
 
 import pydantic
-from pydantic import ConfigDict, Field
+from pydantic import Field
+from typing_extensions import TypedDict
 
 from megastep.agents.errors import shortened
 
 FLOAT, DICT = "$float", "$dict"
 _Count = Annotated[int, Field(ge=0, lt=2**63)]
 _Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_Name = Annotated[str, Field(pattern=r"^((state|world|replay|rank[1-9]\d*)\.pt|config\.json)$")]
+_File = Annotated[str, Field(pattern=r"^((state|world|replay|rank[1-9]\d*)\.pt|config\.json)$")]
 
 
-class _Model(pydantic.BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
+#: A line of metrics.
+Row = dict[str, bool | int | float | str | None]
 
 
-class _Numbers(_Model):
-    __pydantic_extra__: dict[str, bool | int | float]
-    samples: _Count = 0
-    updates: _Count = 0
-    seconds: _Number = 0.0
-
-
-class _File(_Model):
+class _Entry(TypedDict):
     sha256: str
     bytes: _Count
 
 
-class Manifest(_Model):
-    """manifest.json of a checkpoint. Snapshots, which hold weights alone, have no numbers."""
+class Manifest(TypedDict):
+    """manifest.json of a checkpoint."""
 
     step: _Count
     score: float | None
-    numbers: _Numbers
-    files: dict[_Name, _File]
-    made_with: dict[str, str | int | float | None]
+    numbers: dict[str, bool | int | _Number]
+    files: dict[_File, _Entry]
+    made_with: Row
 
 
-class _Member(_Model):
+class _Member(TypedDict):
     name: str
 
 
-class _Trained(_Model):
+class _Train(TypedDict):
     env: _Member
     geometry: _Member
     learner: _Member
     agent: dict[str, Any]
 
 
-class Config(_Model):
+class Config(TypedDict):
     """config.json of a checkpoint. Each setting is checked when it is used."""
 
-    train: _Trained
+    train: _Train
     spaces: dict[str, str]
 
 
-class Facts(_Model):
+class Facts(TypedDict):
     """How the agent in an agent file was trained."""
 
-    __pydantic_extra__: dict[str, str | int | float | None | list[str]]
     samples: _Count
 
 
-class _Table(_Model):
+class Table(TypedDict):
+    """An evaluation in an agent file."""
+
     title: str
     command: str
     rows: list[dict[str, Any]]
 
 
-class Tables(pydantic.RootModel[list[_Table]]):
-    """The evaluations in an agent file."""
-
-
-class Row(_Model):
-    """A line of metrics."""
-
-    __pydantic_extra__: dict[str, bool | int | float | str | None]
-    samples: _Count
-
-
-class _Generation(_Model):
-    samples: _Count
-    generation: _Count
-    member: _Count
-    source: Annotated[_Count, Field(alias="from")]
-
-
-class Generations(pydantic.RootModel[list[_Generation]]):
-    """The lines of a population's members."""
+#: A line about a member of a population.
+Generation = TypedDict(
+    "Generation", {"samples": _Count, "generation": _Count, "member": _Count, "from": _Count}
+)
 
 
 def dumps(value: Any, indent: int | None = None) -> str:
@@ -105,32 +85,37 @@ def dumps(value: Any, indent: int | None = None) -> str:
     return json.dumps(encoded(value), indent=indent, allow_nan=False)
 
 
-def loads(text: str | bytes, model: type[pydantic.BaseModel] | None = None) -> Any:
+def loads(text: str | bytes, kind: object = None) -> Any:
     """The inverse of `dumps`.
 
+    Args:
+        kind: what the value must be, such as `Manifest`; None for anything. Keys of which a kind
+            says nothing may be there.
+
     Raises:
-        ValueError: `dumps` cannot have written the text; or the value does not fit the model, with
-            the first wrong key.
+        ValueError: `dumps` cannot have written the text; or the value is of another kind, with the
+            first wrong key.
     """
     try:
         value = json.loads(text, object_hook=_decoded)
     except RecursionError:
         raise ValueError("it is too deeply nested") from None
-    if model is not None:
-        check(model, value)
+    if kind is not None:
+        check(kind, value)
     return value
 
 
-def check(model: type[pydantic.BaseModel], value: object) -> None:
-    """Raises ValueError, with the first wrong key, for a value that does not fit a model. Keys that
-    the model does not list may be there.
-    """
+def check(kind: object, value: object) -> None:
+    """Raises ValueError, with the first wrong key, for a value of another kind."""
     try:
-        model.model_validate(value)
+        _adapter(kind).validate_python(value, strict=True)
     except pydantic.ValidationError as error:
         line = error.errors(include_url=False, include_input=False)[0]
         name = shortened(".".join(map(str, line["loc"])) or "it", 60)
         raise ValueError(f"{name}: {shortened(line['msg'])}") from None
+
+
+_adapter = functools.cache(pydantic.TypeAdapter)
 
 
 def encoded(value: Any) -> Any:
