@@ -10,7 +10,7 @@ from pathlib import Path
 from megastep import engine
 from megastep.agents.errors import EnvFailed, UserError, memory_problem
 from megastep.agents.factory.settings import Env
-from megastep.hosting.errors import BadValue, EnvError, one_line
+from megastep.hosting.env_error import BadValue, EnvError, one_line
 from megastep.imports import import_object
 
 #: Has the traceback, in the run's folder.

@@ -12,21 +12,21 @@ from typing import TYPE_CHECKING
 from megastep.envs import ENVS
 
 if TYPE_CHECKING:
-    from megastep.adapters.gymnasium import SingleEnv as SingleEnv
-    from megastep.adapters.gymnasium import VectorEnv as VectorEnv
-    from megastep.adapters.pettingzoo import ParallelEnv as ParallelEnv
+    from megastep.adapters.parallel_env import ParallelEnv as ParallelEnv
     from megastep.adapters.rsl_rl import RslRlVecEnv as RslRlVecEnv
     from megastep.adapters.sb3 import SB3VecEnv as SB3VecEnv
     from megastep.adapters.torchrl import TorchRLEnv as TorchRLEnv
+    from megastep.adapters.vector_env import SingleEnv as SingleEnv
+    from megastep.adapters.vector_env import VectorEnv as VectorEnv
 
-#: The module of each name, which is its extra too, with hyphens: older pips find no other.
+#: The module and the extra of each name; extras with hyphens: older pips find no other.
 _MODULES = {
-    "SingleEnv": "gymnasium",
-    "VectorEnv": "gymnasium",
-    "ParallelEnv": "pettingzoo",
-    "RslRlVecEnv": "rsl_rl",
-    "SB3VecEnv": "sb3",
-    "TorchRLEnv": "torchrl",
+    "SingleEnv": ("vector_env", "gymnasium"),
+    "VectorEnv": ("vector_env", "gymnasium"),
+    "ParallelEnv": ("parallel_env", "pettingzoo"),
+    "RslRlVecEnv": ("rsl_rl", "rsl-rl"),
+    "SB3VecEnv": ("sb3", "sb3"),
+    "TorchRLEnv": ("torchrl", "torchrl"),
 }
 #: The environments by their ids in Gymnasium; those of other packages have ids already.
 IDS = {
@@ -39,7 +39,7 @@ IDS = {
 def __getattr__(name) -> object:
     if name not in _MODULES:
         raise AttributeError(f"megastep.adapters has no {name}; it has {', '.join(_MODULES)}")
-    module = _MODULES[name]
+    module, extra = _MODULES[name]
     try:
         return getattr(importlib.import_module(f"{__name__}.{module}"), name)
     except ModuleNotFoundError as error:
@@ -47,7 +47,7 @@ def __getattr__(name) -> object:
             raise
         raise ImportError(
             f"megastep.adapters.{name} needs {error.name}, which is not installed: pip install "
-            f"'megastep-flatland[{module.replace('_', '-')}]'"
+            f"'megastep-flatland[{extra}]'"
         ) from None
 
 
@@ -60,7 +60,7 @@ if importlib.util.find_spec("gymnasium"):
         if _id not in gymnasium.registry:
             gymnasium.register(
                 _id,
-                entry_point="megastep.adapters.gymnasium:make_single",
-                vector_entry_point="megastep.adapters.gymnasium:make_vector",
+                entry_point="megastep.adapters.vector_env:make_single",
+                vector_entry_point="megastep.adapters.vector_env:make_vector",
                 kwargs=dict(name=_name),
             )

@@ -6,7 +6,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from megastep import spaces
-from megastep.adapters.lanes import Lanes
+from megastep.adapters.lane_steps import Lanes
 from megastep.types import Env, optional
 
 __all__ = ["RslRlVecEnv"]

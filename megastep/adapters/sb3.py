@@ -8,8 +8,14 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import VecEnv
 
-from megastep.adapters.lanes import Lanes
-from megastep.adapters.spaces import action_mask, gymnasium_space, row, to_numpy, without_agents
+from megastep.adapters.gymnasium_spaces import (
+    action_mask,
+    gymnasium_space,
+    row,
+    to_numpy,
+    without_agents,
+)
+from megastep.adapters.lane_steps import Lanes
 from megastep.types import Env, Tree, optional
 
 __all__ = ["SB3VecEnv"]

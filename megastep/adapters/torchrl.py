@@ -10,8 +10,8 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs import EnvBase
 
 from megastep import spaces
-from megastep.adapters.lanes import Lanes, ended, fresh
-from megastep.adapters.spaces import action_mask, without_agents
+from megastep.adapters.gymnasium_spaces import action_mask, without_agents
+from megastep.adapters.lane_steps import Lanes, ended, fresh
 from megastep.types import Env, Tree, optional
 
 __all__ = ["TorchRLEnv"]

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 
 from megastep.global_generators import KINDS, GlobalGenerators
-from megastep.hosting.errors import BadValue, EnvError
+from megastep.hosting.env_error import BadValue, EnvError
 from megastep.hosting.probe import TRUE_RETURN, Probe, RewardRecorder, numbers_of
 from megastep.hosting.values import CHECKED_STEPS, allowed_actions, problem
 from megastep.hosting.wrapper_state import give_state, load_wrapper_state, wrapper_state

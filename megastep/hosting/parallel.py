@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
-from megastep.hosting.errors import BadValue
+from megastep.hosting.env_error import BadValue
 from megastep.hosting.guard import close_all
 from megastep.hosting.probe import Probe, play_parallel, probe
 from megastep.hosting.values import CHECKED_STEPS, allowed_actions, masked_actions, problem

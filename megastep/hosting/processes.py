@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium.vector.utils import create_empty_array
 
 from megastep import workers
-from megastep.hosting.errors import EnvError
+from megastep.hosting.env_error import EnvError
 from megastep.hosting.guard import HostedEnvs, start_rendering
 from megastep.hosting.probe import Probe, probe
 from megastep.types import Tree

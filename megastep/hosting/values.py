@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from megastep.hosting.errors import BadValue, one_line
+from megastep.hosting.env_error import BadValue, one_line
 from megastep.types import Space, Tree
 
 __all__ = ["CHECKED_STEPS", "allowed_actions", "beyond_bounds", "masked_actions", "problem"]

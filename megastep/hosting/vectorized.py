@@ -19,7 +19,7 @@ from megastep.dotdict import leaves
 from megastep.env_state import EnvState
 from megastep.hosting.conversions import RESERVED as RESERVED_KEYS
 from megastep.hosting.conversions import actions, identifiers, observation
-from megastep.hosting.errors import BadValue, EnvError
+from megastep.hosting.env_error import BadValue, EnvError
 from megastep.types import Space, Tree
 
 __all__ = ["VectorizedEnv"]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from megastep import capture, contract, engine, spaces
-from megastep.adapters.lanes import Lanes
+from megastep.adapters.lane_steps import Lanes
 from megastep.arrdict import arrdict
 from tests.helpers import graphs_on_cpu
 

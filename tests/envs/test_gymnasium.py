@@ -16,7 +16,7 @@ from megastep.agents.storage.collector import Collector
 from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
 from megastep.envs import Gymnasium
-from megastep.hosting.errors import EnvError
+from megastep.hosting.env_error import EnvError
 
 gymnasium = pytest.importorskip("gymnasium")
 VECTORIZATIONS = "sync", "async", "own"

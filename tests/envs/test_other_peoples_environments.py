@@ -13,7 +13,7 @@ from megastep.env_state import EnvState
 
 gymnasium = pytest.importorskip("gymnasium")
 from megastep.envs import Gymnasium  # noqa: E402
-from megastep.hosting.errors import EnvError  # noqa: E402
+from megastep.hosting.env_error import EnvError  # noqa: E402
 from megastep.hosting.guard import HostedEnvs  # noqa: E402
 from megastep.hosting.probe import probe  # noqa: E402
 from megastep.hosting.vectorized import _as_frame as as_frame  # noqa: E402

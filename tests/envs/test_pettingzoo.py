@@ -16,7 +16,7 @@ from megastep.agents.evaluation import playing, statistics
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from megastep.envs import PettingZoo
-from megastep.hosting.errors import BadValue
+from megastep.hosting.env_error import BadValue
 
 spaces = pytest.importorskip("gymnasium.spaces")
 

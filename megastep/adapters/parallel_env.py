@@ -8,8 +8,7 @@ import numpy as np
 import pettingzoo
 import torch
 
-from megastep.adapters.lanes import Lanes
-from megastep.adapters.spaces import (
+from megastep.adapters.gymnasium_spaces import (
     action_mask,
     gymnasium_space,
     int8,
@@ -18,6 +17,7 @@ from megastep.adapters.spaces import (
     to_numpy,
     without_agents,
 )
+from megastep.adapters.lane_steps import Lanes
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
 

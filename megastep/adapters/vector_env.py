@@ -11,8 +11,7 @@ from gymnasium.vector.utils import batch_space
 from torch.utils import _pytree
 
 from megastep import envs
-from megastep.adapters.lanes import Copies, Lanes, ended, fresh
-from megastep.adapters.spaces import (
+from megastep.adapters.gymnasium_spaces import (
     action_mask,
     gymnasium_space,
     int8,
@@ -21,6 +20,7 @@ from megastep.adapters.spaces import (
     to_numpy,
     without_agents,
 )
+from megastep.adapters.lane_steps import Copies, Lanes, ended, fresh
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
 
