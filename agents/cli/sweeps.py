@@ -1,8 +1,8 @@
 """Sweeps are Hydra's own, with its launchers and sweepers. Added here: the check of all jobs before
 the first starts, the GPUs of each job, what a job returns, and the table of them all.
 
-The basic launcher's jobs run in this process. Each of joblib's has a process of its own, which no
-worker of joblib's is the parent of: if a worker is killed, joblib kills all others.
+The basic launcher's jobs run in this process, those of joblib in processes of their own, started by
+its workers: one that is killed for memory leaves the others.
 """
 
 import contextlib
@@ -24,7 +24,6 @@ import time
 import traceback
 import uuid
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
@@ -139,25 +138,12 @@ def sweep(composer: Composer, words: list[str]) -> int:
         )
     job, problem = new_job(composer, folder), ""
     try:
-        with _lock(job.path("sweep.lock")):
-            while True:
-                n_started = len(job.rows())
-                try:
-                    with signals.interrupting(job.interrupt):
-                        composer.call_hydra(["--multirun", *words], job)
-                    break
-                except Exception as error:  # a launcher's or a sweeper's
-                    problem = shortened(error, 400)
-                with signals.interrupting(job.interrupt):
-                    while job.running():
-                        time.sleep(0.2)
-                # if joblib lost a worker, it dropped the jobs of a grid that had not started
-                choices = config.runtime.choices
-                kinds = choices["hydra/sweeper"], choices["hydra/launcher"]
-                if kinds != ("basic", "joblib") or len(job.rows()) == n_started:
-                    break
+        with signals.interrupting(job.interrupt):
+            composer.call_hydra(["--multirun", *words], job)
+    except Exception as error:  # a launcher's or a sweeper's
+        problem = shortened(error, 400)
     finally:
-        if rows := job.rows():
+        if rows := job.ended_rows():
             report(folder, rows)
         elif is_new:
             shutil.rmtree(folder, ignore_errors=True)
@@ -172,12 +158,8 @@ def sweep(composer: Composer, words: list[str]) -> int:
 
 # ---- Jobs ----
 
-#: Runs a job in a process without a parent, before anything that could not be forked is imported.
-APART = """import os, sys
-os.fork() and os._exit(0)
-sys.path[:] = filter(None, sys.path)
-from megastep.agents.cli import sweeps
-sweeps.run_apart(*sys.argv[1:])"""
+#: Runs a job in a process of its own.
+ALONE = "import sys; from megastep.agents.cli import sweeps; sweeps.run_job(sys.argv[1])"
 
 
 def new_job(composer: Composer, folder: Path) -> "Job":
@@ -226,33 +208,28 @@ class Job:
         words += [word for word in hydra.overrides.hydra if "searchpath" in word]
         launcher = hydra.runtime.choices["hydra/launcher"]
         if self.path(f"{number}.json").exists():
-            # it started before joblib lost a worker, or a cluster starts it again
-            earlier = self.recorded(number)
-            is_over = launcher == "joblib" or earlier["state"] == DONE
-            row = earlier if is_over else self.run(row, words, is_again=True)
+            earlier = self.recorded(number)  # a cluster starts it again
+            row = earlier if earlier["state"] == DONE else self.run(row, words, is_again=True)
         elif launcher != "joblib":
             row = self.run(row, words)
         elif not self.path("stopped").exists():
-            row = self.start_apart(row, words)
+            row = self.run_alone(row, words)
         return row.get("score")
 
-    def start_apart(self, row: "Row", words: list[str]) -> "Row":
+    def run_alone(self, row: "Row", words: list[str]) -> "Row":
         """Runs a job in a process of its own. Returns what became of it."""
-        read, write = os.pipe()  # which closes when that process ends, however it does
-        job = json.dumps([dataclasses.asdict(self), row, words])
-        arguments = [sys.executable, "-c", APART, str(write), job]
         workers.end_with_parent(self.process)
-        with open(read, "rb") as pipe:
-            with open(write, "wb"):
-                subprocess.run(arguments, pass_fds=[write], check=True)
-            with workers.terminal_signals_blocked():
-                pipe.read()
-        if not self.path(f"{row['number']}.json").exists():  # it could not even say that it began
-            self.record(row)
-        row = self.recorded(row["number"])
-        if row["state"] == LOST:
+        self.record(row)
+        job = json.dumps([dataclasses.asdict(self), row, words])
+        process = subprocess.Popen([sys.executable, "-c", ALONE, job])
+        with workers.terminal_signals_blocked():
+            process.wait()
+        ended = self.recorded(row["number"])
+        if ended["state"] == RUNNING:
+            ended["state"] = LOST
+            self.record(ended)
             console.say(f"Job {row['number']} {LOST}", sys.stderr)
-        return row
+        return ended
 
     def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
         """Runs a job in this process. Returns what became of it.
@@ -275,36 +252,35 @@ class Job:
         if os.getpid() != self.process:  # its lines are among those of others
             warnings.showwarning, console.prefix = console.warn, f"job {number}: "
         row |= dict(host=socket.gethostname(), process=os.getpid())
-        with _lock(self.path(f"{number}.lock")):
+        self.record(row)
+        try:
+            with signals.interrupting():
+                composer = self.composer()
+                cfg = composer.settings(words)
+                cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
+                if is_again:  # not for evaluations, which begin again
+                    cfg = settings.changed(cfg, resume=AUTO)
+                grouped = {
+                    label: settings.changed(one, group=Path(self.folder).name)
+                    for label, one in getattr(cfg, "logger", {}).items()
+                    if getattr(one, "group", "") is None
+                }
+                cfg = settings.changed(cfg, logger=getattr(cfg, "logger", {}) | grouped)
+                with gpu_slots.taken(cfg) as cfg:
+                    result = composer.command.run(cfg)
+                row |= {"state": DONE, **(scores.outcome(result) if result else {})}
+        except signals.Interrupted as stop:
+            row["state"] = f"interrupted: {stop.args[1]}"
+            raise
+        except Exception as error:  # whatever it is, the other jobs are worth running
+            kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
+            row["state"] = f"FAILED: {kind}{shortened(error, 400)}"
+            console.say(f"Job {number} {row['state']}", sys.stderr)
+            os.makedirs(row["folder"], exist_ok=True)
+            Path(row["folder"], "error.txt").write_text(traceback.format_exc())
+        finally:
+            row["seconds"] = round(time.monotonic() - began, 1)
             self.record(row)
-            try:
-                with signals.interrupting():
-                    composer = self.composer()
-                    cfg = composer.settings(words)
-                    cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
-                    if is_again:  # not for evaluations, which begin again
-                        cfg = settings.changed(cfg, resume=AUTO)
-                    grouped = {
-                        label: settings.changed(one, group=Path(self.folder).name)
-                        for label, one in getattr(cfg, "logger", {}).items()
-                        if getattr(one, "group", "") is None
-                    }
-                    cfg = settings.changed(cfg, logger=getattr(cfg, "logger", {}) | grouped)
-                    with gpu_slots.taken(cfg) as cfg:
-                        result = composer.command.run(cfg)
-                    row |= {"state": DONE, **(scores.outcome(result) if result else {})}
-            except signals.Interrupted as stop:
-                row["state"] = f"interrupted: {stop.args[1]}"
-                raise
-            except Exception as error:  # whatever it is, the other jobs are worth running
-                kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
-                row["state"] = f"FAILED: {kind}{shortened(error, 400)}"
-                console.say(f"Job {number} {row['state']}", sys.stderr)
-                os.makedirs(row["folder"], exist_ok=True)
-                Path(row["folder"], "error.txt").write_text(traceback.format_exc())
-            finally:
-                row["seconds"] = round(time.monotonic() - began, 1)
-                self.record(row)
         if result and result.is_dir() and row["score"] is None:
             console.warn(f"job {number}: no episode finished, so it has no score; train longer")
         return row
@@ -324,11 +300,16 @@ class Job:
 
     def recorded(self, number: int) -> "Row":
         """Returns what became of a job."""
-        row = {"number": number, "varied": {}, "state": RUNNING}
-        with contextlib.suppress(OSError):  # of a process that ended before it wrote this
-            row = json.loads(self.path(f"{number}.json").read_text())
-        is_lost = row["state"] == RUNNING and not _is_locked(self.path(f"{number}.lock"))
-        return row | {"state": LOST} if is_lost else row
+        with contextlib.suppress(OSError):  # of a full disk
+            return json.loads(self.path(f"{number}.json").read_text())
+        return {"number": number, "varied": {}, "state": RUNNING}
+
+    def ended_rows(self) -> "list[Row]":
+        """Returns what the jobs recorded, once none runs: one that did not say how it ended is
+        lost.
+        """
+        rows = self.rows()
+        return [row | {"state": LOST} if row["state"] == RUNNING else row for row in rows]
 
     def rows(self) -> "list[Row]":
         """Returns what the jobs of this sweep recorded, in order."""
@@ -351,36 +332,16 @@ class Job:
         return [pid for pid in pids if pid != os.getpid()]
 
 
-def run_apart(pipe: str, text: str) -> None:
-    """Runs a job of `Job.start_apart`, and ends with the sweep."""
-    os.set_inheritable(int(pipe), False)
+def run_job(text: str) -> None:
+    """Runs a job of `Job.run_alone`, and ends with the process that started it."""
     fields, row, words = json.loads(text)
     job = Job(**fields)
     signals.exit_on_signals(job.source[0])
     console.open_streams()
     threading.excepthook = console.warn_of_thread
-    workers.end_with(lambda: _is_locked(job.path("sweep.lock")))
+    workers.end_with_parent(os.getppid())
     with contextlib.suppress(signals.Interrupted):
         job.run(row, words)
-
-
-@contextlib.contextmanager
-def _lock(path: Path) -> Iterator[None]:
-    """Holds a file's lock, which the system drops when this process ends."""
-    import filelock  # which takes a while
-
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # no locks, or a full disk: the work is worth more
-            stack.enter_context(filelock.FileLock(path, blocking=False))
-        yield
-
-
-def _is_locked(path: Path) -> bool:
-    import filelock
-
-    with contextlib.suppress(OSError), filelock.FileLock(path, blocking=False):
-        return False
-    return True
 
 
 # ---- The table ----

@@ -310,14 +310,8 @@ def test_job_that_ends_its_process_leaves_the_others(here):
     assert "job 1: Training on cpu in mine/1_env.mood=fine" in out
 
 
-def children(process):
-    """Returns the numbers of a process's children."""
-    text = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
-    return [int(pid) for pid in text.split()]
-
-
 @pytest.mark.nightly
-@pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
+@pytest.mark.parametrize("victim", ["job", "sweep"])
 def test_kill_9(here, victim):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = "seconds=8", "checkpoints.seconds=1", "env.mood=slow", "-m", "seed=1,2,3"
@@ -327,13 +321,13 @@ def test_kill_9(here, victim):
         return [json.loads(path.read_text()) for path in here.glob("mine/.jobs/*/*.json")]
 
     wait_until(lambda: n_learning(here) == 2, process)
-    pids = {"worker": children(process), "sweep": [process.pid]}
+    pids = {"sweep": [process.pid]}
     pids["job"] = [job["process"] for job in jobs()]
-    os.kill(pids[victim][-1], signal.SIGKILL)  # the first child is a tracker
+    os.kill(pids[victim][-1], signal.SIGKILL)
     if victim == "sweep":
         process.communicate(timeout=HUNG)
         deadline = time.monotonic() + 5
-        while any(is_running(pid) for pid in pids["job"] + pids["worker"]):
+        while any(is_running(pid) for pid in pids["job"]):
             assert time.monotonic() < deadline
             time.sleep(0.1)
         assert all("interrupted" in job["state"] for job in jobs())
@@ -341,10 +335,9 @@ def test_kill_9(here, victim):
     _, err = process.communicate(timeout=HUNG)
     assert process.returncode == 1 and "Traceback" not in err, err
     states = {row["job"]: row["state"] for row in rows("mine")}
-    if victim == "job":
-        (killed,) = [job["number"] for job in jobs() if job["process"] == pids["job"][-1]]
-        assert states.pop(str(killed)) == sweeps.LOST
-    assert set(states.values()) == {"done"} and len(states) == 3 - (victim == "job")
+    (killed,) = [job["number"] for job in jobs() if job["process"] == pids["job"][-1]]
+    assert states.pop(str(killed)) == sweeps.LOST
+    assert set(states.values()) == {"done"} and len(states) == 2
 
 
 # ---- Where jobs run ----
