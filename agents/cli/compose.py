@@ -26,7 +26,7 @@ from megastep.agents import package
 from megastep.agents.cli import blocks
 from megastep.agents.cli.words import Typed, key_of, lists_of, parse, typed_of, typed_word
 from megastep.agents.errors import ConfigErrors, UserError, shortened
-from megastep.agents.factory import check, components, settings
+from megastep.agents.factory import check, components, conflicts
 from megastep.settings import closest
 
 if TYPE_CHECKING:
@@ -164,9 +164,9 @@ class Composer:
             keys = [one.key for one in typed if not one.key.startswith("hydra")]
             tree = self.command.prepare(own(config, resolve=not secret), keys)
             groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
-            errors += settings.missing_sources(tree)
+            errors += conflicts.missing_sources(tree)
             chosen = check.check(self.command.kind, tree, groups + self.loader.list_groups(""))
-            errors += settings.ignored_geometry(chosen.env, keys)
+            errors += conflicts.ignored_geometry(chosen.env, keys)
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))
         except ConfigErrors as error:
@@ -185,7 +185,7 @@ class Composer:
         with suppress(*HYDRA_ERRORS):  # in files, which are named when they are composed
             keys = [group for group, members in self.groups().items() if word in members]
         is_run = word == "latest" or "/" in word
-        keys += ["file"] * word.endswith(settings.FILMS) + ["run"] + ["resume"] * is_run
+        keys += ["file"] * word.endswith(conflicts.FILMS) + ["run"] + ["resume"] * is_run
         keys = [key for key in keys if key in (*names, "experiment")]
         if not word or not keys:
             return "is not key=value; --cfg job prints all keys"
@@ -199,7 +199,7 @@ class Composer:
             options = self.members(group)
             chosen = one.value if group == "logger" and isinstance(one.value, list) else [one.value]
             others = [member for member in chosen if member not in options]
-            labels = [settings.label(name) for name in {*map(str, chosen)}]
+            labels = [components.label(name) for name in {*map(str, chosen)}]
             if len({*labels}) < len(labels):
                 errors.append(
                     (one.key, "two loggers have the same class name, and so the same keys")
@@ -299,7 +299,7 @@ def store_member(group: str, member: str, path: str) -> None:
     """Has Hydra know a member of a group that no file in configs/ names."""
     node: dict = {"name": path}
     if group == "logger":
-        node = {settings.label(path): node}
+        node = {components.label(path): node}
     elif group == "learner":  # it has the file of the one that it derives from
         base = blocks.built_in(path) if member == path else None
         node["defaults"] = [*filter(None, [base]), "_self_"]

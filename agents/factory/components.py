@@ -228,3 +228,15 @@ def _files(group) -> dict[str, str]:
 def takes_geometries(env: str) -> bool:
     """Returns whether the environment of an import path takes floor plans."""
     return "geometries" in parameters_of(import_object(env))
+
+
+def label(name: str) -> str:
+    """`explorer` for megastep.envs.explorer:Explorer."""
+    return name.rpartition(":")[2].rpartition(".")[2].lower()
+
+
+def env_name(env: Any) -> str:
+    """What an environment is called in titles, from its settings: `explorer`, or the id that one of
+    other packages has, `CartPole-v1`.
+    """
+    return getattr(env, "id", None) or label(env.name)

@@ -8,24 +8,21 @@ import copy
 import dataclasses
 import functools
 import inspect
-import operator
-import os
 import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from megastep.agents.factory import components
+from megastep.agents.factory import components, conflicts
+from megastep.agents.factory.components import env_name, label
 from megastep.agents.population.variation import Variation
 from megastep.imports import import_object
-from megastep.schedules import Scheduled
-from megastep.settings import AtMost, closest, frozen, located
+from megastep.settings import closest, frozen, located
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from megastep.agents.types import Config
 
 T = TypeVar("T")
 
@@ -109,7 +106,6 @@ Samples = Annotated[
 Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 Split = Literal["training", "test", "all"]
 Member = int | Literal["best"] | None
-FILMS = ".mp4", ".gif", ".png", ".svg", ".pdf"  # endings of what record.py can write
 
 
 # ---- Groups ----
@@ -141,28 +137,6 @@ def changed(settings: T, **changes: object) -> T:
         if hasattr(settings, name):
             object.__setattr__(result, name, value)  # of a frozen class
     return result
-
-
-def ignored_geometry(env: "Env | None", typed: list[str]) -> list[tuple[str, str]]:
-    """Returns [(key, sentence)] of the first typed key that chooses a geometry, if the environment
-    takes none. `env` may be None, that of a run.
-    """
-    keys = [key for key in typed if key.split(".")[0] == "geometry"]
-    if not keys or env is None or components.takes_geometries(env.name):
-        return []
-    return [(keys[0], f"env={env_name(env)} takes no floor plans; leave geometry out")]
-
-
-def label(name: str) -> str:
-    """`explorer` for megastep.envs.explorer:Explorer."""
-    return name.rpartition(":")[2].rpartition(".")[2].lower()
-
-
-def env_name(env: "Env") -> str:
-    """What an environment is called in titles, from its settings: `explorer`, or the id that one of
-    other packages has, `CartPole-v1`.
-    """
-    return getattr(env, "id", None) or label(env.name)
 
 
 def run_name(cfg: "Train") -> str:
@@ -207,103 +181,6 @@ else:
     Agent, Opponents = map(_group, components.SINGLE)
 #: {label: settings}, such as {"wandb": ...}
 Loggers = Annotated[dict[str, Logger], BeforeValidator(_chosen_loggers)]
-
-
-def missing_sources(tree: "Config") -> list[tuple[str, str]]:
-    """Returns [(key, sentence)] of files and parts of a mix that are named in nested dicts and do
-    not exist.
-    """
-    match tree.get("geometry"):
-        case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
-            return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
-        case {"name": components.SUITE, "plans": str(path)} if not os.path.isfile(path):
-            return [("geometry.plans", f"there is no file {path!r}; give an .npz of floor plans")]
-        case {"name": components.MIXED | components.SUITE, "parts": dict(parts)}:
-            try:
-                import_object(components.CHECK_PARTS)(parts)
-            except ValueError as error:
-                return [("geometry.parts", str(error))]
-    return []
-
-
-def _fields(cfg: "Train") -> Iterator[tuple[str, Any, Any]]:
-    """Yields (key, field, value) of the settings of the learner and the environment."""
-    for prefix, part in (("learner", cfg.learner), ("env", cfg.env)):
-        for name, field in part.__pydantic_fields__.items():
-            yield f"{prefix}.{name}", field, getattr(part, name)
-
-
-def _bounds(field) -> Scheduled | None:
-    """Returns the bounds of a setting that may be a schedule, None of any other."""
-    return next((extra for extra in field.metadata if isinstance(extra, Scheduled)), None)
-
-
-def schedules_of(cfg: "Train") -> list[str]:
-    """Returns the keys of settings that have a schedule."""
-    fields = [*_fields(cfg)]
-    for item in cfg.env.wrappers:
-        if isinstance(item, dict):
-            wrapper = components.wrapper_settings(item)
-            fields += [
-                ("env.wrappers", field, getattr(wrapper, name))
-                for name, field in wrapper.__pydantic_fields__.items()
-            ]
-    return [k for k, field, value in fields if _bounds(field) and not isinstance(value, float)]
-
-
-def variable(cfg: "Train") -> dict[str, Scheduled]:
-    """Returns the bounds of the settings that may vary between the members of a population, by key:
-    those that may be schedules.
-    """
-    return {key: bounds for key, field, _ in _fields(cfg) if (bounds := _bounds(field))}
-
-
-def _population_conflicts(cfg: "Train") -> Iterator[tuple[str, str]]:
-    chosen, bounds, is_many = cfg.population, variable(cfg), cfg.population.size > 1
-    for key, one in chosen.vary.items():
-        problem = one.problem()
-        if key not in bounds:
-            problem = f"cannot vary; {closest(key, bounds)}"
-        elif key in schedules_of(cfg):
-            problem = f"is a schedule, {getattr(cfg.learner, key[8:], '')}, and so cannot vary"
-        elif key == "learner.lr" and getattr(cfg.learner, "desired_kl", None) is not None:
-            problem = "follows learner.desired_kl, and so cannot vary"
-        elif not problem:
-            try:
-                for number in one.ends():
-                    bounds[key].check(number)
-            except ValueError as error:
-                problem = str(error)
-        if problem:
-            yield "population.vary", f"{key} {problem}"
-            break
-    if chosen.schedule is not None:
-        if is_many:
-            text = "is of a single agent, and cannot be combined with population.size"
-            yield "population.schedule", text
-        elif not os.path.isfile(chosen.schedule):
-            text = f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
-            yield "population.schedule", text
-    if not is_many:
-        if chosen.vary:
-            text = "is 1, and population.vary needs several members: population.size=8"
-            yield "population.size", text
-        return
-    is_in_samples = cfg.evaluation.every is not None and not isinstance(cfg.evaluation.every, str)
-    if chosen.score == "evaluated" and not is_in_samples:
-        text = "is evaluated, which needs evaluations every so many samples: evaluation.every=10M"
-        yield "population.score", text
-    if isinstance(cfg.ranks, int) and cfg.ranks > chosen.size:
-        text = f"is more than population.size={chosen.size}; each rank needs a member"
-        yield "ranks", f"{cfg.ranks} {text}"
-    if cfg.resume == "auto":
-        yield "resume", "cannot be auto for a population yet; give resume=RUN, its folder"
-
-
-def changes_lr(learner: "Learner") -> bool:
-    """Returns whether the learning rate has a schedule, or follows the KL divergence."""
-    is_constant = isinstance(getattr(learner, "lr", 0.0), (int, float))
-    return not is_constant or getattr(learner, "desired_kl", None) is not None
 
 
 # ---- Scripts ----
@@ -418,49 +295,7 @@ class Train(Common):
     member: Member = None
 
     def conflicts(self) -> Iterator[tuple[str, str]]:
-        env, learner, over = self.env, self.learner, self.learner.anneal
-        lag = getattr(learner, "lag", 0)
-        # classes of users are asked when they are made
-        draws = getattr(env, "resample", not env.name.startswith("megastep."))
-        if self.curriculum.name != "none" and lag:
-            text = "the homes to draw change with every update, so nothing can be collected ahead"
-            yield "curriculum", f"{text} of it; use learner.lag=0"
-        elif self.curriculum.name != "none" and not draws:
-            cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
-            yield "curriculum", f"env={env_name(env)} draws no home for each episode; {cure}"
-        for key, field, value in _fields(self):
-            for limit in (extra for extra in field.metadata if isinstance(extra, AtMost)):
-                if value > (most := operator.attrgetter(limit.key)(self)):
-                    yield key, f"{value} is more than {limit.key}={most}"
-        if self.opponents.league and self.population.size == 1:
-            text = "are other members of a population, which needs population.size=2 or more"
-            yield "opponents.league", text
-        if lag and (self.opponents.past or self.opponents.bot or self.opponents.league):
-            text = "opponents change with every update, so nothing can be collected ahead of it"
-            yield "learner.lag", f"{text}; use learner.lag=0, or no opponents"
-        if over in ("samples", "seconds") and getattr(self, over) is None:
-            text = f"is {over}, and no {over}= is given for the learning rate to fall over"
-            yield "learner.anneal", text
-        elif over in ("samples", "seconds") and changes_lr(learner):
-            text = "but learner.lr is a schedule or follows learner.desired_kl"
-            yield "learner.anneal", f"is {over}, {text}; leave learner.anneal out"
-        if (self.samples, self.seconds, self.rerun, self.resume) == (None,) * 4:
-            for key in dict.fromkeys(schedules_of(self)):
-                yield key, "is a schedule over the budget; give samples= or seconds="
-        for name in ("samples", "seconds"):
-            if self.resume is None and getattr(self, f"more_{name}") is not None:
-                text = f"extends a resumed run; give resume=RUN, or {name}= for a new run"
-                yield f"more_{name}", text
-        yield from _population_conflicts(self)
-        if self.member is not None and self.init is None:
-            yield "member", "is of a population whose weights start a run; give init=RUN"
-        if self.evaluation.stop and self.evaluation.every is None:
-            text = "needs evaluations in training to reach it: give evaluation.every=60s, or 1M"
-            yield "evaluation.stop", text
-        budgets = self.samples, self.seconds, self.more_samples, self.more_seconds
-        if self.checkpoints.snapshots and not any(budgets):
-            text = "are spread over the budget; give samples= or seconds="
-            yield "checkpoints.snapshots", text
+        return conflicts.of_training(self)
 
 
 @frozen
@@ -535,26 +370,4 @@ class Record(Played):
     axes: bool = False
 
     def conflicts(self) -> Iterator[tuple[str, str]]:
-        has_run, has_env = self.run is not None or self.runs is not None, self.env is not None
-        stored = [name for name in ("worst", "episode") if getattr(self, name) is not None]
-        if not (has_run or has_env):
-            yield "run", "is missing; without a run, env=explorer records random actions"
-        if has_run and has_env and not stored:
-            yield "env", "cannot be combined with run, which has its own"
-        if self.runs is not None and self.run is not None:
-            yield "runs", "cannot be combined with run; list all runs in runs"
-        elif self.runs is not None and self.homes is not None:
-            yield "runs", "cannot be combined with homes; choose one home="
-        if self.file is not None and not self.file.endswith(FILMS):
-            text = "is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or .pdf"
-            yield "file", f"{self.file!r} {text}"
-        if self.against is not None and self.run is None:
-            yield "against", "needs run=, the agent that plays against it"
-        if len(stored) == 2:
-            yield "episode", "cannot be combined with worst"
-        for name in stored:
-            if self.run is None:
-                yield name, "needs run=, whose newest evaluation it is about"
-        for name in ("geometry", "homes", "against", "env") if stored else ():
-            if getattr(self, name) is not None:
-                yield name, f"cannot be combined with {stored[0]}, whose evaluation has its own"
+        return conflicts.of_recording(self)

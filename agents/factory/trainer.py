@@ -17,7 +17,7 @@ import torch
 from megastep.agents import console, factory, package
 from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
-from megastep.agents.factory import check, settings
+from megastep.agents.factory import check, conflicts, settings
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.runs import (
     agent_file,
@@ -253,7 +253,7 @@ def budget_of(
         if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
             assert loaded.state is not None
             recorded = recorded[: loaded.state["updates"]]
-    is_scheduled = bool(settings.schedules_of(cfg))
+    is_scheduled = bool(conflicts.schedules_of(cfg))
     return budget.Budget(*limits, recorded, cfg.rerun is not None, is_scheduled)
 
 
@@ -261,7 +261,7 @@ def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
     """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
     limited, else by never; by never if the learner has no `set_lr`, or lr does not stay constant.
     """
-    changes_itself = settings.changes_lr(cfg.learner)
+    changes_itself = conflicts.changes_lr(cfg.learner)
     limits = [
         name
         for name in ("samples", "seconds")
