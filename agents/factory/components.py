@@ -82,6 +82,7 @@ class Group(NamedTuple):
         methods: that a class must have.
         where: the folder of its modules, or the module of its functions, relative to megastep's.
         first: the first argument of its members, which others there do not have.
+        shared: modules there that hold no member.
     """
 
     reserved: tuple[str, ...] = ()
@@ -91,6 +92,7 @@ class Group(NamedTuple):
     methods: tuple[str, ...] = ()
     where: str | None = None
     first: str | None = None
+    shared: tuple[str, ...] = ()
 
 
 GROUPS = {
@@ -101,6 +103,7 @@ GROUPS = {
         missing={"n_envs": 128},
         more={"name": str, "wrappers": (Annotated[tuple, BeforeValidator(_wrappers)], ())},
         where="envs",
+        shared=("first_person",),
     ),
     "geometry": Group(
         reserved=("split",),
@@ -209,7 +212,11 @@ def _modules(group) -> dict[str, str]:
         # a class that is called like its module, but for capitals
         name = rf"^(?:class|from [\w.]+ import) ({stem.replace('_', '')})\b"
         match = re.search(name, text, re.I | re.M)
-        if match and (not group.first or re.search(rf"self,\s*{group.first}\b", text)):
+        if (
+            match
+            and stem not in group.shared
+            and (not group.first or re.search(rf"self,\s*{group.first}\b", text))
+        ):
             found[stem] = f"{module}.{stem}:{match[1]}"
     return found
 
