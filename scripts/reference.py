@@ -31,14 +31,10 @@ from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-import megastep
 from megastep.agents import package
-from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.cli import blocks
 from megastep.agents.errors import EXIT_CODES
 from megastep.agents.factory import check, components, settings
-from megastep.agents.networks.cores import CORES
-from megastep.agents.networks.policy import Policy
 from megastep.imports import import_object
 from megastep.schedules import Scheduled
 from megastep.settings import AtMost, allowed
@@ -542,34 +538,6 @@ def _exit_codes():
     return table(["exit code", "meaning"], [[str(k), text] for k, text in EXIT_CODES.items()])
 
 
-def _cores():
-    rows = [[f"`{name}`", first_sentence(kind)] for name, kind in CORES.items()]
-    return table(["`agent.core=`", "what it is"], rows)
-
-
-_HOME = {"geometry": "box", "privileged": True}
-#: Trainings whose memory is told: an environment, and arguments of it, of Policy and of PPO.
-TRAININGS = {
-    "Explorer, LSTM of 256 units": ("explorer", _HOME, {}, {}),
-    "the same, 2 layers": ("explorer", _HOME, {"layers": 2}, {}),
-    "the same, LSTM of 512": ("explorer", _HOME, {"width": 512}, {}),
-    "the same, minGRU of 256": ("explorer", _HOME, {"core": "mingru"}, {}),
-    "LSTM of 256, 16 minibatches in place of 4": ("explorer", _HOME, {}, {"n_minibatches": 16}),
-    "LSTM of 256, rollouts of 128 steps in place of 32": ("explorer", _HOME, {}, {"n_steps": 128}),
-    "Pong, no core, 64 units": ("pong", {}, {"core": "none", "width": 64}, {}),
-}
-
-
-def _environments_per_gb():
-    rows = []
-    for title, (name, of_env, of_policy, of_learner) in TRAININGS.items():
-        env = megastep.make(name, n_envs=16, device="cpu", **of_env)
-        policy = Policy(env, **of_policy)
-        each = PPO(policy, **of_learner).bytes_per_env(env)
-        rows.append([title, f"{round(1e9 / each, -2):,.0f}"])
-    return table(["training", "environments per GB"], rows)
-
-
 def _benchmarks():
     sys.path.append(str(Path(__file__).parent / "benchmarks"))
     import paths
@@ -584,8 +552,6 @@ PAGES: dict[str, Callable[..., str]] = {
     "api": api,
     "module": documentation,
     "settings": _settings_page,
-    "cores": _cores,
-    "environments-per-gb": _environments_per_gb,
     "benchmarks": _benchmarks,
     "recipes": _recipes,
     "metrics": _metrics_page,
