@@ -17,7 +17,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.utils import JobRuntime
 
 from megastep.agents.cli import blocks
-from megastep.agents.launch import train as launch_train
+from megastep.agents.launch import run as launch_run
 from tests.helpers.in_this_process import InThisProcess
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -54,13 +54,13 @@ def here(tmp_path, monkeypatch):
 @pytest.fixture
 def trainers(monkeypatch):
     """The trainers that `train` makes during a test."""
-    made, make_trainer = [], launch_train.make_trainer
+    made, make_trainer = [], launch_run.make_trainer
 
     def remember(*arguments, **options):
         made.append(make_trainer(*arguments, **options))
         return made[-1]
 
-    monkeypatch.setattr(launch_train, "make_trainer", remember)
+    monkeypatch.setattr(launch_run, "make_trainer", remember)
     return made
 
 

@@ -1,16 +1,22 @@
-"""What follows training: an evaluation, a video, a report, and the loggers' last word."""
+"""What follows training: an evaluation, a video, a report, the loggers' last word, and for a run
+that repeats another, whether it has the same bytes.
+"""
 
+import itertools
 import json
 from pathlib import Path
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
+from megastep.agents.errors import Differs
 from megastep.agents.evaluation import evaluate_run, filming, tables
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_loggers
-from megastep.agents.runs import scores
+from megastep.agents.runs import folders, populations, provenance, scores
 from megastep.agents.types import RunResult
 from megastep.imports import import_object
+
+METRICS = "metrics.jsonl"
 
 
 def finish(cfg: settings.Train, folder: Path, samples: int) -> None:
@@ -59,3 +65,48 @@ def tell_loggers(
         logger = make_loggers(cfg, folder, samples)
         logger.finish(samples, RunResult({"samples": samples, **numbers}, film, cells))
         logger.close()
+
+
+def next_command(cfg: settings.Train, folder: Path) -> str:
+    """Returns what people do next with a run that has ended: evaluate it, film it, or continue."""
+    if not cfg.finish.evaluate:
+        return f"To evaluate it: {folders.command_of('evaluate', 'run', folder)}"
+    if not cfg.finish.record:
+        return f"To film it: {folders.command_of('record', 'run', folder)}"
+    return f"To train it further: {folders.resume_command(folder)} more_seconds=10min"
+
+
+def compare(folder: Path, original: Path) -> None:
+    """Checks that two runs have the same metrics. Raises Differs if not."""
+    generation = populations.first_copy(original)
+    cause = generation and (
+        f"in generation {generation} it copied another member, which a run of its own cannot: "
+        f"rerun={original.parent} repeats the whole population"
+    )
+    _check(METRICS, folder, original, cause or "")
+    console.say(f"{METRICS} equals that of {original}, byte for byte.")
+
+
+def compare_population(folder: Path, original: Path) -> None:
+    """Checks that two populations have the same generations, and their members the same metrics.
+    Raises Differs if not.
+    """
+    members = populations.members(original)
+    for name in (*(f"{member.name}/{METRICS}" for member in members), populations.FILE):
+        _check(name, folder, original)
+    console.say(
+        f"{populations.FILE} and {METRICS} of all {len(members)} members equal those of "
+        f"{original}, byte for byte."
+    )
+
+
+def _check(name: str, folder: Path, original: Path, cause: str = "") -> None:
+    ours, theirs = ((one / name).read_bytes() for one in (folder, original))
+    if ours == theirs:
+        return
+    pairs = enumerate(itertools.zip_longest(ours.split(b"\n"), theirs.split(b"\n")), 1)
+    number = next(number for number, (one, other) in pairs if one != other)
+    cause = cause or (
+        f"equal bits need the same versions, device and threads: see {provenance.FILE} of both"
+    )
+    raise Differs(f"{name} differs from that of {original} from line {number} on; {cause}")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -37,8 +37,8 @@ from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
 
 if TYPE_CHECKING:
+    from megastep.agents.factory.settings import Population as PopulationSettings
     from megastep.agents.networks.policy import Policy
-    from megastep.agents.population.variation import Variation
     from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import Learner, Row, StateDict
 
@@ -137,14 +137,9 @@ class Population:
         streams: in which they were made.
         folder: where `population.jsonl` is written.
         seed: that decisions are drawn with.
-        every: samples of each member from one generation to the next. A generation is at the first
-            report after so many, and none when the budget is spent.
-        vary: the settings that differ, by key, and what they may be.
-        exploit, explore: as for `decisions.decide`.
-        score: what members are ranked by: "running", the return of their last report; "evaluated",
-            that of their last evaluation; or another of the last report's `Episodes.names`.
+        chosen: its settings, `factory.settings.Population`. A generation is at the first report
+            after `every` samples, and none when the budget is spent.
         checkpoint_seconds: seconds between two checkpoints of all members.
-        size: members on all ranks; None: as many as there are trainers.
         visitor: with several ranks, holds what a member of another one has learnt.
         repeated: the samples after which the generations are, if another population is repeated.
 
@@ -161,21 +156,16 @@ class Population:
         streams: Streams,
         folder: Path,
         seed: int,
-        every: int,
-        vary: Mapping[str, Variation],
-        exploit: str = "truncation",
-        explore: str = "factor",
-        score: str = "running",
+        chosen: PopulationSettings,
         checkpoint_seconds: float = 30.0,
-        size: int | None = None,
         visitor: AgentParts | None = None,
         repeated: Collection[int] | None = None,
     ):
-        self.trainers, self.streams, self.seed, self.every = [*trainers], streams, seed, every
-        self.size, self.visitor = size or len(trainers), visitor
+        self.trainers, self.streams, self.seed = [*trainers], streams, seed
+        self.chosen, self.size, self.visitor = chosen, chosen.size, visitor
         self.members = hosted(self.size)
         self.rank, self.n_ranks = rank(), n_ranks()
-        self.vary, self.exploit, self.explore, self.score = vary, exploit, explore, score
+        self.vary, self.score = chosen.vary, chosen.score
         self.repeated = repeated
         self.checkpoint_seconds, self.saved_at = checkpoint_seconds, time.monotonic()
         self.path = folder / populations.FILE
@@ -192,7 +182,7 @@ class Population:
             self._restore(generations)
         else:
             members = range(self.size)
-            self.settings = [decisions.first(seed, member, vary) for member in members]
+            self.settings = [decisions.first(seed, member, self.vary) for member in members]
             self._write([None for _ in members], [*members])
 
     def _earlier(self) -> list[list[Row]]:
@@ -261,7 +251,7 @@ class Population:
         leader, before, is_due = self.leader, self.samples_at_round, False
         if leader.samples_at_report == leader.samples:
             self.samples_at_round = self.samples
-            is_due = self.samples // self.every > before // self.every
+            is_due = self.samples // self.chosen.every > before // self.chosen.every
         is_left = leader.fraction_left > 0
         if self.repeated is not None:  # when a budget was spent, the clock may have decided
             is_due, is_left = self.samples in self.repeated, True
@@ -311,7 +301,7 @@ class Population:
         self.generation += 1
         made = decisions.decide(
             *(self.seed, self.generation, scores, self.settings, self.vary),
-            *(self.exploit, self.explore),
+            *(self.chosen.exploit, self.chosen.explore),
         )
         self.streams.wait()
         for member in decisions.order(made, scores):

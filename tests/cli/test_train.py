@@ -24,7 +24,7 @@ from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory.check import check
 from megastep.agents.factory.settings import Train
 from megastep.agents.factory.trainer import annealed
-from megastep.agents.launch import train as launch_train
+from megastep.agents.launch import run as launch_run
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.runs.folders import locked
 from megastep.agents.training import loggers
@@ -462,7 +462,7 @@ def test_unusable_run_folder(here, monkeypatch, capsys, folder):
     (here / "link").symlink_to("nowhere")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("")
-    monkeypatch.setattr(launch_train, "make_trainer", None)
+    monkeypatch.setattr(launch_run, "make_trainer", None)
     assert train.main([*TINY, f"folder={folder}"]) == 2
     error = capsys.readouterr().err.strip()
     assert shortened(folder) in error and "folder=" in error and "\n" not in error

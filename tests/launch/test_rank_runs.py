@@ -11,7 +11,7 @@ import torch
 
 from megastep.agents.cli import train
 from megastep.agents.distributed import process_group
-from megastep.agents.launch import train as launch_train
+from megastep.agents.launch import run as launch_run
 from megastep.agents.runs import annealing, checkpoint, json_lines
 from tests.cli.test_exact_resume import CASES, EVERY_UPDATE, differences
 from tests.helpers import ranks, tiny
@@ -24,17 +24,17 @@ PPO = [*tiny.TINY, *tiny.SHORT_EPISODES]
 
 def trained(*words):
     """Trains in this rank. Returns what it learnt, and a copy of its state."""
-    trainers, make_trainer = [], launch_train.make_trainer
+    trainers, make_trainer = [], launch_run.make_trainer
 
     def remember(*arguments, **options):
         trainers.append(make_trainer(*arguments, **options))
         return trainers[-1]
 
-    launch_train.make_trainer = remember
+    launch_run.make_trainer = remember
     try:
         assert train.main([*words]) == 0
     finally:
-        launch_train.make_trainer = make_trainer
+        launch_run.make_trainer = make_trainer
     (trainer,) = trainers
     state = trainer.run_state.state_dict()
     return dict(

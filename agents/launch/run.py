@@ -1,0 +1,244 @@
+"""A run: its folder and lock, its start, training, what ends it, and what follows."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from megastep import engine
+from megastep.agents import console, factory, package
+from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.distributed import process_group
+from megastep.agents.distributed.agreement import from_rank_0, together
+from megastep.agents.distributed.drift import DriftError
+from megastep.agents.distributed.ranks import ONE, Ranks, world
+from megastep.agents.errors import EnvFailed, NonFinite, UserError, memory_problem
+from megastep.agents.evaluation import in_training
+from megastep.agents.factory import env_failures, settings
+from megastep.agents.factory.trainer import make_trainer
+from megastep.agents.launch import again, finishing, gpu, rank_checks, signals
+from megastep.agents.runs import folders, provenance
+from megastep.agents.training import curves
+from megastep.agents.training.budget import reaches
+from megastep.agents.training.callbacks import Progress
+
+if TYPE_CHECKING:
+    from megastep.agents.launch.watch import Team
+    from megastep.agents.training.trainer import Trainer
+
+
+class Run:
+    """The run of an agent, in this process alone or as one of several ranks, which all do the same
+    here. `PopulationRun` has what differs for a population.
+
+    Args:
+        cfg: its settings.
+        team: the ranks; None in a single process.
+
+    Attributes:
+        folder: the run folder.
+        training: what trains: the trainer, or the population.
+        trainers: those of this rank.
+    """
+
+    ranks: Ranks  # those that train a policy together
+    of_each = ""  # agent, in messages about samples
+    folder: Path
+    training: Any
+    trainers: Sequence[Trainer]
+
+    def __init__(self, cfg: settings.Train, team: Team | None):
+        self.cfg, self.team, self.ranks = cfg, team, world()
+        self.is_first, self.n_ranks = self.ranks.rank == 0, self.ranks.n
+        self.device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
+        self.progress = console.Progress()
+
+    def run(self) -> Path:
+        """Opens or continues the run, trains, and finishes it. Returns its folder.
+
+        Raises:
+            Interrupted: a signal came; the run was saved.
+            UserError: training cannot start or continue.
+        """
+        if self.cfg.resume == again.AUTO:
+            start = together(lambda: again.automatic(self.cfg))
+            if start.is_done:
+                why = "reached its stop" if start.is_reached else "used up its budget"
+                console.say(f"The run in {start.folder} has already {why}.")
+                return start.folder
+            self.cfg = start.cfg
+        rank_checks.check_start(self.cfg)
+        with contextlib.ExitStack() as locks:
+            self.start(locks)
+            self.train()
+            self.finish()
+        return self.folder
+
+    # ---- Before training ----
+
+    def start(self, locks: contextlib.ExitStack) -> None:
+        """Opens the folder, which is removed again if training cannot start, and makes what trains.
+
+        Args:
+            locks: keeps the folder locked.
+        """
+        cfg = self.cfg
+        is_auto = cfg.resume == again.AUTO
+        is_new = not cfg.resume or (is_auto and not os.path.exists(str(cfg.folder)))
+        self.cfg = rank_checks.started_again(cfg, self.team)
+        with contextlib.ExitStack() as undo:
+            with signals.deferred():
+                self.folder, source = from_rank_0(lambda: self.open(locks))
+                if self.is_first and is_new:
+                    undo.callback(shutil.rmtree, self.folder, ignore_errors=True)
+            token = rank_checks.check_shared(self.folder)
+            if self.team:
+                self.team.set_folder(self.folder)
+            told = env_failures.told(self.cfg.env, self.folder, rank=process_group.rank())
+            try:
+                together(told(lambda: self.make(source, token)))
+            except EnvFailed:
+                undo.pop_all()  # the folder has the traceback
+                raise
+            self.began()
+            if self.is_first:
+                folders.record_start(self.folder)
+                if self.cfg.device == "auto":
+                    gpu.warn_of_job_without()
+                where = f"{self.n_ranks} x {self.device.type}" if self.n_ranks > 1 else self.device
+                console.say(f"{self.title()} on {where} in {self.folder}")
+            undo.pop_all()
+
+    def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:
+        """Returns the folder, locked, and what `make` continues from, if anything. On rank 0."""
+        cfg = self.cfg
+        if cfg.resume in (None, again.AUTO):
+            folder = folders.new(settings.run_name(cfg), cfg.folder, cfg.resume == again.AUTO)
+            locks.enter_context(folders.locked(folder))
+            return folder, None
+        folder = folders.folder_of(folders.find(str(cfg.resume)))
+        locks.enter_context(folders.locked(folder))
+        if self.n_ranks > 1:  # all ranks from the same intact checkpoint
+            return folder, str(folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).path)
+        return folder, cfg.resume
+
+    def make(self, source: Any, token: str) -> None:
+        """Makes what trains, without waiting for other ranks.
+
+        Args:
+            source: from `open`.
+            token: of `rank_checks.check_shared`.
+        """
+        self.cfg = again.with_more(settings.changed(self.cfg, resume=source))
+        self.training = make_trainer(
+            *(self.cfg, self.folder, self.device, token),
+            callbacks=[Progress(self.progress.show)],
+            make_evaluator=in_training.Evaluator,
+        )
+        self.trainers = [self.training]
+
+    def began(self) -> None:
+        """Checks what all ranks have made, and writes what it is."""
+        rank_checks.check_world(self.cfg, self.training)
+        hosts = process_group.gather_objects(process_group.hostname())
+        lost = process_group.gather_objects(self.training.lost)
+        from_rank_0(lambda: record(self.training, self.device, hosts))
+        if clauses := dict.fromkeys(itertools.chain(*lost)):
+            console.say(f"Resuming, but not bit for bit: {'; '.join(clauses)}.")
+
+    def title(self) -> str:
+        """Returns what a run is doing, as the beginning of a sentence."""
+        return "Training"
+
+    # ---- Training ----
+
+    def train(self) -> None:
+        """Trains, and turns what may happen into a sentence."""
+        try:
+            with (
+                env_failures.told(self.cfg.env, self.folder, self.saved, process_group.rank()),
+                signals.handled() as numbers,
+                self.around(),
+                self.progress if self.is_first else contextlib.nullcontext(),
+                contextlib.closing(self.training),
+            ):
+                self.training.train(lambda: bool(numbers))
+        except NonFiniteError as error:
+            hint = "" if self.of_each else self.trainers[0].nonfinite_guard.hint
+            text = f"{error}. Earlier checkpoints are in {self.folder}{hint}"
+            raise NonFinite(text) from error
+        except DriftError as error:
+            raise UserError(f"{error}. Earlier checkpoints are in {self.folder}") from error
+        except (MemoryError, RuntimeError) as error:
+            problem = memory_problem(error)
+            if not (problem or isinstance(error, engine.EngineError)):
+                raise
+            reason = problem or str(error).partition("\n")[0].rstrip(".")
+            raise UserError(f"{reason}. {self.saved()}") from error
+        finally:
+            with process_group.unhurried():
+                for trainer in self.trainers if self.is_first or self.ranks == ONE else ():
+                    curves.plot_curves(trainer.saver.folder.parent)
+        # all ranks stop if one got a signal or could not save a checkpoint
+        unsaved = next((one.saver.error for one in self.trainers if one.saver.error), None)
+        ends = process_group.gather_objects((numbers[:1], unsaved))
+        if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
+            text = f"Stopped after {self.training.samples:,} samples{self.of_each}."
+            raise signals.Interrupted(signal, f"{text} {folders.to_continue(self.folder)}")
+        if unsaved := next((error for _, error in ends if error), None):
+            raise UserError(unsaved)
+
+    def around(self) -> contextlib.AbstractContextManager:
+        """Returns what training is done inside."""
+        return contextlib.nullcontext()
+
+    def saved(self) -> str:
+        """Returns how much of a run that ended with an error is saved, and how to resume it."""
+        trainer = self.training
+        text = trainer.saver.error or "The latest updates could not be saved"
+        text = f"All {trainer.samples:,} samples are saved" if trainer.is_saved else text
+        return f"{text}. {folders.to_continue(self.folder)}"
+
+    # ---- After training ----
+
+    def finish(self) -> None:
+        """Does what `cfg.finish` asks for, and says what came of the run."""
+        cfg, trainer, folder = self.cfg, self.training, self.folder
+        guard, samples, result = trainer.nonfinite_guard, trainer.samples, self.result()
+        nonfinite, hint = guard.value, guard.hint
+        del self.training, self.trainers, trainer, guard  # frees GPU memory for the evaluation
+        finishing.finish(cfg, folder, samples)
+        if nonfinite and nonfinite.is_from_env:
+            learnt = f"All other rollouts were used; the run is in {folder}"
+            raise NonFinite(f"{nonfinite}. {learnt}{hint}")
+        if cfg.rerun and self.is_first:
+            finishing.compare(folder, Path(cfg.rerun))
+        console.say(f"{result}. The run is in {folder}\n{finishing.next_command(cfg, folder)}")
+
+    def result(self) -> str:
+        """Returns what a run came to: samples, seconds, and the return of its last episodes."""
+        trainer, stop = self.training, self.cfg.evaluation.stop
+        text = f"Trained {trainer.samples:,} samples in {console.duration(trainer.clock.seconds)}"
+        if reaches(trainer.evaluation, stop):
+            goals = ", ".join(
+                f"{name} {trainer.evaluation[name]:.4g} (evaluation.stop.{name}={goal:g})"
+                for name, goal in stop.items()
+            )
+            return f"{text}, when an evaluation had {goals}"
+        latest = trainer.latest_stats
+        if "episode/return" not in latest:
+            return f"{text}; no episode ended since the last report"
+        n = f"{latest['episode/window']:,.0f}"
+        return f"{text}; mean return {latest['episode/return']:.4g} of the last {n} episodes"
+
+
+def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
+    """Writes the settings of an agent that starts to train, and a line about where it does."""
+    folder = trainer.saver.folder.parent
+    folders.write_config(folder, trainer.saver.config["train"])
+    provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, hosts)
