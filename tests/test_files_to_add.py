@@ -98,9 +98,21 @@ ADDED = {
     },
     "command": {
         "agents/cli/greet.py": """
-            def main(words):
-                print("hello", *words)
-                return 0
+            from megastep.agents.cli.command import Command
+            from megastep.settings import frozen
+
+
+            @frozen
+            class Greet:
+                name: str
+
+
+            def run(cfg):
+                print("hello", cfg.name)
+
+
+            COMMAND = Command("greet", Greet, "Says hello.")
+            main = COMMAND.main
             """,
         "agents/cli/entry.py": """
 
@@ -123,10 +135,11 @@ def test_contributing_counts_the_files():
 
 @pytest.mark.slow
 def test_one_of_each_is_added_to_a_copy(tmp_path):
-    for folder in ("agents", "megastep", "configs"):
+    for folder in ("agents", "megastep", "configs", "tests"):
         ignored = shutil.ignore_patterns("__pycache__", "*.npz" if folder == "agents" else "-")
         shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=ignored)
-    shutil.copy(ROOT / "train.py", tmp_path)
+    for name in ("train.py", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
     for files in ADDED.values():
         for name, text in files.items():
             with open(tmp_path / name, "a") as file:
@@ -138,7 +151,7 @@ def test_one_of_each_is_added_to_a_copy(tmp_path):
         options = dict(cwd=tmp_path, env=environment, check=True, text=True, timeout=300)
         return subprocess.run(command, stdout=subprocess.PIPE, **options).stdout
 
-    assert run("-m", "megastep", "greet", "you") == "hello you\n"
+    assert run("-m", "megastep", "greet", "name=you") == "hello you\n"
     chosen = "env=count env.limit=4 env.n_envs=8 learner=slow learner.patience=2 agent.core=leaky"
     chosen += " agent.width=8 logger=memo logger.memo.word=said samples=256 folder=run"
     chosen += " logging.every=1"
@@ -149,3 +162,6 @@ def test_one_of_each_is_added_to_a_copy(tmp_path):
     assert (tmp_path / "run" / "memo.txt").read_text().startswith("said ")
     words = "env=minimal geometry=rooms geometry.width=4 env.n_envs=4 env.res=8 device=cpu".split()
     assert "environments" in run("train.py", *words, "dry_run=true")
+    # tests over what exists take what is new
+    of_all = "every_group_member or loggers or help_lists"
+    run("-m", "pytest", "-q", "-n", "0", "-m", "", "-k", of_all, "tests/cli/test_config.py")

@@ -26,11 +26,6 @@ COMMANDS = {
     "inspect": "verifies a run's checkpoints and prints what is in them",
     "rerun": "repeats a run and compares its metrics, byte for byte",
 }
-#: What only a clone of the repository has, and what runs it there.
-IN_A_CLONE = {
-    "bench": "python scripts/benchmarks/benchmark.py step",
-    "show": "python scripts/show_homes.py homes.png",
-}
 
 
 def main() -> int:
@@ -40,7 +35,9 @@ def main() -> int:
         script = "".join(line.split()[1:2])  # which is completed here, its options elsewhere
         if "query=" not in " ".join(words):
             words = ["train", *words]
-        elif script and (len(line.split()) > 2 or line.endswith(" ")):
+        elif script in ("train", "evaluate", "record") and (
+            len(line.split()) > 2 or line.endswith(" ")
+        ):
             os.environ["COMP_LINE"] = line.replace(script, "", 1)
             words = [script, *words]
         else:
@@ -59,10 +56,6 @@ def main() -> int:
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
     elif words[0] == "--version":
         console.say(package.version())
-    elif words[0] in IN_A_CLONE:
-        text = f"{words[0]} needs a clone of the repository: {IN_A_CLONE[words[0]]}"
-        console.say(f"megastep: {text}", sys.stderr)
-        return 2
     elif words[0]:
         text = f"{words[0]!r} is unknown; {closest(words[0], COMMANDS)}"
         console.say(f"megastep: {text}", sys.stderr)

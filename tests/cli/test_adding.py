@@ -14,7 +14,6 @@ import textwrap
 
 import pytest
 
-from megastep.agents import package
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.factory.components import kind_of
 from megastep.agents.runs import checkpoint, folders
@@ -148,16 +147,6 @@ def test_custom_environment(outside, capsys):
     assert train.main([*sizes, *RUN]) == 0 and capsys.readouterr().out.count("done") >= 2
 
 
-def test_custom_environment_with_a_config_file(outside, monkeypatch, tmp_path):
-    """configs/env/counter.yaml holds the import path and differences from the defaults."""
-    shutil.copytree(ROOT / "configs", tmp_path / "configs")
-    monkeypatch.setattr(package, "CONFIGS", tmp_path / "configs")
-    yaml = "name: counter:Counter\nlimit: 4\n"
-    add(outside, "environment", {"counter.py": COUNTER, "configs/env/counter.yaml": yaml})
-    assert train.main(["env=counter", *RUN]) == 0
-    assert saved().config["train"]["env"]["limit"] == 4
-
-
 def test_custom_geometry(outside):
     source = """
         from megastep import toys
@@ -271,16 +260,6 @@ MEAN = '''
                 outputs.append(self.layer(total))
             return torch.stack(outputs), arrdict(total=total)
     '''
-
-
-def test_custom_recurrent_core(outside):
-    add(outside, "core", {"mean.py": MEAN})
-    words = [*MINIMAL, *SMALL, "samples=64", "agent.core=mean:Mean"]
-    assert train.main(words) == 0
-    assert saved().config["train"]["agent"]["core"] == "mean:Mean"
-    assert "core.layer.weight" in saved().state["policy"]
-    assert evaluate.main(["run=latest", "episodes=4"]) == 0
-    assert train.main(["resume=latest", "samples=96"]) == 0
 
 
 def test_custom_encoder(outside):

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from megastep.agents.cli import train
-from megastep.agents.runs import checkpoint, folders
+from megastep.agents.runs import checkpoint
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, ROOT, finished, forked, start, wait_until
 
@@ -131,32 +131,3 @@ for zone, *words in map(str.split, sys.argv[1:]):
     time.tzset()
     assert train.main(words) == 0, words
 """
-
-
-@pytest.mark.slow
-def test_folder_that_the_locale_cannot_spell(tmp_path, monkeypatch):
-    """And a clock that is put back by a day, as the time zone changes."""
-    folder = tmp_path / "r n ü"
-    folder.mkdir()
-    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TERM": "dumb"}
-    commands = (
-        ["Pacific/Kiritimati", *TINY, "samples=32"],
-        ["Pacific/Midway", "resume=latest", "more_samples=32"],
-        ["Pacific/Midway", *TINY, "samples=1", "finish.evaluate=true", "finish.episodes=4"],
-    )
-    commands[-1].extend(["finish.record=true", "finish.steps=2"])
-    process = subprocess.run(
-        [sys.executable, "-c", ACROSS_ZONES, *map(" ".join, commands)],
-        cwd=folder,
-        stderr=subprocess.PIPE,
-        timeout=HUNG,
-        env={**os.environ, **ascii_only, "PYTHONPATH": str(ROOT)},
-    )
-    assert (process.returncode, process.stderr) == (0, b"")
-    monkeypatch.chdir(folder)
-    latest, first = sorted(folder.glob("runs/*/checkpoints"))  # by name, which has the local time
-    assert folders.find("latest").resolve() == latest.parent
-    assert [checkpoint.load_latest(path).step for path in (first, latest)] == [64, 32]
-    assert (latest.parent / "video.mp4").exists() and any(latest.parent.glob("evaluations/*.json"))
-    code, _, err = finished("train", *TINY, "folder='ü'", cwd=folder, **ascii_only)
-    assert code == 2 and "is not valid text in this locale" in err and "Traceback" not in err

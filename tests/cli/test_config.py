@@ -206,16 +206,6 @@ def test_out_of_range_values(tree, key):
         assert [path for path, _ in error.value.errors] == [key], value
 
 
-def test_missing_key(tree):
-    with pytest.raises(ConfigErrors, match="seed: is missing"):
-        check(Train, {key: value for key, value in tree.items() if key != "seed"})
-
-
-def test_several_cameras():
-    for env in "explorer", "pointgoal":
-        assert compose(f"env={env}", "env.cameras=[0,120,240]").env.cameras == [0, 120, 240]
-
-
 def test_missing_geometry_file_is_told_with_all_else():
     messages = errors("geometry=files", "geometry.path=nope.npz", "learner.lrr=1")
     assert set(messages) == {"geometry.path", "learner.lrr"}
@@ -326,17 +316,6 @@ def test_evaluations_without_a_run(words, key, sentence):
     assert error.value.errors == [(key, sentence)]
 
 
-def test_other_errors_are_named_beside_a_missing_run():
-    with pytest.raises(ConfigErrors) as error:
-        compose("seed=x", script="evaluate")
-    assert {key for key, _ in error.value.errors} == {"run", "seed"}
-
-
-def test_a_video_without_a_key():
-    with pytest.raises(ConfigErrors, match="did you mean file=out.mp4"):
-        compose("out.mp4", script="record")
-
-
 def test_launcher_not_installed(monkeypatch):
     composer = Composer(load("train"))
     composer.members = lambda group: ["basic"]
@@ -431,10 +410,6 @@ def test_a_geometry_that_the_environment_does_not_take_is_refused(key, value):
 def test_empty_sweep(word):
     with pytest.raises(ConfigErrors, match="has no value"):
         jobs(word)
-
-
-def test_glob_sweep():
-    assert jobs("geometry=glob(b*)") == [["geometry=bench"], ["geometry=box"]]
 
 
 def test_help_lists_groups_and_members(capsys):

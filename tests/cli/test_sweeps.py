@@ -7,12 +7,10 @@ import json
 import logging
 import os
 import pathlib
-import pickle
 import signal
 import sys
 import tempfile
 import time
-from types import SimpleNamespace
 
 import cloudpickle
 import pytest
@@ -23,10 +21,8 @@ from omegaconf import OmegaConf
 from megastep.agents.cli import evaluate, sweeps, train
 from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
-from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory.components import kind_of
 from megastep.agents.launch import gpu_slots
-from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import folders, scores
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, ROOT, finished, is_running, start, wait_until
@@ -116,15 +112,6 @@ def test_sweep_folders_and_table(here, capsys):
     assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
-def test_score_of_a_run_has_its_last_evaluation(here):
-    (here / "run/evaluations").mkdir(parents=True)
-    for number, name in enumerate("ba"):
-        path = here / f"run/evaluations/{name}.json"
-        path.write_text(json.dumps({"rows": [{"return": number, "lower": 0, "upper": 1}]}))
-        os.utime(path, (number, number))
-    assert scores.outcome(here / "run")["evaluated"] == 1
-
-
 @pytest.mark.parametrize(
     "more", [[], pytest.param(["hydra.sweeper.max_batch_size=1"], marks=pytest.mark.slow)]
 )
@@ -166,17 +153,6 @@ def test_table_stands_while_jobs_run(here, monkeypatch):
     assert states == [["running"], ["done", "running"]]
 
 
-@pytest.mark.slow
-def test_sweeps_in_the_same_second(here, monkeypatch):
-    monkeypatch.setattr(train, "run", lambda cfg: None)
-    noon = SimpleNamespace(strftime=lambda pattern: "noon")
-    monkeypatch.setattr("hydra.core.utils.datetime", SimpleNamespace(now=lambda: noon))
-    for _ in range(2):
-        assert train.main([*SHORT, "-m", "seed=1,2"]) == 0
-    assert sorted(path.name for path in (here / "sweeps").iterdir()) == ["noon", "noon-2"]
-    assert len(list((here / "sweeps").glob("*/0_seed=1"))) == 2
-
-
 def test_job_refuses_a_used_folder(here):
     words = [*SHORT, "-m", "seed=1", "hydra.sweep.dir=mine"]
     assert train.main(words) == 0
@@ -185,16 +161,6 @@ def test_job_refuses_a_used_folder(here):
     (row,) = rows("mine")
     assert "is not empty" in row["state"] and "resume=mine/0_default" in row["state"]
     assert (here / "mine/0_default/metrics.jsonl").read_bytes() == before
-
-
-@pytest.mark.slow
-def test_paths_with_hydra_job_chdir(here):
-    assert train.main([*SHORT, "folder=first", "hydra.job.chdir=true"]) == 0
-    assert os.getcwd() == str(here) and (here / "first/checkpoints").is_dir()
-    words = [*SHORT, "-m", "init=first", "seed=1,2", "hydra.job.chdir=true", "hydra.sweep.dir=mine"]
-    assert train.main(words) == 0
-    assert [row["state"] for row in rows("mine")] == ["done", "done"]
-    assert folders.find("latest") == pathlib.Path("mine/1_seed=2")
 
 
 def test_hydra_run_dir_is_the_folder(here, capsys):
@@ -450,13 +416,6 @@ def test_slurm_jobs_are_given_their_gpus_elsewhere(gpus):
     gpu_slots.check(jobs, hydra)
 
 
-def test_errors_can_be_pickled():
-    errors = pickle.loads(pickle.dumps(ConfigErrors([("seed", "is missing")])))
-    assert errors.errors == [("seed", "is missing")] and "seed: is missing" in str(errors)
-    stop = pickle.loads(pickle.dumps(Interrupted(15, "saved")))
-    assert stop.args == (15, "saved")
-
-
 # ---- Names and scores ----
 
 
@@ -489,19 +448,6 @@ def test_score_is_the_mean_over_the_episodes_of_the_last_reports(here):
     assert score(here, *[report(n, 0, 0, None) for n in range(3)]) is None
     (here / "empty").mkdir()
     assert scores.outcome(here / "empty")["score"] is None
-
-
-def test_score_counts_every_episode_once(here):
-    """A lucky episode of 3.68 begins a run of 0.75. Means over all episodes so far repeat it."""
-    means = [(3.68 + 0.75 * (n - 1)) / n for n in range(1, 11)]
-    lines = [report(n, 1, n, mean) for n, mean in enumerate(means, 1)]
-    assert score(here, *lines) == pytest.approx((3.68 + 9 * 0.75) / 10)
-    # reports without an episode repeat a mean, and a mean may reach back beyond ten reports
-    lines = [report(n, 10 * (n > 0), 10 * n, 2.0) for n in range(11)]
-    lines += [report(n, 0, 100, 2.0) for n in range(11, 20)]
-    assert score(here, report(0, 50, 50, 9.0), *lines) == pytest.approx(2)
-    lines += [report(20, 200, 200, 5.0)]
-    assert score(here, *lines) == pytest.approx((200 * 5 + 100 * 2) / 300)
 
 
 # ---- --config-dir; completion ----
@@ -561,9 +507,3 @@ def test_shell_completion(monkeypatch, capsys, line, expected):
     monkeypatch.setenv("COMP_LINE", f"python train.py {line}")
     assert train.main(["-sc", "query=bash"]) == 0
     assert capsys.readouterr().out.strip() == expected
-
-
-def test_loggers_are_swept():
-    words = ["logger=csv,[csv,tensorboard],none"]
-    _, jobs, _ = sweeps.jobs_of(Composer(load("train")), words)
-    assert [[*job.logger] for job in jobs] == [["csv"], ["csv", "tensorboard"], []]

@@ -4,12 +4,10 @@ import contextlib
 import itertools
 import json
 import os
-import pathlib
 import re
 import shlex
 import signal
 import time
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -28,9 +26,6 @@ from megastep.agents.launch import run as launch_run
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.runs.folders import locked
 from megastep.agents.training import loggers
-from megastep.agents.training.budget import Budget
-from megastep.agents.training.callbacks import Progress
-from megastep.agents.training.episodes import Episodes
 from megastep.agents.training.trainer import Trainer
 from megastep.settings import MAX_ENVS
 from tests.helpers import faults, tiny
@@ -195,17 +190,6 @@ def test_init_refuses_other_shapes(here):
     with pytest.raises(UserError, match="agent.width=8.*size mismatch.*8, 24.*16, 24"):
         train.run(configured("samples=1", f"init={first}", "agent.width=16"))
     assert [*(here / "runs").glob("*/")] == [here / first]  # the refused runs left nothing behind
-
-
-def test_several_layers(here):
-    run = train.run(configured("agent.core=mingru", "agent.layers=2", "samples=1"))
-    assert {"core.0.input.weight", "core.1.input.weight"} <= set(weights(run))
-    assert evaluate.main([f"run={run}", "episodes=4"]) == 0
-    train.run(configured(f"resume={run}", f"samples={2 * UPDATE}", tiny=[]))
-    assert checkpoint.load_latest(run / "checkpoints").step == 2 * UPDATE
-    for layers, odd in (1, "core.input.weight"), (3, "core.2.input.weight"):
-        with pytest.raises(UserError, match=f"agent.layers=2.*{odd}"):
-            train.run(configured(f"init={run}", "samples=1", f"agent.layers={layers}"))
 
 
 def test_resume_after_a_signal(here, monkeypatch, capsys):
@@ -479,57 +463,6 @@ def test_finish(here, capsys):
     assert [row["agent"] for row in result["rows"]] == ["trained", "random"]
     assert (folder / "video.mp4").stat().st_size > 1000
     assert "random" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "early, late",  # updates, between which a leak shows
-    [
-        pytest.param(150, 400, marks=pytest.mark.slow),
-        pytest.param(400, 1200, marks=pytest.mark.nightly),
-    ],
-)
-def test_long_run_leaks_nothing(here, monkeypatch, early, late):
-    real, seen = Trainer.report, {}
-
-    def report(self):
-        real(self)
-        pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
-        seen[self.updates] = pages * 4096 / 1e6, len(os.listdir("/proc/self/fd"))
-
-    monkeypatch.setattr(Trainer, "report", report)
-    train.run(configured(f"samples={late * UPDATE}", "checkpoints.seconds=0.5"))
-    grown = seen[late][0] - seen[early][0]
-    # a checkpoint that is being written has a file open
-    files, files_late = (min(seen[i][1] for i in range(n - 50, n)) for n in (early, late))
-    assert grown < 4 and files_late == files, seen  # megabytes
-
-
-def test_progress_metrics():
-    latest = {"episode/return/leader": 12.345, "episode/return/follower": 2.0}
-    latest |= {"episode/coverage": 0.8371, "episode/length": 9.0}
-    episodes = Episodes.__new__(Episodes)
-    episodes.stats = SimpleNamespace(metrics=["coverage"], groups=("leader", "follower"))
-    assert episodes.few_means(latest) == ["leader 12.3", "follower 2", "coverage 0.837"]
-    assert episodes.few_means({}) == []
-    episodes.stats.metrics += "abcd"
-    assert episodes.few_means(latest) == []
-
-
-def test_progress_says_how_many_episodes_a_return_is_of():
-    running = SimpleNamespace(
-        samples=2_000_000,
-        timing=SimpleNamespace(rate=1e6),
-        fraction_left=1.0,
-        latest_stats={"episode/return": 26.34, "episode/window": 1312, "episode/won/past": 0.6},
-        episodes=SimpleNamespace(few_means=lambda latest: []),
-        budget=Budget(),
-        evaluation={},
-    )
-    shown = []
-    Progress(lambda *line: shown.append(line)).on_report(running, {})
-    ((fraction, words),) = shown
-    assert fraction is None
-    assert words == ["2M samples", "1M/s", "return 26.3 of 1.31k episodes", "won vs past 60 %"]
 
 
 def test_cpu_threads():
