@@ -161,6 +161,8 @@ def _run_composed(command, options, argv, parser) -> int:
             gpu.start_driver()  # beside composing
         with rank.joined() if command.has_ranks else contextlib.nullcontext() as team:
             cfg = rank.together(lambda: _ready(composer, words))
+            if cfg is None:
+                return sweeps.sweep(composer, words)
             if team is None and (cfg.device != "auto" or gpu.is_available()):
                 gpu.wake(cfg.device)  # beside the imports of what runs
             command.run(cfg)
@@ -168,8 +170,10 @@ def _run_composed(command, options, argv, parser) -> int:
 
 
 def _ready(composer, words) -> Any:
-    """Returns settings that can be run."""
-    cfg = composer.settings(words)
+    """Returns settings that can be run; None if files say that this is a sweep."""
+    cfg, config = composer.compose(words)
+    if config.hydra.mode is not None and config.hydra.mode.name == "MULTIRUN":
+        return None
     composer.command.ready(cfg)
     return cfg
 
