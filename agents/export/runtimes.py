@@ -14,7 +14,7 @@ import torch
 from megastep.agents import package
 from megastep.agents.errors import UserError, shortened
 from megastep.agents.export.step import Step
-from megastep.agents.networks.kernels.library import plain_operations
+from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.outputs import FORBIDDEN
 from megastep.arrdict import arrdict
 from megastep.atomic_files import write_atomically

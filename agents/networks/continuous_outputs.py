@@ -14,7 +14,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from megastep import spaces
-from megastep.agents.networks.layers import linear
+from megastep.agents.networks.linear import linear
 from megastep.agents.networks.outputs import Output
 
 # Actions closer to a bound count as this far from it: atanh would be infinite.

@@ -19,7 +19,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.intakes import ACTIVATIONS
-from megastep.agents.networks.layers import linear
+from megastep.agents.networks.linear import linear
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict

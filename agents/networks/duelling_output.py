@@ -11,12 +11,112 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from megastep import spaces
-from megastep.agents.networks import products
-from megastep.agents.networks.kernels import duelling as kernels
-from megastep.agents.networks.kernels.library import aligned
-from megastep.agents.networks.layers import linear
+from megastep.agents.networks.fused import LIBRARY, aligned, fused
+from megastep.agents.networks.linear import (
+    gradient_of_inputs,
+    gradient_of_weights,
+    linear,
+    product,
+    sum_rows,
+)
 from megastep.agents.networks.outputs import FORBIDDEN, Output, gather
 from megastep.agents.networks.precision import cast, compute_dtype
+from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
+
+_MAX_OUTPUTS, _STRIP, _THREADS = (
+    LIBRARY.constants[f"DUELLING_{name}"] for name in ("OUTPUTS", "STRIP", "THREADS")
+)
+_BLOCK_ROWS = BLOCK // WARP * (WARP // _MAX_OUTPUTS)
+
+
+def _fits(output, x) -> bool:
+    is_bf16 = x.is_cuda and compute_dtype(output.hidden.weight) == torch.bfloat16
+    return is_bf16 and x.shape[-1] % 8 == 0 and math.prod(output.shape) <= _MAX_OUTPUTS
+
+
+def _launch_values(operation, hidden, parameters, shape, **fields) -> torch.Tensor:
+    """Computes action values (N, A, n) float32 from the hidden layer (N, 2 W) after its ReLU, and
+    from weights and biases of the value and of the advantages.
+    """
+    n_rows, n_features = hidden.shape
+    values = torch.empty(n_rows, *shape, device=hidden.device)
+    names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"
+    unused = dict.fromkeys(("noise", "epsilon", "actions", "logprobs"))
+    parameters = (aligned(p.detach()) for p in parameters)
+    launch(
+        *(LIBRARY, operation, hidden.device, Blocks(-(-n_rows // _BLOCK_ROWS))),
+        **dict(zip(names, parameters, strict=True), hidden=hidden, values=values),
+        **{**unused, "usual_epsilon": 1.0, **fields},
+        **dict(n_rows=n_rows, width=n_features // 2, n_agents=shape[0], n_choices=shape[1]),
+    )
+    return values
+
+
+def _act_on_gpu(
+    output, x, sample=True, generator=None, mask=None, epsilon=None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Acts in one kernel after the hidden layer's."""
+    hidden, (n_lanes, device) = linear(x, output.hidden, torch.relu), (len(x), x.device)
+    noise = output.noise((n_lanes, output.shape[0]), generator, device) if sample else None
+    actions = torch.empty(n_lanes, output.shape[0], dtype=torch.int64, device=device)
+    logprobs = torch.empty(n_lanes, device=device)
+    epsilon = None if epsilon is None else epsilon.float().contiguous()
+    results = dict(noise=noise, epsilon=epsilon, actions=actions, logprobs=logprobs)
+    where = "duelling_act", hidden, output.value_parameters(), output.shape
+    values = _launch_values(*where, usual_epsilon=output.epsilon, **results)
+    return values, actions, logprobs
+
+
+def _acts_on_gpu(output, x, sample=True, generator=None, mask=None, epsilon=None) -> bool:
+    return mask is None and not torch.is_grad_enabled() and _fits(output, x)
+
+
+def _values_on_gpu(output, x) -> torch.Tensor:
+    parameters = *output.hidden.parameters(), *output.value_parameters()
+    return _Values.apply(x.to(torch.bfloat16), *parameters, output.shape)
+
+
+class _Values(torch.autograd.Function):
+    """`DuellingOutput.forward`: one product and one kernel forward, two products and one kernel
+    backward. The values and the weights' gradients are float32 sums.
+    """
+
+    @staticmethod
+    def forward(ctx, x, hidden_weight, hidden_bias, *parameters_and_shape) -> torch.Tensor:
+        *parameters, shape = parameters_and_shape
+        lead, x = x.shape[:-1], x.flatten(0, -2)
+        weight, bias = (cast(leaf, x.dtype) for leaf in (hidden_weight, hidden_bias))
+        hidden = product(x, weight, bias, has_relu=True)
+        values = _launch_values("duelling_values", hidden, parameters, shape)
+        value_weight, _, advantage_weight, _ = parameters
+        ctx.save_for_backward(x, weight, hidden, aligned(value_weight), aligned(advantage_weight))
+        return values.unflatten(0, lead)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_values) -> tuple[torch.Tensor | None, ...]:
+        x, weight, hidden, value_weight, advantage_weight = ctx.saved_tensors
+        lead, d_values = d_values.shape[:-2], d_values.flatten(0, -3).contiguous()
+        n_rows, n_agents, n_choices = d_values.shape
+        width, n_outputs = value_weight.shape[1], n_agents * n_choices
+        sizes = [2 * width, n_agents * width, n_outputs * width, n_agents, n_outputs]
+        n_strips, n_parts = -(-n_rows // _STRIP), -(-width // _THREADS)
+        d_hidden, sums = torch.empty_like(hidden), d_values.new_empty(n_strips, sum(sizes))
+        launch(
+            *(LIBRARY, "duelling_backward", hidden.device, Blocks(n_strips, n_parts, _THREADS)),
+            **dict(hidden=hidden, value_weight=value_weight, advantage_weight=advantage_weight),
+            **dict(d_values=d_values, d_hidden=d_hidden, sums=sums, n_sums=sum(sizes)),
+            **dict(n_rows=n_rows, width=width, n_agents=n_agents, n_choices=n_choices),
+        )
+        d_bias, d_value, d_advantage, d_value_bias, d_advantage_bias = sum_rows(sums).split(sizes)
+        d_x = None
+        if ctx.needs_input_grad[0]:
+            d_x = gradient_of_inputs(d_hidden, weight).unflatten(0, lead)
+        return (
+            *(d_x, gradient_of_weights(d_hidden, x), d_bias),
+            *(d_value.view_as(value_weight), d_value_bias),
+            *(d_advantage.view_as(advantage_weight), d_advantage_bias, None),
+        )
 
 
 class DuellingOutput(Output):
@@ -47,10 +147,8 @@ class DuellingOutput(Output):
             nn.init.orthogonal_(layer.weight, gain=0.1)
             nn.init.zeros_(layer.bias)
 
+    @fused(_values_on_gpu, _fits)
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if self._is_fused(x):
-            x = x.to(torch.bfloat16)
-            return _DuellingValues.apply(x, *self.hidden.parameters(), *self._values(), self.shape)
         hidden = linear(x, self.hidden, torch.relu)
         # bfloat16 would round large values by more than actions differ
         with torch.autocast(x.device.type, enabled=False):
@@ -59,6 +157,7 @@ class DuellingOutput(Output):
             advantage = self.advantage(advantage).unflatten(-1, self.shape)
         return value + advantage - advantage.mean(-1, keepdim=True)
 
+    @fused(_act_on_gpu, _acts_on_gpu)
     def act(
         self,
         x: torch.Tensor,
@@ -67,38 +166,22 @@ class DuellingOutput(Output):
         mask: torch.Tensor | None = None,
         epsilon: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Does the same as `Output.act`, without a mask on a GPU in one kernel after the hidden
-        layer's.
-        """
-        if torch.is_grad_enabled() or not self._is_fused(x) or mask is not None:
-            options: dict = {} if epsilon is None else dict(epsilon=epsilon)
-            if mask is not None:
-                options["is_masked"] = True
-            return super().act(x, sample, generator, mask, **options)
-        hidden = linear(x, self.hidden, torch.relu)
-        noise = self._noise((len(x), self.shape[0]), generator, x.device) if sample else None
-        parameters = [aligned(p.detach()) for p in self._values()]
-        if epsilon is not None:
-            epsilon = epsilon.float().contiguous()
-        return kernels.act(hidden, parameters, self.shape, noise, epsilon, self.epsilon)
+        """Does the same as `Output.act`."""
+        options: dict = {} if epsilon is None else dict(epsilon=epsilon)
+        if mask is not None:
+            options["is_masked"] = True
+        return super().act(x, sample, generator, mask, **options)
 
     def masked(self, logits: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Returns values with which only allowed actions are the best."""
         return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN)
 
-    def _is_fused(self, x) -> bool:
-        return (
-            x.is_cuda
-            and compute_dtype(self.hidden.weight) == torch.bfloat16
-            and x.shape[-1] % 8 == 0
-            and math.prod(self.shape) <= kernels.MAX_OUTPUTS
-        )
-
-    def _values(self) -> tuple[torch.Tensor, ...]:
+    def value_parameters(self) -> tuple[torch.Tensor, ...]:
+        """Returns weight and bias of the value, then of the advantages."""
         return *self.value.parameters(), *self.advantage.parameters()
 
     @staticmethod
-    def _noise(shape, generator, device) -> torch.Tensor:
+    def noise(shape, generator, device) -> torch.Tensor:
         """Returns (2, *shape) from 0 to 1: which random action, and whether to take it."""
         return torch.rand(2, *shape, generator=generator, device=device)
 
@@ -116,7 +199,7 @@ class DuellingOutput(Output):
         """
         limit = self.epsilon if epsilon is None else epsilon[..., None]
         best, n = self.greedy(logits), logits.shape[-1]
-        which, whether = self._noise(best.shape, generator, logits.device)
+        which, whether = self.noise(best.shape, generator, logits.device)
         if is_masked:
             rank = (logits > FORBIDDEN / 2).cumsum(-1)  # of each allowed action, from 1
             n = rank[..., -1].clamp(min=1)
@@ -138,32 +221,3 @@ class DuellingOutput(Output):
     def action_value(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Returns the value (...,) of actions."""
         return gather(logits, actions)
-
-
-class _DuellingValues(torch.autograd.Function):
-    """`DuellingOutput.forward`: one product and one kernel forward, two products and one kernel
-    backward. The values and the weights' gradients are float32 sums.
-    """
-
-    @staticmethod
-    def forward(ctx, x, hidden_weight, hidden_bias, *parameters_and_shape) -> torch.Tensor:
-        *parameters, shape = parameters_and_shape
-        lead, x = x.shape[:-1], x.flatten(0, -2)
-        weight, bias = (cast(leaf, x.dtype) for leaf in (hidden_weight, hidden_bias))
-        hidden = products.layer(x, weight, bias, has_relu=True)
-        parameters = [aligned(p.detach()) for p in parameters]
-        values = kernels.values(hidden, parameters, shape)
-        value_weight, _, advantage_weight, _ = parameters
-        ctx.save_for_backward(x, weight, hidden, value_weight, advantage_weight)
-        return values.unflatten(0, lead)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, d_values) -> tuple[torch.Tensor | None, ...]:
-        x, weight, hidden, *weights = ctx.saved_tensors
-        lead, d_values = d_values.shape[:-2], d_values.flatten(0, -3).contiguous()
-        d_hidden, gradients = kernels.backward(hidden, *weights, d_values=d_values)
-        d_x = None
-        if ctx.needs_input_grad[0]:
-            d_x = products.of_inputs(d_hidden, weight).unflatten(0, lead)
-        return d_x, products.of_weights(d_hidden, x), *gradients, None

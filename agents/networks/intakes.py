@@ -11,23 +11,56 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks import intake_cpu
-from megastep.agents.networks.encoders import (
-    Cnn,
-    Conv,
-    Flat,
-    Part,
-    can_encode,
-    encode,
-    make_encoder,
-)
-from megastep.agents.networks.layers import linear, normalised
+from megastep.agents.networks.encoders import Cnn, Flat, make_encoder
+from megastep.agents.networks.fused import LIBRARY, fused
+from megastep.agents.networks.linear import linear
 from megastep.agents.networks.precision import compute_dtype
-from megastep.agents.networks.running_norm import RunningNorm
+from megastep.agents.networks.row_convolutions import Conv, Part, encode
+from megastep.agents.networks.running_norm import (
+    MAX_LEAVES,
+    RunningNorm,
+    are_readable,
+    packed_leaf,
+)
+from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.types import Space, Tree
 
 #: Activations of hidden layers by name.
 ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
+_MAX_STEPS = 65_535  # blocks along y
+_ROWS = LIBRARY.constants["NORMALISED_ROWS"]
+
+
+def _fits(intake, obs, lanes=None) -> bool:
+    leaves = intake.leaves(obs)
+    has_known = intake.is_fused and len(leaves) <= MAX_LEAVES and are_readable(leaves)
+    is_bf16 = compute_dtype(intake.project.weight) == torch.bfloat16
+    has_gradient = any(leaf.requires_grad for leaf in leaves)
+    is_long = lanes is not None and len(leaves[0]) > _MAX_STEPS
+    return has_known and is_bf16 and not has_gradient and not is_long
+
+
+def _encode_on_gpu(intake, obs, lanes=None) -> torch.Tensor:
+    """Selects lanes, normalises and concatenates leaves in one kernel."""
+    leaves, norms = intake.leaves(obs), intake.running_norms
+    flat = [leaves[i].flatten(-norms[i].mean.dim()) for i in intake.order]
+    lead, norms = flat[0].shape[:-1], [norms[i] for i in intake.order]
+    if lanes is None:
+        flat = [leaf.reshape(1, -1, leaf.shape[-1]) for leaf in flat]
+    n_steps, n_lanes = flat[0].shape[:2]
+    n_selected = n_lanes if lanes is None else len(lanes)
+    shape = n_steps, n_selected, intake.n_columns
+    features = flat[0].new_empty(shape, dtype=torch.bfloat16)
+    plain = itertools.takewhile(lambda leaf: leaf.shape[-1] % 4 == 0, flat)
+    n_threads = intake.n_columns // 4 * -(-n_selected // _ROWS)
+    launch(
+        *(LIBRARY, "normalise", features.device, Blocks(-(-n_threads // BLOCK), n_steps)),
+        leaves=b"".join(map(packed_leaf, norms, flat)),
+        **dict(lanes=lanes, features=features, n_steps=n_steps, n_lanes=n_lanes),
+        **dict(n_selected=n_selected, n_columns=intake.n_columns),
+        n_plain_words=sum(leaf.shape[-1] // 4 for leaf in plain),
+    )
+    return intake.encode_columns(features if lanes is not None else features.view(*lead, -1))
 
 
 class ConcatIntake(nn.Module):
@@ -120,22 +153,15 @@ class ConcatIntake(nn.Module):
         """Returns the features (..., width) of what `encode` returned."""
         return linear(encoded, self.project, self.activation)
 
+    @fused(_encode_on_gpu, _fits)
     def encode(self, obs: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
         """Returns all leaves, normalised, encoded and concatenated, with columns of zeros at the
         end: (..., n_features + n_padding).
         """
-        leaves = self._leaves(obs)
-        if self.is_fused:
-            norms = self.running_norms  # of every leaf
-            ordered = [leaves[i] for i in self.order], [norms[i] for i in self.order]
-            columns = normalised(*ordered, self.n_columns, lanes)
-            if columns is not None:
-                return self._encode_columns(columns)
+        leaves = self.leaves(obs)
         if lanes is not None:
             leaves = [leaf.index_select(1, lanes) for leaf in leaves]
         dtype = compute_dtype(self.project.weight)
-        if dtype == torch.float32 and intake_cpu.fits(leaves, [*self.norms], [*self.encoders]):
-            return intake_cpu.normalised(leaves, self.running_norms, self.n_padding)
         features = [
             encoder(norm(leaf)).to(dtype)
             for leaf, norm, encoder in zip(leaves, self.norms, self.encoders, strict=True)
@@ -144,14 +170,13 @@ class ConcatIntake(nn.Module):
             features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
         return torch.cat(features, dim=-1)
 
-    def _encode_columns(self, columns) -> torch.Tensor:
+    def encode_columns(self, columns: torch.Tensor) -> torch.Tensor:
         """Returns `encode` of normalised leaves side by side, (..., n_columns)."""
         if all(i is None for i, *_ in self.runs):  # one run, of all columns
             return columns
         if not any(isinstance(encoder, Cnn) for encoder in self.encoders):
-            rows, parts = columns.flatten(0, -2), self._parts()
-            if can_encode(rows, parts):
-                return encode(rows, parts).unflatten(0, columns.shape[:-1])
+            features = encode(columns.flatten(0, -2), self._parts())
+            return features.unflatten(0, columns.shape[:-1])
         features = []
         for i, shape, start, end in self.runs:
             part = columns[..., start:end]
@@ -183,9 +208,10 @@ class ConcatIntake(nn.Module):
 
     def normalised_leaves(self, obs: Tree) -> list[torch.Tensor]:
         """Returns the leaf of each of `running_norms`."""
-        pairs = zip(self.norms, self._leaves(obs), strict=True)
+        pairs = zip(self.norms, self.leaves(obs), strict=True)
         return [leaf for norm, leaf in pairs if isinstance(norm, RunningNorm)]
 
-    def _leaves(self, obs) -> list[torch.Tensor]:
+    def leaves(self, obs: Tree) -> list[torch.Tensor]:
+        """Returns the observation's leaves, in the order of `paths`."""
         values = spaces.leaves(obs)
         return [values[path] for path in self.paths]

@@ -6,196 +6,287 @@ PyTorch. Matrix products run in the compute dtype (autocast's) on a GPU and in f
 cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would round small
 additions away.
 
-The part between two matrix products is written here in PyTorch. On a GPU it is a kernel with the
-same arguments (`megastep.agents.networks.kernels.lstm`); acting with few lanes, one kernel has the
-product, too (`megastep.agents.networks.kernels.few_rows`). GPUs with clusters of blocks run a
-whole sequence, products included, in one kernel (`megastep.agents.networks.kernels.lstm_sequence`),
-and so does a CPU if W is a multiple of 16 (`megastep.agents.networks.lstm_cpu`).
+`lstm_sequence` is the recurrence in PyTorch. A CPU runs a whole sequence in one kernel, and so does a GPU
+with clusters of blocks (Hopper and later); others run one kernel per step between two products. When
+acting, a GPU has one product of inputs and last outputs, or with few lanes one kernel for all.
 """
 
-from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from megastep.agents.networks import products
-from megastep.agents.networks.kernels import few_rows, lstm_sequence
-from megastep.agents.networks.kernels import lstm as kernels
-from megastep.agents.networks.kernels.library import aligned, check_shapes, is_plain
-from megastep.agents.networks.lstm_cpu import CpuSequence, fits
+from megastep.agents.networks import few_rows
+from megastep.agents.networks.fused import (
+    DTYPES,
+    LIBRARY,
+    aligned,
+    check_shapes,
+    fused,
+    has_hopper,
+    is_built_for_cpu,
+    launch_units,
+)
+from megastep.agents.networks.linear import (
+    gradient_of_inputs,
+    gradient_of_weights,
+    matmul,
+    product,
+    sum_rows,
+)
 from megastep.agents.networks.precision import cast, cast_joined, compute_dtype
 from megastep.arrdict import arrdict
+from megastep.engine.devices import threads
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
+from megastep.kernels.build.launch import Blocks, launch
 
-if TYPE_CHECKING:
-    from types import ModuleType
-
-_sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)
-_tanh_backward = torch.ops.aten.tanh_backward.grad_input  # (d, y): d (1 - y^2)
-
-
-def _split(gates) -> tuple[torch.Tensor, ...]:
-    return gates.view(len(gates), 4, -1).unbind(1)
-
-
-def _start(reset, last_output, last_cell, hidden, cell) -> None:
-    reset = reset[:, None]
-    hidden.copy_(last_output).masked_fill_(reset, 0.0)
-    cell.copy_(last_cell).masked_fill_(reset, 0.0)
-
-
-def _forward(gates, cell, next_reset, output, next_hidden, next_cell) -> None:
-    """Leaves the gates activated for `_backward`; the kernels recompute the activations instead."""
-    i, f, g, o = _split(gates)
-    gates[:, : 2 * i.shape[1]].sigmoid_()
-    g.tanh_()
-    o.sigmoid_()
-    torch.mul(f, cell, out=next_cell).addcmul_(i, g)
-    torch.tanh(next_cell, out=output).mul_(o)
-    if next_reset is not None:
-        reset = next_reset[:, None]
-        next_hidden.copy_(output).masked_fill_(reset, 0.0)
-        next_cell.masked_fill_(reset, 0.0)
+# Lambdas with type parameters are device code only if everything is.
+CLUSTERS = KernelLibrary(
+    Path(__file__).parent / "kernels" / "clusters",
+    (*FAST_CUDA_FLAGS, "--device-as-default-execution-space"),
+)
+#: Widths that the kernels for clusters have.
+WIDTHS = 128, 256
+_MAX_STEPS, _THREADS, _LANES, _BLOCK_UNITS = (
+    CLUSTERS.constants[name]
+    for name in ("MAX_STEPS", "SEQUENCE_THREADS", "SEQUENCE_LANES", "BLOCK_UNITS")
+)
 
 
-def _backward(
-    gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell
-) -> None:
-    i, f, g, o = _split(gates)
-    d_i, d_f, d_g, d_o = _split(d_gates)
-    squashed = (f * cell).addcmul_(i, g).tanh_()
-    if next_reset is not None:
-        reset = next_reset[:, None]
-        d_output = d_output + d_next_hidden.masked_fill(reset, 0.0)
-        d_next_cell = d_next_cell.masked_fill(reset, 0.0)
-    d_after = _tanh_backward(d_output * o, squashed, grad_input=d_cell).add_(d_next_cell)
-    _sigmoid_backward(d_after * g, i, grad_input=d_i)
-    _sigmoid_backward(d_after * cell, f, grad_input=d_f)
-    _tanh_backward(d_after * i, g, grad_input=d_g)
-    _sigmoid_backward(squashed.mul_(d_output), o, grad_input=d_o)
-    d_cell.mul_(f)
+class Unrolled(NamedTuple):
+    """What a form of the recurrence computes of a sequence.
 
-
-_CPU_STEPS = SimpleNamespace(start=_start, forward=_forward, backward=_backward)
-
-
-def _steps(x) -> "ModuleType | SimpleNamespace":
-    return kernels if x.is_cuda else _CPU_STEPS
-
-
-def _unroll(
-    x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual
-) -> lstm_sequence.Unrolled:
-    """Unrolls the recurrence step by step.
-
-    Returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output and cell
-    (B, W), and what `_unroll_backward` needs.
+    Attributes:
+        outputs: (T, B, W).
+        hiddens: (T, B, W), each step's recurrent input: the last output, 0 after a reset.
+        last_output: (B, W) float32, without a residual.
+        last_cell: (B, W) float32.
+        saved: what its backward pass needs.
     """
-    steps = _steps(x)
+
+    outputs: torch.Tensor
+    hiddens: torch.Tensor
+    last_output: torch.Tensor
+    last_cell: torch.Tensor
+    saved: tuple
+
+
+class Gradients(NamedTuple):
+    """The gradients of the gates (T, B, 4 W), of the bias (4 W,), and of the output and the cell
+    before the sequence, (B, W); and of the inputs (T, B, W), or None if it is left to the caller.
+    """
+
+    gates: torch.Tensor
+    bias: torch.Tensor
+    output: torch.Tensor
+    cell: torch.Tensor
+    x: torch.Tensor | None = None
+
+
+# ---- On a GPU, step by step ----
+
+
+def _forward_in_steps(
+    x, input_weight, bias, weight, reset, output, cell, saves, residual
+) -> Unrolled:
     gates = F.linear(x, input_weight, bias)
-    # hiddens[t] is the output of step t - 1 as step t sees it: 0 after a reset
     outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
     cells = [torch.empty_like(cell)]
-    steps.start(reset[0], output, cell, hiddens[0], cells[0])
+    launch_units(
+        *("lstm_start", x.dtype, cell),
+        **dict(reset=reset[0], last_output=output, last_cell=cell),
+        **dict(hidden=hiddens[0], cell=cells[0]),
+    )
     next_steps = [*zip(reset[1:], hiddens[1:], strict=True), (None, None)]
     for t, (next_reset, next_hidden) in enumerate(next_steps):
         gates[t].addmm_(hiddens[t], weight.T)
-        cells.append(torch.empty_like(cells[t]))
-        steps.forward(gates[t], cells[t], next_reset, outputs[t], next_hidden, cells[t + 1])
+        cells.append(torch.empty_like(cell))
+        launch_units(
+            *("lstm_forward", x.dtype, cell),
+            **dict(gates=gates[t], cell=cells[t], next_reset=next_reset, output=outputs[t]),
+            **dict(next_hidden=next_hidden, next_cell=cells[t + 1]),
+        )
     last = outputs[-1].float()
-    outputs = outputs + x if is_residual else outputs
-    return outputs, hiddens, last, cells[-1], (gates, *cells[:-1])
+    outputs = outputs if residual is None else outputs + residual
+    return Unrolled(outputs, hiddens, last, cells[-1], (gates, *cells[:-1]))
 
 
-def _unroll_backward(
-    weight, reset, saved, d_outputs, d_cell, needs_state
-) -> lstm_sequence.Gradients:
-    """Returns the gradients of the gates (T, B, 4 W), of the bias and, if needed, of the output and
-    the cell before the sequence. `d_cell` None: the last cell has no gradient.
-    """
+def _backward_in_steps(input_weight, weight, reset, saved, d_outputs, d_cell) -> Gradients:
     gates, *cells = saved
-    steps, d_gates = _steps(gates), torch.empty_like(gates)
+    d_gates = torch.empty_like(gates)
     d_cell = torch.zeros_like(cells[0]) if d_cell is None else d_cell
     next_reset = d_hidden = None
     for t in reversed(range(len(reset))):
         d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
-        steps.backward(
-            *(gates[t], cells[t], next_reset),
-            *(d_outputs[t], d_hidden, d_next_cell),
-            *(d_gates[t], d_cell),
+        launch_units(
+            *("lstm_backward", gates.dtype, d_cell),
+            **dict(gates=gates[t], cell=cells[t], next_reset=next_reset, d_output=d_outputs[t]),
+            **dict(d_next_hidden=d_hidden, d_next_cell=d_next_cell),
+            **dict(d_gates=d_gates[t], d_cell=d_cell),
         )
-        if t or needs_state:
-            next_reset, d_hidden = reset[t], d_gates[t] @ weight
-    d_bias = d_gates.flatten(0, 1).sum(0)
-    if not needs_state:
-        return d_gates, d_bias, None, None
-    assert d_hidden is not None
-    d_output = d_hidden.float().masked_fill_(reset[0, :, None], 0.0)
-    return d_gates, d_bias, d_output, d_cell.masked_fill_(reset[0, :, None], 0.0)
+        next_reset, d_hidden = reset[t], d_gates[t] @ weight
+    is_reset = reset[0, :, None]
+    d_states = d_hidden.float().masked_fill_(is_reset, 0.0), d_cell.masked_fill_(is_reset, 0.0)
+    return Gradients(d_gates, d_gates.flatten(0, 1).sum(0), *d_states)
 
 
-def _unroll_on_chip(
-    x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual
-) -> lstm_sequence.Unrolled:
-    """`_unroll` in one kernel after the inputs' product."""
-    gates, residual = products.layer(x, input_weight, bias), x if is_residual else None
-    return lstm_sequence.forward(gates, weight, reset, output, cell, needs_backward, residual)
+# ---- On a GPU with clusters of blocks: the recurrent weights stay on the chip ----
 
 
-def _unroll_on_chip_backward(
-    weight, reset, saved, d_outputs, d_cell, needs_state
-) -> lstm_sequence.Gradients:
-    """`_unroll_backward` in one kernel."""
+def _fits_clusters(x, *_) -> bool:
+    return (
+        x.is_cuda
+        and x.dtype == torch.bfloat16
+        and x.shape[-1] in WIDTHS
+        and 2 <= len(x) <= _MAX_STEPS  # for one step, loading the weights takes too long
+        and x.numel() > 0
+        and has_hopper(x.device, max(_memory(name, x.shape[-1]) for name in _DIRECTIONS))
+    )
+
+
+_DIRECTIONS = "forward", "backward"
+
+
+def _memory(direction, width) -> int:
+    """Returns the bytes of shared memory that a block needs."""
+    return CLUSTERS.constants[f"{direction.upper()}_MEMORY_{width}"]
+
+
+def _launch_clusters(direction, width, device, n_lanes, **fields) -> None:
+    n_clusters = -(-n_lanes // _LANES)
+    n_blocks, shared = width // _BLOCK_UNITS * n_clusters, _memory(direction, width)
+    launch(
+        *(CLUSTERS, f"lstm_sequence_{direction}_{width}", device),
+        Blocks(n_blocks, threads=_THREADS, shared=shared),
+        **fields,
+        n_lanes=n_lanes,
+        n_clusters=n_clusters,
+    )
+
+
+def _forward_on_clusters(
+    x, input_weight, bias, weight, reset, output, cell, saves, residual
+) -> Unrolled:
+    gates, (n_steps, n_lanes, width) = product(x, input_weight, bias), x.shape
+    outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
+    last_output, last_cell, saved = torch.empty_like(output), torch.empty_like(cell), (None, None)
+    if saves:
+        lead = n_steps, -(-n_lanes // _LANES), width // _BLOCK_UNITS, _LANES // 8, _THREADS
+        saved = gates.new_empty(*lead, 8), cell.new_empty(*lead, 2)
+    _launch_clusters(
+        *("forward", width, x.device, n_lanes),
+        **dict(gates=gates, weight=weight, reset=reset, residual=residual),
+        **dict(last_output=output, last_cell=cell, output=last_output, cell=last_cell),
+        **dict(outputs=outputs, hiddens=hiddens, saved_gates=saved[0], saved_cells=saved[1]),
+        n_steps=n_steps,
+    )
+    return Unrolled(outputs, hiddens, last_output, last_cell, saved)
+
+
+def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell) -> Gradients:
+    n_steps, n_lanes, width = d_outputs.shape
+    d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * width)
+    d_bias = saved[1].new_empty(-(-n_lanes // _LANES), 4 * width)
+    d_last_output, d_last_cell = (saved[1].new_empty(n_lanes, width) for _ in range(2))
+    _launch_clusters(
+        *("backward", width, weight.device, n_lanes),
+        **dict(weight=weight.T.contiguous(), reset=reset),
+        **dict(saved_gates=saved[0], saved_cells=saved[1], d_outputs=d_outputs, d_cell=d_cell),
+        **dict(d_gates=d_gates, d_bias=d_bias),
+        **dict(d_last_output=d_last_output, d_last_cell=d_last_cell),
+        n_steps=n_steps,
+    )
+    return Gradients(d_gates, sum_rows(d_bias), d_last_output, d_last_cell)
+
+
+# ---- On a CPU ----
+
+
+def _launch_on_cpu(direction, like, **fields) -> None:
+    n_steps, n_lanes, width = like.shape
+    launch(
+        *(LIBRARY, f"lstm_sequence_{direction}", like.device, 0),
+        **fields,
+        n_steps=n_steps,
+        n_lanes=n_lanes,
+        width=width,
+        n_threads=threads(),
+    )
+
+
+def _forward_on_cpu(
+    x, input_weight, bias, weight, reset, output, cell, saves, residual
+) -> Unrolled:
+    gates = x.new_empty((*x.shape[:2], 4 * x.shape[2]))
+    hiddens, cells, outputs = (torch.empty_like(x) for _ in range(3))
+    last_cell = torch.empty_like(cell)
+    _launch_on_cpu(
+        *("forward", x),
+        **dict(x=x, input_weight=input_weight, bias=bias, weight=weight, reset=reset),
+        **dict(first_output=output, first_cell=cell, gates=gates, hiddens=hiddens, cells=cells),
+        **dict(outputs=outputs, last_cell=last_cell),
+    )
+    summed = outputs if residual is None else outputs + residual
+    return Unrolled(summed, hiddens, outputs[-1].clone(), last_cell, (gates, cells))
+
+
+def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> Gradients:
     gates, cells = saved
-    return lstm_sequence.backward(weight, reset, gates, cells, d_outputs, d_cell)
+    d_gates, d_x, d_last = torch.empty_like(gates), torch.empty_like(d_outputs), cells[0]
+    d_cell = torch.zeros_like(d_last) if d_cell is None else d_cell
+    d_first_output, d_first_cell = torch.empty_like(d_last), torch.empty_like(d_last)
+    _launch_on_cpu(
+        *("backward", d_outputs),
+        **dict(input_weight=input_weight, weight=weight, reset=reset, gates=gates, cells=cells),
+        **dict(d_outputs=d_outputs, d_last_cell=d_cell, d_gates=d_gates, d_x=d_x),
+        **dict(d_output=d_first_output, d_cell=d_first_cell),
+    )
+    return Gradients(d_gates, d_gates.flatten(0, 1).sum(0), d_first_output, d_first_cell, d_x)
+
+
+# ---- The recurrence with an explicit gradient ----
+
+
+class _Form(NamedTuple):
+    forward: Callable[..., Unrolled]
+    backward: Callable[..., Gradients]
+
+
+IN_STEPS = _Form(_forward_in_steps, _backward_in_steps)
+ON_CLUSTERS = _Form(_forward_on_clusters, _backward_on_clusters)
+ON_CPU = _Form(_forward_on_cpu, _backward_on_cpu)
 
 
 class _Sequence(torch.autograd.Function):
-    """The recurrence over time with an explicit gradient.
-
-    Autograd would accumulate the weights' gradients step by step. Here each is one matrix product
-    over all steps.
+    """The recurrence by one of the forms. Autograd would accumulate the weights' gradients step by
+    step. Here each is one matrix product over all steps.
     """
 
     @staticmethod
     def forward(
-        ctx, x, input_weight, bias, weight, reset, output, cell, is_residual=False, has_grad=True
+        ctx, form, has_grad, x, input_weight, bias, weight, reset, output, cell, is_residual
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Unrolls the recurrence.
-
-        Args:
-            x: (T, B, W) in the compute dtype.
-            input_weight: (4 W, W).
-            bias: (4 W,).
-            weight: (4 W, W), of the recurrent product.
-            reset: (T, B) bool.
-            output: (B, W) float32, last output before the sequence.
-            cell: (B, W) float32, last cell before the sequence.
-            is_residual: adds x to the outputs.
-            has_grad: whether autograd is on; it never is in here.
-
-        Returns:
-            outputs (T, B, W) in the compute dtype, the last cell (B, W), and the last output (B, W)
-            float32 without x.
-        """
         ctx.set_materialize_grads(False)
-        ctx.on_chip, ctx.is_residual = lstm_sequence.is_supported(x), is_residual
-        unroll = _unroll_on_chip if ctx.on_chip else _unroll
-        x, reset = aligned(x), reset.contiguous()
-        input_weight, bias, weight = (cast(w, x.dtype) for w in (input_weight, bias, weight))
-        outputs, hiddens, last_output, last_cell, saved = unroll(
-            *(x, input_weight, bias, weight, reset, aligned(output), aligned(cell)),
-            has_grad and any(ctx.needs_input_grad),
-            is_residual,
+        ctx.form, ctx.is_residual = form, is_residual
+        x, reset, output, cell = aligned(x), reset.contiguous(), aligned(output), aligned(cell)
+        input_weight, bias, weight = (
+            cast(w, x.dtype).contiguous() for w in (input_weight, bias, weight)
         )
-        ctx.save_for_backward(x, input_weight, weight, reset, hiddens, *saved)
-        return outputs, last_cell, last_output
+        saves = has_grad and any(ctx.needs_input_grad)
+        result = form.forward(
+            *(x, input_weight, bias, weight, reset, output, cell),
+            *(saves, x if is_residual else None),
+        )
+        ctx.save_for_backward(x, input_weight, weight, reset, result.hiddens, *result.saved)
+        return result.outputs, result.last_output, result.last_cell
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_outputs, d_cell, d_last_output) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx, d_outputs, d_last_output, d_cell) -> tuple[torch.Tensor | None, ...]:
         x, input_weight, weight, reset, hiddens, *saved = ctx.saved_tensors
         d_sum = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
         d_outputs = d_sum
@@ -203,23 +294,112 @@ class _Sequence(torch.autograd.Function):
             d_outputs = d_sum.clone()
             d_outputs[-1] += d_last_output
         d_cell = None if d_cell is None else aligned(d_cell)
-        backward = _unroll_on_chip_backward if ctx.on_chip else _unroll_backward
-        needs_state = any(ctx.needs_input_grad[5:7])
-        d_gates, d_bias, d_output, d_cell = backward(
-            weight, reset, saved, d_outputs, d_cell, needs_state
-        )
-        flat = d_gates.flatten(0, 1)
-        return (
-            products.of_inputs(d_gates, input_weight, d_sum if ctx.is_residual else None),
-            products.of_weights(flat, x.flatten(0, 1)),
-            d_bias.float(),
-            products.of_weights(flat, hiddens.flatten(0, 1)),
-            None,
-            d_output,
-            d_cell,
-            None,
-            None,
-        )
+        d = ctx.form.backward(input_weight, weight, reset, saved, d_outputs, d_cell)
+        flat, residual, d_x = d.gates.flatten(0, 1), d_sum if ctx.is_residual else None, d.x
+        if d_x is None:
+            d_x = gradient_of_inputs(d.gates, input_weight, residual)
+        elif residual is not None:
+            d_x += residual
+        rows = [rows.flatten(0, 1) for rows in (x, hiddens)]
+        if x.is_cuda:
+            d_weights = [gradient_of_weights(flat, each) for each in rows]
+        else:
+            d_weights = [matmul(flat.T, each) for each in rows]
+        gradients = d_x, d_weights[0], d.bias.float(), d_weights[1], None, d.output, d.cell, None
+        return None, None, *gradients
+
+
+def _by(form) -> Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    return lambda *inputs: _Sequence.apply(form, torch.is_grad_enabled(), *inputs)
+
+
+@fused(
+    _by(ON_CPU),
+    lambda x, *_: (
+        x.device.type == "cpu"
+        and x.dtype == torch.float32
+        and x.shape[-1] % 16 == 0
+        and is_built_for_cpu()
+    ),
+)
+@fused(_by(ON_CLUSTERS), _fits_clusters)
+@fused(_by(IN_STEPS), lambda x, *_: x.is_cuda and x.dtype in DTYPES)
+def lstm_sequence(
+    x: torch.Tensor,
+    input_weight: torch.Tensor,
+    bias: torch.Tensor,
+    weight: torch.Tensor,
+    reset: torch.Tensor,
+    output: torch.Tensor,
+    cell: torch.Tensor,
+    is_residual: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Unrolls the recurrence. Nothing is done in place, as exporters want it.
+
+    Args:
+        x: (T, B, W) in the compute dtype.
+        input_weight: (4 W, W).
+        bias: (4 W,).
+        weight: (4 W, W), of the recurrent product.
+        reset: (T, B) bool.
+        output: (B, W) float32, last output before the sequence.
+        cell: (B, W) float32, last cell before the sequence.
+        is_residual: adds x to the outputs.
+
+    Returns:
+        outputs (T, B, W) in the compute dtype, the last output without x and the last cell, (B, W)
+        float32.
+    """
+    outputs = []
+    for t in range(len(x)):
+        output, cell = (leaf.masked_fill(reset[t, :, None], 0.0) for leaf in (output, cell))
+        gates = F.linear(x[t], input_weight, bias) + F.linear(output, weight)
+        i, f, g, o = gates.float().chunk(4, -1)
+        cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
+        output = o.sigmoid() * cell.tanh()
+        outputs.append(output.to(x.dtype) + x[t] if is_residual else output.to(x.dtype))
+    return torch.stack(outputs), output, cell
+
+
+def _act_on_gpu(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+    """Computes one step with one product of inputs and last outputs."""
+    dtype = compute_dtype(core.recurrent.weight)
+    weight = cast_joined((core.input.weight, core.recurrent.weight), dtype)
+    bias = cast(core.input.bias, dtype)
+    x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
+    if few_rows.fits_step(x, weight):
+        output, after = few_rows.lstm_step(x, weight, bias, reset, state, is_residual)
+        return output[None], after
+    last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
+    output, joined = torch.empty_like(x), x.new_empty(len(x), 2 * core.width)
+    after = arrdict(output=torch.empty_like(last_output), cell=torch.empty_like(last_cell))
+    launch_units(
+        *("lstm_join", dtype, last_output),
+        **dict(reset=reset, x=x, last_output=last_output, joined=joined),
+    )
+    with torch.autocast(x.device.type, enabled=False):
+        gates = F.linear(joined, weight, bias)
+    launch_units(
+        *("lstm_act", dtype, last_cell),
+        **dict(gates=gates, reset=reset, last_cell=last_cell, residual=x if is_residual else None),
+        **dict(output=output, next_output=after.output, next_cell=after.cell),
+    )
+    return output[None], after
+
+
+def _acts_on_gpu(core, x, *_) -> bool:
+    is_step = len(x) == 1 and x.is_cuda and not torch.is_grad_enabled()
+    return is_step and compute_dtype(core.recurrent.weight) in DTYPES
+
+
+@fused(_act_on_gpu, _acts_on_gpu)
+def lstm(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+    """Does `LSTM.forward`."""
+    x = x.to(compute_dtype(core.recurrent.weight) if x.is_cuda else torch.float32)
+    weights = core.input.weight, core.input.bias, core.recurrent.weight
+    states = state["output"].float(), state["cell"].float()
+    outputs, output, cell = lstm_sequence(x, *weights, reset.bool(), *states, is_residual)
+    return outputs, arrdict(output=output, cell=cell)
 
 
 class LSTM(nn.Module):
@@ -249,53 +429,5 @@ class LSTM(nn.Module):
         """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
         compute dtype on a GPU and float32 on a CPU. ValueError if shapes or devices do not fit.
         """
-        if is_plain():
-            return self._plain(x, reset, state, is_residual)
-        check_shapes(x, reset, state, ("output", "cell"))
-        if len(x) == 1 and x.is_cuda and not torch.is_grad_enabled():
-            return self._act(x, reset, state, is_residual)
-        dtype = compute_dtype(self.recurrent.weight) if x.is_cuda else torch.float32
-        x, states = x.to(dtype), (state["output"].float(), state["cell"].float())
-        weights = self.input.weight, self.input.bias, self.recurrent.weight
-        # autocast would choose its own dtypes inside
-        with torch.autocast(x.device.type, enabled=False):
-            if fits(x):
-                outputs, cell = CpuSequence.apply(x, *weights, reset.bool(), *states)
-                last_output, outputs = outputs[-1], outputs + x if is_residual else outputs
-            else:
-                sequence = x, *weights, reset.bool(), *states, is_residual, torch.is_grad_enabled()
-                outputs, cell, last_output = _Sequence.apply(*sequence)
-        return outputs, arrdict(output=last_output, cell=cell)
-
-    def _plain(self, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
-        """Does the same as `forward` in float32, for exporters, which want nothing in place."""
-        output, cell, outputs = state["output"], state["cell"], []
-        for t in range(len(x)):
-            output, cell = (leaf.masked_fill(reset[t, :, None], 0.0) for leaf in (output, cell))
-            i, f, g, o = (self.input(x[t]) + self.recurrent(output)).chunk(4, -1)
-            cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
-            output = o.sigmoid() * cell.tanh()
-            outputs.append(output + x[t] if is_residual else output)
-        return torch.stack(outputs), arrdict(output=output, cell=cell)
-
-    def _act(self, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
-        """Does the same as `forward` for one step on a GPU, without a gradient: with one product of
-        inputs and last outputs.
-        """
-        dtype = compute_dtype(self.recurrent.weight)
-        weight = cast_joined((self.input.weight, self.recurrent.weight), dtype)
-        bias = cast(self.input.bias, dtype)
-        x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
-        if self.width in few_rows.WIDTHS and few_rows.is_supported(x, weight):
-            output, after = few_rows.lstm_step(x, weight, bias, reset, state, is_residual)
-            return output[None], after
-        last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
-        output, joined = torch.empty_like(x), x.new_empty(len(x), 2 * self.width)
-        after = map(torch.empty_like, (last_output, last_cell))
-        after = arrdict(zip(("output", "cell"), after))
-        kernels.join(reset, x, last_output, joined)
-        with torch.autocast(x.device.type, enabled=False):
-            gates = F.linear(joined, weight, bias)
-        residual = x if is_residual else None
-        kernels.act(gates, reset, last_cell, residual, output, after.output, after.cell)
-        return output[None], after
+        check_shapes(x, reset, state)
+        return lstm(self, x, reset, state, is_residual)

@@ -14,28 +14,32 @@ T time, B lanes, W width. Gates are laid out (..., 2 W): update gate before its 
 Matrix products run in the compute dtype (autocast's). The recurrence is float32: over hundreds of
 steps a bfloat16 state would round small additions away.
 
-The recurrence is written here for the CPU. On a GPU it is a kernel with the same arguments
-(`megastep.agents.networks.kernels.mingru`). When acting, one kernel does product and recurrence
-(`megastep.agents.networks.kernels.mingru_step`).
+The recurrence over a sequence is written here for the CPU, with its gradient; a GPU has a kernel
+for each. When acting, one kernel does product and recurrence (`mingru_step`). `mingru` is the plain
+form of all of it.
 """
-
-from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks import products
-from megastep.agents.networks.kernels import mingru as kernels
-from megastep.agents.networks.kernels import mingru_step
-from megastep.agents.networks.kernels.library import aligned, check_shapes, is_plain
+from megastep.agents.networks import mingru_step
+from megastep.agents.networks.fused import (
+    DTYPES,
+    LIBRARY,
+    aligned,
+    check_shapes,
+    fused,
+    launch_units,
+)
+from megastep.agents.networks.linear import gradient_of_weights, product, sum_rows
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict
+from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
-if TYPE_CHECKING:
-    from types import ModuleType
+_LARGEST_BLOCK = 256  # threads, of the backward kernel
+_MANY_BLOCKS = 128  # about one per multiprocessor
 
 
 def _split(gates) -> tuple[torch.Tensor, torch.Tensor]:
@@ -43,7 +47,27 @@ def _split(gates) -> tuple[torch.Tensor, torch.Tensor]:
     return update.sigmoid(), candidate
 
 
-def _forward(gates, reset, start, residual, states, outputs, last) -> None:
+def _forward_on_gpu(gates, reset, start, residual, states, outputs, last) -> None:
+    launch_units(
+        *("mingru_step" if len(gates) == 1 else "mingru_forward", gates.dtype, start),
+        **dict(gates=gates, reset=reset, start=start, residual=residual),
+        **dict(states=states, outputs=outputs, last=last, n_steps=len(gates)),
+    )
+
+
+@fused(_forward_on_gpu, lambda gates, *_: gates.is_cuda)
+def recurrence(gates, reset, start, residual, states, outputs, last) -> None:
+    """Computes the last three from the gates and the first state.
+
+    Args:
+        gates: (T, B, 2 W).
+        reset: (T, B) bool.
+        start: (B, W) float32.
+        residual: (T, B, W), added to the outputs. None: nothing is.
+        states: (T, B, W), the outputs without the residual. None: not wanted.
+        outputs: (T, B, W).
+        last: (B, W) float32.
+    """
     (z, candidate), reset = _split(gates), reset[..., None]
     terms, factors = z * candidate, 1 - z
     terms[0].addcmul_(factors[0], start.masked_fill(reset[0], 0.0))
@@ -54,9 +78,42 @@ def _forward(gates, reset, start, residual, states, outputs, last) -> None:
         states.copy_(exact)
 
 
-def _backward(
+def _backward_on_gpu(
     gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
 ) -> torch.Tensor:
+    n_lanes, width = start.shape
+    n_units = 1 if width % 4 else 4
+    per_lane = width // n_units  # threads
+    per_block = max(1, min(_LARGEST_BLOCK // per_lane, n_lanes // _MANY_BLOCKS))  # lanes
+    adds_lanes = per_lane <= _LARGEST_BLOCK
+    block = per_block * per_lane if adds_lanes else BLOCK
+    d_biases = start.new_empty(-(-n_lanes // per_block), gates.shape[-1])
+    blocks = Blocks(-(-n_lanes * per_lane // block), threads=block, shared=4 * n_units * block)
+    launch(
+        *(LIBRARY, f"mingru_backward_{DTYPES[gates.dtype]}", start.device, blocks),
+        **dict(gates=gates, reset=reset, start=start, states=states),
+        **dict(d_outputs=d_outputs, d_last=d_last, d_gates=d_gates, d_start=d_start),
+        **dict(d_residual=d_residual, d_biases=d_biases),
+        **dict(n_steps=len(gates), n_lanes=n_lanes, width=width, n_units=n_units),
+        adds_lanes=int(adds_lanes),
+    )
+    return sum_rows(d_biases)
+
+
+@fused(_backward_on_gpu, lambda gates, *_: gates.is_cuda)
+def recurrence_backward(
+    gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
+) -> torch.Tensor:
+    """Computes the gradients of `recurrence`'s gates and first state from those of its outputs.
+
+    Args:
+        d_last: None: zeros.
+        d_start: None: not wanted.
+        d_residual: (T, B, W), a copy of `d_outputs`. None: not wanted.
+
+    Returns:
+        the gates' gradient summed over steps and lanes, (2 W,) float32.
+    """
     (z, candidate), reset = _split(gates), reset[..., None]
     factors, before = 1 - z, torch.cat([start[None], states[:-1]]).masked_fill(reset, 0.0)
     terms = d_outputs
@@ -72,13 +129,6 @@ def _backward(
     if d_residual is not None:
         d_residual.copy_(d_outputs)
     return d_gates.flatten(0, 1).sum(0).float()
-
-
-_CPU_RECURRENCE = SimpleNamespace(forward=_forward, backward=_backward)
-
-
-def _recurrence(x) -> "ModuleType | SimpleNamespace":
-    return kernels if x.is_cuda else _CPU_RECURRENCE
 
 
 class _Sequence(torch.autograd.Function):
@@ -111,13 +161,13 @@ class _Sequence(torch.autograd.Function):
         x, reset, start = aligned(x), reset.contiguous(), aligned(start)
         weight, bias = cast(weight, x.dtype), cast(bias, x.dtype)
         needs_backward = has_grad and any(ctx.needs_input_grad)
-        if not needs_backward and mingru_step.is_supported(x):
+        if not needs_backward and mingru_step.fits(x):
             return mingru_step.forward(x, weight, bias, reset, start, is_residual)
-        gates = products.layer(x, weight, bias)
+        gates = product(x, weight, bias)
         outputs, last = torch.empty_like(x), torch.empty_like(start)
         states = torch.empty_like(x) if is_residual and needs_backward else None
         residual = x if is_residual else None
-        _recurrence(x).forward(gates, reset, start, residual, states, outputs, last)
+        recurrence(gates, reset, start, residual, states, outputs, last)
         states = outputs if states is None else states
         ctx.save_for_backward(x, weight, gates, reset, start, states)
         return outputs, last
@@ -132,7 +182,7 @@ class _Sequence(torch.autograd.Function):
         d_start = torch.empty_like(start) if ctx.needs_input_grad[4] else None
         # torch.addmm would copy d_outputs, and a gradient must not change in place
         d_residual = torch.empty_like(x) if ctx.is_residual else None
-        d_bias = _recurrence(x).backward(
+        d_bias = recurrence_backward(
             *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
         )
         flat = d_gates.flatten(0, 1)
@@ -143,7 +193,27 @@ class _Sequence(torch.autograd.Function):
             d_x = d_residual
         else:  # in one operation, a CPU would add up the product's sums in another order
             d_x = d_residual.add_((flat @ weight).view_as(x))
-        return d_x, products.of_weights(flat, x.flatten(0, 1)), d_bias, None, d_start, None, None
+        return d_x, gradient_of_weights(flat, x.flatten(0, 1)), d_bias, None, d_start, None, None
+
+
+def _sequence(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+    x, start = x.to(compute_dtype(core.input.weight)), state["output"].float()
+    sequence = x, core.input.weight, core.input.bias, reset.bool(), start, is_residual
+    # autocast would choose its own dtypes inside
+    with torch.autocast(x.device.type, enabled=False):
+        outputs, last = _Sequence.apply(*sequence, torch.is_grad_enabled())
+    return outputs, arrdict(output=last)
+
+
+@fused(_sequence, lambda core, *_: compute_dtype(core.input.weight) in DTYPES)
+def mingru(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+    """Does `MinGRU.forward` step by step. Nothing is done in place, as exporters want it."""
+    output, outputs = state["output"], []
+    for t in range(len(x)):
+        z, candidate = _split(core.input(x[t]))
+        output = (1 - z) * output.masked_fill(reset[t, :, None], 0.0) + z * candidate
+        outputs.append(output.to(x.dtype) + x[t] if is_residual else output.to(x.dtype))
+    return torch.stack(outputs), arrdict(output=output)
 
 
 class MinGRU(nn.Module):
@@ -171,21 +241,5 @@ class MinGRU(nn.Module):
         """Unrolls over a sequence, as the head of cores.py says. Outputs are in the
         compute dtype. ValueError if shapes or devices do not fit.
         """
-        if is_plain():
-            return self._plain(x, reset, state, is_residual)
-        check_shapes(x, reset, state, ("output",))
-        x, start = x.to(compute_dtype(self.input.weight)), state["output"].float()
-        sequence = x, self.input.weight, self.input.bias, reset.bool(), start, is_residual
-        # autocast would choose its own dtypes inside
-        with torch.autocast(x.device.type, enabled=False):
-            outputs, last = _Sequence.apply(*sequence, torch.is_grad_enabled())
-        return outputs, arrdict(output=last)
-
-    def _plain(self, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
-        """Does the same as `forward` in float32, for exporters, which want nothing in place."""
-        output, outputs = state["output"], []
-        for t in range(len(x)):
-            z, candidate = _split(self.input(x[t]))
-            output = (1 - z) * output.masked_fill(reset[t, :, None], 0.0) + z * candidate
-            outputs.append(output + x[t] if is_residual else output)
-        return torch.stack(outputs), arrdict(output=output)
+        check_shapes(x, reset, state)
+        return mingru(self, x, reset, state, is_residual)

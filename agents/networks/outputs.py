@@ -10,19 +10,21 @@ from collections.abc import Callable, Iterable, Mapping
 
 import torch
 from torch import nn
+from torch.autograd.function import once_differentiable
 
 from megastep import spaces
-from megastep.agents.networks.kernels import layers as kernels
-from megastep.agents.networks.kernels.library import DTYPES
-from megastep.agents.networks.layers import CategoricalTerms, linear
+from megastep.agents.networks.fused import DTYPES, LIBRARY, fused
+from megastep.agents.networks.linear import linear
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.arrdict import arrdict
+from megastep.kernels.build.launch import launch
 from megastep.types import Tree
 
 #: Score of an action that a mask forbids: its probability is 0, and no sum with it is NaN.
 FORBIDDEN = -1e9
 # below the smallest exponential sample in float32, and far from underflow
 _TINY = 1e-20
+_MAX_CHOICES = LIBRARY.constants["ACT_THREADS"]
 
 
 class Output(nn.Module):
@@ -74,6 +76,64 @@ class Output(nn.Module):
         return self.logprob(logits, actions), self.entropy(logits)
 
 
+def _act_on_gpu(
+    output, x, sample=True, generator=None, mask=None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    dtype = compute_dtype(output.linear.weight)
+    weight, bias = (cast(leaf, dtype) for leaf in output.linear.parameters())
+    features, (n_agents, n_choices) = x.to(dtype).contiguous(), output.shape
+    n_lanes, width = features.shape
+    noise = None
+    if sample:
+        noise = torch.empty(n_lanes, *output.shape, device=x.device)
+        noise.exponential_(generator=generator)
+    logits = features.new_empty(n_lanes, *output.shape, dtype=torch.float32)
+    actions = torch.empty(n_lanes, n_agents, dtype=torch.int64, device=x.device)
+    logprobs = torch.empty_like(logits[:, 0, 0])
+    launch(
+        *(LIBRARY, f"categorical_act_{DTYPES[dtype]}", x.device, _MAX_CHOICES * n_lanes),
+        **dict(features=features, weight=weight, bias=bias, noise=noise),
+        **dict(logits=logits, actions=actions, logprobs=logprobs),
+        **dict(n_lanes=n_lanes, width=width, n_agents=n_agents, n_choices=n_choices),
+    )
+    return logits, actions, logprobs
+
+
+def _acts_on_gpu(output, x, sample=True, generator=None, mask=None) -> bool:
+    is_known = compute_dtype(output.linear.weight) in DTYPES and not x.shape[-1] % 8
+    is_small = output.shape[1] <= _MAX_CHOICES and mask is None
+    return x.is_cuda and is_known and is_small and not torch.is_grad_enabled()
+
+
+class _Terms(torch.autograd.Function):
+    """`MultiDiscreteOutput.terms` in one kernel each way."""
+
+    @staticmethod
+    def forward(ctx, logits, actions) -> tuple[torch.Tensor, ...]:
+        lead = logits.shape[:-2]
+        logits = logits.flatten(0, -3).contiguous()
+        actions = actions.flatten(0, -2).long().contiguous()
+        ctx.save_for_backward(logits, actions)
+        results = logits.new_empty(2, len(logits))
+        _launch_terms("", logits, actions, logprobs=results[0], entropies=results[1])
+        return tuple(each.view(lead) for each in results)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_logprobs, d_entropies) -> tuple[torch.Tensor, None]:
+        logits, actions = ctx.saved_tensors
+        d = dict(d_logprobs=d_logprobs.contiguous(), d_entropies=d_entropies.contiguous())
+        d_logits = torch.empty_like(logits)
+        _launch_terms("_backward", logits, actions, **d, d_logits=d_logits)
+        return d_logits.unflatten(0, d_logprobs.shape), None
+
+
+def _launch_terms(direction, logits, actions, **fields) -> None:
+    sizes = dict(zip(("n_rows", "n_agents", "n_choices"), logits.shape))
+    where = LIBRARY, f"categorical_terms{direction}", logits.device, len(logits)
+    launch(*where, logits=logits, actions=actions, **fields, **sizes)
+
+
 class MultiDiscreteOutput(Output):
     """One categorical choice out of n per agent.
 
@@ -102,6 +162,7 @@ class MultiDiscreteOutput(Output):
         """Returns log-probabilities among the allowed actions."""
         return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN).log_softmax(-1)
 
+    @fused(_act_on_gpu, _acts_on_gpu)
     def act(
         self,
         x: torch.Tensor,
@@ -109,24 +170,17 @@ class MultiDiscreteOutput(Output):
         generator: torch.Generator | None = None,
         mask: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Does the same as `Output.act`, without a mask on a GPU in one kernel."""
-        dtype = compute_dtype(self.linear.weight)
-        is_fused = x.is_cuda and dtype in DTYPES and not torch.is_grad_enabled() and mask is None
-        if not is_fused or self.shape[1] > kernels.MAX_CHOICES or x.shape[-1] % 8:
-            return super().act(x, sample, generator, mask)
-        noise = None
-        if sample:
-            noise = torch.empty(len(x), *self.shape, device=x.device)
-            noise.exponential_(generator=generator)
-        weight, bias = (cast(leaf, dtype) for leaf in self.linear.parameters())
-        return kernels.act(x.to(dtype).contiguous(), weight, bias, self.shape, noise)
+        """Does the same as `Output.act`."""
+        return super().act(x, sample, generator, mask)
 
+    @fused(
+        lambda self, logits, actions: _Terms.apply(logits, actions),
+        lambda self, logits, actions: logits.is_cuda and logits.dtype == torch.float32,
+    )
     def terms(
         self, logits: torch.Tensor, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Does the same as `Output.terms`, on a GPU in one kernel."""
-        if logits.is_cuda and logits.dtype == torch.float32:
-            return CategoricalTerms.apply(logits, actions)
+        """Does the same as `Output.terms`."""
         return super().terms(logits, actions)
 
     def sample(

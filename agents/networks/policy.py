@@ -15,10 +15,9 @@ from torch import nn
 
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.generator import SeededGenerator, stream_seed
-from megastep.agents.networks import cores, encoders, heads, joint_heads, running_norm
+from megastep.agents.networks import cores, encoders, heads, running_norm
 from megastep.agents.networks.critic import Critic
-from megastep.agents.networks.layers import linear
-from megastep.agents.networks.outputs import MultiDiscreteOutput
+from megastep.agents.networks.joint_heads import head_terms, prediction_error
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.agents.types import Moments
 from megastep.arrdict import arrdict
@@ -278,7 +277,7 @@ class Policy(nn.Module):
         """
         with self.compute_dtype():
             encoded = self._critic.encode(privileged, lanes)
-            return self._prediction_error(features, encoded)
+            return prediction_error(self.prediction, features, encoded)
 
     def terms(
         self,
@@ -303,29 +302,16 @@ class Policy(nn.Module):
             has_errors: false leaves the errors out, None.
             mask: (T, M, A, n) bool per discrete action space, allowed actions. None: all.
         """
-        names = "logprobs", "entropies", "errors", "values", "features"
         with self.compute_dtype():
             features, _ = self._features(obs, reset, state, lanes)
-            encoded = errors = None
+            encoded = prediction = None
             if self.privileged_space:
                 encoded = self._critic.encode(privileged, lanes)
-                is_joint = has_errors and mask is None
-                if is_joint and joint_heads.fit(self.output, self._critic, features, encoded):
-                    output = cast(MultiDiscreteOutput, self.output)
-                    heads_of = output, self._critic, self.prediction
-                    terms = joint_heads.joint_terms(*heads_of, features, encoded, actions)
-                    return arrdict(zip(names, (*terms, features), strict=True))
-                if has_errors:
-                    errors = self._prediction_error(features, encoded)
-            logits = self.output.masked(self.output(features), mask)
-            logprobs, entropies = self.output.terms(logits, actions)
-            values = self._critic.from_encoded(features, encoded)
-        return arrdict(zip(names, (logprobs, entropies, errors, values, features), strict=True))
-
-    def _prediction_error(self, features, encoded) -> torch.Tensor:
-        target = encoded[..., : self._critic.intake.n_features].detach()
-        predicted = linear(features, self.prediction).float()
-        return (predicted - target).square().mean(-1)
+                prediction = self.prediction if has_errors else None
+            heads_of = self.output, self._critic, prediction
+            terms = head_terms(*heads_of, features, encoded, actions, mask)
+        names = "logprobs", "entropies", "errors", "values", "features"
+        return arrdict(zip(names, (*terms, features), strict=True))
 
     def compute_dtype(self) -> ComputeDtype:
         """Returns the autocast context of matrix products. Inside one context, each weight is cast

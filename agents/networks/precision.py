@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from megastep.agents.networks.kernels import casts as kernels
+from megastep.agents.networks.fused import LIBRARY, is_plain_on_gpu
+from megastep.kernels.build.launch import Blocks, launch
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -25,6 +26,7 @@ class _Casts(threading.local):
 
 _CASTS = _Casts()
 _MULTIPLE = 8  # rows that tensor cores want; the only padding of weights that are cast together
+_MAX_ROWS, _THREADS = LIBRARY.constants["CAST_ROWS"], LIBRARY.constants["CAST_THREADS"]
 
 
 class ComputeDtype(torch.autocast):
@@ -118,16 +120,31 @@ def _cast_together(weight) -> None:
     """Rounds all weights of the context to bfloat16, if this is one of them: in one kernel instead
     of one or two for each.
     """
-    weights = [w for w in _CASTS.weights() if w.dim() and _is_float32_on_gpu(w)]
+    weights = [w for w in _CASTS.weights() if w.dim() and is_plain_on_gpu(w)]
     if not any(w is weight for w in weights):
         return
-    for w, padded in zip(weights, kernels.cast(weights, _MULTIPLE), strict=True):
+    for w, padded in zip(weights, rounded(weights), strict=True):
         _CASTS.by_weight[id(w), torch.bfloat16, 1] = w, padded[: len(w)]
         _CASTS.by_weight[id(w), torch.bfloat16, _MULTIPLE] = w, padded
 
 
-def _is_float32_on_gpu(weight) -> bool:
-    return weight.is_cuda and weight.dtype == torch.float32 and weight.is_contiguous()
+def rounded(weights: list[torch.Tensor]) -> list[torch.Tensor]:
+    """Returns weights (N, ...) float32, contiguous on a GPU, in bfloat16. Rows of zeros are added
+    until there are a multiple of 8.
+    """
+    shapes = [(len(weight) + -len(weight) % _MULTIPLE, *weight.shape[1:]) for weight in weights]
+    sizes = [torch.Size(shape).numel() for shape in shapes]
+    memory = torch.empty(sum(sizes), dtype=torch.bfloat16, device=weights[0].device)
+    targets = memory.split(sizes)
+    for start in range(0, len(weights), _MAX_ROWS):
+        some, rows, n_blocks = slice(start, start + _MAX_ROWS), [], 0
+        for weight, target in zip(weights[some], targets[some], strict=True):
+            numbers = dict(n=weight.numel(), n_padded=target.numel(), first_block=n_blocks)
+            rows.append(LIBRARY.params.CastRowParams(source=weight, target=target, **numbers))
+            n_blocks += max(1, -(-target.numel() // (8 * _THREADS)))
+        blocks = Blocks(n_blocks, threads=_THREADS)
+        launch(LIBRARY, "cast", memory.device, blocks, rows=b"".join(rows), n_rows=len(rows))
+    return [target.view(shape) for target, shape in zip(targets, shapes, strict=True)]
 
 
 def compute_dtype(weight: torch.Tensor) -> torch.dtype:

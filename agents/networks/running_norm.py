@@ -4,16 +4,16 @@ Ignores non-finite numbers.
 B lanes; `...` any further axes.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Protocol
 
 import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks.kernels import moments as kernels
-from megastep.agents.networks.kernels.library import LIBRARY
+from megastep.agents.networks.fused import LIBRARY, fused, is_plain_on_gpu
 from megastep.agents.types import Moments
+from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Space
 
 #: The version of the rules below. A run that began with others cannot continue bit for bit.
@@ -22,6 +22,9 @@ VERSION = 2
 UNKNOWN_SCALE = LIBRARY.constants["UNKNOWN_SCALE"]
 #: A standard deviation below this fraction of the mean may be rounding errors.
 RESOLUTION = LIBRARY.constants["RESOLUTION"]
+#: Leaves of an observation that a kernel handles.
+MAX_LEAVES = LIBRARY.constants["MAX_LEAVES"]
+_THREADS = LIBRARY.constants["MOMENTS_THREADS"]
 
 
 class _Statistics(Protocol):
@@ -65,92 +68,119 @@ class RunningNorm(nn.Module):
         """
         self.scale.masked_fill_(self.count == 0, UNKNOWN_SCALE)
 
-    @torch.no_grad()
-    def moments(self, obs: torch.Tensor, is_counted: torch.Tensor | bool = True) -> Moments:
-        """Returns the number of lanes that count, and the mean and variance of their observations.
 
-        Args:
-            obs: (B, ...).
-            is_counted: () or (B,) bool, lanes to count.
-        """
-        lanes = torch.ones(len(obs), dtype=torch.bool, device=obs.device) & is_counted
-        is_masked = ~lanes.view(-1, *[1] * (obs.dim() - 1))
-        n_lanes = lanes.sum()
-        n = n_lanes.clamp(min=1) * (obs[0].numel() // self.mean.numel())
-        mean = obs.float().masked_fill(is_masked, 0.0).sum(self.pooled_axes, keepdim=True) / n
-        error = (obs.float() - mean).masked_fill(is_masked, 0.0)
-        variance = error.square().sum(self.pooled_axes, keepdim=True) / n
-        return n_lanes, mean[0], variance[0]
-
-    @torch.no_grad()
-    def add(self, n_lanes: torch.Tensor, mean: torch.Tensor, variance: torch.Tensor) -> None:
-        """Adds moments to the statistics, the n-th call with weight 1/n.
-
-        Changes nothing if no lane was counted, or if a mean or variance is not finite.
-        """
-        count = self.count + 1
-        mean, scale = mix_moments(self, mean, variance, 1 / count)
-        scale = scale.masked_fill(scale <= RESOLUTION * mean.abs(), UNKNOWN_SCALE)
-        is_stored = (n_lanes > 0) & (mean + scale).isfinite().all()
-        store_if(is_stored, [(self.mean, mean), (self.scale, scale), (self.count, count)])
+def packed_leaf(norm: RunningNorm, flat: torch.Tensor) -> bytes:
+    """Returns a leaf (..., F) float16 or float32 and its statistics, as kernels take them."""
+    n_features = flat.shape[-1]
+    return LIBRARY.params.IntakeLeafParams(
+        **dict(values=flat, mean=norm.mean, scale=norm.scale, n_features=n_features),
+        **dict(group=n_features // norm.mean.numel(), is_half=int(flat.dtype == torch.float16)),
+    )
 
 
-@torch.no_grad()
-def moments_of(
-    norms: Sequence[RunningNorm],
-    leaves: Sequence[torch.Tensor],
-    is_counted: torch.Tensor | bool = True,
-) -> list[Moments]:
-    """Returns `RunningNorm.moments` of each norm; on a GPU in one kernel for up to `MAX_LEAVES`.
+def are_readable(leaves: Iterable[torch.Tensor]) -> bool:
+    """Returns whether kernels read these leaves."""
+    return all(
+        leaf.is_cuda and leaf.is_contiguous() and leaf.dtype in (torch.float16, torch.float32)
+        for leaf in leaves
+    )
 
-    Args:
-        leaves: the observations (B, ...) of each norm.
-        is_counted: () or (B,) bool, lanes to count.
-    """
-    pairs = list(zip(norms, leaves, strict=True))
-    if not all(_is_fused(norm) and _is_readable(leaf) for norm, leaf in pairs):
-        return [norm.moments(leaf, is_counted) for norm, leaf in pairs]
-    moments = []
-    for start in range(0, len(pairs), kernels.MAX_LEAVES):
-        some = pairs[start : start + kernels.MAX_LEAVES]
-        n_lanes, means, variances = kernels.moments(
-            [obs.flatten(1) for _, obs in some],
-            [norm.mean.numel() for norm, _ in some],
-            torch.as_tensor(is_counted, device=some[0][1].device).expand(len(some[0][1])),
+
+def _parts(n) -> Iterator[slice]:
+    return (slice(start, start + MAX_LEAVES) for start in range(0, n, MAX_LEAVES))
+
+
+def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
+    device, n_lanes = leaves[0].device, len(leaves[0])
+    is_counted = torch.as_tensor(is_counted, device=device).expand(n_lanes).contiguous()
+    moments: list[Moments] = []
+    for part in _parts(len(norms)):
+        sizes = [norm.mean.numel() for norm in norms[part]]
+        results = torch.empty(2 * sum(sizes), device=device)
+        n_counted = torch.empty((), dtype=torch.int64, device=device)
+        flat = [leaf.flatten(1) for leaf in leaves[part]]
+        launch(
+            *(LIBRARY, "moments", device, Blocks(sum(sizes), threads=_THREADS)),
+            leaves=b"".join(map(packed_leaf, norms[part], flat)),
+            **dict(is_counted=is_counted, moments=results, n_counted=n_counted, n_lanes=n_lanes),
         )
+        pairs = results.split([2 * size for size in sizes])
         moments += [
-            (n_lanes, mean.view_as(norm.mean), variance.view_as(norm.mean))
-            for (norm, _), mean, variance in zip(some, means, variances, strict=True)
+            (n_counted, *(each.view_as(norm.mean) for each in pair.chunk(2)))
+            for norm, pair in zip(norms[part], pairs, strict=True)
         ]
     return moments
 
 
 @torch.no_grad()
+@fused(
+    _moments_on_gpu,
+    lambda norms, leaves, *_: (
+        bool(leaves) and are_readable(leaves) and is_plain_on_gpu(*(norm.mean for norm in norms))
+    ),
+)
+def moments_of(
+    norms: Sequence[RunningNorm],
+    leaves: Sequence[torch.Tensor],
+    is_counted: torch.Tensor | bool = True,
+) -> list[Moments]:
+    """Returns of each norm the number of lanes that count, and the mean and variance of their
+    observations.
+
+    Args:
+        leaves: the observations (B, ...) of each norm.
+        is_counted: () or (B,) bool, lanes to count.
+    """
+    moments: list[Moments] = []
+    for norm, obs in zip(norms, leaves, strict=True):
+        lanes = torch.ones(len(obs), dtype=torch.bool, device=obs.device) & is_counted
+        is_masked = ~lanes.view(-1, *[1] * (obs.dim() - 1))
+        n_lanes = lanes.sum()
+        n = n_lanes.clamp(min=1) * (obs[0].numel() // norm.mean.numel())
+        mean = obs.float().masked_fill(is_masked, 0.0).sum(norm.pooled_axes, keepdim=True) / n
+        error = (obs.float() - mean).masked_fill(is_masked, 0.0)
+        variance = error.square().sum(norm.pooled_axes, keepdim=True) / n
+        moments.append((n_lanes, mean[0], variance[0]))
+    return moments
+
+
+def _add_on_gpu(norms, moments, is_counted=None) -> None:
+    for part in _parts(len(norms)):
+        rows, kept = [], []
+        for norm, (n_counted, mean, variance) in zip(norms[part], moments[part], strict=True):
+            kept.append((mean.contiguous(), variance.contiguous(), n_counted.long()))
+            names = "new_mean", "new_variance", "n_counted"
+            rows.append(
+                LIBRARY.params.RunningNormParams(
+                    **dict(mean=norm.mean, scale=norm.scale, count=norm.count),
+                    **dict(zip(names, kept[-1], strict=True)),
+                    n=mean.numel(),
+                )
+            )
+        blocks = Blocks(len(rows), threads=_THREADS)
+        fields = dict(norms=b"".join(rows), is_counted=is_counted)
+        launch(LIBRARY, "add_moments", norms[0].mean.device, blocks, **fields)
+
+
+@torch.no_grad()
+@fused(_add_on_gpu, lambda norms, *_: is_plain_on_gpu(*(norm.mean for norm in norms)))
 def add_moments(
     norms: Sequence[RunningNorm], moments: Sequence[Moments], is_counted: torch.Tensor | None = None
 ) -> None:
-    """Does `RunningNorm.add` for each norm; on a GPU in one kernel for up to `MAX_LEAVES`.
+    """Adds moments to the statistics of each norm, the n-th call with weight 1/n. Changes nothing
+    if no lane was counted, or if a mean or variance is not finite.
 
     Args:
         moments: of each norm.
         is_counted: () bool; if false, nothing changes. None: true.
     """
-    if all(map(_is_fused, norms)):
-        for start in range(0, len(norms), kernels.MAX_LEAVES):
-            some = slice(start, start + kernels.MAX_LEAVES)
-            kernels.add_moments(norms[some], moments[some], is_counted)
-        return
     for norm, (n_lanes, mean, variance) in zip(norms, moments, strict=True):
-        norm.add(n_lanes if is_counted is None else n_lanes * is_counted, mean, variance)
-
-
-def _is_fused(norm) -> bool:
-    return norm.mean.is_cuda and norm.mean.dtype == torch.float32
-
-
-def _is_readable(leaf) -> bool:
-    is_float = leaf.dtype in (torch.float16, torch.float32)
-    return leaf.is_cuda and is_float and leaf.is_contiguous()
+        n_lanes = n_lanes if is_counted is None else n_lanes * is_counted
+        count = norm.count + 1
+        mean, scale = mix_moments(norm, mean, variance, 1 / count)
+        scale = scale.masked_fill(scale <= RESOLUTION * mean.abs(), UNKNOWN_SCALE)
+        is_stored = (n_lanes > 0) & (mean + scale).isfinite().all()
+        store_if(is_stored, [(norm.mean, mean), (norm.scale, scale), (norm.count, count)])
 
 
 def mix_moments(

@@ -1,1 +1,1 @@
-"""The networks' kernels, and a module per core that launches those for the GPU."""
+"""The networks' kernels."""

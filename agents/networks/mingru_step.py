@@ -8,19 +8,24 @@ from pathlib import Path
 
 import torch
 
-from megastep.agents.networks.kernels.library import aligned
+from megastep.agents.networks.fused import aligned, fused
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 
-LIBRARY = KernelLibrary(Path(__file__).parent / "acting", FAST_CUDA_FLAGS)
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels" / "acting", FAST_CUDA_FLAGS)
 _LANES, _UNITS, _PARTS, _THREADS = (
     LIBRARY.constants[f"STEP_{name}"] for name in "LANES UNITS PARTS THREADS".split()
 )
 WIDTHS = tuple(range(_UNITS, (_PARTS + 1) * _UNITS, _UNITS))
 
 
-def is_supported(x: torch.Tensor) -> bool:
+@fused(lambda x: True, lambda x: _fit(x))
+def fits(x: torch.Tensor) -> bool:
     """Returns whether the kernel takes inputs x (T, B, W) of this dtype on their device."""
+    return False
+
+
+def _fit(x) -> bool:
     n_steps, _, width = x.shape
     if not x.is_cuda or x.dtype != torch.bfloat16 or n_steps != 1 or width not in WIDTHS:
         return False

@@ -10,27 +10,38 @@ from pathlib import Path
 
 import torch
 
-from megastep.agents.networks.kernels.library import aligned
+from megastep.agents.networks.fused import aligned, fused
 from megastep.arrdict import arrdict
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 
-LIBRARY = KernelLibrary(Path(__file__).parent / "few_rows", FAST_CUDA_FLAGS)
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels" / "few_rows", FAST_CUDA_FLAGS)
 _SIZES = LIBRARY.constants
 _TILE = _SIZES["TILE"]
 WIDTHS = 128, 256
 MAX_ROWS = _SIZES["MAX_ROWS"]
 
 
-def is_supported(rows: torch.Tensor, *others: torch.Tensor) -> bool:
+@fused(lambda *matrices: True, lambda *matrices: _fit(matrices))
+def fits(*matrices: torch.Tensor) -> bool:
     """Returns whether the kernels take rows (N, K) and other matrices on their device."""
+    return False
+
+
+def fits_step(x: torch.Tensor, weight: torch.Tensor) -> bool:
+    """Returns whether `lstm_step` takes inputs (B, W) and their weight."""
+    return x.shape[1] in WIDTHS and fits(x, weight)
+
+
+def _fit(matrices) -> bool:
+    rows = matrices[0]
     if not rows.is_cuda or not 0 < len(rows) <= MAX_ROWS:
         return False
     has_bf16 = torch.cuda.get_device_capability(rows.device) >= (8, 0)
-    return has_bf16 and all(map(_is_laid_out, (rows, *others)))
+    return has_bf16 and all(map(_has_words, matrices))
 
 
-def _is_laid_out(matrix) -> bool:
+def _has_words(matrix) -> bool:
     """Returns whether a matrix is as the head of this file says."""
     n_columns, is_bf16 = matrix.shape[1], matrix.dtype == torch.bfloat16
     has_words = not (n_columns % 8 or matrix.stride(0) % 8 or matrix.data_ptr() % 16)

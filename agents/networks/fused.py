@@ -1,0 +1,168 @@
+"""Operations with a fused form: a kernel that computes what takes PyTorch several operations.
+
+An operation is written in PyTorch first, which runs everywhere. Kernels come before it, and the
+first one that takes the arguments computes it:
+
+    @fused(_gae_on_gpu, lambda reward, value, *_, **__: value.is_cuda)
+    def gae(reward, value, ...):
+
+Which form runs depends on the tensors alone. `plain_operations` asks for PyTorch's, for exporters
+and to tell a kernel's fault from a recipe's.
+"""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from megastep.arrdict import arrdict
+from megastep.kernels.build import kernel_library
+from megastep.kernels.build.compile import EngineError, cpu
+from megastep.kernels.build.kernel_library import KernelLibrary
+from megastep.kernels.build.launch import launch
+
+# Unlike in the engine, no bits have to agree: fused multiply-adds.
+_CPU_FLAGS = tuple(
+    flag.replace("contract=off", "contract=fast") for flag in kernel_library.CPU_FLAGS
+)
+#: The kernels of the networks, for CPU and GPU.
+LIBRARY = KernelLibrary(
+    Path(__file__).parent / "kernels", kernel_library.FAST_CUDA_FLAGS, _CPU_FLAGS
+)
+#: Dtypes that the recurrent cores' kernels compute in, and how kernels are named for them.
+DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
+#: Names of the operations that have a fused form, such as `returns.gae`.
+OPERATIONS: set[str] = set()
+#: Those that run in their plain form.
+_plain: frozenset[str] = frozenset()
+
+Operation = Callable[..., Any]
+
+
+def fused(kernel: Operation, fits: Callable[..., bool]) -> Callable[[Operation], Any]:
+    """Decorates an operation in PyTorch.
+
+    Args:
+        kernel: computes the same, from the same arguments.
+        fits: returns whether the kernel takes these arguments.
+    """
+
+    def decorate(operation: Operation) -> Operation:
+        name = f"{operation.__module__.rpartition('.')[2]}.{operation.__qualname__}"
+        OPERATIONS.add(name)
+
+        @functools.wraps(operation)
+        def chosen(*args, **options):
+            if name not in _plain and fits(*args, **options):
+                return kernel(*args, **options)
+            return operation(*args, **options)
+
+        return chosen
+
+    return decorate
+
+
+@contextlib.contextmanager
+def plain_operations(*names: str) -> Iterator[None]:
+    """Computes operations in their plain form for the duration of the context.
+
+    Args:
+        names: some of `OPERATIONS`. Default: all.
+    """
+    global _plain
+    before, _plain = _plain, frozenset(names or OPERATIONS)
+    try:
+        yield
+    finally:
+        _plain = before
+
+
+@functools.cache
+def is_built_for_cpu() -> bool:
+    """Returns whether there are kernels for the CPU, which takes a C++ compiler."""
+    try:
+        return bool(cpu(LIBRARY))
+    except EngineError:
+        return False
+
+
+def is_plain_on_gpu(*tensors: torch.Tensor) -> bool:
+    """Returns whether tensors are float32, contiguous and on a GPU."""
+    return all(x.is_cuda and x.dtype == torch.float32 and x.is_contiguous() for x in tensors)
+
+
+def has_hopper(device: torch.device, n_bytes: int) -> bool:
+    """Returns whether a GPU is a Hopper or later, with so many bytes of shared memory per block:
+    consumer GPUs of the same generations have less.
+    """
+    gpu = torch.cuda.get_device_properties(device)
+    return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= n_bytes
+
+
+def launch_units(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> None:
+    """Launches a kernel of a recurrent core: a thread has one or four neighbouring units of a lane.
+
+    All tensors are contiguous, and start at a multiple of 16 bytes if the width is one of 4.
+
+    Args:
+        operation: such as "lstm_start".
+        dtype: of `DTYPES`, of products, gates and outputs.
+        state: (B, W).
+        fields: the others of its struct.
+    """
+    n_lanes, width = state.shape
+    n_units = 1 if width % 4 else 4
+    launch(
+        *(LIBRARY, f"{operation}_{DTYPES[dtype]}", state.device, state.numel() // n_units),
+        **fields,
+        n_lanes=n_lanes,
+        width=width,
+        n_units=n_units,
+    )
+
+
+def aligned(tensor: torch.Tensor) -> torch.Tensor:
+    """Returns the tensor, or a copy, contiguous and starting at a multiple of 16 bytes."""
+    if tensor.data_ptr() % 16:
+        return tensor.clone(memory_format=torch.contiguous_format)
+    return tensor.contiguous()
+
+
+def aligned_rows(matrix: torch.Tensor) -> torch.Tensor:
+    """Returns the matrix, or `aligned` of it if a row does not start at a multiple of 16 bytes, or
+    is not contiguous.
+    """
+    n_rows, n_columns = matrix.shape
+    n_bytes = matrix.stride(0) * matrix.element_size()
+    is_apart = n_rows > 1 and matrix.stride(0) >= n_columns and not n_bytes % 16
+    if is_apart and matrix.stride(1) == 1 and not matrix.data_ptr() % 16:
+        return matrix
+    return aligned(matrix)
+
+
+def check_shapes(x: torch.Tensor, reset: torch.Tensor, state: arrdict) -> None:
+    """Checks the inputs of a recurrent core, since kernels would read out of bounds.
+
+    Args:
+        x: (T, B, W), T at least 1.
+        reset: (T, B), on the device of `x`.
+        state: of (B, W), on the device of `x`.
+
+    Raises:
+        ValueError: naming the tensor that does not fit `x`.
+    """
+    if _plain:  # such as for an exporter, which does not know the number of lanes
+        return
+    if not len(x):
+        raise ValueError(f"x is {tuple(x.shape)}, but a sequence has at least one step")
+    tensors = {"reset": (reset, x.shape[:2])}
+    tensors |= {f"state.{name}": (leaf, x.shape[1:]) for name, leaf in state.items()}
+    for name, (tensor, shape) in tensors.items():
+        if tensor.shape != shape or tensor.device != x.device:
+            raise ValueError(
+                f"{name} is {tuple(tensor.shape)} on {tensor.device}, but x asks for "
+                f"{tuple(shape)} on {x.device}"
+            )

@@ -1,0 +1,265 @@
+"""Linear layers, and the matrix products of layers and of their gradients.
+
+In bfloat16 on a GPU, a layer's bias and ReLU are part of the product, and one kernel masks the
+gradient and adds up its rows. Its weights' gradients are float32 sums that are never rounded to
+bfloat16. On a CPU a kernel divides large float32 products among the engine's threads.
+
+N rows, K inputs, M outputs; `...` any leading axes, such as (T, B) time and lanes.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import nn
+from torch.autograd.function import once_differentiable
+
+from megastep.agents.networks import few_rows
+from megastep.agents.networks.fused import LIBRARY, aligned_rows, fused, is_built_for_cpu
+from megastep.agents.networks.precision import cast, compute_dtype
+from megastep.engine.devices import threads
+from megastep.kernels.build.launch import WARP, Blocks, launch
+
+Activation = Callable[[torch.Tensor], torch.Tensor]
+
+_MIN_OUTPUTS = 16  # PyTorch takes less time on a CPU for fewer, such as actions and values
+_STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_THREADS"]
+
+
+def linear(
+    x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    layer: nn.Linear,
+    activation: Activation | None = None,
+) -> torch.Tensor:
+    """Applies a linear layer and an activation in the compute dtype: (..., K) -> (..., M).
+
+    Args:
+        x: the input, or two parts of it, as if concatenated.
+        layer: the layer.
+        activation: such as `torch.relu`.
+    """
+    return affine(x, layer.weight, layer.bias, activation)
+
+
+def affine(
+    x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    weight: torch.Tensor,
+    bias: torch.Tensor,
+    activation: Activation | None = None,
+) -> torch.Tensor:
+    """Does what `linear` does, for a weight (M, K) and a bias (M,)."""
+    dtype = compute_dtype(weight)
+    parts = [part.to(dtype) for part in (x if isinstance(x, tuple) else (x,))]
+    return _layer(weight, bias, activation, *parts)
+
+
+def _fits(weight, bias, activation, *parts) -> bool:
+    if activation not in (None, torch.relu):
+        return False
+    if parts[0].is_cuda:
+        are_words = not any(part.shape[-1] % 8 for part in parts)
+        return parts[0].dtype == torch.bfloat16 and are_words
+    tensors = weight, bias, *parts
+    are_floats = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    return are_floats and len(weight) >= _MIN_OUTPUTS and is_built_for_cpu()
+
+
+@fused(lambda *inputs: _Layer.apply(*inputs), _fits)
+def _layer(weight, bias, activation, *parts) -> torch.Tensor:
+    x = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
+    y = nn.functional.linear(x, weight, bias)
+    return y if activation is None else activation(y)
+
+
+class _Layer(torch.autograd.Function):
+    """A layer whose weights' gradient is that of each part of the input. On a GPU, odd numbers of
+    outputs are padded to a multiple of 8, as tensor cores want.
+    """
+
+    @staticmethod
+    def forward(ctx, weight, bias, activation, *parts) -> torch.Tensor:
+        ctx.n_outputs, has_relu = len(weight), activation is not None
+        dtype, on_gpu, lead = parts[0].dtype, parts[0].is_cuda, parts[0].shape[:-1]
+        weight, bias = (cast(leaf, dtype, multiple=8 if on_gpu else 1) for leaf in (weight, bias))
+        parts = [part.reshape(-1, part.shape[-1]) for part in parts]
+        weights = weight.split([part.shape[1] for part in parts], 1)
+        multiply, last = product if on_gpu else _product_on_cpu, len(parts) - 1
+        y = multiply(parts[0], weights[0], bias, has_relu and not last)
+        for i in range(1, len(parts)):
+            multiply(parts[i], weights[i], None, has_relu and i == last, y)
+        ctx.has_relu = has_relu
+        ctx.save_for_backward(weight, *parts, *[y] * has_relu)
+        return y[:, : ctx.n_outputs].view(*lead, ctx.n_outputs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d) -> tuple[torch.Tensor | None, ...]:
+        weight, *saved = ctx.saved_tensors
+        parts, activated = (saved[:-1], saved[-1]) if ctx.has_relu else (saved, None)
+        lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
+        d = d.reshape(-1, ctx.n_outputs)
+        d = nn.functional.pad(d, (0, n_padding)) if n_padding else d
+        d, d_bias = bias_gradient(d, activated)
+        of_weights, of_inputs = gradient_of_weights, gradient_of_inputs
+        if not d.is_cuda:
+            of_weights, of_inputs = (lambda d, x: matmul(d.T, x)), matmul
+        d_weight = None
+        if ctx.needs_input_grad[0]:
+            d_weights = [of_weights(d, part) for part in parts]
+            d_weight = torch.cat(d_weights, 1) if len(parts) > 1 else d_weights[0]
+            d_weight = d_weight[: ctx.n_outputs]
+        d_parts: list[torch.Tensor | None] = [None] * len(parts)
+        for i, its_weight in enumerate(weight.split([part.shape[1] for part in parts], 1)):
+            if ctx.needs_input_grad[3 + i]:
+                d_parts[i] = of_inputs(d, its_weight).view(*lead, its_weight.shape[1])
+        return d_weight, d_bias[: ctx.n_outputs], None, *d_parts
+
+
+# ---- The sums of a gradient ----
+
+
+def _bias_gradient_on_gpu(d, activated=None) -> tuple[torch.Tensor, torch.Tensor]:
+    d = aligned_rows(d)
+    n_rows, n_columns = d.shape
+    n_strips, n_words = -(-n_rows // _STRIP), n_columns // 8
+    d_masked = None if activated is None else torch.empty_like(activated)
+    sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
+    blocks = Blocks(n_strips, -(-n_words // WARP), _STRIP_THREADS)
+    launch(
+        *(LIBRARY, "bias_gradient", d.device, blocks),
+        **dict(d=d, activated=activated, d_masked=d_masked, sums=sums),
+        **dict(n_rows=n_rows, n_columns=n_columns, d_stride=d.stride(0)),
+    )
+    return d if d_masked is None else d_masked, sum_rows(sums)
+
+
+@fused(_bias_gradient_on_gpu, lambda d, *_: d.is_cuda and d.dtype == torch.bfloat16)
+def bias_gradient(
+    d: torch.Tensor, activated: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the gradient before a ReLU (N, M), and its sum over rows (M,) float32.
+
+    Args:
+        d: (N, M), the gradient after the ReLU; on a GPU, M is a multiple of 8.
+        activated: the ReLU's outputs. None: there is no ReLU, and d is returned.
+    """
+    if activated is not None:
+        d = torch.ops.aten.threshold_backward(d, activated, 0)
+    return d, d.sum(0)
+
+
+def sum_rows(rows: torch.Tensor) -> torch.Tensor:
+    """Returns the sums (M,) of rows (N, M) float32 on a GPU, always in the same order."""
+    sums = rows.new_empty(rows.shape[1])
+    blocks = Blocks(-(-rows.shape[1] // WARP), threads=_STRIP_THREADS)
+    sizes = dict(n_rows=rows.shape[0], n_columns=rows.shape[1])
+    launch(LIBRARY, "sum_rows", rows.device, blocks, rows=rows, sums=sums, **sizes)
+    return sums
+
+
+# ---- Matrix products on a GPU ----
+#
+# Those of few rows are by kernels of our own, and others by PyTorch. Gradients of weights are always
+# by PyTorch, which splits the rows that they add up. All matrices of a product have one dtype.
+
+
+def product(
+    x: torch.Tensor,
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    has_relu: bool = False,
+    onto: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Returns the outputs (..., M) of a linear layer.
+
+    Args:
+        x: (..., K).
+        weight: (M, K).
+        bias: (M,); None with `onto`.
+        has_relu: applies a ReLU.
+        onto: (N, M), to which the product of x (N, K) is added, in place.
+    """
+    rows = x.flatten(0, -2)
+    if onto is not None:
+        if few_rows.fits(rows, weight, onto):
+            few_rows.layer(rows, weight, onto=onto)
+        else:
+            onto.addmm_(rows, weight.T)
+        return onto.relu_() if has_relu else onto
+    assert bias is not None
+    if few_rows.fits(rows, weight) and not len(weight) % 8 and bias.is_contiguous():
+        outputs = few_rows.layer(rows, weight, bias, has_relu)
+    elif has_relu:
+        outputs = torch._addmm_activation(bias, rows, weight.T)
+    else:
+        outputs = torch.addmm(bias, rows, weight.T)
+    return outputs.unflatten(0, x.shape[:-1])
+
+
+def gradient_of_inputs(
+    d: torch.Tensor, weight: torch.Tensor, addend: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Returns the gradient (..., K) of a layer's inputs, plus an addend of that shape.
+
+    Args:
+        d: (..., M), that of its outputs.
+        weight: (M, K).
+        addend: (..., K), contiguous; None: nothing.
+    """
+    rows = d.flatten(0, -2)
+    flat = None if addend is None else addend.flatten(0, -2)
+    addends = () if flat is None else (flat,)
+    if few_rows.fits(rows, weight, *addends) and all(x.is_contiguous() for x in addends):
+        result = few_rows.of_inputs(rows, weight, flat)
+    else:
+        result = rows @ weight if flat is None else torch.addmm(flat, rows, weight)
+    return result.unflatten(0, d.shape[:-1])
+
+
+def gradient_of_weights(d: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+    """Returns the gradient (M, K) float32 of a layer's weights. A GPU does not round it to the
+    matrices' dtype.
+
+    Args:
+        d: (N, M), that of its outputs.
+        x: (N, K), its inputs.
+    """
+    if d.is_cuda and d.dtype != torch.float32:
+        return torch.mm(d.T, x, out_dtype=torch.float32)
+    return (d.T @ x).float()
+
+
+# ---- Matrix products on a CPU ----
+
+
+def matmul(
+    a: torch.Tensor,
+    b: torch.Tensor,
+    out: torch.Tensor | None = None,
+    bias: torch.Tensor | None = None,
+    adds: bool = False,
+    has_relu: bool = False,
+) -> torch.Tensor:
+    """Returns the product of (rows, depth) and (depth, columns), of any strides, without a
+    gradient.
+
+    Args:
+        a, b: the matrices, float32 on the CPU.
+        out: where to write it, (rows, columns) with contiguous rows. None: a new tensor.
+        bias: (columns,) to add.
+        adds: adds to what `out` holds.
+        has_relu: applies a ReLU at the end.
+    """
+    if out is None:
+        out = torch.empty(len(a), b.shape[1])
+    launch(
+        *(LIBRARY, "matmul", a.device, 0),
+        **dict(a=a, b=b, bias=None if bias is None else bias.contiguous(), out=out),
+        **dict(a_row=a.stride(0), a_column=a.stride(1), b_row=b.stride(0), b_column=b.stride(1)),
+        **dict(out_row=out.stride(0), n_rows=len(a), n_columns=b.shape[1], depth=len(b)),
+        **dict(adds=adds, has_relu=has_relu, n_threads=threads()),
+    )
+    return out
+
+
+def _product_on_cpu(x, weight, bias, has_relu, onto=None) -> torch.Tensor:
+    return matmul(x, weight.T, onto, bias, adds=onto is not None, has_relu=has_relu)
