@@ -1,5 +1,5 @@
-"""Adam: on a CPU through PyTorch's fused operation, on a GPU in one kernel for all parameters that
-also clips their gradients. PyTorch's takes ten times as long there for networks this small.
+"""Adam: PyTorch's fused operation on a CPU, on a GPU one kernel for all parameters that also clips
+their gradients. PyTorch's takes ten times as long there for networks this small.
 
 `torch.optim.Adam` imports PyTorch's compiler first, which takes more than a second.
 """
@@ -10,6 +10,7 @@ from types import MappingProxyType
 import torch
 
 from megastep.agents.algorithms.kernels import LIBRARY
+from megastep.agents.networks.fused import fused, is_plain_on_gpu
 from megastep.agents.types import StateDict
 from megastep.kernels.build.launch import Blocks, launch
 
@@ -51,45 +52,18 @@ class Adam:
         self.means = [torch.zeros_like(p) for p in self.parameters]
         self.squares = [torch.zeros_like(p) for p in self.parameters]
         # those of one step size and one decay are updated by one operation
-        self._groups: dict[tuple[float, float], list] = {}
+        self.groups: dict[tuple[float, float], list] = {}
         for row in zip(self.parameters, self.means, self.squares, strict=True):
             key = lr_factors.get(row[0], 1.0), weight_decays.get(row[0], 0.0)
-            self._groups.setdefault(key, []).append(row)
-
-    @property
-    def is_fused(self) -> bool:
-        """True if kernels can handle the parameters and their present gradients."""
-        gradients = [p.grad for p in self.parameters if p.grad is not None]
-        tensors = [*self.parameters, *gradients]
-        return bool(gradients) and all(
-            x.is_cuda and x.dtype == torch.float32 and x.is_contiguous() for x in tensors
-        )
+            self.groups.setdefault(key, []).append(row)
 
     @torch.no_grad()
+    @fused(lambda self: squared_norms(self).sum().sqrt(), lambda self: has_kernels(self))
     def grad_norm(self) -> torch.Tensor:
         """Returns the norm () of all gradients together."""
-        if self.is_fused:
-            return self.squared_norms().sum().sqrt()
         gradients = [p.grad for p in self.parameters if p.grad is not None]
         return torch.nn.utils.get_total_norm(gradients)
 
-    def squared_norms(self) -> torch.Tensor:
-        """Returns (n,) numbers that add up to the square of `grad_norm`, if it `is_fused`."""
-        launches = list(self._launches())
-        n_sums, first_sum = sum(n_blocks for _, n_blocks in launches), 0
-        sums = self.n_steps.new_empty(n_sums)
-        for rows, n_blocks in launches:
-            launch(
-                *(LIBRARY, "squared_norm", sums.device, Blocks(n_blocks, threads=_THREADS)),
-                rows=b"".join(rows),
-                sums=sums,
-                n_rows=len(rows),
-                first_sum=first_sum,
-            )
-            first_sum += n_blocks
-        return sums
-
-    @torch.no_grad()
     def step(
         self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0
     ) -> None:
@@ -101,20 +75,24 @@ class Adam:
             max_norm: longer gradients are scaled down to this norm.
         """
         self.n_steps += is_taken
-        if self.is_fused:
-            self.step_on_gpu(is_taken, grad_norm, max_norm)
-            return
+        self.update(is_taken, grad_norm, max_norm)
+
+    @torch.no_grad()
+    @fused(lambda *inputs: _update_on_gpu(*inputs), lambda self, *_: has_kernels(self))
+    def update(
+        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None, max_norm: float
+    ) -> None:
+        """Takes a `step` that `n_steps` counts already."""
         if grad_norm is not None:
             torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
-        for (factor, weight_decay), members in self._groups.items():
+        for (factor, weight_decay), members in self.groups.items():
             rows = [(p, p.grad, *moments) for p, *moments in members if p.grad is not None]
             if rows:
-                lr = self.lr if factor == 1 else self.lr * factor
                 torch._fused_adamw_(  # pyright: ignore[reportPrivateImportUsage]
                     *map(list, zip(*rows)),
                     max_exp_avg_sqs=[],
                     state_steps=[self.n_steps] * len(rows),
-                    lr=lr,
+                    lr=self.lr if factor == 1 else self.lr * factor,
                     beta1=self.betas[0],
                     beta2=self.betas[1],
                     weight_decay=weight_decay,
@@ -123,50 +101,6 @@ class Adam:
                     maximize=False,
                     found_inf=(~is_taken).float(),
                 )
-
-    def step_on_gpu(
-        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None, max_norm: float
-    ) -> None:
-        """Takes a `step` that `n_steps` counts already, if it `is_fused`."""
-        for rows, n_blocks in self._launches():
-            launch(
-                *(LIBRARY, "adam", self.lr.device, Blocks(n_blocks, threads=_THREADS)),
-                rows=b"".join(rows),
-                lr=self.lr,
-                n_steps=self.n_steps,
-                grad_norm=grad_norm,
-                is_taken=is_taken,
-                n_rows=len(rows),
-                max_norm=max_norm,
-                beta1=self.betas[0],
-                beta2=self.betas[1],
-                eps=self.eps,
-            )
-
-    def _launches(self) -> Iterator[tuple[list[bytes], int]]:
-        """Yields the packed rows of a launch, at most `_MAX_ROWS`, and its number of blocks."""
-        rows, n_blocks = [], 0
-        for (factor, weight_decay), members in self._groups.items():
-            for p, mean, square in members:
-                if p.grad is None:
-                    continue
-                if len(rows) == _MAX_ROWS:
-                    yield rows, n_blocks
-                    rows, n_blocks = [], 0
-                addresses = [x.data_ptr() for x in (p, p.grad, mean, square)]
-                names = "parameter", "gradient", "mean", "square"
-                rows.append(
-                    LIBRARY.params.AdamRowParams(
-                        **dict(zip(names, addresses, strict=True)),
-                        n=p.numel(),
-                        first_block=n_blocks,
-                        is_aligned=int(not any(address % 16 for address in addresses)),
-                        lr_factor=factor,
-                        weight_decay=weight_decay,
-                    )
-                )
-                n_blocks += max(1, -(-p.numel() // (4 * _THREADS)))
-        yield rows, n_blocks
 
     def zero_grad(self) -> None:
         """Frees the gradients."""
@@ -183,3 +117,59 @@ class Adam:
         saved = state["means"] + state["squares"]
         for target, source in zip(self.means + self.squares, saved):
             target.copy_(source)
+
+
+# ---- On a GPU ----
+
+
+def has_kernels(adam: Adam) -> bool:
+    """Returns whether kernels take the parameters and their present gradients."""
+    gradients = [p.grad for p in adam.parameters if p.grad is not None]
+    return bool(gradients) and is_plain_on_gpu(*adam.parameters, *gradients)
+
+
+def squared_norms(adam: Adam) -> torch.Tensor:
+    """Returns (n,) numbers that add up to the square of `grad_norm`."""
+    launches = list(_launches(adam))
+    sums, first_sum = adam.n_steps.new_empty(sum(n for _, n in launches)), 0
+    for rows, n_blocks in launches:
+        launch(
+            *(LIBRARY, "squared_norm", sums.device, Blocks(n_blocks, threads=_THREADS)),
+            **dict(rows=b"".join(rows), sums=sums, n_rows=len(rows), first_sum=first_sum),
+        )
+        first_sum += n_blocks
+    return sums
+
+
+def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
+    for rows, n_blocks in _launches(adam):
+        launch(
+            *(LIBRARY, "adam", adam.lr.device, Blocks(n_blocks, threads=_THREADS)),
+            **dict(rows=b"".join(rows), n_rows=len(rows), lr=adam.lr, n_steps=adam.n_steps),
+            **dict(grad_norm=grad_norm, is_taken=is_taken, max_norm=max_norm),
+            **dict(beta1=adam.betas[0], beta2=adam.betas[1], eps=adam.eps),
+        )
+
+
+def _launches(adam) -> Iterator[tuple[list[bytes], int]]:
+    """Yields the packed rows of a launch, at most `_MAX_ROWS`, and its number of blocks."""
+    rows, n_blocks = [], 0
+    for (factor, weight_decay), members in adam.groups.items():
+        for p, mean, square in members:
+            if p.grad is None:
+                continue
+            if len(rows) == _MAX_ROWS:
+                yield rows, n_blocks
+                rows, n_blocks = [], 0
+            addresses = [x.data_ptr() for x in (p, p.grad, mean, square)]
+            names = "parameter", "gradient", "mean", "square"
+            rows.append(
+                LIBRARY.params.AdamRowParams(
+                    **dict(zip(names, addresses, strict=True)),
+                    **dict(n=p.numel(), first_block=n_blocks),
+                    is_aligned=int(not any(address % 16 for address in addresses)),
+                    **dict(lr_factor=factor, weight_decay=weight_decay),
+                )
+            )
+            n_blocks += max(1, -(-p.numel() // (4 * _THREADS)))
+    yield rows, n_blocks

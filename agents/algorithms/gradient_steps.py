@@ -5,17 +5,45 @@ from types import MappingProxyType
 
 import torch
 
-from megastep.agents.algorithms.adam import Adam
+from megastep.agents.algorithms.adam import Adam, has_kernels, squared_norms
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.algorithms.optimizers import make_optimizer
 from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
+from megastep.agents.networks.fused import fused
 from megastep.agents.types import StateDict
 from megastep.kernels.build.launch import Blocks, launch
 
 #: Bounds of a step size that follows the KL divergence, those of rsl_rl.
 ADAPTIVE_LR = 1e-5, 1e-2
 _NONE = MappingProxyType({})
+
+
+def _take_on_gpu(steps, is_enabled=True) -> torch.Tensor:
+    """Decides whether a step is taken in two kernels, which also count it and its metrics."""
+    adam, device = steps.optimizer, steps.lr.device
+    sums, metrics = squared_norms(adam), [value.float() for value in steps.metrics.values()]
+    is_first = steps.totals is None
+    if is_first:
+        steps.totals = sums.new_empty(len(metrics) + 3)
+    grad_norm, is_taken = sums.new_empty(()), torch.empty_like(steps.is_finite)
+    is_enabled = None if is_enabled is True else torch.as_tensor(is_enabled, device=device)
+    launch(
+        *(LIBRARY, "judge", device, Blocks(1, threads=LIBRARY.constants["ADAM_THREADS"])),
+        metrics=b"".join(LIBRARY.params.MetricParams(values=value) for value in metrics),
+        **dict(sums=sums, is_finite=steps.is_finite, is_enabled=is_enabled),
+        **dict(n_valid=steps.n_valid, n_steps=adam.n_steps, grad_norm=grad_norm),
+        **dict(is_taken=is_taken, totals=steps.totals, n_sums=len(sums)),
+        **dict(n_metrics=len(metrics), is_first=int(is_first)),
+    )
+    adam.update(is_taken, grad_norm, steps.max_grad_norm)
+    steps.metrics["grad_norm"] = grad_norm
+    return is_taken
+
+
+def _fits(steps, *_) -> bool:
+    is_adam = isinstance(steps.optimizer, Adam) and has_kernels(steps.optimizer)
+    return is_adam and len(steps.metrics) <= LIBRARY.constants["JUDGED_METRICS"]
 
 
 class GradientSteps:
@@ -56,17 +84,17 @@ class GradientSteps:
         weight_decays: Mapping[torch.nn.Parameter, float] = _NONE,
     ):
         self.max_grad_norm = max_grad_norm
-        self._lr = torch.as_tensor(lr, device=device)
-        self.optimizer = make_optimizer(optimizer, parameters, self._lr, lr_factors, weight_decays)
+        self.lr = torch.as_tensor(lr, device=device)
+        self.optimizer = make_optimizer(optimizer, parameters, self.lr, lr_factors, weight_decays)
         self.check = NonFiniteCheck(device)
         # of the update in progress; totals are those of metrics, then steps taken and skipped
-        self._is_finite: torch.Tensor | None = None
-        self._totals: torch.Tensor | None = None
-        self._metrics: dict[str, torch.Tensor] = {}
+        self.is_finite: torch.Tensor | None = None
+        self.totals: torch.Tensor | None = None
+        self.metrics: dict[str, torch.Tensor] = {}
 
     def set_lr(self, lr: float) -> None:
         """Changes the step size, also for a captured update."""
-        self._lr.fill_(lr)
+        self.lr.fill_(lr)
 
     def follow_kl(self, kl: torch.Tensor, desired: float) -> None:
         """Changes the step size so that updates have about a desired KL divergence: where it is
@@ -78,11 +106,11 @@ class GradientSteps:
             desired: the one to have.
         """
         least, most = ADAPTIVE_LR
-        lower, higher = (self._lr / 1.5).clamp(min=least), (self._lr * 1.5).clamp(max=most)
-        lr = torch.where((kl < desired / 2) & (kl > 0), higher, self._lr)
+        lower, higher = (self.lr / 1.5).clamp(min=least), (self.lr * 1.5).clamp(max=most)
+        lr = torch.where((kl < desired / 2) & (kl > 0), higher, self.lr)
         lr = torch.where(kl > 2 * desired, lower, lr)
-        assert self._is_finite is not None
-        self._lr.copy_(torch.where(self._is_finite, lr, self._lr))
+        assert self.is_finite is not None
+        self.lr.copy_(torch.where(self.is_finite, lr, self.lr))
 
     def begin(
         self, floats: dict[str, torch.Tensor], *moments: Moments
@@ -97,9 +125,9 @@ class GradientSteps:
             () bool, whether `floats` are all finite, on every rank: if not, no step of this update
             is taken. And the moments of all ranks, as `pool_moments` returns them.
         """
-        self._is_finite, pooled = pool_with_condition(self.check(floats), *moments)
-        self._totals = None
-        return self._is_finite, pooled
+        self.is_finite, pooled = pool_with_condition(self.check(floats), *moments)
+        self.totals = None
+        return self.is_finite, pooled
 
     def backward(
         self, loss: torch.Tensor, metrics: dict[str, torch.Tensor], n_valid: torch.Tensor
@@ -118,9 +146,10 @@ class GradientSteps:
         loss.backward()
         parameters = self.optimizer.parameters
         n_valid, means = average_gradients(parameters, n_valid, [*metrics.values()])
-        self._n_valid, self._metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
-        return self._metrics
+        self.n_valid, self.metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
+        return self.metrics
 
+    @fused(_take_on_gpu, _fits)
     def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
         """Takes one step down the gradient. Without a valid transition, it is not taken.
 
@@ -130,57 +159,17 @@ class GradientSteps:
         Returns:
             () bool, whether the step was taken.
         """
-        max_metrics = LIBRARY.constants["JUDGED_METRICS"]
-        adam = self.optimizer
-        if isinstance(adam, Adam) and adam.is_fused and len(self._metrics) <= max_metrics:
-            grad_norm, is_taken = self._judge_on_gpu(adam, is_enabled)
-            adam.step_on_gpu(is_taken, grad_norm, self.max_grad_norm)
-        else:
-            grad_norm, is_taken = self._judge(is_enabled)
-            self.optimizer.step(is_taken, grad_norm, self.max_grad_norm)
-        self._metrics["grad_norm"] = grad_norm
-        return is_taken
-
-    def _judge(self, is_enabled) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the gradients' norm and whether the step is taken, () each, and adds up the
-        metrics of steps that are.
-        """
-        assert self._is_finite is not None
+        assert self.is_finite is not None
         grad_norm = self.optimizer.grad_norm()
-        is_finite = grad_norm.isfinite() & self._is_finite
-        is_taken = is_finite & is_enabled & (self._n_valid > 0)
-        row = torch.stack([*self._metrics.values(), grad_norm]).masked_fill(~is_taken, 0.0)
+        is_finite = grad_norm.isfinite() & self.is_finite
+        is_taken = is_finite & is_enabled & (self.n_valid > 0)
+        row = torch.stack([*self.metrics.values(), grad_norm]).masked_fill(~is_taken, 0.0)
         is_skipped = ~is_finite & is_enabled
         row = torch.cat([row, torch.stack([is_taken, is_skipped]).float()])
-        self._totals = row if self._totals is None else self._totals + row
-        return grad_norm, is_taken
-
-    def _judge_on_gpu(self, adam, is_enabled) -> tuple[torch.Tensor, torch.Tensor]:
-        """Does `_judge` in two kernels, and counts the step."""
-        sums, device = adam.squared_norms(), self._lr.device
-        metrics = [value.float() for value in self._metrics.values()]
-        pack = LIBRARY.params.MetricParams
-        assert self._is_finite is not None
-        is_first = self._totals is None
-        if is_first:
-            self._totals = sums.new_empty(len(metrics) + 3)
-        grad_norm, is_taken = sums.new_empty(()), torch.empty_like(self._is_finite)
-        launch(
-            *(LIBRARY, "judge", device, Blocks(1, threads=LIBRARY.constants["ADAM_THREADS"])),
-            metrics=b"".join(pack(values=value) for value in metrics),
-            sums=sums,
-            is_finite=self._is_finite,
-            is_enabled=None if is_enabled is True else torch.as_tensor(is_enabled, device=device),
-            n_valid=self._n_valid,
-            n_steps=self.optimizer.n_steps,
-            grad_norm=grad_norm,
-            is_taken=is_taken,
-            totals=self._totals,
-            n_sums=len(sums),
-            n_metrics=len(metrics),
-            is_first=int(is_first),
-        )
-        return grad_norm, is_taken
+        self.totals = row if self.totals is None else self.totals + row
+        self.optimizer.step(is_taken, grad_norm, self.max_grad_norm)
+        self.metrics["grad_norm"] = grad_norm
+        return is_taken
 
     def end(self) -> dict[str, torch.Tensor]:
         """Ends the update. Returns the means of the metrics over the steps taken, and
@@ -188,24 +177,24 @@ class GradientSteps:
 
         Without a step, the means are NaN: a trainer leaves them out of its report.
         """
-        assert self._totals is not None
-        n_taken, n_skipped = self._totals[-2], self._totals[-1]
+        assert self.totals is not None
+        n_taken, n_skipped = self.totals[-2], self.totals[-1]
         self.check.count((n_taken == 0) & (n_skipped > 0))
-        means = (self._totals[:-2] / n_taken).unbind()
-        return {**dict(zip(self._metrics, means, strict=True)), "skipped_steps": n_skipped}
+        means = (self.totals[:-2] / n_taken).unbind()
+        return {**dict(zip(self.metrics, means, strict=True)), "skipped_steps": n_skipped}
 
     def copy_from(self, other: "GradientSteps") -> None:
         """Takes over the step size of others, and has skipped no update."""
-        self._lr.copy_(other._lr)
-        self.check.count(torch.zeros((), dtype=torch.bool, device=self._lr.device))
+        self.lr.copy_(other.lr)
+        self.check.count(torch.zeros((), dtype=torch.bool, device=self.lr.device))
 
     def state_dict(self) -> StateDict:
         """Returns the optimizer's state, the step size and what `check` has counted."""
         check = self.check.state_dict()
-        return dict(optimizer=self.optimizer.state_dict(), lr=self._lr.clone(), check=check)
+        return dict(optimizer=self.optimizer.state_dict(), lr=self.lr.clone(), check=check)
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`."""
         self.optimizer.load_state_dict(state["optimizer"])
-        self._lr.copy_(state["lr"])
+        self.lr.copy_(state["lr"])
         self.check.load_state_dict(state["check"])

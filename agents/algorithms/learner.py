@@ -93,15 +93,6 @@ def check_learner(learner: object) -> None:
             raise LearnerError(f"it has no {name}: {description}")
 
 
-def check_minibatches(n_minibatches: int, n_lanes: int) -> None:
-    """Raises ValueError if there are fewer lanes than minibatches."""
-    if n_lanes < n_minibatches:
-        raise ValueError(
-            f"{n_lanes} lanes cannot be split into {n_minibatches} minibatches of whole lanes: use "
-            "fewer minibatches (n_minibatches) or more lanes"
-        )
-
-
 class GradientLearner:
     """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
 
@@ -196,12 +187,21 @@ class GradientLearner:
         Raises:
             ValueError: if there are fewer lanes than minibatches.
         """
-        check_minibatches(self.n_minibatches, rollout.n_lanes)
+        if rollout.n_lanes < self.n_minibatches:
+            raise ValueError(
+                f"{rollout.n_lanes} lanes cannot be split into {self.n_minibatches} minibatches of "
+                "whole lanes: use fewer minibatches (n_minibatches) or more lanes"
+            )
         return {f"loss/{name}": value for name, value in self.cuda_graph(rollout).items()}
 
     def _update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Performs one update without synchronising, so that it can be captured."""
         raise NotImplementedError
+
+    def minibatches(self, n_lanes: int) -> tuple[torch.Tensor, ...]:
+        """Returns the lanes of each minibatch, (M,) int64, in a random order."""
+        keys = torch.rand(n_lanes, generator=self.generator.on(self.device), device=self.device)
+        return keys.argsort(stable=True).tensor_split(self.n_minibatches)
 
     def set_lr(self, lr: float) -> None:
         """Changes the step size, the critic's by the same factor, also for a captured update."""

@@ -11,6 +11,7 @@ import torch
 from torch.utils._pytree import tree_leaves_with_path
 
 from megastep.agents.algorithms.kernels import LIBRARY
+from megastep.agents.networks.fused import fused
 from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Tree
 
@@ -114,11 +115,7 @@ class NonFiniteCheck:
         # [12:] the magnitudes of these: -1 for NaN, 1.8e308 for infinity
         self.record = torch.zeros(4 + 2 * MAX_NAMED, dtype=torch.float64, device=device)
 
-    @property
-    def found(self) -> torch.Tensor:
-        """() bool on the device, true if a non-finite number was detected since the last `read`."""
-        return self.record[2] > 0
-
+    @fused(lambda *inputs: _check_on_gpu(*inputs), lambda self, floats: _are_readable(floats))
     def __call__(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
         """Checks a rollout. Keeps the first non-finite number of each lane until `read`.
 
@@ -128,8 +125,6 @@ class NonFiniteCheck:
         Returns:
             () bool on the device, true if all numbers are finite and within `LIMIT`.
         """
-        if _is_fused(floats):
-            return self._check_on_gpu(floats)
         count, first = self.record[:1], self.record[2:]
         count += 1
         sizes = _sizes(floats)
@@ -143,47 +138,8 @@ class NonFiniteCheck:
         latest[2 : 2 + len(index)] = index
         worst = sizes.flatten()[index.clamp(max=sizes.numel() - 1)].double()
         latest[-MAX_NAMED:][: len(index)] = worst.nan_to_num(nan=-1.0)
-        first.copy_(torch.where((n_bad == 0) | self.found, first, latest))
+        first.copy_(torch.where((n_bad == 0) | (self.record[2] > 0), first, latest))
         return n_bad == 0
-
-    def _check_on_gpu(self, floats) -> torch.Tensor:
-        """Implements `__call__` with two kernels."""
-        tensors = list(floats.values())
-        n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
-        device, constants = tensors[0].device, LIBRARY.constants
-        first_rows = torch.full((n_lanes,), 2**31 - 1, dtype=torch.int32, device=device)
-        is_finite = torch.empty((), dtype=torch.bool, device=device)
-        block_bytes = 16 * constants["CHECKED_THREADS"] * constants["CHECKED_WORDS"]
-        packed, n_blocks = [], 0
-        for tensor in tensors:
-            packed.append(
-                LIBRARY.params.CheckedTensorParams(
-                    values=tensor,
-                    first_block=n_blocks,
-                    n_steps=len(tensor),
-                    n_features=math.prod(tensor.shape[2:]),
-                    is_half=int(tensor.dtype == torch.float16),
-                )
-            )
-            # one more block than full ones, for the numbers after the last whole word
-            n_blocks += tensor.numel() * tensor.element_size() // block_bytes + 1
-        shared = dict(
-            tensors=b"".join(packed),
-            first_rows=first_rows,
-            n_tensors=len(tensors),
-            n_steps=n_steps,
-            n_lanes=n_lanes,
-        )
-        blocks = Blocks(n_blocks, threads=constants["CHECKED_THREADS"])
-        launch(LIBRARY, "find_bad", device, blocks, **shared, limit=LIMIT)
-        launch(
-            *(LIBRARY, "record", device, Blocks(1, threads=constants["RECORD_THREADS"])),
-            **shared,
-            record=self.record,
-            is_finite=is_finite,
-            n_named=MAX_NAMED,
-        )
-        return is_finite
 
     def state_dict(self) -> torch.Tensor:
         """Returns (2,) float64: rollouts checked, and updates skipped in a row.
@@ -223,7 +179,7 @@ class NonFiniteCheck:
         return dataclasses.replace(values[0], others=others, n_lanes=int(n_bad)), int(n_skipped)
 
 
-def _is_fused(floats) -> bool:
+def _are_readable(floats) -> bool:
     """Returns True if kernels can check these tensors."""
     tensors = list(floats.values())
     return len(tensors) <= LIBRARY.constants["CHECKED_TENSORS"] and all(
@@ -234,6 +190,35 @@ def _is_fused(floats) -> bool:
         and len(tensor) - min(map(len, tensors)) <= 1
         for tensor in tensors
     )
+
+
+def _check_on_gpu(check, floats) -> torch.Tensor:
+    """Finds the first row of each lane with a bad number, then records the lanes."""
+    tensors = list(floats.values())
+    n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
+    device, constants = tensors[0].device, LIBRARY.constants
+    first_rows = torch.full((n_lanes,), 2**31 - 1, dtype=torch.int32, device=device)
+    is_finite = torch.empty((), dtype=torch.bool, device=device)
+    block_bytes = 16 * constants["CHECKED_THREADS"] * constants["CHECKED_WORDS"]
+    packed, n_blocks = [], 0
+    for tensor in tensors:
+        packed.append(
+            LIBRARY.params.CheckedTensorParams(
+                **dict(values=tensor, first_block=n_blocks, n_steps=len(tensor)),
+                n_features=math.prod(tensor.shape[2:]),
+                is_half=int(tensor.dtype == torch.float16),
+            )
+        )
+        # one more block than full ones, for the numbers after the last whole word
+        n_blocks += tensor.numel() * tensor.element_size() // block_bytes + 1
+    shared = dict(tensors=b"".join(packed), first_rows=first_rows, n_tensors=len(tensors))
+    shared |= dict(n_steps=n_steps, n_lanes=n_lanes)
+    blocks = Blocks(n_blocks, threads=constants["CHECKED_THREADS"])
+    launch(LIBRARY, "find_bad", device, blocks, **shared, limit=LIMIT)
+    results = dict(record=check.record, is_finite=is_finite, n_named=MAX_NAMED)
+    blocks = Blocks(1, threads=constants["RECORD_THREADS"])
+    launch(LIBRARY, "record", device, blocks, **shared, **results)
+    return is_finite
 
 
 def _sizes(floats) -> torch.Tensor:

@@ -36,7 +36,7 @@ def make_optimizer(
 class SGD:
     """Gradient descent without momentum, as a few operations that a CUDA graph can repeat."""
 
-    is_fused, capturable = False, True
+    capturable = True
 
     def __init__(
         self,

@@ -5,12 +5,14 @@ over valid steps: those that the environment took, of lanes that learn. An updat
 synchronises: conditions are bool tensors on the device.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from pydantic import Field
+from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms import returns
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.learner import (
     Coefficient,
     GradientLearner,
@@ -21,9 +23,8 @@ from megastep.agents.algorithms.learner import (
     ScheduledPositive,
     Warmup,
 )
-from megastep.agents.algorithms.masked_stats import pooled_normalise
-from megastep.agents.algorithms.order import random_order
-from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
+from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
+from megastep.agents.networks.fused import fused
 from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
@@ -33,10 +34,126 @@ from megastep.agents.storage.rollout import (
     make_rollout,
     without_last,
 )
+from megastep.arrdict import arrdict
+from megastep.coefficients import on_device
+from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
 _PARTS = "starts", "actions", "logprobs", "mask"  # of a rollout, that a minibatch copies
+
+
+_METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
+
+
+class Coefficients(NamedTuple):
+    """The settings of the loss; see `PPO`. Tensors () on the device may change between replays of a
+    graph.
+    """
+
+    clip: float | torch.Tensor
+    value_clip: float | None
+    value_coef: float | torch.Tensor
+    entropy_coef: float | torch.Tensor
+    auxiliary_coef: float | torch.Tensor
+
+
+class _Loss(torch.autograd.Function):
+    """`ppo_loss` in one kernel, which leaves the gradients for the backward pass."""
+
+    @staticmethod
+    def forward(
+        ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        numbers = coefficients._asdict()
+        value_clip, device = numbers.pop("value_clip"), logprobs.device
+        inputs = dict(logprobs=logprobs, entropies=entropies, values=values, errors=errors)
+        inputs |= dict(old_logprobs=batch.logprobs, advantages=batch.advantages)
+        inputs |= dict(targets=batch.targets, valid=batch.valid)
+        inputs["old_values"] = None if value_clip is None else batch.old_value
+        names = "d_logprobs", "d_entropies", "d_values", "d_errors"
+        gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
+        n_rows = logprobs.numel()
+        blocks = Blocks(-(-n_rows // BLOCK))
+        sums = logprobs.new_empty(blocks.x, LIBRARY.constants["N_SUMS"])
+        launch(
+            *(LIBRARY, "ppo_loss", device, blocks),
+            **{name: None if x is None else x.contiguous() for name, x in inputs.items()},
+            **{**dict.fromkeys(names), **dict(zip(names, gradients))},
+            **{name: on_device(number, device) for name, number in numbers.items()},
+            **dict(n_valid=batch.n_valid, value_scale=value_scale, sums=sums, n_rows=n_rows),
+            value_clip=value_clip or 0.0,
+        )
+        ctx.save_for_backward(*gradients)
+        means = sums.sum(0)
+        metrics, loss = means[:-1], means[-1]
+        ctx.mark_non_differentiable(metrics)
+        return loss, metrics
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_loss, d_metrics) -> tuple[torch.Tensor | None, ...]:
+        # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
+        gradients = torch._foreach_mul(ctx.saved_tensors, d_loss)  # pyright: ignore[reportPrivateImportUsage]
+        return *gradients, *[None] * (7 - len(gradients))
+
+
+def _loss_on_gpu(**inputs) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    names = "logprobs", "entropies", "values", "errors", "batch", "value_scale", "coefficients"
+    loss, means = _Loss.apply(*(inputs[name] for name in names))
+    metrics: dict[str, torch.Tensor] = dict(zip(_METRICS, means.unbind(), strict=True))
+    if inputs["errors"] is None:
+        metrics.pop("auxiliary")
+    return loss, metrics
+
+
+@fused(_loss_on_gpu, lambda logprobs, **_: logprobs.is_cuda)
+def ppo_loss(
+    *,
+    logprobs: torch.Tensor,
+    entropies: torch.Tensor,
+    values: torch.Tensor,
+    errors: torch.Tensor | None,
+    batch: arrdict,
+    value_scale: torch.Tensor,
+    coefficients: Coefficients,
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Returns the loss, a mean over the valid steps, and its metrics, tensors ().
+
+    Args:
+        logprobs: (T, M) float32, of the actions.
+        entropies: (T, M), of the policy.
+        values: (T, M), in units of reward.
+        errors: (T, M), of the auxiliary prediction, or None.
+        batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each, and `n_valid` (),
+            the number of valid steps; with a `value_clip` also `old_value` (T, M).
+        value_scale: (), the value's own scale.
+        coefficients: the settings.
+    """
+    clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
+    valid = batch.valid
+    log_ratio = logprobs - batch.logprobs
+    log_ratio = log_ratio.masked_fill(~valid, 0.0)  # its exp may overflow, and 0 * inf is NaN
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1 - clip, 1 + clip)
+    surrogate = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)
+    squared = ((values - batch.targets) / value_scale).square()
+    if value_clip is not None:
+        limit = value_clip * value_scale
+        moved = batch.old_value + (values - batch.old_value).clamp(-limit, limit)
+        squared = torch.maximum(squared, ((moved - batch.targets) / value_scale).square())
+    policy = -masked_mean(surrogate, valid)
+    value, entropy = masked_mean(squared, valid), masked_mean(entropies, valid)
+    with torch.no_grad():
+        # this estimate of the KL divergence is never negative, unlike the mean log ratio
+        kl = masked_mean(ratio - 1 - log_ratio, valid)
+        clip_fraction = masked_mean((ratio != clipped).float(), valid)
+    loss = policy + value_coef * value - entropy_coef * entropy
+    metrics = dict(policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction)
+    if errors is not None:
+        metrics["auxiliary"] = masked_mean(errors, valid)
+        loss = loss + auxiliary_coef * metrics["auxiliary"]
+    return loss, metrics
 
 
 class PPO(GradientLearner):
@@ -151,9 +268,8 @@ class PPO(GradientLearner):
 
     def _update(self, rollout) -> "dict[str, torch.Tensor]":
         transitions = rollout.transitions()
-        estimates = returns.gae(
-            **transitions, learns=rollout.learns[:-1], gamma=self.gamma, lambda_=self.lambda_
-        )
+        numbers = dict(gamma=self.coefficients["gamma"], lambda_=self.coefficients["lambda_"])
+        estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **numbers)
         advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
         moments = masked_moments(valid, targets, advantages)
         (_, _, variance), (_, _, error) = moments  # an advantage is the error of the value
@@ -171,9 +287,7 @@ class PPO(GradientLearner):
 
         is_enabled = True
         for _ in range(self.n_epochs):
-            generator = self.generator.on(self.device)
-            order = random_order(rollout.n_lanes, generator, self.device)
-            for lanes in order.tensor_split(self.n_minibatches):
+            for lanes in self.minibatches(rollout.n_lanes):
                 parts = SEQUENCES if self.has_extra_loss else _PARTS
                 batch = rollout.sequences(lanes, parts, estimates)
                 batch["n_valid"] = batch.valid.sum()

@@ -14,23 +14,41 @@ import torch
 
 from megastep import arrdict
 from megastep.agents.algorithms.kernels import LIBRARY
-from megastep.agents.networks.scan import linear_scan
+from megastep.agents.networks.fused import fused
+from megastep.agents.networks.mingru import linear_scan
 from megastep.coefficients import on_device
 from megastep.kernels.build.launch import launch
-
-
-def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor:
-    """Returns x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis.
-
-    Exact where a discount is 0, as at the end of an episode.
-    """
-    return linear_scan(terms, discounts, reverse=True)
 
 
 def _following(value, last_value) -> torch.Tensor:
     return torch.cat([value[1:], last_value[None]])
 
 
+def _are_floats_on_gpu(*tensors) -> bool:
+    return all(x.is_cuda and x.dtype == torch.float32 for x in tensors)
+
+
+def _gae_on_gpu(
+    reward, value, last_value, reset, terminal, truncated, learns=None, *, gamma, lambda_
+) -> arrdict.arrdict:
+    """Goes from the last step to the first, a thread per lane."""
+    (n_steps, n_lanes), device = reward.shape, value.device
+    advantages, targets = reward.new_empty(2, n_steps, n_lanes)
+    valid = torch.empty_like(advantages, dtype=torch.bool)
+    flags = dict(reset=reset, terminal=terminal, truncated=truncated, learns=learns)
+    launch(
+        *(LIBRARY, "gae", device, n_lanes),
+        **dict(reward=reward.contiguous(), values=value.contiguous()),
+        last_value=last_value.contiguous(),
+        **{name: flag if flag is None else flag.contiguous() for name, flag in flags.items()},
+        **dict(advantages=advantages, targets=targets, valid=valid),
+        **dict(gamma=on_device(gamma, device), lambda_=on_device(lambda_, device)),
+        **dict(n_steps=n_steps, n_lanes=n_lanes),
+    )
+    return arrdict.arrdict(advantages=advantages, targets=targets, valid=valid)
+
+
+@fused(_gae_on_gpu, lambda reward, value, *_, **__: _are_floats_on_gpu(reward, value))
 def gae(
     reward: torch.Tensor,
     value: torch.Tensor,
@@ -55,40 +73,38 @@ def gae(
         arrdict(advantages, targets, valid), each (T, B). Targets are the lambda returns A + V,
         which the value should fit. A is 0 where the environment ignored the action.
     """
-    if value.is_cuda and value.dtype == reward.dtype == torch.float32:
-        flags = dict(reset=reset, terminal=terminal, truncated=truncated, learns=learns)
-        return _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_)
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
     ends = terminal | truncated | reset
     discounts = (torch.ones_like(value) * (gamma * lambda_)).masked_fill(ends, 0.0)
-    advantages = discounted_sum(delta, discounts)
+    advantages = linear_scan(delta, discounts, reverse=True)
     valid = ~reset if learns is None else ~reset & learns
     return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=valid)
 
 
-def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_) -> arrdict.arrdict:
-    """Computes `gae` in one kernel, lane by lane."""
-    n_steps, n_lanes = reward.shape
-    advantages, targets = reward.new_empty(2, n_steps, n_lanes)
-    valid = torch.empty_like(advantages, dtype=torch.bool)
+def _vtrace_on_gpu(
+    log_ratio, reward, value, last_value, reset, terminal, truncated, **numbers
+) -> arrdict.arrdict:
+    (n_steps, n_lanes), device = value.shape, value.device
+    advantages, targets = value.new_empty(2, n_steps, n_lanes)
+    steps = dict(log_ratio=log_ratio, reward=reward, reset=reset, terminal=terminal)
+    numbers = {**dict.fromkeys(("lambda_", "rho_clip", "c_clip"), 1.0), **numbers}
     launch(
-        *(LIBRARY, "gae", value.device, n_lanes),
-        reward=reward.contiguous(),
-        values=value.contiguous(),
-        last_value=last_value.contiguous(),
-        **{name: flag if flag is None else flag.contiguous() for name, flag in flags.items()},
-        advantages=advantages,
-        targets=targets,
-        valid=valid,
-        gamma=on_device(gamma, value.device),
-        lambda_=on_device(lambda_, value.device),
-        n_steps=n_steps,
-        n_lanes=n_lanes,
+        *(LIBRARY, "vtrace", device, n_lanes),
+        **{name: leaf.contiguous() for name, leaf in steps.items()},
+        truncated=truncated.contiguous(),
+        values=torch.cat([value, last_value[None]]),
+        **dict(advantages=advantages, targets=targets),
+        **{name: on_device(number, device) for name, number in numbers.items()},
+        **dict(n_steps=n_steps, n_lanes=n_lanes),
     )
-    return arrdict.arrdict(advantages=advantages, targets=targets, valid=valid)
+    return arrdict.arrdict(advantages=advantages, targets=targets, valid=~reset)
 
 
+@fused(
+    _vtrace_on_gpu,
+    lambda log_ratio, reward, value, *_, **__: _are_floats_on_gpu(log_ratio, reward, value),
+)
 def vtrace(
     log_ratio: torch.Tensor,
     reward: torch.Tensor,
@@ -120,11 +136,6 @@ def vtrace(
         arrdict(advantages, targets, valid), each (T, B). The value should fit the targets v; the
         policy's gradient is weighted by A. Where the action was not valid, v = V and A = 0.
     """
-    if value.is_cuda and value.dtype == reward.dtype == log_ratio.dtype == torch.float32:
-        steps = dict(log_ratio=log_ratio, reward=reward, reset=reset)
-        steps |= dict(terminal=terminal, truncated=truncated)
-        settings = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
-        return _vtrace_on_gpu(steps, value, last_value, settings)
     following = _following(value, last_value)
     ratio = log_ratio.exp()
     rho = ratio.clamp(max=rho_clip)
@@ -133,7 +144,7 @@ def vtrace(
     discounts = (gamma * lambda_ * ratio.clamp(max=c_clip)).masked_fill(
         terminal | truncated | reset, 0.0
     )
-    targets = value + discounted_sum(delta, discounts)
+    targets = value + linear_scan(delta, discounts, reverse=True)
 
     beyond = torch.where(truncated, following, _following(targets, last_value)).masked_fill(
         terminal, 0.0
@@ -142,23 +153,6 @@ def vtrace(
     return arrdict.arrdict(
         advantages=advantages.masked_fill(reset, 0.0), targets=targets, valid=~reset
     )
-
-
-def _vtrace_on_gpu(steps, value, last_value, settings) -> arrdict.arrdict:
-    """Computes `vtrace` in one kernel, lane by lane."""
-    n_steps, n_lanes = value.shape
-    advantages, targets = value.new_empty(2, n_steps, n_lanes)
-    launch(
-        *(LIBRARY, "vtrace", value.device, n_lanes),
-        **{name: leaf.contiguous() for name, leaf in steps.items()},
-        values=torch.cat([value, last_value[None]]),
-        advantages=advantages,
-        targets=targets,
-        **{name: on_device(number, value.device) for name, number in settings.items()},
-        n_steps=n_steps,
-        n_lanes=n_lanes,
-    )
-    return arrdict.arrdict(advantages=advantages, targets=targets, valid=~steps["reset"])
 
 
 def n_step_returns(

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from megastep.agents.algorithms import returns
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
+from megastep.agents.networks.fused import fused
 from megastep.agents.networks.outputs import Output
 from megastep.agents.storage.rollout import without_last
 from megastep.arrdict import arrdict
@@ -19,7 +20,7 @@ from megastep.coefficients import on_device
 from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Tree
 
-METRICS = "td", "td_error", "q", "staleness", "effective_samples"
+_METRICS = "td", "td_error", "q", "staleness", "effective_samples"
 _ENDS = "reward", "terminal", "truncated"
 _EPS = 1e-3  # of `returns.rescale`
 _THREADS = LIBRARY.constants["TD_THREADS"]
@@ -51,8 +52,59 @@ class Result(NamedTuple):
     n_valid: torch.Tensor
 
 
+class _Loss(torch.autograd.Function):
+    """`td_loss` in two kernels. The gradient of the sum over valid steps is left for the
+    backward pass.
+    """
+
+    @staticmethod
+    def forward(
+        ctx, q, target_q, batch, settings
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        n_rows, n_sequences, n_agents, n_choices = q.shape
+        n_blocks = -(-n_sequences // _SEQUENCES)
+        d_q = torch.empty_like(q, memory_format=torch.contiguous_format)
+        values = q.new_empty(n_rows, n_sequences)
+        priorities = q.new_empty(n_sequences)
+        sums, metrics = q.new_empty(n_blocks, _N_SUMS), q.new_empty(_N_METRICS)
+        names = *_ENDS, "actions", "starts", "learns", "weight", "age"
+        tensors = {name: batch[name].contiguous() for name in names}
+        launch(
+            *(LIBRARY, "td_loss", q.device, Blocks(n_blocks, threads=_THREADS)),
+            **dict(q=q.contiguous(), target_q=target_q.contiguous(), **tensors),
+            **dict(values=values, d_q=d_q, priorities=priorities, sums=sums),
+            **dict(n_steps=n_rows - 1, n_sequences=n_sequences),
+            **dict(n_agents=n_agents, n_choices=n_choices),
+            **dict(gamma=on_device(settings.gamma, q.device), eta=settings.eta, eps=_EPS),
+            n_return_steps=settings.return_steps,
+        )
+        launch(
+            *(LIBRARY, "td_metrics", q.device, Blocks(1, threads=_THREADS)),
+            **dict(sums=sums, metrics=metrics, n_blocks=n_blocks, n_sequences=n_sequences),
+        )
+        ctx.save_for_backward(d_q, metrics)
+        ctx.mark_non_differentiable(metrics, priorities)
+        return metrics[0].clone(), metrics, priorities
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_loss, d_metrics, d_priorities) -> tuple[torch.Tensor | None, ...]:
+        d_q, metrics = ctx.saved_tensors
+        return d_q * (d_loss * metrics[-1]), None, None, None
+
+
+def _loss_on_gpu(q, target_q, batch, output, settings) -> Result:
+    loss, metrics, priorities = _Loss.apply(q, target_q, batch, settings)
+    *values, n_valid, _ = metrics.unbind()
+    return Result(loss, dict(zip(_METRICS, values, strict=True)), priorities, n_valid)
+
+
+@fused(
+    _loss_on_gpu,
+    lambda q, *_: isinstance(q, torch.Tensor) and q.is_cuda and q.dtype == torch.float32,
+)
 def td_loss(q: Tree, target_q: Tree, batch: arrdict, output: Output, settings: Settings) -> Result:
-    """Computes loss, metrics and priorities. On a GPU two kernels do, and leave the gradient.
+    """Computes loss, metrics and priorities.
 
     Args:
         q: (T+1, M, A, n) of the online network, or a tree of these.
@@ -62,17 +114,6 @@ def td_loss(q: Tree, target_q: Tree, batch: arrdict, output: Output, settings: S
         output: the policy's output.
         settings: the settings.
     """
-    if not (isinstance(q, torch.Tensor) and q.is_cuda and q.dtype == torch.float32):
-        return plain_loss(q, target_q, batch, output, settings)
-    loss, metrics, priorities = _FusedLoss.apply(q, target_q, batch, settings)
-    *values, n_valid, _ = metrics.unbind()
-    return Result(loss, dict(zip(METRICS, values, strict=True)), priorities, n_valid)
-
-
-def plain_loss(
-    q: Tree, target_q: Tree, batch: arrdict, output: Output, settings: Settings
-) -> Result:
-    """Does the same in PyTorch."""
     reset = batch.starts[1:]
     valid = ~reset & batch.learns[:-1]
     with torch.no_grad():
@@ -100,56 +141,3 @@ def plain_loss(
             effective_samples=effective_sample_size(batch.weight, all_sequences),
         )
     return Result(loss, metrics, priorities, valid.sum())
-
-
-class _FusedLoss(torch.autograd.Function):
-    """`plain_loss` in two kernels. The gradient of the sum over valid steps is left for the
-    backward pass.
-    """
-
-    @staticmethod
-    def forward(
-        ctx, q, target_q, batch, settings
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        n_rows, n_sequences, n_agents, n_choices = q.shape
-        n_blocks = -(-n_sequences // _SEQUENCES)
-        d_q = torch.empty_like(q, memory_format=torch.contiguous_format)
-        values = q.new_empty(n_rows, n_sequences)
-        priorities = q.new_empty(n_sequences)
-        sums, metrics = q.new_empty(n_blocks, _N_SUMS), q.new_empty(_N_METRICS)
-        names = *_ENDS, "actions", "starts", "learns", "weight", "age"
-        tensors = {name: batch[name].contiguous() for name in names}
-        launch(
-            *(LIBRARY, "td_loss", q.device, Blocks(n_blocks, threads=_THREADS)),
-            q=q.contiguous(),
-            target_q=target_q.contiguous(),
-            **tensors,
-            gamma=on_device(settings.gamma, q.device),
-            values=values,
-            d_q=d_q,
-            priorities=priorities,
-            sums=sums,
-            n_steps=n_rows - 1,
-            n_sequences=n_sequences,
-            n_agents=n_agents,
-            n_choices=n_choices,
-            n_return_steps=settings.return_steps,
-            eta=settings.eta,
-            eps=_EPS,
-        )
-        launch(
-            *(LIBRARY, "td_metrics", q.device, Blocks(1, threads=_THREADS)),
-            sums=sums,
-            metrics=metrics,
-            n_blocks=n_blocks,
-            n_sequences=n_sequences,
-        )
-        ctx.save_for_backward(d_q, metrics)
-        ctx.mark_non_differentiable(metrics, priorities)
-        return metrics[0].clone(), metrics, priorities
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, d_loss, d_metrics, d_priorities) -> tuple[torch.Tensor | None, ...]:
-        d_q, metrics = ctx.saved_tensors
-        return d_q * (d_loss * metrics[-1]), None, None, None

@@ -7,7 +7,7 @@ replayed sequences if there is a replay buffer. Means are over valid steps: thos
 environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -29,21 +29,18 @@ from megastep.agents.algorithms.masked_stats import (
     masked_mean,
     pooled_mean,
 )
-from megastep.agents.algorithms.order import random_order
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage import mixed_batches
 from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings
-from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
+from megastep.arrdict import arrdict, cat
+from megastep.dotdict import mapping
 from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
-
-if TYPE_CHECKING:
-    from megastep.arrdict import arrdict
 
 # Metrics count larger ratios as e^20, so that their squares stay finite.
 _MAX_LOG_RATIO = 20.0
@@ -217,9 +214,7 @@ class VTrace(GradientLearner):
         is_enabled = ~(is_unknown & is_finite)
         all_estimates = []
         for _ in range(self.n_epochs):
-            generator = self.generator.on(self.device)
-            order = random_order(rollout.n_lanes, generator, self.device)
-            for lanes in order.tensor_split(self.n_minibatches):
+            for lanes in self.minibatches(rollout.n_lanes):
                 loss, metrics, estimates = self._losses(self._batch(rollout, lanes), len(lanes))
                 kl = self.steps.backward(loss, metrics, estimates.valid.sum())["kl"]
                 if self.desired_kl is not None:
@@ -239,17 +234,15 @@ class VTrace(GradientLearner):
         self.policy.add_moments(of_obs, is_finite)
         return self.steps.end()
 
-    def _batch(self, rollout, lanes) -> "arrdict":
-        batch = mixed_batches.from_rollout(rollout, lanes)
+    def _batch(self, rollout, lanes) -> arrdict:
+        batch = fresh_batch(rollout, lanes)
         if self.replay_buffer is None or self.replay_settings is None:
             return batch
         n_replayed = max(1, round(self.replay_settings.ratio * len(lanes)))
         generator = self.generator.on(self.device)
-        return mixed_batches.add_replayed(
-            batch, self.replay_buffer, self.policy, n_replayed, generator
-        )
+        return with_replayed(batch, self.replay_buffer, self.policy, n_replayed, generator)
 
-    def _losses(self, batch, n_fresh) -> "tuple[torch.Tensor, dict[str, torch.Tensor], arrdict]":
+    def _losses(self, batch, n_fresh) -> tuple[torch.Tensor, dict[str, torch.Tensor], arrdict]:
         """Returns the loss of a minibatch, its metrics, tensors (), and V-trace's estimates.
 
         Args:
@@ -314,3 +307,42 @@ class VTrace(GradientLearner):
             clip_fraction=masked_mean((ratio > rho_clip).float(), valid),
             effective_samples=effective_sample_size(ratio, valid),
         )
+
+
+# ---- Fresh sequences followed by replayed ones ----
+
+# keys with a time axis
+_IN_TIME = (
+    *("obs", "privileged", "starts", "learns", "mask"),
+    *("actions", "logprobs", "reward", "terminal", "truncated"),
+)
+
+
+def fresh_batch(rollout: Rollout, lanes: torch.Tensor) -> arrdict:
+    """Returns `Rollout.sequences` of some lanes (M,), with `weight` 1 and `age` 0, both (M,)."""
+    batch = rollout.sequences(lanes)
+    return arrdict(batch, weight=torch.ones_like(batch.reward[0]), age=torch.zeros_like(lanes))
+
+
+def with_replayed(
+    batch: arrdict, replay: ReplayBuffer, policy: Policy, n: int, generator: torch.Generator
+) -> arrdict:
+    """Returns a fresh batch followed by n replayed sequences, (T, M + n, ...).
+
+    Burn-in steps warm up the hidden state and are then removed. Until the buffer is ready, replayed
+    sequences have `learns` false. `index` (n,) is for `ReplayBuffer.set_priorities`.
+    """
+    replayed = _burn_in(replay.sample(n, generator), policy, replay.settings.burn_in)
+    replayed["learns"] = replayed.learns & replay.is_ready
+    joined = {key: cat([batch[key], replayed[key]], int(key in _IN_TIME)) for key in batch}
+    return arrdict(joined, index=replayed.index)
+
+
+def _burn_in(batch, policy, n_steps) -> arrdict:
+    """Returns a batch without its first steps, with the hidden state after them."""
+    if not n_steps:
+        return batch
+    first, rest = mapping(lambda leaf: leaf[:n_steps]), mapping(lambda leaf: leaf[n_steps:])
+    state = policy.warm_up(first(batch.obs), first(batch.starts), batch.state)
+    parts = {key: rest(part) if key in _IN_TIME else part for key, part in batch.items()}
+    return arrdict(parts, state=state)

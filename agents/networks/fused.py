@@ -55,7 +55,7 @@ def fused(kernel: Operation, fits: Callable[..., bool]) -> Callable[[Operation],
         OPERATIONS.add(name)
 
         @functools.wraps(operation)
-        def chosen(*args, **options):
+        def chosen(*args, **options) -> object:
             if name not in _plain and fits(*args, **options):
                 return kernel(*args, **options)
             return operation(*args, **options)

@@ -158,8 +158,8 @@ def sum_rows(rows: torch.Tensor) -> torch.Tensor:
 
 # ---- Matrix products on a GPU ----
 #
-# Those of few rows are by kernels of our own, and others by PyTorch. Gradients of weights are always
-# by PyTorch, which splits the rows that they add up. All matrices of a product have one dtype.
+# Those of few rows are by kernels of our own, and others by PyTorch. Gradients of weights are
+# always by PyTorch, which splits the rows that they add up. All matrices have one dtype.
 
 
 def product(
@@ -189,7 +189,7 @@ def product(
     if few_rows.fits(rows, weight) and not len(weight) % 8 and bias.is_contiguous():
         outputs = few_rows.layer(rows, weight, bias, has_relu)
     elif has_relu:
-        outputs = torch._addmm_activation(bias, rows, weight.T)
+        outputs = torch._addmm_activation(bias, rows, weight.T)  # pyright: ignore[reportPrivateImportUsage]
     else:
         outputs = torch.addmm(bias, rows, weight.T)
     return outputs.unflatten(0, x.shape[:-1])

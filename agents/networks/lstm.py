@@ -6,9 +6,10 @@ PyTorch. Matrix products run in the compute dtype (autocast's) on a GPU and in f
 cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would round small
 additions away.
 
-`lstm_sequence` is the recurrence in PyTorch. A CPU runs a whole sequence in one kernel, and so does a GPU
-with clusters of blocks (Hopper and later); others run one kernel per step between two products. When
-acting, a GPU has one product of inputs and last outputs, or with few lanes one kernel for all.
+`lstm_sequence` is the recurrence in PyTorch. A CPU runs a whole sequence in one kernel, and so does
+a GPU with clusters of blocks (Hopper and later); others run one kernel per step between two
+products. When acting, a GPU has one product of inputs and last outputs, or with few lanes one
+kernel for all.
 """
 
 from collections.abc import Callable

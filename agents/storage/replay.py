@@ -9,19 +9,22 @@ the following rollouts. Its last row is the observation to bootstrap from. A seq
 once its last row has been stored, and until its first row is overwritten.
 """
 
+import math
+
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
+from megastep.agents.networks.fused import fused
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage import replay_kernels as kernels
-from megastep.agents.storage.copies import require_stored
+from megastep.agents.storage.copies import LIBRARY, require_stored
 from megastep.agents.storage.replay_columns import Column, stored_dtype
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, copy_tree
-from megastep.agents.storage.sum_tree import SumTree
+from megastep.agents.storage.sum_tree import SET_THREADS, SumTree, has_kernels, packed
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
+from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Env, Space, Tree
 
 #: Bool tensors of a row, stored as one bit each.
@@ -30,6 +33,106 @@ _FLAGS = "starts", "learns", "terminal", "truncated"
 _WITH_LAST = "obs", "privileged", "starts", "learns", "mask"
 #: Smallest priority before it is raised to alpha, so that sequences of zero error can be drawn.
 _MIN_PRIORITY = 1e-6
+
+
+_MAX_TENSORS = LIBRARY.constants["MAX_SELECTED"]
+_READ_THREADS = LIBRARY.constants["READ_THREADS"]
+_MAX_ENTRIES = 2**31  # kernels count lanes, rows and words in 32 bits
+_COPIES = {size: LIBRARY.constants[f"COPY_{size}"] for size in (16, 8, 4, 2, 1)}
+#: How a stored dtype is read as another.
+_CONVERSIONS = {
+    (torch.uint8, torch.int64): LIBRARY.constants["BYTE_TO_LONG"],
+    (torch.int16, torch.int64): LIBRARY.constants["SHORT_TO_LONG"],
+    (torch.int32, torch.int64): LIBRARY.constants["INT_TO_LONG"],
+    (torch.uint8, torch.float16): LIBRARY.constants["BYTE_TO_HALF"],
+    (torch.uint8, torch.float32): LIBRARY.constants["BYTE_TO_FLOAT"],
+    (torch.float16, torch.float32): LIBRARY.constants["HALF_TO_FLOAT"],
+}
+
+
+# ---- On a GPU ----
+
+
+def _parts(replay) -> tuple[list[Column], list[int], object]:
+    """Returns the columns of a sequence's tensors, how many rows it has of each, and their tree."""
+    columns, n_rows = [], []
+    tree = arrdict(replay.columns, state=replay.state)
+    for name, part in tree.items():
+        of_part, _ = tree_flatten(part)
+        length = 1 if name == "state" else replay.length + (name in _WITH_LAST)
+        columns += of_part
+        n_rows += [length] * len(of_part)
+    return columns, n_rows, tree_flatten(tree)[1]
+
+
+def _can_read(replay, index, probability) -> bool:
+    columns, *_ = _parts(replay)
+    n_words = (replay.length + 1) * len(index)
+    return len(columns) <= _MAX_TENSORS and all(
+        column.rows.is_cuda
+        and column.rows.is_contiguous()
+        and (column.rows.dtype == column.dtype or (column.rows.dtype, column.dtype) in _CONVERSIONS)
+        and column.rows.shape[0] * column.rows.shape[1] < _MAX_ENTRIES
+        and n_words * math.prod(column.rows.shape[2:]) * column.rows.element_size() < _MAX_ENTRIES
+        for column in columns
+    )
+
+
+def _read_on_gpu(replay, index, probability) -> arrdict:
+    """Reads sequences, weights and ages in one kernel."""
+    columns, n_rows, spec = _parts(replay)
+    n_sequences, n_steps, device, packed_rows = len(index), replay.length, index.device, []
+    results, n_blocks = [], 1 + -(-(n_steps + 1) * n_sequences // _READ_THREADS)
+    for column, n in zip(columns, n_rows, strict=True):
+        rows, dtype = column.rows, column.dtype
+        result = torch.empty(n, n_sequences, *rows.shape[2:], dtype=dtype, device=device)
+        n_words, kind = math.prod(rows.shape[2:]), _CONVERSIONS.get((rows.dtype, dtype))
+        if rows.dtype == dtype:
+            n_bytes = n_words * rows.element_size()
+            addresses = n_bytes | rows.data_ptr() | result.data_ptr()
+            word_size = next(size for size in _COPIES if not addresses % size)
+            n_words, kind = n_bytes // word_size, _COPIES[word_size]
+        packed_rows.append(
+            LIBRARY.params.ReadTensorParams(
+                **dict(target=result, source=rows, n_rows=n, n_words=n_words, kind=kind),
+                **dict(rows_per_rollout=len(rows) // replay.n_rollouts, first_block=n_blocks),
+            )
+        )
+        results.append(result)
+        n_blocks += -(-n * n_sequences * n_words // _READ_THREADS)
+    flags = {
+        name: torch.empty(
+            n_steps + (name in _WITH_LAST), n_sequences, dtype=torch.bool, device=device
+        )
+        for name in _FLAGS
+    }
+    weights, age = torch.empty_like(probability), torch.empty_like(index)
+    weight = torch.empty_like(probability, dtype=torch.float32)
+    launch(
+        *(LIBRARY, "read_sequences", device, Blocks(n_blocks, threads=_READ_THREADS)),
+        **dict(tensors=b"".join(packed_rows), flags=replay.flags.rows, **flags),
+        **dict(index=index, probability=probability, weights=weights, weight=weight, age=age),
+        **dict(n_added=replay.n_added, n_available=replay.n_available),
+        **dict(n_tensors=len(columns), n_sequences=n_sequences, n_steps=n_steps),
+        **dict(n_lanes=replay.n_lanes, n_rollouts=replay.n_rollouts),
+        **dict(rows_per_rollout=replay.n_steps, beta=replay.settings.beta),
+    )
+    batch = arrdict(tree_unflatten(results, spec), weight=weight, age=age, **flags)
+    batch["state"] = mapping(lambda leaf: leaf[0])(batch.state)
+    return batch
+
+
+def _store_priorities_on_gpu(replay, index, errors) -> None:
+    settings, values = replay.settings, torch.empty_like(errors, dtype=torch.float64)
+    first_rollouts = -(-settings.start // (replay.n_steps * replay.n_lanes))
+    launch(
+        *(LIBRARY, "set_priorities", index.device, Blocks(1, threads=SET_THREADS)),
+        **dict(tree=packed(replay.tree), index=index.contiguous(), values=values),
+        **dict(errors=errors.float().contiguous(), n_added=replay.n_added),
+        **dict(n_available=replay.n_available, new_priority=replay.new_priority, n=len(index)),
+        first_rollouts=min(first_rollouts, _MAX_ENTRIES - 1),
+        **dict(smallest=_MIN_PRIORITY, alpha=settings.alpha),
+    )
 
 
 class ReplayBuffer:
@@ -174,11 +277,11 @@ class ReplayBuffer:
             age: int64, number of rollouts added since the one in which it starts
         """
         index, probability = self.tree.draw(n, generator)
-        batch = self._read_on_gpu(index, probability)
-        batch = self._read(index, probability) if batch is None else batch
+        batch = self._read(index, probability)
         batch["index"], batch["probability"] = index, probability
         return batch
 
+    @fused(_read_on_gpu, _can_read)
     def _read(self, index, probability) -> arrdict:
         """Returns the sequences with their weights and ages."""
         slot, lane = index // self.n_lanes, index % self.n_lanes
@@ -198,26 +301,6 @@ class ReplayBuffer:
         batch["age"] = (self.n_added - 1 - slot) % self.n_rollouts
         return batch
 
-    def _read_on_gpu(self, index, probability) -> arrdict | None:
-        """Does the same as `_read` in one kernel; returns None where the kernel does not apply."""
-        tree = arrdict(self.columns, state=self.state)
-        columns, spec = tree_flatten(tree)
-        n_rows = {name: self.length + (name in _WITH_LAST) for name in self.columns}
-        n_rows["state"] = 1
-        n_rows = [n_rows[name] for name, part in tree.items() for _ in tree_flatten(part)[0]]
-        tensors = [(column.rows, column.dtype) for column in columns]
-        if not kernels.can_read(tensors, (self.length + 1) * len(index)):
-            return None
-        results, flags, weight, age = kernels.read_sequences(
-            [(*tensor, n) for tensor, n in zip(tensors, n_rows, strict=True)],
-            self.flags.rows,
-            *(index, probability, (self.n_added, self.n_available)),
-            *(self.length, self.n_rollouts, self.settings.beta),
-        )
-        batch = arrdict(tree_unflatten(results, spec), weight=weight, age=age)
-        batch["state"] = mapping(lambda leaf: leaf[0])(batch.state)
-        return arrdict(batch, **dict(zip(_FLAGS, flags, strict=True)))
-
     @torch.no_grad()
     def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
         """Sets the priorities of the last sample's sequences to `values`, (M,), to the power alpha.
@@ -231,20 +314,14 @@ class ReplayBuffer:
                 f"it is {tuple(values.shape)}"
             )
         require_stored(index=index, values=values)
-        if self.settings.alpha == 0:
-            return
-        if self.tree.is_fused and len(index) <= kernels.MAX_SET:
-            kernels.set_priorities(
-                self.tree.levels,
-                index.contiguous(),
-                values.float().contiguous(),
-                (self.n_added, self.n_available),
-                self.new_priority,
-                first_rollouts=-(-self.settings.start // (self.n_steps * self.n_lanes)),
-                smallest=_MIN_PRIORITY,
-                alpha=self.settings.alpha,
-            )
-            return
+        if self.settings.alpha:
+            self._store_priorities(index, values)
+
+    @fused(
+        _store_priorities_on_gpu,
+        lambda self, index, errors: has_kernels(self.tree, len(index)),
+    )
+    def _store_priorities(self, index, values) -> None:
         old = self.tree.priorities.index_select(0, index)
         new = values.double().clamp(min=_MIN_PRIORITY) ** self.settings.alpha
         # old is 0 where the sequence cannot be drawn

@@ -10,8 +10,44 @@ import itertools
 
 import torch
 
-from megastep.agents.storage import replay_kernels as kernels
-from megastep.agents.storage.copies import require_stored
+from megastep.agents.networks.fused import fused
+from megastep.agents.storage.copies import LIBRARY, require_stored
+from megastep.kernels.build.launch import WARP, Blocks, launch
+
+#: Indices that a launch sets, and its threads.
+MAX_SET, SET_THREADS = LIBRARY.constants["MAX_SET"], LIBRARY.constants["SET_THREADS"]
+
+
+def packed(tree: "SumTree") -> bytes:
+    """Returns a tree as kernels take it."""
+    rows = [LIBRARY.params.TreeLevelParams(sums=level) for level in tree.levels]
+    return LIBRARY.params.SumTreeParams(levels=b"".join(rows), n_levels=len(tree.levels))
+
+
+def has_kernels(tree: "SumTree", n_set: int = 0) -> bool:
+    """Returns whether kernels draw from a tree, and set so many priorities."""
+    is_known = tree.fan_out == WARP and len(tree.levels) <= LIBRARY.constants["MAX_LEVELS"]
+    return tree.levels[-1].is_cuda and is_known and n_set <= MAX_SET
+
+
+def _draw_on_gpu(tree, fractions) -> tuple[torch.Tensor, torch.Tensor]:
+    index = torch.empty_like(fractions, dtype=torch.int64)
+    probability = torch.empty_like(fractions)
+    launch(
+        *(LIBRARY, "sample_tree", fractions.device, WARP * len(fractions)),
+        **dict(tree=packed(tree), fractions=fractions, index=index, probability=probability),
+        n_samples=len(fractions),
+    )
+    return index, probability
+
+
+def _store_on_gpu(tree, index, values) -> None:
+    if len(index):
+        launch(
+            *(LIBRARY, "set_tree", index.device, Blocks(1, threads=SET_THREADS)),
+            **dict(tree=packed(tree), index=index.contiguous(), values=values.contiguous()),
+            n=len(index),
+        )
 
 
 class SumTree:
@@ -50,13 +86,6 @@ class SumTree:
         return self.levels[-1].sum()
 
     @property
-    def is_fused(self) -> bool:
-        """Whether kernels implement `draw` and `set`."""
-        top = self.levels[-1]
-        is_known = self.fan_out == kernels.FAN_OUT and len(self.levels) <= kernels.MAX_LEVELS
-        return top.is_cuda and is_known
-
-    @property
     def bytes(self) -> int:
         """Size in bytes."""
         return sum(level.nbytes for level in self.levels)
@@ -77,11 +106,10 @@ class SumTree:
                 f"values is {tuple(values.shape)}"
             )
         require_stored(index=index, values=values)
-        values = values.to(torch.float64)
-        if self.is_fused and len(index) <= kernels.MAX_SET:
-            if len(index):
-                kernels.set_tree(self.levels, index.contiguous(), values.contiguous())
-            return
+        self._store(index, values.to(torch.float64))
+
+    @fused(_store_on_gpu, lambda self, index, values: has_kernels(self, len(index)))
+    def _store(self, index, values) -> None:
         self.priorities.scatter_reduce_(0, index, values, "amax", include_self=False)
         for lower, upper in itertools.pairwise(self.levels):
             sums = upper.view(-1)
@@ -94,22 +122,22 @@ class SumTree:
     def draw(
         self, n: int, generator: torch.Generator | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns indices as from `sample` and their `probability`; on a GPU, in one kernel."""
-        if self.is_fused:
-            return kernels.draw(self.levels, self._fractions(n, generator))
-        index = self.sample(n, generator)
-        return index, self.probability(index)
-
-    def sample(self, n: int, generator: torch.Generator | None = None) -> torch.Tensor:
-        """Draws n indices in proportion to their priorities, (n,) int64 in ascending order.
+        """Draws n indices in proportion to their priorities, (n,) int64 in ascending order, and
+        returns their `probability`, too.
 
         Sampling is stratified: one index is drawn from each of n equal parts of the total. Indices
         of priority 0 are never drawn, unless all priorities are 0; then each result is index 0.
         """
-        if self.is_fused:
-            return self.draw(n, generator)[0]
-        top, fraction = self.levels[-1], self._fractions(n, generator)
-        rest = (fraction + torch.arange(n, device=top.device)) / n * self.total
+        if n < 1:
+            raise ValueError(f"n must be at least 1 index to draw, but {n} was given")
+        device = self.levels[-1].device
+        # the position of each sample within its part, from 0 to 1
+        return self._at(torch.rand(n, generator=generator, dtype=torch.float64, device=device))
+
+    @fused(_draw_on_gpu, lambda self, fractions: has_kernels(self))
+    def _at(self, fractions) -> tuple[torch.Tensor, torch.Tensor]:
+        n, top = len(fractions), self.levels[-1]
+        rest = (fractions + torch.arange(n, device=top.device)) / n * self.total
         children = torch.arange(self.fan_out, device=top.device)
         index = torch.zeros(n, dtype=torch.int64, device=top.device)
         for level in reversed(self.levels):
@@ -123,17 +151,10 @@ class SumTree:
             child = torch.minimum(first, last)
             rest = rest - (sums - block).gather(-1, child[:, None])[:, 0]
             index = index * self.fan_out + child
-        return index
+        return index, self.probability(index)
 
     def probability(self, index: torch.Tensor) -> torch.Tensor:
         """Returns the probability (M,) float64 of each index; 0 while all priorities are 0."""
         require_stored(index=index)
         tiny = torch.finfo(torch.float64).tiny
         return self.priorities.index_select(0, index) / self.total.clamp(min=tiny)
-
-    def _fractions(self, n, generator) -> torch.Tensor:
-        """Returns the position of each sample within its part, (n,) float64 from 0 to 1."""
-        if n < 1:
-            raise ValueError(f"n must be at least 1 index to draw, but {n} was given")
-        device = self.levels[-1].device
-        return torch.rand(n, generator=generator, dtype=torch.float64, device=device)

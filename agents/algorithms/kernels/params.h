@@ -20,12 +20,6 @@ struct GaeParams {
     int n_lanes;
 };
 
-struct OrderParams {
-    const float* keys;  // (n), no NaN
-    long long* order;   // (n), indices of the keys from the smallest on
-    int n;
-};
-
 struct VtraceParams {
     const float* log_ratio;          // (T, B)
     const float* reward;             // (T, B)
