@@ -125,12 +125,12 @@ OWN_USERS = {
         "agents/algorithms/kernels/*.py",
         "agents/distributed/bucket.py",
         "agents/export/web.py",
-        "agents/networks/*_cpu.py",
-        "agents/networks/kernels/*.py",
+        "agents/networks/*.py",
         "agents/networks/web/*.py",
         "agents/selfplay/opponents.py",
         "agents/storage/copies.py",
-        "agents/storage/replay_kernels.py",
+        "agents/storage/replay.py",
+        "agents/storage/sum_tree.py",
         "agents/training/episode_stats.py",
     )
 }

@@ -86,7 +86,7 @@ class _Layer(torch.autograd.Function):
         y = multiply(parts[0], weights[0], bias, has_relu and not last)
         for i in range(1, len(parts)):
             multiply(parts[i], weights[i], None, has_relu and i == last, y)
-        ctx.has_relu = has_relu
+        ctx.has_relu, ctx.on_gpu = has_relu, on_gpu
         ctx.save_for_backward(weight, *parts, *[y] * has_relu)
         return y[:, : ctx.n_outputs].view(*lead, ctx.n_outputs)
 
@@ -100,7 +100,7 @@ class _Layer(torch.autograd.Function):
         d = nn.functional.pad(d, (0, n_padding)) if n_padding else d
         d, d_bias = bias_gradient(d, activated)
         of_weights, of_inputs = gradient_of_weights, gradient_of_inputs
-        if not d.is_cuda:
+        if not ctx.on_gpu:
             of_weights, of_inputs = (lambda d, x: matmul(d.T, x)), matmul
         d_weight = None
         if ctx.needs_input_grad[0]:

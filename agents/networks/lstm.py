@@ -302,10 +302,10 @@ class _Sequence(torch.autograd.Function):
         elif residual is not None:
             d_x += residual
         rows = [rows.flatten(0, 1) for rows in (x, hiddens)]
-        if x.is_cuda:
-            d_weights = [gradient_of_weights(flat, each) for each in rows]
-        else:
+        if ctx.form is ON_CPU:
             d_weights = [matmul(flat.T, each) for each in rows]
+        else:
+            d_weights = [gradient_of_weights(flat, each) for each in rows]
         gradients = d_x, d_weights[0], d.bias.float(), d_weights[1], None, d.output, d.cell, None
         return None, None, *gradients
 
@@ -333,7 +333,7 @@ def lstm_sequence(
     reset: torch.Tensor,
     output: torch.Tensor,
     cell: torch.Tensor,
-    is_residual: bool = False,
+    is_residual: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Unrolls the recurrence. Nothing is done in place, as exporters want it.
 

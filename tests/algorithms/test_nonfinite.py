@@ -170,11 +170,11 @@ def test_kernels_find_what_the_plain_form_finds(
         bad_rollout(seed, n_lanes, n, value, extra_row, to_gpu)
         for seed, n in enumerate((0, n_bad, 2 * n_bad))
     )
-    assert nonfinite._is_fused(good)
+    assert nonfinite._are_readable(good)
     results = []
     for is_fused in (True, False):
         if not is_fused:
-            monkeypatch.setattr(nonfinite, "_is_fused", lambda floats: False)
+            monkeypatch.setattr(nonfinite, "_are_readable", lambda floats: False)
         check, texts = NonFiniteCheck(good["rgb"].device), []
         for rollout in (good, first, second, good, None, second, good, None, first, None):
             if rollout is None:
@@ -182,7 +182,7 @@ def test_kernels_find_what_the_plain_form_finds(
                 texts.append(repr(bad))
             else:
                 texts.append(bool(check(rollout)))
-            texts.append(bool(check.found))
+            texts.append(bool(check.record[2] > 0))
         results.append((texts, check.state_dict().tolist()))
     assert results[0] == results[1]
     texts = results[0][0]
@@ -212,7 +212,7 @@ def test_what_kernels_cannot_check_is_checked_all_the_same(change):
         rollout["value"] = torch.cat([values[0, :1], values.flatten()])[1:].view_as(values)
     else:
         rollout |= {f"more{i}": rollout["reward"] for i in range(16)}
-    assert not nonfinite._is_fused(rollout)
+    assert not nonfinite._are_readable(rollout)
     check = NonFiniteCheck(torch.device("cuda"))
     assert check(rollout)
     rollout["value"][3, 2] = torch.nan

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.ppo_loss import Coefficients, plain_loss, ppo_loss
+from megastep.agents.algorithms.ppo import Coefficients, ppo_loss
 from megastep.arrdict import arrdict
 
 T, M = 7, 133
@@ -31,17 +31,24 @@ def case(to, value_clip, auxiliary):
     return leaves, batch, to(torch.tensor(2.5)), settings
 
 
+def loss_of(leaves, batch, scale, settings):
+    names = "logprobs", "entropies", "values", "errors"
+    others = dict(batch=batch, value_scale=scale, coefficients=settings)
+    return ppo_loss(**dict(zip(names, leaves)), **others)
+
+
 @pytest.mark.parametrize("value_clip", [None, 0.3])
 @pytest.mark.parametrize("auxiliary", [False, True])
 def test_fused_loss_matches_plain(value_clip, auxiliary, to_gpu):
     results = []
-    for to, function in ((to_gpu, ppo_loss), (torch.Tensor.cpu, plain_loss)):
+    for to in (to_gpu, torch.Tensor.cpu):
         leaves, batch, scale, settings = case(to, value_clip, auxiliary)
-        loss, metrics = function(*leaves, batch, scale, settings)
+        loss, metrics = loss_of(leaves, batch, scale, settings)
         inputs = [leaf for leaf in leaves if leaf is not None]
         gradients = torch.autograd.grad(3 * loss, inputs)
-        results.append([loss, *metrics.values(), *gradients])
-        names = ["loss", *metrics, *range(len(inputs))]
+        names = sorted(metrics)
+        results.append([loss, *(metrics[name] for name in names), *gradients])
+        names = ["loss", *names, *range(len(inputs))]
     for name, fused, plain in zip(names, *results, strict=True):
         close = dict(rtol=1e-4, atol=1e-6, msg=lambda text, name=name: f"{name}: {text}")
         torch.testing.assert_close(fused.detach().cpu(), plain.detach(), **close)
@@ -51,7 +58,7 @@ def test_without_valid_steps_nothing_is_learned(to_gpu):
     leaves, batch, scale, settings = case(to_gpu, None, True)
     batch["valid"] = torch.zeros_like(batch.valid)
     batch["n_valid"] = batch.valid.sum()
-    loss, metrics = ppo_loss(*leaves, batch, scale, settings)
+    loss, metrics = loss_of(leaves, batch, scale, settings)
     assert not loss and not any(metrics.values())
     assert not any(gradient.any() for gradient in torch.autograd.grad(loss, leaves))
 
@@ -93,7 +100,7 @@ def test_fused_loss_takes_other_layouts(to_gpu):
     results = []
     for change in (torch.Tensor.contiguous, transposed):
         inputs = [change(leaf.detach()).requires_grad_() for leaf in leaves]
-        loss, _ = ppo_loss(*inputs, batch.map(change), scale, settings)
+        loss, _ = loss_of(inputs, batch.map(change), scale, settings)
         results.append([loss.detach(), *torch.autograd.grad(loss, inputs)])
     for one, other in zip(*results, strict=True):
         assert torch.equal(one, other)

@@ -100,16 +100,6 @@ def test_vtrace_matches_hand_calculation():
     torch.testing.assert_close(r.advantages[:, 0], column(9, 5, 10)[:, 0], **F64_CLOSE)
 
 
-@pytest.mark.parametrize("T", [1, 2, 3, 8, 13])
-def test_discounted_sum_matches_recursion(T):
-    terms, discounts = torch.randn(2, T, 5, dtype=torch.float64)
-    discounts[torch.rand(T, 5) < 0.3] = 0.0
-    expected, tail = torch.empty_like(terms), torch.zeros(5, dtype=torch.float64)
-    for t in reversed(range(T)):
-        tail = expected[t] = terms[t] + discounts[t] * tail
-    torch.testing.assert_close(returns.discounted_sum(terms, discounts), expected, **F64_CLOSE)
-
-
 def test_vtrace_ignores_actions_of_probability_zero():
     case, _ = episodes()
     r = returns.vtrace(torch.full_like(case["reward"], -torch.inf), **case, gamma=0.9)

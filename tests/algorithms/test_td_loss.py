@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.algorithms.td_loss import Settings, plain_loss, td_loss
+from megastep.agents.algorithms.td_loss import Settings, td_loss
 from megastep.agents.networks import heads
 from megastep.arrdict import arrdict
 
@@ -45,9 +45,9 @@ def case(n_steps, n_sequences, n_agents, n_choices, to):
 )
 def test_fused_loss_matches_plain(sizes, to_gpu):
     results = []
-    for to, function in ((to_gpu, td_loss), (torch.Tensor.cpu, plain_loss)):
+    for to in (to_gpu, torch.Tensor.cpu):
         q, *rest = case(*sizes, to)
-        loss, metrics, priorities, n_valid = function(q, *rest, SETTINGS)
+        loss, metrics, priorities, n_valid = td_loss(q, *rest, SETTINGS)
         (gradient,) = torch.autograd.grad(3 * loss, q)
         rest = dict(loss=loss, priorities=priorities, n_valid=n_valid, gradient=gradient)
         results.append(metrics | rest)

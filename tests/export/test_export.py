@@ -14,7 +14,7 @@ from megastep.agents.cli import evaluate, export, train
 from megastep.agents.errors import UserError
 from megastep.agents.export import hub, runtimes
 from megastep.agents.export.step import Step
-from megastep.agents.networks.kernels.library import plain_operations
+from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict
 from megastep.types import n_lanes

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from megastep.agents.networks.kernels.library import LIBRARY
+from megastep.agents.networks.fused import LIBRARY
 from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.envs.deathmatch.deathmatch_step import LIBRARY as DEATHMATCH
 from megastep.envs.explorer.explorer import LIBRARY as EXPLORER

@@ -7,9 +7,9 @@ import subprocess
 import pytest
 
 from megastep.agents.algorithms.kernels import LIBRARY as ALGORITHMS
-from megastep.agents.networks.kernels.library import LIBRARY
-from megastep.agents.networks.kernels.lstm_sequence import LIBRARY as SEQUENCES
-from megastep.agents.networks.kernels.mingru_step import LIBRARY as ACTING
+from megastep.agents.networks.fused import LIBRARY
+from megastep.agents.networks.lstm import CLUSTERS as SEQUENCES
+from megastep.agents.networks.mingru_step import LIBRARY as ACTING
 from megastep.agents.selfplay.opponents import LIBRARY as SELFPLAY
 from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.agents.training.episode_stats import LIBRARY as TRAINING

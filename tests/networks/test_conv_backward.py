@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from megastep.agents.networks.kernels.conv import conv_backward, is_supported, n_outputs
+from megastep.agents.networks.row_convolutions import conv_backward, n_outputs, takes
 
 DEVICE = "cuda"
 BF16 = torch.bfloat16
@@ -75,7 +75,7 @@ def assert_same(results, expected):
 )
 def test_gradients(n_rows, n_channels, n_columns):
     inputs = make_inputs(n_rows, n_channels, n_columns)
-    assert is_supported(inputs[2])
+    assert takes(inputs[2])
     assert_close(conv_backward(*inputs), plain(*inputs), TOLERANCE)
 
 
@@ -165,8 +165,8 @@ def test_what_is_not_supported():
     def rows(*shape, dtype=BF16, device=DEVICE):
         return torch.zeros(2, *shape, dtype=dtype, device=device)
 
-    assert is_supported(rows(3, 128))
-    assert not is_supported(rows(9, 128))
-    assert not is_supported(rows(8, 1024)), "more than the shared memory of a block"
-    assert not is_supported(rows(3, 128, dtype=torch.float32))
-    assert not is_supported(rows(3, 128, device="cpu"))
+    assert takes(rows(3, 128))
+    assert not takes(rows(9, 128))
+    assert not takes(rows(8, 1024)), "more than the shared memory of a block"
+    assert not takes(rows(3, 128, dtype=torch.float32))
+    assert not takes(rows(3, 128, device="cpu"))

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from megastep import spaces
 from megastep.agents.networks import encoders, heads
-from megastep.agents.networks.kernels import conv as kernels
+from megastep.agents.networks import row_convolutions as kernels
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.arrdict import arrdict
 
@@ -54,7 +54,7 @@ def test_cnn_sees_every_pixel(side, n_features):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("n_columns", [128, 2 * encoders.BandedConv1d.MAX_BANDED])
+@pytest.mark.parametrize("n_columns", [128, 2 * kernels.BandedConv1d.MAX_BANDED])
 def test_gpu_matches_cpu(n_columns):
     conv = encoders.Conv(spaces.MultiImage(1, 3, 1, n_columns))
     image = torch.rand(7, 1, 3, 1, n_columns, generator=torch.Generator().manual_seed(1))
@@ -108,9 +108,9 @@ def test_an_intake_writes_features_side_by_side(space, n_calls, monkeypatch):
     monkeypatch.setattr(kernels, "conv_forward", conv_forward)
     monkeypatch.setattr(kernels, "conv_backward", torch.enable_grad()(gradients))
     for is_supported in (True, False):
-        monkeypatch.setattr(kernels, "is_supported", lambda rows, value=is_supported: value)
+        monkeypatch.setattr(kernels, "takes", lambda rows, value=is_supported: value)
         with ComputeDtype("cpu", BF16):
-            features = intake._encode_columns(columns)
+            features = intake.encode_columns(columns)
         loss = features.float().square().sum()
         results.append([features, *torch.autograd.grad(loss, [*intake.encoders.parameters()])])
     assert len(calls) == n_calls
@@ -128,30 +128,30 @@ def test_frozen_parameters_get_no_gradient(monkeypatch):
         leaf.requires_grad_(False)
     monkeypatch.setattr(kernels, "conv_forward", convolve)
     monkeypatch.setattr(kernels, "conv_backward", torch.enable_grad()(gradients))
-    monkeypatch.setattr(kernels, "is_supported", lambda rows: True)
+    monkeypatch.setattr(kernels, "takes", lambda rows: True)
     with ComputeDtype("cpu", BF16):
-        features = intake._encode_columns(torch.randn(5, intake.n_columns).to(BF16))
+        features = intake.encode_columns(torch.randn(5, intake.n_columns).to(BF16))
     features.float().sum().backward()
     for leaf in intake.encoders.parameters():
         assert (leaf.grad is None) == any(leaf is other for other in frozen)
 
 
 def test_observations_that_need_gradients_and_odd_columns_are_left_to_other_forms(monkeypatch):
-    monkeypatch.setattr(kernels, "is_supported", lambda rows: True)
+    monkeypatch.setattr(kernels, "takes", lambda rows: True)
     columns = torch.zeros(5, 48, dtype=BF16)
     encoder = encoders.Conv(IMAGE)
 
     def part(encoder, target):
-        return encoders.Part(encoder, slice(0, 48), slice(target, target + 96))
+        return kernels.Part(encoder, slice(0, 48), slice(target, target + 96))
 
-    assert encoders.can_encode(columns, [part(encoder, 0), part(None, 96)])
-    last = encoders.Part(None, slice(0, 5), slice(99, 104))
-    assert not encoders.can_encode(columns, [part(encoder, 3), last])
-    assert not encoders.can_encode(columns, [part(encoder, 0), last._replace(target=slice(96, 99))])
-    assert not encoders.can_encode(columns, [part(encoders.Conv(IMAGE, channels=16), 0)])
-    wide = encoders.Conv(spaces.MultiImage(1, 1, 1, 2 * encoders.BandedConv1d.MAX_BANDED))
-    assert not encoders.can_encode(columns, [part(wide, 0)])
-    assert not encoders.can_encode(columns.requires_grad_(), [part(encoder, 0)])
+    assert kernels._can_encode(columns, [part(encoder, 0), part(None, 96)])
+    last = kernels.Part(None, slice(0, 5), slice(99, 104))
+    assert not kernels._can_encode(columns, [part(encoder, 3), last])
+    assert not kernels._can_encode(columns, [part(encoder, 0), last._replace(target=slice(96, 99))])
+    assert not kernels._can_encode(columns, [part(encoders.Conv(IMAGE, channels=16), 0)])
+    wide = encoders.Conv(spaces.MultiImage(1, 1, 1, 2 * kernels.BandedConv1d.MAX_BANDED))
+    assert not kernels._can_encode(columns, [part(wide, 0)])
+    assert not kernels._can_encode(columns.requires_grad_(), [part(encoder, 0)])
 
 
 @pytest.mark.parametrize("n_columns", [1, 5, 16, 37, 128, 256])
@@ -190,7 +190,7 @@ def test_kernel_matches_convolutions(shape, n_rows):
     conv = encoders.Conv(spaces.MultiImage(1, shape[0], 1, shape[1]))
     weights = weights_of(conv)
     rows = torch.randn(n_rows, *shape).to("cuda", BF16)
-    assert kernels.is_supported(rows)
+    assert kernels.takes(rows)
     features = torch.full((n_rows, conv.n_features + 16), torch.nan, dtype=BF16, device="cuda")
     ours = kernels.conv_forward(rows, *weights, features[:, 8:-8])
     expected = convolve(rows.cpu(), *(weight.cpu() for weight in weights))

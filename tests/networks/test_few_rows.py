@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from megastep.agents.networks import products as chosen
-from megastep.agents.networks.kernels import few_rows
+from megastep.agents.networks import few_rows
+from megastep.agents.networks import linear as chosen
 from megastep.arrdict import arrdict
 
 SLACK = dict(rtol=0, atol=2e-2)  # of numbers rounded to bfloat16
@@ -90,7 +90,7 @@ def test_kernels_take_few_rows_of_whole_words(cuda_on_cpu, monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: tuple(capability))
 
     def takes(*matrices):
-        return few_rows.is_supported(*map(cuda_on_cpu.tensor, matrices))
+        return few_rows.fits(*map(cuda_on_cpu.tensor, matrices))
 
     most, weight = torch.zeros(few_rows.MAX_ROWS, 16).bfloat16(), torch.zeros(24, 16).bfloat16()
     assert takes(most, weight) and takes(most[:1], weight) and takes(most[:, 8:], weight[:, 8:])
@@ -98,7 +98,7 @@ def test_kernels_take_few_rows_of_whole_words(cuda_on_cpu, monkeypatch):
     assert not takes(most.float(), weight) and not takes(most, weight.float())
     assert not takes(most[:, :12], weight[:, :12]) and not takes(most[:, 1:9], weight[:, :8])
     assert not takes(weight.T, weight)
-    assert not few_rows.is_supported(most, weight)  # on a CPU
+    assert not few_rows.fits(most, weight)  # on a CPU
     capability[0] = 7
     assert not takes(most, weight)
 
@@ -109,21 +109,21 @@ def test_products_are_the_same_by_kernels_and_by_pytorch(cuda_on_cpu, monkeypatc
     inputs = x, weight, bias, d, addend = product_inputs(21, 16, 24)
     if is_few:
         cuda_on_cpu.install(monkeypatch)
-        monkeypatch.setattr(few_rows, "is_supported", lambda *matrices: True)
+        monkeypatch.setattr(few_rows, "fits", lambda *matrices: True)
     else:
         x, weight, bias, d, addend = (leaf.double() for leaf in inputs)
     onto = d.clone()
-    chosen.add_layer(onto, x, weight)
+    chosen.product(x, weight, None, onto=onto)
     results = [
-        chosen.layer(x.view(3, 7, -1), weight, bias).flatten(0, 1),
-        chosen.layer(x, weight, bias, has_relu=True),
+        chosen.product(x.view(3, 7, -1), weight, bias).flatten(0, 1),
+        chosen.product(x, weight, bias, has_relu=True),
         onto,
-        chosen.of_inputs(d.view(3, 7, -1), weight).flatten(0, 1),
-        chosen.of_inputs(d, weight, addend),
+        chosen.gradient_of_inputs(d.view(3, 7, -1), weight).flatten(0, 1),
+        chosen.gradient_of_inputs(d, weight, addend),
     ]
     check_products(inputs, [result.bfloat16() for result in results])
     expected = inputs[3].double().T @ inputs[0].double()
-    weights = chosen.of_weights(d, x).double()
+    weights = chosen.gradient_of_weights(d, x).double()
     torch.testing.assert_close(weights, expected, rtol=1e-2, atol=1e-2)
 
 

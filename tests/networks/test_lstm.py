@@ -1,8 +1,9 @@
-"""The LSTM against torch.nn.LSTMCell, and its kernels against the CPU implementation.
+"""The LSTM against torch.nn.LSTMCell, and its kernels against PyTorch's operations.
 
 Kernels run on a GPU, and on a CPU from the same source (`tests/helpers/cuda_on_cpu.py`).
 """
 
+import contextlib
 from types import SimpleNamespace
 
 import pytest
@@ -11,10 +12,8 @@ from torch import nn
 
 from megastep import engine
 from megastep.agents.networks import lstm as lstm_module
-from megastep.agents.networks import lstm_cpu
-from megastep.agents.networks.kernels import library
-from megastep.agents.networks.kernels import lstm as kernels
-from megastep.agents.networks.lstm import LSTM
+from megastep.agents.networks.fused import aligned, launch_units, plain_operations
+from megastep.agents.networks.lstm import IN_STEPS, LSTM, ON_CLUSTERS, ON_CPU, WIDTHS
 from megastep.arrdict import arrdict
 from tests.helpers.recurrent import assert_close, check_captured
 
@@ -59,10 +58,12 @@ def by_hand(cell, x, reset, state):
 
 
 @pytest.mark.parametrize("p_reset", [0.0, 0.3, 1.0])
-def test_outputs_and_gradients_match_torch(p_reset):
+@pytest.mark.parametrize("context", [contextlib.nullcontext, plain_operations])
+def test_outputs_and_gradients_match_torch(p_reset, context):
     lstm, x, reset, state = case(p_reset=p_reset)
     cell = torch_cell(lstm)
-    outputs, after = lstm(x, reset, state)
+    with context():
+        outputs, after = lstm(x, reset, state)
     expected, expected_cell = by_hand(cell, x, reset, state)
     torch.testing.assert_close(outputs, expected, **CLOSE)
     torch.testing.assert_close(after.output, expected[-1], **CLOSE)
@@ -122,17 +123,21 @@ def where(request, monkeypatch):
     if request.param == "cuda":
         return "cuda"
     request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
-    monkeypatch.setattr(lstm_module, "_steps", lambda x: kernels)
     return "cpu"
 
 
-def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell, is_residual=False):
-    """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU."""
+def sequence(form, device, dtype, x, reset, state, weights, d_outputs, d_cell, is_residual=False):
+    """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU.
+
+    Args:
+        form: of the recurrence; None: PyTorch's operations.
+    """
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
-    outputs, cell, last = lstm_module._Sequence.apply(
-        *(*to, reset.to(device), *states), is_residual
-    )
+    inputs = *to, reset.to(device), *states, is_residual
+    with plain_operations():
+        apply = lstm_module.lstm_sequence if form is None else lstm_module._by(form)
+        outputs, last, cell = apply(*inputs)
     assert is_residual or torch.equal(last, outputs[-1].float())
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
@@ -151,7 +156,7 @@ SLACK = {torch.float32: 2e-3, torch.bfloat16: 6e-2}
 @pytest.mark.parametrize(
     "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
 )
-def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
+def test_kernels_match_pytorch(where, dtype, n_steps, n_lanes, width):
     torch.manual_seed(0)
     inputs = dict(
         # rounded to bfloat16, so that both start with the same numbers; not contiguous
@@ -165,10 +170,8 @@ def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
         d_outputs=torch.randn(width, n_steps, n_lanes).permute(1, 2, 0).bfloat16().float(),
         d_cell=torch.randn(width, n_lanes).T,
     )
-    results = sequence(where, dtype, **inputs)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._CPU_STEPS)
-        expected = sequence("cpu", torch.float32, **inputs)
+    results = sequence(IN_STEPS, where, dtype, **inputs)
+    expected = sequence(None, "cpu", torch.float32, **inputs)
     assert_close(NAMES, results, expected, SLACK[dtype])
 
 
@@ -177,9 +180,9 @@ def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
 def test_aligned_is_contiguous_in_16_byte_words(offset, shape):
     tensor = torch.arange(40.0)[offset : offset + 32].view(shape)
     for source in (tensor, tensor.T):
-        aligned = library.aligned(source)
-        assert torch.equal(aligned, source)
-        assert aligned.is_contiguous() and not aligned.data_ptr() % 16
+        copied = aligned(source)
+        assert torch.equal(copied, source)
+        assert copied.is_contiguous() and not copied.data_ptr() % 16
 
 
 @pytest.mark.parametrize("dtype", SLACK, ids=str)
@@ -196,22 +199,22 @@ def test_kernels_clear_even_nan_at_reset(where, dtype, width):
     )
     inputs["weights"].insert(1, torch.randn(4 * width))
     inputs["reset"][[0, 4]] = True
-    clean = sequence(where, dtype, **inputs)
+    clean = sequence(IN_STEPS, where, dtype, **inputs)
     inputs["x"][:4] = torch.nan
-    after_nan = sequence(where, dtype, **inputs)
+    after_nan = sequence(IN_STEPS, where, dtype, **inputs)
     assert torch.equal(after_nan[0][4:], clean[0][4:]) and after_nan[0][:4].isnan().all()
     assert torch.equal(after_nan[1], clean[1])  # the cell
     assert torch.equal(after_nan[2][4:], clean[2][4:])  # d x
     inputs["x"][:4] = 0.0
     inputs["state"] = [torch.full((B, width), torch.nan) for _ in range(2)]
-    results = sequence(where, dtype, **inputs)
+    results = sequence(IN_STEPS, where, dtype, **inputs)
     assert torch.equal(results[0][4:], clean[0][4:])
     assert all(leaf.isfinite().all() for leaf in results)
     assert not results[-2].any() and not results[-1].any()  # d output, d cell: cut by the reset
     # a NaN gradient does not pass a reset, either
     inputs["state"] = [torch.zeros(B, width) for _ in range(2)]
     inputs["d_outputs"][4:] = torch.nan
-    d_x = sequence(where, dtype, **inputs)[2]
+    d_x = sequence(IN_STEPS, where, dtype, **inputs)[2]
     assert d_x[:4].isfinite().all() and d_x[4:].isnan().all()
 
 
@@ -224,16 +227,13 @@ def test_acting_matches_a_sequence_of_one_step(where, dtype, is_residual, n_lane
     lstm, x = LSTM(width), torch.randn(1, n_lanes, width).bfloat16().float()
     reset = torch.arange(n_lanes)[None] % 3 == 1
     state = arrdict({key: torch.randn(n_lanes, width) for key in ("output", "cell")})
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lstm_module, "fits", lambda x: False)
-        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._CPU_STEPS)
+    with plain_operations():
         expected, expected_after = lstm(x, reset, state, is_residual)
     state.output[1] = torch.nan  # cleared by the reset
     state.cell[1] = torch.nan
     with torch.autocast(where, torch.bfloat16, enabled=dtype == torch.bfloat16):
-        result, after = lstm.to(where)._act(
-            x.to(where), reset.to(where), state.to(where), is_residual
-        )
+        inputs = x.to(where), reset.to(where), state.to(where), is_residual
+        result, after = lstm_module._act_on_gpu(lstm.to(where), *inputs)
     assert result.dtype == dtype and after.output.dtype == after.cell.dtype == torch.float32
     results = [leaf.float().cpu() for leaf in (result, after.output, after.cell)]
     expected = expected, expected_after.output, expected_after.cell
@@ -250,7 +250,11 @@ def test_gates_saturate_and_nan_propagates(where, width):
     gates = values[:, None].expand(-1, 4 * width).contiguous().to(where)
     cell = torch.full((len(values), width), 0.5, device=where)
     output, after = (torch.full_like(cell, 7.0) for _ in range(2))
-    kernels.forward(gates, cell, None, output, None, after)
+    launch_units(
+        *("lstm_forward", torch.float32, cell),
+        **dict(gates=gates, cell=cell, next_reset=None, output=output),
+        **dict(next_hidden=None, next_cell=after),
+    )
     sigmoid, squashed = values.double().sigmoid(), values.double().tanh()
     cells = sigmoid * 0.5 + sigmoid * squashed
     for result, expected in ((after, cells), (output, sigmoid * cells.tanh())):
@@ -264,14 +268,17 @@ def test_gates_saturate_and_nan_propagates(where, width):
 
 
 def test_kernels_round_to_bfloat16_like_torch(where):
-    """Uses `start`, which only rounds: ties, infinities, the largest float and NaN."""
+    """Uses `lstm_start`, which only rounds: ties, infinities, the largest float and NaN."""
     inf, nan = torch.inf, torch.nan
     values = torch.tensor([0.0, -0.0, 1 + 2**-8, 1 + 3 * 2**-8, -1 - 2**-8, 3.3e38, inf, -inf, nan])
     bits = torch.tensor([0x3F80_7FFF, 0x3F80_8001, 0x7F7F_FFFF, 0x7FFF_FFFF], dtype=torch.int32)
     values = torch.cat([values, bits.view(torch.float32), torch.randn(1011)]).view(-1, 4).to(where)
     reset = torch.zeros(len(values), dtype=torch.bool, device=where)
     hidden, cell = torch.empty_like(values, dtype=torch.bfloat16), torch.empty_like(values)
-    kernels.start(reset, values, values, hidden, cell)
+    launch_units(
+        *("lstm_start", torch.bfloat16, cell),
+        **dict(reset=reset, last_output=values, last_cell=values, hidden=hidden, cell=cell),
+    )
     torch.testing.assert_close(hidden, values.bfloat16(), rtol=0, atol=0, equal_nan=True)
     torch.testing.assert_close(cell, values, rtol=0, atol=0, equal_nan=True)
 
@@ -288,7 +295,15 @@ def test_captured_unroll_matches_steps(bf16):
 
 
 def whole_sequence(
-    device, dtype, seed, n_steps, n_lanes, nan_before_reset=False, is_residual=False, width=256
+    form,
+    device,
+    dtype,
+    seed,
+    n_steps,
+    n_lanes,
+    nan_before_reset=False,
+    is_residual=False,
+    width=256,
 ):
     """Returns outputs, last cell and gradients of a sequence."""
     torch.manual_seed(seed)
@@ -306,7 +321,7 @@ def whole_sequence(
     if nan_before_reset:
         inputs["reset"][n_steps // 2] = True
         inputs["x"][: n_steps // 2] = torch.nan
-    return sequence(device, dtype, **inputs, is_residual=is_residual)
+    return sequence(form, device, dtype, **inputs, is_residual=is_residual)
 
 
 @pytest.mark.parametrize(
@@ -317,30 +332,28 @@ def test_sequence_on_chip_matches_float32_in_every_order(
     cuda_on_cpu, monkeypatch, n_steps, n_lanes, is_residual, width
 ):
     case = 0, n_steps, n_lanes, False, is_residual, width
-    expected = whole_sequence("cpu", torch.float32, *case)
+    expected = whole_sequence(None, "cpu", torch.float32, *case)
     cuda_on_cpu.install(monkeypatch)
-    monkeypatch.setattr(lstm_module.lstm_sequence, "is_supported", lambda x: True)
-    results = cuda_on_cpu.in_every_order(lambda: whole_sequence("cpu", torch.bfloat16, *case))
+    case = ON_CLUSTERS, "cpu", torch.bfloat16, *case
+    results = cuda_on_cpu.in_every_order(lambda: whole_sequence(*case))
     assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
     names = {f"lstm_sequence_{direction}_{width}" for direction in ("forward", "backward")}
     assert names <= cuda_on_cpu.launched
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("width", lstm_module.lstm_sequence.WIDTHS)
+@pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("n_steps, n_lanes", [(2, 1), (9, 33), (32, 1024), (17, 4100)])
 def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, width):
     x = torch.empty(n_steps, n_lanes, width, dtype=torch.bfloat16, device="cuda")
-    assert lstm_module.lstm_sequence.is_supported(x)
+    assert lstm_module._fits_clusters(x)
     case = 0, n_steps, n_lanes, False, False, width
-    first = whole_sequence("cuda", torch.bfloat16, *case)
-    second = whole_sequence("cuda", torch.bfloat16, *case)
+    first = whole_sequence(ON_CLUSTERS, "cuda", torch.bfloat16, *case)
+    second = whole_sequence(ON_CLUSTERS, "cuda", torch.bfloat16, *case)
     assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))
-    expected = whole_sequence("cuda", torch.float32, *case)
+    expected = whole_sequence(IN_STEPS, "cuda", torch.float32, *case)
     assert_close(NAMES, first, expected, SLACK[torch.bfloat16])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lstm_module.lstm_sequence, "is_supported", lambda x: False)
-        by_steps = whole_sequence("cuda", torch.bfloat16, *case)
+    by_steps = whole_sequence(IN_STEPS, "cuda", torch.bfloat16, *case)
     assert_close(NAMES, first, by_steps, SLACK[torch.bfloat16])
     errors = [
         [((leaf - other).norm() / other.norm()).item() for leaf, other in zip(leaves, expected)]
@@ -356,7 +369,7 @@ def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes, wi
 def test_sequence_on_chip_cuts_nan_at_resets():
     n_steps, n_lanes = 8, 50
     outputs, cell, d_x, *_, d_output, d_cell = whole_sequence(
-        "cuda", torch.bfloat16, 1, n_steps, n_lanes, nan_before_reset=True
+        ON_CLUSTERS, "cuda", torch.bfloat16, 1, n_steps, n_lanes, nan_before_reset=True
     )
     assert outputs[: n_steps // 2].isnan().any() and outputs[n_steps // 2 :].isfinite().all()
     assert cell.isfinite().all() and d_x[n_steps // 2 :].isfinite().all()
@@ -370,7 +383,7 @@ def test_no_gradient_of_the_last_cell_is_one_of_zeros(device):
     x, weight = torch.randn(3, 50, 256, **options), torch.randn(1024, 256, **options)
     bias, states = torch.zeros(1024, **options), torch.zeros(2, 50, 256, device=device).unbind()
     reset = torch.zeros(3, 50, dtype=torch.bool, device=device)
-    outputs, cell, _ = lstm_module._Sequence.apply(x, weight, bias, weight, reset, *states)
+    outputs, _, cell = lstm_module.lstm_sequence(x, weight, bias, weight, reset, *states, False)
     d, leaves = torch.randn_like(outputs), (x, weight, bias)
     alone = torch.autograd.grad(outputs, leaves, d, retain_graph=True)
     both = torch.autograd.grad([outputs, cell], leaves, [d, torch.zeros_like(cell)])
@@ -384,7 +397,7 @@ CPU_SLACK = 2e-5
 
 
 def on_cpu(kind, n_steps, n_lanes, width):
-    """Returns outputs, last cell and all gradients by `lstm._Sequence` or `CpuSequence`."""
+    """Returns outputs, last cell and all gradients by the CPU's kernel, or by PyTorch (None)."""
     torch.manual_seed(0)
     inputs = [
         torch.randn(width, n_steps, n_lanes).permute(1, 2, 0),  # not contiguous
@@ -397,7 +410,10 @@ def on_cpu(kind, n_steps, n_lanes, width):
     inputs = [leaf.requires_grad_() for leaf in inputs]
     reset = (torch.rand(n_lanes, n_steps) < 0.3).T
     d_results = torch.randn(n_steps, n_lanes, width), torch.randn(n_lanes, width)
-    results = kind.apply(*inputs[:4], reset, *inputs[4:])[:2]
+    with plain_operations():
+        apply = lstm_module.lstm_sequence if kind is None else lstm_module._by(kind)
+        outputs, _, cell = apply(*inputs[:4], reset, *inputs[4:], False)
+    results = outputs, cell
     return [*results, *torch.autograd.grad(results, inputs, d_results)]
 
 
@@ -405,15 +421,15 @@ def on_cpu(kind, n_steps, n_lanes, width):
     "shape", [(9, 5, 16), (1, 3, 48), (32, 64, 64), (3, 7, 256), (70, 1, 80)], ids=str
 )
 def test_cpu_sequence_matches_pytorch(shape):
-    expected = on_cpu(lstm_module._Sequence, *shape)
-    assert_close(NAMES, on_cpu(lstm_cpu.CpuSequence, *shape), expected, CPU_SLACK)
+    expected = on_cpu(None, *shape)
+    assert_close(NAMES, on_cpu(ON_CPU, *shape), expected, CPU_SLACK)
 
 
 def test_cpu_sequence_has_the_same_bits_with_any_number_of_threads():
     results = []
     for n_threads in (1, 2, 3):
         engine.set_threads(n_threads)
-        results.append(on_cpu(lstm_cpu.CpuSequence, 32, 65, 64))
+        results.append(on_cpu(ON_CPU, 32, 65, 64))
     engine.set_threads(None)
     for other in results[1:]:
         assert all(map(torch.equal, results[0], other))
@@ -424,31 +440,15 @@ def test_large_gates_saturate_on_cpu():
     x, zeros = torch.zeros(1, 1, W), torch.zeros(1, W)
     weights = torch.zeros(4 * W, W), torch.full((4 * W,), 1e4), torch.zeros(4 * W, W)
     reset = torch.zeros(1, 1, dtype=torch.bool)
-    outputs, cell = lstm_cpu.CpuSequence.apply(x, *weights, reset, zeros, zeros + 2)
+    outputs, _, cell = lstm_module._by(ON_CPU)(x, *weights, reset, zeros, zeros + 2, False)
     torch.testing.assert_close(cell, torch.full((1, W), 3.0), **CLOSE)
     torch.testing.assert_close(outputs[0], torch.full((1, W), 3.0).tanh(), **CLOSE)
 
 
 def test_widths_that_kernels_do_not_take_use_pytorch():
-    assert lstm_cpu.fits(torch.zeros(1, 1, 16)) and not lstm_cpu.fits(torch.zeros(1, 1, 17))
     lstm = LSTM(17)
     output, _ = lstm(torch.zeros(1, 1, 17), torch.zeros(1, 1, dtype=bool), lstm.initial(1))
     assert output.isfinite().all()
-
-
-@pytest.mark.cuda
-def test_sequence_saves_nothing_without_autograd(monkeypatch):
-    lstm, saved = LSTM(256).cuda(), []
-    on_chip = lstm_module.lstm_sequence.forward
-    monkeypatch.setattr(
-        lstm_module.lstm_sequence, "forward", lambda *args: saved.append(args[5]) or on_chip(*args)
-    )
-    x, reset = torch.randn(3, 5, 256, device="cuda"), torch.zeros(3, 5, device="cuda").bool()
-    with torch.autocast("cuda", torch.bfloat16):
-        outputs, _ = lstm(x, reset, lstm.initial(5, "cuda"))
-        with torch.no_grad():
-            again, _ = lstm(x, reset, lstm.initial(5, "cuda"))
-    assert saved == [True, False] and torch.equal(outputs, again)
 
 
 @pytest.mark.cuda
@@ -457,7 +457,7 @@ def test_gpus_without_clusters_or_memory_take_step_by_step(monkeypatch, major, s
     x = torch.zeros(2, 3, 256, dtype=torch.bfloat16, device="cuda")
     gpu = SimpleNamespace(major=major, shared_memory_per_block_optin=shared_memory)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
-    assert not lstm_module.lstm_sequence.is_supported(x)
+    assert not lstm_module._fits_clusters(x)
 
 
 @pytest.mark.cuda

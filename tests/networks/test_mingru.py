@@ -10,11 +10,10 @@ import torch
 from torch.nn import functional
 
 from megastep.agents.networks import mingru as mingru_module
-from megastep.agents.networks.kernels import mingru as kernels
-from megastep.agents.networks.kernels import mingru_step
-from megastep.agents.networks.mingru import MinGRU
+from megastep.agents.networks import mingru_step
+from megastep.agents.networks.fused import plain_operations
+from megastep.agents.networks.mingru import MinGRU, linear_scan
 from megastep.arrdict import arrdict
-from megastep.kernels.build.compile import EngineError
 from tests.helpers.recurrent import assert_close, check_captured
 
 T, B, W = 9, 5, 16
@@ -28,23 +27,25 @@ def case(n_steps=T, p_reset=0.3):
     return gates, torch.rand(n_steps, B) < p_reset, torch.randn(B, W, requires_grad=True)
 
 
-def recurrence(gates, reset, start, d_outputs, d_last=None, residual=None):
+def recurrence(gates, reset, start, d_outputs, d_last=None, residual=None, on_gpu=False):
     """Returns outputs, the last state, and gradients of the gates, of the first state and of the
     biases. All but the last are written to tensors that are NaN before.
     """
-    functions, nan = mingru_module._recurrence(gates), torch.nan
+    nan, forward, backward = torch.nan, mingru_module.recurrence, mingru_module.recurrence_backward
+    if on_gpu:
+        forward, backward = mingru_module._forward_on_gpu, mingru_module._backward_on_gpu
     outputs, last = torch.full_like(d_outputs, nan), torch.full_like(start, nan)
     states = None if residual is None else torch.full_like(outputs, nan)
-    functions.forward(gates, reset, start, residual, states, outputs, last)
+    forward(gates, reset, start, residual, states, outputs, last)
     if residual is not None:  # as when acting: without states
         alone = torch.full_like(outputs, nan), torch.full_like(last, nan)
-        functions.forward(gates, reset, start, residual, None, *alone)
+        forward(gates, reset, start, residual, None, *alone)
         for result, expected in zip(alone, (outputs, last), strict=True):
             torch.testing.assert_close(result, expected, rtol=0, atol=0, equal_nan=True)
     states = outputs if states is None else states
     d_gates, d_start = torch.full_like(gates, nan), torch.full_like(start, nan)
     d_residual = None if residual is None else torch.full_like(outputs, nan)
-    d_bias = functions.backward(
+    d_bias = backward(
         *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
     )
     assert residual is None or torch.equal(d_residual, d_outputs)
@@ -167,6 +168,52 @@ def test_gradients_match_finite_differences(uses, is_residual):
     torch.testing.assert_close(slope, measured, rtol=1e-2, atol=0.1)
 
 
+# ---- The scan ----
+
+F64_CLOSE = dict(rtol=1e-10, atol=1e-10)  # two orders of summing a few float64 numbers
+
+
+def sums_by_steps(terms, factors, reset):
+    sums, last = [], torch.zeros_like(terms[0])
+    for term, factor, is_reset in zip(terms, factors, reset, strict=True):
+        last = torch.where(is_reset, term, term + factor * last)
+        sums.append(last)
+    return torch.stack(sums)
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 3, 8, 13, 32])
+def test_scan_matches_recursion_in_both_directions(n_steps):
+    torch.manual_seed(n_steps)
+    terms, factors = torch.randn(2, n_steps, 5, 3, dtype=torch.float64)
+    reset = torch.rand(n_steps, 5, 1) < 0.2
+    expected = sums_by_steps(terms, factors, reset)
+    torch.testing.assert_close(linear_scan(terms, factors, reset), expected, **F64_CLOSE)
+    backwards = sums_by_steps(terms.flip(0), factors.flip(0), reset.flip(0)).flip(0)
+    torch.testing.assert_close(
+        linear_scan(terms, factors, reset, reverse=True), backwards, **F64_CLOSE
+    )
+    unbroken = sums_by_steps(terms, factors, torch.zeros(n_steps, 1, 1, dtype=torch.bool))
+    torch.testing.assert_close(linear_scan(terms, factors), unbroken, **F64_CLOSE)
+
+
+def test_reset_restarts_the_scan():
+    ones = torch.ones(6, 1)
+    reset = torch.tensor([0, 0, 0, 1, 0, 0], dtype=torch.bool)[:, None]
+    assert linear_scan(ones, ones)[:, 0].tolist() == [1, 2, 3, 4, 5, 6]
+    assert linear_scan(ones, ones, reset)[:, 0].tolist() == [1, 2, 3, 1, 2, 3]
+    assert linear_scan(ones, ones, reset, reverse=True)[:, 0].tolist() == [4, 3, 2, 1, 2, 1]
+
+
+@pytest.mark.parametrize("garbage", [torch.nan, torch.inf, 1e30])
+def test_values_before_a_reset_of_the_scan_change_no_bit_after_it(garbage):
+    terms, factors = torch.randn(2, 13, 4)
+    reset = torch.zeros(13, 1, dtype=torch.bool)
+    reset[5] = True
+    clean = linear_scan(terms, factors, reset)
+    terms[:5], factors[:6] = garbage, garbage
+    assert torch.equal(linear_scan(terms, factors, reset)[5:], clean[5:])
+
+
 # ---- The kernels ----
 
 
@@ -176,17 +223,16 @@ def where(request, monkeypatch):
     if request.param == "cuda":
         return "cuda"
     request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
-    monkeypatch.setattr(mingru_module, "_recurrence", lambda gates: kernels)
     return "cpu"
 
 
-def sequence(device, dtype, gates, reset, start, d_outputs, d_last, residual=None):
+def sequence(on_gpu, device, dtype, gates, reset, start, d_outputs, d_last, residual=None):
     """Returns what `recurrence` does, as float32 on the CPU."""
     gates, d_outputs = (leaf.to(device, dtype).contiguous() for leaf in (gates, d_outputs))
     residual = None if residual is None else residual.to(device, dtype).contiguous()
     reset, start = (leaf.to(device).contiguous() for leaf in (reset, start))
     d_last = None if d_last is None else d_last.to(device).contiguous()
-    results = recurrence(gates, reset, start, d_outputs, d_last, residual)
+    results = recurrence(gates, reset, start, d_outputs, d_last, residual, on_gpu)
     assert results[1].dtype == results[-1].dtype == torch.float32
     return [leaf.float().cpu() for leaf in results]
 
@@ -222,10 +268,8 @@ def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width, is_residual):
         d_last=None if is_residual else torch.randn(n_lanes, width),
         residual=rounded(n_steps, n_lanes, width) if is_residual else None,
     )
-    results = sequence(where, dtype, **inputs)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mingru_module, "_recurrence", lambda gates: mingru_module._CPU_RECURRENCE)
-        expected = sequence("cpu", torch.float32, **inputs)
+    results = sequence(True, where, dtype, **inputs)
+    expected = sequence(False, "cpu", torch.float32, **inputs)
     assert_close(NAMES, results, expected, SLACK[dtype])
 
 
@@ -241,16 +285,16 @@ def test_kernels_clear_even_nan_at_reset(where, dtype, width):
         d_last=torch.randn(B, width),
     )
     inputs["reset"][[0, 4]] = True
-    clean = sequence(where, dtype, **inputs)
+    clean = sequence(True, where, dtype, **inputs)
     broken = dict(inputs, gates=inputs["gates"].clone(), start=torch.full((B, width), torch.nan))
     broken["gates"][:4] = torch.nan
-    outputs, last, d_gates, d_start, _ = sequence(where, dtype, **broken)
+    outputs, last, d_gates, d_start, _ = sequence(True, where, dtype, **broken)
     assert torch.equal(outputs[4:], clean[0][4:]) and outputs[:4].isnan().all()
     assert torch.equal(last, clean[1]) and torch.equal(d_gates[4:], clean[2][4:])
     assert not d_start.any()  # cut by the reset
     # a NaN gradient does not pass a reset, either
     inputs["d_outputs"][4:] = torch.nan
-    d_gates = sequence(where, dtype, **inputs)[2]
+    d_gates = sequence(True, where, dtype, **inputs)[2]
     assert torch.equal(d_gates[:4], clean[2][:4]) and d_gates[4:].isnan().all()
 
 
@@ -264,7 +308,7 @@ def test_gates_saturate_and_nan_propagates(where, width):
     start, reset = torch.full((len(values), width), 5.0), torch.zeros(1, len(values)).bool()
     gates, start, reset = (tensor.to(where) for tensor in (gates, start, reset))
     outputs, last = torch.full_like(gates[..., :width], 7.0).contiguous(), torch.empty_like(start)
-    kernels.forward(gates, reset, start, None, None, outputs, last)
+    mingru_module._forward_on_gpu(gates, reset, start, None, None, outputs, last)
     expected = (5.0 - 2.0 * values.double().sigmoid()).float()[:, None].expand(-1, width)
     for result in (outputs[0], last):
         torch.testing.assert_close(result.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
@@ -281,24 +325,22 @@ def test_outputs_round_to_nearest_bfloat16(where):
     gates[..., :4] = -torch.inf
     reset = torch.zeros(1, len(start), dtype=torch.bool, device=where)
     outputs, last = gates.new_full((1, *start.shape), torch.nan), torch.full_like(start, torch.nan)
-    kernels.forward(gates, reset, start, None, None, outputs, last)
+    mingru_module._forward_on_gpu(gates, reset, start, None, None, outputs, last)
     assert torch.equal(last, start)
     assert torch.equal(outputs[0].cpu(), start.cpu().bfloat16())
 
 
-def test_unsupported_dtype_raises(where):
-    _, reset, start = (tensor.to(where) for tensor in case())
-    core, x = MinGRU(W).to(where).half(), torch.randn(T, B, W, device=where).half()
-    with pytest.raises(EngineError, match="float32 or bfloat16.*float16"):
-        core(x, reset, arrdict(output=start))
-
-
 @pytest.mark.parametrize("is_residual", [False, True])
 @pytest.mark.parametrize("is_transposed", [False, True])
-def test_module_with_kernels_matches_cpu(where, is_residual, is_transposed):
+@pytest.mark.parametrize("form", ["cpu", "compiled", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_module_matches_its_plain_form(request, monkeypatch, form, is_residual, is_transposed):
     """Whatever the strides of the inputs and of the outputs' gradient."""
     torch.manual_seed(0)
-    core = MinGRU(W)
+    core, device = MinGRU(W), "cuda" if form == "cuda" else "cpu"
+    if form == "compiled":
+        request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
+        monkeypatch.setattr(mingru_module, "recurrence", mingru_module._forward_on_gpu)
+        monkeypatch.setattr(mingru_module, "recurrence_backward", mingru_module._backward_on_gpu)
     x, reset, start = torch.randn(T, B, W), torch.rand(T, B) < 0.3, torch.randn(B, W)
     weights = torch.randn(T, B, W)
     if is_transposed:
@@ -316,16 +358,15 @@ def test_module_with_kernels_matches_cpu(where, is_residual, is_transposed):
         results = [leaf.detach().cpu() for leaf in (outputs, after.output, *gradients)]
         with torch.no_grad():
             acted, _ = own(inputs[0], reset.to(device), state, is_residual)
-        assert torch.equal(acted.cpu(), results[0])
+        torch.testing.assert_close(acted.cpu(), results[0], rtol=0, atol=0)
         return results
 
-    results = run(where)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mingru_module, "_recurrence", lambda x: mingru_module._CPU_RECURRENCE)
+    results = run(device)
+    with plain_operations():
         expected = run("cpu")
     names = "outputs", "last", "d x", "d start", "d weight", "d bias"
     # TF32 rounds products to 11 bits
-    assert_close(names, results, expected, 5e-3 if where == "cuda" else 1e-5)
+    assert_close(names, results, expected, 5e-3 if form == "cuda" else 1e-5)
 
 
 @pytest.mark.cuda
@@ -358,7 +399,7 @@ def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
         calls.append(args)
         return plain_step(*args)
 
-    monkeypatch.setattr(mingru_step, "is_supported", lambda x: len(x) == 1)
+    monkeypatch.setattr(mingru_step, "fits", lambda x: len(x) == 1)
     monkeypatch.setattr(mingru_step, "forward", step)
     results = []
     for grad in (True, False):
@@ -378,19 +419,13 @@ def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
     assert len(calls) == 2
 
 
-def test_each_width_has_a_kernel_that_fits():
-    names = {f"mingru_step_{width}" for width in mingru_step.WIDTHS}
-    assert mingru_step.LIBRARY.cuda_operations.keys() == names
-    assert max(map(mingru_step._shared, mingru_step.WIDTHS)) <= 227 * 1024  # of Hopper
-
-
 def test_the_kernel_takes_one_step_of_the_widths_it_has(monkeypatch):
     hopper = SimpleNamespace(major=9, shared_memory_per_block_optin=227 * 1024)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: hopper)
     on_gpu = dict(is_cuda=True, dtype=torch.bfloat16, device="cuda")
 
     def is_supported(n_steps, width):
-        return mingru_step.is_supported(SimpleNamespace(shape=(n_steps, B, width), **on_gpu))
+        return mingru_step.fits(SimpleNamespace(shape=(n_steps, B, width), **on_gpu))
 
     width = mingru_step.WIDTHS[0]
     assert is_supported(1, width)
@@ -419,7 +454,7 @@ def two_kernels(gates, reset, start, residual):
     """Returns outputs and state after the step from rounded gates (1, B, 2 W)."""
     outputs, last = torch.full_like(gates[..., : start.shape[1]], torch.nan), start.clone()
     outputs = outputs.contiguous()
-    kernels.forward(gates, reset, start, residual, None, outputs, last)
+    mingru_module._forward_on_gpu(gates, reset, start, residual, None, outputs, last)
     return outputs, last
 
 
@@ -436,7 +471,7 @@ def test_step_has_the_bits_of_two_kernels(n_lanes, width, is_residual):
     """Where sums are exact in any order."""
     inputs = [leaf.cuda() for leaf in step_inputs(n_lanes, width, is_exact=True)]
     x, weight, bias, reset, start = inputs
-    assert mingru_step.is_supported(x)
+    assert mingru_step.fits(x)
     gates = functional.linear(*(leaf.double() for leaf in (x, weight, bias))).bfloat16()
     expected = two_kernels(gates, reset, start, x if is_residual else None)
     results = mingru_step.forward(*inputs, is_residual)
@@ -513,6 +548,6 @@ def test_captured_step_acts_like_the_two_kernels(monkeypatch, is_residual):
     reset.logical_not_()
     graph.replay()
     assert len(calls) == 2 and all(map(torch.equal, captured, act()))
-    monkeypatch.setattr(mingru_step, "is_supported", lambda x: False)
+    monkeypatch.setattr(mingru_step, "fits", lambda x: False)
     assert_close(("outputs", "last"), captured, act(), SLACK[torch.bfloat16])
     assert len(calls) == 3

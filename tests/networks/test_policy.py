@@ -8,8 +8,6 @@ import torch
 
 from megastep import spaces
 from megastep.agents.generator import SeededGenerator, stream_seed
-from megastep.agents.networks import joint_heads
-from megastep.agents.networks import layers as layers_module
 from megastep.agents.networks.cores import CORES
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
@@ -272,7 +270,7 @@ def relative_error(one, other):
 @pytest.mark.parametrize("moves", [MOVES, spaces.MultiDiscrete(1, 7)])
 @pytest.mark.parametrize("layers", [1, 3])
 @pytest.mark.parametrize("core", CORES)
-def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, moves, monkeypatch):
+def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, moves):
     """What learning computes, for some lanes. The LSTM of 256 units runs on chip; with actions of
     one kind, the heads are computed together.
     """
@@ -294,14 +292,8 @@ def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, m
         for output in outputs:
             output.linear.weight.mul_(100)  # far from uniform
     plain.update_stats(world[0].obs, privileged[0])
-    fused, launches = copy.deepcopy(plain).cuda(), []
+    fused = copy.deepcopy(plain).cuda()
     expected = learnt(plain, world, privileged, lanes, weights)
-    for module, name in (
-        (layers_module.kernels, "bias_gradient"),
-        (joint_heads.kernels, "backward"),
-    ):
-        kernel = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda *d, k=kernel, n=name: launches.append(n) or k(*d))
     on_gpu = (leaf.cuda() for leaf in (world, privileged, lanes, weights))
     for name, leaf in learnt(fused, *on_gpu).items():
         assert leaf.shape == expected[name].shape
@@ -309,9 +301,6 @@ def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, m
         # whose input is near 0 may pass a gradient in one of both forms only
         limit = 0.2 if name in dict(plain.named_parameters()) else 0.03
         assert relative_error(leaf, expected[name]) < limit, name
-    # intakes of actor and critic, the critic's hidden layer and output, prediction, two outputs
-    assert launches.count("bias_gradient") >= (7 if moves is MOVES else 2)
-    assert launches.count("backward") == (moves is not MOVES)
 
 
 def test_wrong_numbers_of_lanes_are_named():

@@ -13,15 +13,8 @@ TINY = "experiment=deathmatch geometry=box env.n_envs=8 seconds=null finish.reco
 
 def test_an_unknown_part_is_refused(capsys):
     assert train_plain.main(["lstm,head"]) == 2
-    assert (
-        "unknown part 'head'. Available: streams, lstm, products, mingru" in capsys.readouterr().err
-    )
-    assert train_plain.chosen("all") == [*train_plain.PARTS] and train_plain.chosen("none") == []
-
-
-def test_a_part_that_is_gone_is_an_error():
-    with pytest.raises(AttributeError, match="no gone in train_plain"):
-        train_plain.replace("gone", None, train_plain)
+    assert "unknown part 'head'. Available: adam, critic, " in capsys.readouterr().err
+    assert len(train_plain.chosen("all")) > 30 and train_plain.chosen("none") == []
 
 
 @pytest.mark.slow

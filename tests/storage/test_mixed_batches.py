@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from megastep import spaces
+from megastep.agents.algorithms import vtrace
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage import mixed_batches
 from megastep.agents.storage.replay import ReplayBuffer
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout
@@ -38,8 +38,8 @@ def batch_of(n_rollouts, n=5, burn_in=0, **settings):
             replay = ReplayBuffer(rollout, OBS, MOVES, settings)
         replay.add(rollout)
     generator = torch.Generator().manual_seed(1)
-    batch = mixed_batches.from_rollout(rollout, LANES)
-    return policy, replay, rollout, mixed_batches.add_replayed(batch, replay, policy, n, generator)
+    batch = vtrace.fresh_batch(rollout, LANES)
+    return policy, replay, rollout, vtrace.with_replayed(batch, replay, policy, n, generator)
 
 
 @pytest.mark.parametrize("burn_in", [0, 2])

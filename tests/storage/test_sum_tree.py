@@ -30,7 +30,7 @@ def oracle(priorities, n, seed):
 def test_sample_matches_search_in_cumulative_sum(n, fan_out):
     priorities = np.random.default_rng(n).exponential(size=n) ** 3
     tree = filled(priorities, fan_out=fan_out)
-    drawn = tree.sample(257, torch.Generator().manual_seed(5)).numpy()
+    drawn = tree.draw(257, torch.Generator().manual_seed(5))[0].numpy()
     assert np.array_equal(drawn, oracle(priorities, 257, 5))
     testing.assert_close(tree.total.item(), priorities.sum(), rtol=1e-12, atol=0)
     chance = tree.probability(torch.from_numpy(drawn)).numpy()
@@ -43,7 +43,7 @@ def test_sample_frequencies_match_priorities(fan_out, device):
     tree = filled(priorities, device, fan_out=fan_out)
     # one sample per call, so that samples are independent
     generator = torch.Generator(device).manual_seed(1)
-    drawn = torch.cat([tree.sample(1, generator) for _ in range(4000)])
+    drawn = torch.cat([tree.draw(1, generator)[0] for _ in range(4000)])
     counts = np.bincount(drawn.cpu().numpy(), minlength=len(priorities))
     expected = 4000 * priorities / priorities.sum()
     positive = priorities > 0
@@ -53,7 +53,7 @@ def test_sample_frequencies_match_priorities(fan_out, device):
 
 
 def test_sampling_is_stratified():
-    drawn = filled(np.ones(64)).sample(64, torch.Generator().manual_seed(3))
+    drawn = filled(np.ones(64)).draw(64, torch.Generator().manual_seed(3))[0]
     assert drawn.tolist() == list(range(64))
 
 
@@ -65,7 +65,7 @@ def test_zero_priorities_are_never_drawn(where):
     is_zero = {"first": index < 990, "last": index >= 10, "one in ten": index % 10 != 7}[where]
     priorities[is_zero] = 0
     tree = filled(priorities)
-    drawn = tree.sample(20_000, torch.Generator().manual_seed(4)).numpy()
+    drawn = tree.draw(20_000, torch.Generator().manual_seed(4))[0].numpy()
     assert not is_zero[drawn].any()
     assert set(drawn) == set(np.flatnonzero(~is_zero))
 
@@ -73,12 +73,12 @@ def test_zero_priorities_are_never_drawn(where):
 def test_sample_at_edge_between_priorities(monkeypatch):
     """Random numbers of exactly 0 hit the cumulative sums themselves."""
     monkeypatch.setattr(torch, "rand", lambda n, **options: torch.zeros(n, dtype=torch.float64))
-    assert filled(np.array([0.0, 1, 0, 2, 1])).sample(4).tolist() == [1, 3, 3, 4]
+    assert filled(np.array([0.0, 1, 0, 2, 1])).draw(4)[0].tolist() == [1, 3, 3, 4]
 
 
 def test_all_zero_priorities_draw_index_zero():
     tree = SumTree(100)
-    drawn = tree.sample(8)
+    drawn = tree.draw(8)[0]
     assert drawn.tolist() == [0] * 8 and tree.probability(drawn).tolist() == [0.0] * 8
 
 
@@ -114,7 +114,7 @@ def test_million_priorities():
     tree = filled(priorities)
     assert len(tree.levels) == 4
     assert tree.bytes < 1.05 * 8 * n
-    drawn = tree.sample(4096, torch.Generator().manual_seed(7)).numpy()
+    drawn = tree.draw(4096, torch.Generator().manual_seed(7))[0].numpy()
     # sums in another order may select a neighbour
     assert np.abs(drawn - oracle(priorities, 4096, 7)).max() <= 1
 
@@ -161,7 +161,7 @@ def test_captured_tree_matches_eager():
 
         def work(tree=tree, generator=generator, out=out):
             for row in out:
-                row.copy_(tree.sample(64, generator))
+                row.copy_(tree.draw(64, generator)[0])
                 tree.set(row, tree.probability(row) * 100)
 
         if is_captured:
@@ -179,7 +179,7 @@ def test_never_synchronises():
     values, generator = torch.rand(100, device="cuda"), torch.Generator("cuda").manual_seed(1)
     with no_synchronisation():
         tree.set(index, values)
-        tree.probability(tree.sample(64, generator))
+        tree.probability(tree.draw(64, generator)[0])
 
 
 @pytest.mark.parametrize("values", [torch.ones(2), torch.ones(5), torch.ones(1), torch.ones(1, 3)])
@@ -188,7 +188,7 @@ def test_values_of_another_shape_are_named(values):
     with pytest.raises(ValueError, match=r"^index and values .*\(3,\) and values is"):
         tree.set(torch.arange(3), values)
     with pytest.raises(ValueError, match="^n must be at least 1 .* 0 was given"):
-        tree.sample(0)
+        tree.draw(0)[0]
     assert tree.priorities.tolist() == 9 * [1.0]
 
 

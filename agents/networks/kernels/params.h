@@ -374,21 +374,6 @@ struct LstmSequenceBackwardParams {
     int n_threads;
 };
 
-// The normalisation of a leaf of an observation, on the CPU: N rows, C channels of P pixels.
-
-struct NormaliseLeafParams {
-    const void* obs;     // (N, C, P) fp16 if is_half, else float32
-    const float* mean;   // (C)
-    const float* scale;  // (C)
-    float* out;          // rows of C P numbers, row_stride apart
-    int row_stride;
-    int n_rows;      // N
-    int n_channels;  // C
-    int n_pixels;    // P: those of a channel share mean and scale
-    int is_half;
-    int n_threads;
-};
-
 // A matrix product on the CPU: out = a b. Rows and columns of a and b are so many floats apart.
 
 struct MatmulParams {

@@ -1,4 +1,4 @@
-"""Intakes and outputs made from spaces, and distributions of actions."""
+"""Outputs made from spaces, distributions of actions, and their kernels against PyTorch."""
 
 import math
 
@@ -7,7 +7,9 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks import encoders, heads, intake_cpu, running_norm
+from megastep.agents.networks import duelling_output, heads
+from megastep.agents.networks import linear as linear_module
+from megastep.agents.networks.fused import plain_operations
 from megastep.arrdict import arrdict
 
 IMAGE = spaces.MultiImage(2, 3, 1, 16)
@@ -30,53 +32,6 @@ def random_obs(space, *lead, seed=0, dtype=torch.float32):
     return space.map(leaf) if isinstance(space, dict) else leaf(space)
 
 
-@pytest.mark.parametrize("encoder", encoders.ENCODERS)
-@pytest.mark.parametrize(
-    "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
-)
-@pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
-def test_intake_shape(space, encoder, lead):
-    intake = heads.intake(space, WIDTH, encoder)
-    out = intake(random_obs(space, *lead))
-    assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
-
-
-@pytest.mark.parametrize("encoder", encoders.ENCODERS)
-def test_every_pixel_and_leaf_has_a_gradient(encoder):
-    torch.manual_seed(0)
-    intake = heads.intake(TREE, 512, encoder)
-    obs = random_obs(TREE, 1)
-    for leaf in (obs.eyes.rgb, obs.eyes.d, obs.imu):
-        leaf.requires_grad_()
-    intake(obs).sum().backward()
-    for leaf in (obs.eyes.rgb, obs.eyes.d, obs.imu):
-        assert (leaf.grad != 0).all()
-    other = arrdict({**obs, "team": (obs.team + 1) % 4})
-    assert not torch.equal(intake(other), intake(obs))
-
-
-def test_tanh_bounds_features_that_relu_does_not():
-    obs = random_obs(TREE, 6)
-    far = arrdict({**obs, "imu": obs.imu * 1e3})
-    for activation, is_bounded in ("tanh", True), ("relu", False):
-        features = heads.intake(TREE, WIDTH, activation=activation)(far)
-        assert (features.abs().max() <= 1) == is_bounded
-
-
-def test_order_of_keys_does_not_matter():
-    intake = heads.intake(TREE, WIDTH)
-    obs = random_obs(TREE, 6)
-    backwards = arrdict({key: obs[key] for key in reversed(obs)})
-    assert torch.equal(intake(backwards), intake(obs))
-
-
-def test_float16_observations():
-    intake = heads.intake(TREE, WIDTH)
-    half = random_obs(TREE, 6, dtype=torch.float16)
-    single = half.map(lambda leaf: leaf.float() if leaf.is_floating_point() else leaf)
-    assert torch.equal(intake(half), intake(single))
-
-
 def test_autocast_changes_features_not_logits():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
     with torch.autocast("cpu", torch.bfloat16):
@@ -88,19 +43,6 @@ def test_autocast_changes_features_not_logits():
 def test_key_that_modules_use_is_refused():
     with pytest.raises(ValueError, match="^an action space cannot have the key 'type',.*type_$"):
         heads.output(arrdict(type=spaces.MultiDiscrete(1, 2)), WIDTH)
-
-
-def test_leaves_have_equal_initial_weight():
-    # an image of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
-    # 1
-    torch.manual_seed(0)
-    intake = heads.intake(
-        arrdict(rgb=spaces.MultiImage(1, 3, 1, 64), imu=spaces.MultiVector(1, 3)), 4096
-    )
-    rgb, imu, padding = intake.project.weight.split([192, 3, 5], dim=1)
-    assert not padding.any()
-    for block in (rgb, imu):  # 4096 samples: 4.5 standard errors
-        assert block.sum(1).var().item() == pytest.approx(1, abs=0.1)
 
 
 def test_shapes_of_logits_and_actions():
@@ -243,57 +185,154 @@ def test_unknown_spaces_raise(make, error):
         make()
 
 
-def update(intake, obs):
-    norms = intake.running_norms
-    running_norm.add_moments(norms, running_norm.moments_of(norms, intake.normalised_leaves(obs)))
+# ---- On a GPU ----
 
 
-def test_normalises_images_per_channel_and_vectors_per_number():
-    space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
-    intake = heads.intake(space, WIDTH)
-    rgb = (
-        torch.tensor([[1.0, 2.0, 3.0], [10.0, 10.0, 40.0]])
-        .view(1, 1, 2, 1, 3)
-        .expand(4, -1, -1, -1, -1)
-    )
-    imu = torch.tensor([[5.0, 0.0], [7.0, 0.0], [5.0, 0.0], [7.0, 0.0]])[:, None]
-    update(intake, arrdict(rgb=rgb.half(), imu=imu.half()))
-    rgb_norm, imu_norm = intake.norms
-    torch.testing.assert_close(
-        rgb_norm(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
-    )  # std sqrt 2/3
-    torch.testing.assert_close(
-        rgb_norm(rgb)[0, 0, 1, 0], torch.tensor([-(0.5**0.5), -(0.5**0.5), 2**0.5])
-    )
-    torch.testing.assert_close(imu_norm(imu)[:, 0, 0], torch.tensor([-1.0, 1.0, -1.0, 1.0]))
-    assert not imu_norm(imu)[..., 1].any()  # a constant divides by min_scale, not by 0
-
-    # the second call has weight 1/2: mean (6 + 10) / 2, mean square (37 + 100) / 2
-    update(intake, arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
-    assert imu_norm.mean[0, 0].item() == 8
-    assert imu_norm.scale[0, 0].item() == pytest.approx((137 / 2 - 64) ** 0.5)
-
-
-def test_statistics_are_saved_with_weights():
-    intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), random_obs(TREE, 6)
-    update(intake, obs)
-    other.load_state_dict(intake.state_dict())
-    assert torch.equal(other(obs), intake(obs))
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
-@pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
-def test_normalisation_on_cpu_has_the_bits_of_pytorch(monkeypatch, lead, dtype):
+@pytest.mark.cuda
+@pytest.mark.parametrize("bf16", [False, True])
+@pytest.mark.parametrize("shape", [(1, 7), (3, 2), (1, 8), (1, 32)])
+def test_acting_matches_the_plain_form(bf16, shape):
     torch.manual_seed(0)
-    space = arrdict(rgb=IMAGE, imu=VECTOR)
-    intake, obs = heads.intake(space, WIDTH), random_obs(space, *lead, dtype=dtype)
-    for norm in intake.norms:
-        norm.mean.normal_()
-        norm.scale.uniform_(0.1, 2)
-    fits = intake_cpu.fits
-    assert fits([obs.rgb, obs.imu], intake.norms, intake.encoders)
-    encoded = intake.encode(obs)
-    monkeypatch.setattr(intake_cpu, "fits", lambda *arguments: False)
-    assert torch.equal(encoded, intake.encode(obs))
-    obs.imu.requires_grad_()
-    assert not fits([obs.rgb, obs.imu], intake.norms, intake.encoders)
+    output = heads.output(spaces.MultiDiscrete(*shape), 256).cuda()
+    nn.init.normal_(output.linear.weight, std=0.1)
+    x = torch.randn(1000, 256, device="cuda").bfloat16().float()
+    for sample in (True, False):
+        generators = [torch.Generator("cuda").manual_seed(3) for _ in range(2)]
+        with torch.autocast("cuda", torch.bfloat16, enabled=bf16), torch.no_grad():
+            fused = output.act(x, sample, generators[0])
+            plain = super(type(output), output).act(x, sample, generators[1])
+        torch.testing.assert_close(fused[0], plain[0], rtol=0, atol=6e-2 if bf16 else 1e-2)
+        same = (fused[1] == plain[1]).all(-1)
+        assert same.float().mean() > (0.97 if bf16 else 0.995)
+        torch.testing.assert_close(fused[2], output.logprob(fused[0], fused[1]))
+
+
+@pytest.mark.parametrize("n_lanes, shape", [(1, (1, 7)), (37, (3, 2)), (70, (1, 8))])
+def test_actions_are_those_of_the_plain_form(to_gpu, n_lanes, shape):
+    torch.manual_seed(0)
+    output = heads.output(spaces.MultiDiscrete(*shape), 64)
+    nn.init.normal_(output.linear.weight, std=0.1)
+    x, generator = torch.randn(n_lanes, 64), torch.Generator()
+    for sample in (True, False):
+        with torch.no_grad():
+            logits, actions, logprobs = output.act(to_gpu(x), sample, generator.manual_seed(1))
+            with plain_operations():
+                plain = output.act(x, sample, generator.manual_seed(1))
+        torch.testing.assert_close(logits, plain[0], rtol=0, atol=1e-5)
+        assert torch.equal(actions, plain[1])
+        torch.testing.assert_close(logprobs, plain[2])
+
+
+@pytest.mark.cuda
+def test_actions_follow_their_probabilities():
+    output = heads.output(spaces.MultiDiscrete(1, 4), 8).cuda()
+    nn.init.normal_(output.linear.weight)
+    x = torch.randn(1, 8, device="cuda").expand(200_000, -1)
+    with torch.no_grad():
+        logits, actions, _ = output.act(x, True, torch.Generator("cuda").manual_seed(1))
+    shares = actions.flatten().bincount(minlength=4) / len(x)
+    torch.testing.assert_close(shares, logits[0, 0].exp(), rtol=0, atol=5e-3)
+
+
+def test_terms_match_the_plain_form(to_gpu):
+    torch.manual_seed(0)
+    output = heads.output(spaces.MultiDiscrete(2, 7), 8)
+    logits = torch.randn(9, 33, 2, 7).log_softmax(-1).requires_grad_()
+    actions = torch.randint(7, (9, 33, 2))
+    plain = output.logprob(logits, actions), output.entropy(logits)
+    on_gpu = to_gpu(logits.detach().clone()).requires_grad_()
+    fused = output.terms(on_gpu, to_gpu(actions))
+    weights = torch.randn(2, 9, 33)
+    for one, other in zip(fused, plain, strict=True):
+        torch.testing.assert_close(one.cpu(), other)
+    losses = [
+        sum((w.to(x.device) * x).sum() for w, x in zip(weights, terms)) for terms in (fused, plain)
+    ]
+    (d_fused,), (d_plain,) = (
+        torch.autograd.grad(loss, leaf) for loss, leaf in zip(losses, (on_gpu, logits))
+    )
+    torch.testing.assert_close(d_fused.cpu(), d_plain)
+
+
+# rows, features, agents, choices; from 264 features on, a thread reads several words
+CASES = [(7, 8, 1, 8), (300, 256, 1, 7), (129, 264, 2, 3), (257, 64, 8, 1), (130, 520, 2, 4)]
+DUELS = pytest.mark.parametrize("n_rows, width, n_agents, n_choices", CASES)
+
+
+def duel(to_gpu, n_rows, width, n_agents, n_choices):
+    """Returns an output whose values and advantages are large, and features."""
+    torch.manual_seed(0)
+    output = heads.output(spaces.MultiDiscrete(n_agents, n_choices), width, "duelling")
+    for name, leaf in [*output.named_parameters()]:
+        module, _, name = name.rpartition(".")
+        scale = width**-0.5 if module == "hidden" else 1.0
+        leaf = torch.nn.Parameter(to_gpu((scale * torch.randn(leaf.shape)).bfloat16().float()))
+        setattr(output.get_submodule(module), name, leaf)
+    return output, to_gpu(torch.randn(n_rows, width).bfloat16()).requires_grad_()
+
+
+@DUELS
+def test_duelling_values_and_gradients_match_plain(
+    to_gpu, monkeypatch, n_rows, width, n_agents, n_choices
+):
+    output, x = duel(to_gpu, n_rows, width, n_agents, n_choices)
+    leaves, d_values = [x, *output.parameters()], torch.randn(n_rows, n_agents, n_choices)
+    monkeypatch.setattr(linear_module.few_rows, "fits", lambda *matrices: False)
+    if not torch.cuda.is_available():  # a CPU's products of bfloat16 have results in bfloat16
+        monkeypatch.setattr(
+            duelling_output, "gradient_of_weights", lambda d, x: d.float().T @ x.float()
+        )
+    fused = duelling_output._values_on_gpu(output, x)
+    ours = torch.autograd.grad(fused, leaves, to_gpu(d_values))
+    with plain_operations():
+        plain = output(x.float())
+        theirs = torch.autograd.grad(plain, leaves, to_gpu(d_values))
+    # the hidden layer and its gradient are rounded to 8 bits
+    for i, (one, other) in enumerate(zip([fused, *ours], [plain, *theirs], strict=True)):
+        error = (one.float() - other.float()).norm() / other.float().norm().clamp(min=1e-3)
+        assert error < 2e-2, (i, error)
+
+
+@DUELS
+def test_duelling_acts_like_plain(to_gpu, monkeypatch, n_rows, width, n_agents, n_choices):
+    monkeypatch.setattr(linear_module.few_rows, "fits", lambda *matrices: False)
+    output, x = duel(to_gpu, n_rows, width, n_agents, n_choices)
+    epsilon, generator = to_gpu(torch.rand(n_rows)), torch.Generator(x.device)
+    for sample in (True, False):
+        inputs = output, x, sample, generator.manual_seed(1), None, epsilon
+        with torch.no_grad(), torch.autocast(x.device.type, torch.bfloat16):
+            values, actions, logprobs = duelling_output._act_on_gpu(*inputs)
+        generator.manual_seed(1)
+        expected = output.greedy(values)
+        if sample:
+            expected = output.sample(values, generator, epsilon=epsilon)
+        assert torch.equal(actions, expected)
+        torch.testing.assert_close(logprobs, output.logprob(values, actions), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.cuda
+def test_duelling_matches_float32():
+    torch.manual_seed(0)
+    output = heads.output(spaces.MultiDiscrete(2, 3), 64, "duelling").cuda()
+    x = torch.randn(5, 40, 64, device="cuda", requires_grad=True)
+    results = []
+    for enabled in (False, True):
+        with torch.autocast("cuda", torch.bfloat16, enabled=enabled):
+            values = output(x)
+        inputs = [x, *output.parameters()]
+        results.append([values, *torch.autograd.grad(values.square().sum(), inputs)])
+    for i, (one, other) in enumerate(zip(*results, strict=True)):
+        # 8 bits; a ReLU's input near 0 may change its sign
+        error = (one - other).norm() / one.norm()
+        assert other.shape == one.shape and error < 0.1, (i, error)
+
+
+@pytest.mark.cuda
+def test_duelling_draws_the_same_actions_fused_or_not():
+    output = heads.output(spaces.MultiDiscrete(1, 4), 64, "duelling").cuda()
+    x, epsilon = torch.randn(4000, 64, device="cuda"), torch.rand(4000, device="cuda")
+    generator = torch.Generator("cuda")
+    with torch.no_grad(), torch.autocast("cuda", torch.bfloat16):
+        logits, fused, _ = output.act(x, True, generator.manual_seed(3), epsilon=epsilon)
+        plain = output.sample(logits, generator.manual_seed(3), epsilon=epsilon)
+    assert torch.equal(fused, plain)
