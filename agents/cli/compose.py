@@ -164,7 +164,6 @@ class Composer:
             keys = [one.key for one in typed if not one.key.startswith("hydra")]
             tree = self.command.prepare(own(config, resolve=not secret), keys)
             groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
-            errors += conflicts.missing_sources(tree)
             chosen = check.check(self.command.kind, tree, groups + self.loader.list_groups(""))
             errors += conflicts.ignored_geometry(chosen.env, keys)
         except OmegaConfBaseException as error:

@@ -348,10 +348,8 @@ def run_job(text: str) -> None:
 
 
 def report(folder: Path, rows: "list[Row]") -> None:
-    """Prints the table of a sweep and one that pools its seeds, and writes both into its folder."""
+    """Prints the table of a sweep, and writes it into its folder."""
     console.say(f"Sweep\n{console.table(*_cells(rows), width=console.terminal_width())}")
-    if pooled := _pooled(rows):
-        console.say(console.table(*pooled, width=console.terminal_width()))
     with console.warned(f"{folder} cannot be written: "):
         write_table(folder, rows)
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
@@ -359,9 +357,8 @@ def report(folder: Path, rows: "list[Row]") -> None:
 
 def write_table(folder: Path, rows: "list[Row]") -> None:
     """Writes sweep.md, the tables as printed, and sweep.csv, with all digits and folders."""
-    tables = filter(None, [_cells(rows), _pooled(rows)])
-    texts = [console.table(*table, is_markdown=True) for table in tables]
-    write_atomically(folder / "sweep.md", "\n\n".join(texts).encode())
+    text = console.table(*_cells(rows), is_markdown=True)
+    write_atomically(folder / "sweep.md", text.encode())
     head, text = [*_head(rows), "folder"], io.StringIO()
     rows = [row | row["varied"] | {"job": row["number"]} for row in rows]
     csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
@@ -381,22 +378,6 @@ def _cells(rows) -> tuple[list[str], list[list[str]]]:
     """Returns the head and the rows of a table, as text."""
     rows, head = [row | row["varied"] | {"job": row["number"]} for row in rows], _head(rows)
     return head, [[_brief(row.get(name)) for name in head] for row in rows]
-
-
-def _pooled(rows) -> tuple[list[str], list[list[str]]] | None:
-    """Returns head and rows of the table of `megastep compare`: jobs that differ in their seeds
-    alone are one row. None if there are no such jobs.
-    """
-    scores: dict[str, list[float]] = {}
-    for row in rows:
-        if row.get("score") is not None:
-            varied = [f"{key}={value}" for key, value in row["varied"].items() if key != "seed"]
-            scores.setdefault(", ".join(varied) or "all", []).append(row["score"])
-    if all(len(values) < 2 for values in scores.values()):
-        return None
-    from megastep.agents.reports import seeds  # with NumPy, which errors do not need
-
-    return [text.format("episode/return") for text in seeds.POOLED], seeds.pooled(scores)
 
 
 def _brief(value: object) -> str:

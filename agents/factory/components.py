@@ -20,9 +20,6 @@ from megastep.settings import closest, frozen, parameters_of, sentence, settings
 POLICY = "megastep.agents.networks.policy:Policy"
 #: Floor plans unless geometry= says otherwise.
 HOMES = "megastep.geometries.sources:homes"
-FILES = "megastep.geometries.sources:files"
-MIXED = "megastep.geometries.sources:mixed"
-CHECK_PARTS = "megastep.geometries.sources:check_parts"
 SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
 #: Returns pydantic's adapter of a dataclass of settings.

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from megastep.agents.factory import components
 from megastep.agents.factory.components import env_name
-from megastep.imports import import_object
 from megastep.schedules import Scheduled
 from megastep.settings import AtMost, closest
 
 if TYPE_CHECKING:
     from megastep.agents.factory.settings import Env, Learner, Record, Train
-    from megastep.agents.types import Config
 
 #: Endings of what record.py can write.
 FILMS = ".mp4", ".gif", ".png", ".svg", ".pdf"
@@ -181,20 +179,3 @@ def ignored_geometry(env: "Env | None", typed: list[str]) -> list[tuple[str, str
     if not keys or env is None or components.takes_geometries(env.name):
         return []
     return [(keys[0], f"env={env_name(env)} takes no floor plans; leave geometry out")]
-
-
-def missing_sources(tree: "Config") -> list[tuple[str, str]]:
-    """Returns [(key, sentence)] of files and parts of a mix that are named in nested dicts and do
-    not exist.
-    """
-    match tree.get("geometry"):
-        case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
-            return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
-        case {"name": components.SUITE, "plans": str(path)} if not os.path.isfile(path):
-            return [("geometry.plans", f"there is no file {path!r}; give an .npz of floor plans")]
-        case {"name": components.MIXED | components.SUITE, "parts": dict(parts)}:
-            try:
-                import_object(components.CHECK_PARTS)(parts)
-            except ValueError as error:
-                return [("geometry.parts", str(error))]
-    return []

@@ -3,7 +3,6 @@
 import copy
 import functools
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -48,8 +47,6 @@ if TYPE_CHECKING:
 
 #: Number of environments in which the memory of one is measured.
 PROBE = 65
-#: A network of fewer bytes, and for fewer numbers in a row, is not in the check of memory.
-LARGE, FEW = 2**28, 4096
 #: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
 #: What the library raises for bad arguments, files and devices, and for too little memory.
@@ -223,57 +220,15 @@ def check_memory(
                 raise
 
 
-def check_network(agent: Agent, env: types.Env, n_rows: int, is_learning: bool) -> None:
-    """Raises UserError with the size of the spaces if a network for them does not fit into memory.
-
-    Args:
-        n_rows: observations that it reads at once.
-    """
-    n_inputs, n_outputs = sizes_of(env)
-    n_features = n_inputs
-    if agent.encoder == "cnn":  # about as many as pixels, however many channels there are
-        images = [x for x in spaces.leaves(env.obs_space).values() if hasattr(x, "H")]
-        n_features -= sum((x.C - 1) * x.n_agents * x.H * x.W for x in images)
-    # weights and their initialisation, gradients and the two moments of Adam
-    n_bytes = 4 * agent.width * (n_features + n_outputs) * (5 if is_learning else 2)
-    # one-hot observations, probabilities and their gradients, beyond what `check_memory` counts
-    n_many = max(0, n_features + n_outputs - FEW)
-    n_bytes += 4 * n_rows * n_many * (4 if is_learning else 2)
-    if n_bytes > LARGE and n_bytes > 0.95 * (free := engine.free_memory(env.device)):
-        raise UserError(
-            f"{getattr(env, 'id', type(env).__name__)} has {n_inputs:,} numbers to observe and "
-            f"{n_outputs:,} actions, for which a network of agent.width={agent.width} needs "
-            f"{n_bytes / 1e9:.1f} GB, but {free / 1e9:.1f} GB are free on {env.device}; choose a "
-            "smaller width, fewer environments, or an environment with smaller spaces"
-        )
-
-
-def sizes_of(env: types.Env) -> tuple[int, int]:
-    """Returns the numbers that a network reads and gives: of integers, one for each value."""
-
-    def size(space) -> int:
-        return math.prod(space.shape) * getattr(space, "n_actions", 1)
-
-    sides = env.obs_space, env.action_space
-    n_inputs, n_outputs = (sum(map(size, spaces.leaves(side).values())) for side in sides)
-    return n_inputs, n_outputs
-
-
 def make_policy(
     agent: Agent,
     env: types.Env,
     seed: int = 1,
     critic: str | None = None,
-    n_rows: int | None = None,
 ) -> Policy:
-    """Returns a policy on the environment's device; without a `critic` it can only act.
-
-    Args:
-        n_rows: observations that it will read at once. Default: one of each lane of `env`.
-    """
+    """Returns a policy on the environment's device; without a `critic` it can only act."""
     if torch.device(env.device).type == "cpu":
         share_threads(agent.width)
-    check_network(agent, env, n_rows or n_lanes(env), critic is not None)
     with errors():
         spaces = env.obs_space, env.action_space, optional(env, "privileged_space")
         arguments: dict = vars(agent) | {"critic": critic}

@@ -35,7 +35,6 @@ from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.imports import import_object
-from megastep.types import optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
@@ -81,10 +80,7 @@ def make_trainer(
         "privileged": cfg.agent.critic == "asymmetric",
     }
     sample = factory.make_sample(cfg.env, **where)
-    n_rows = cfg.env.n_envs * optional(sample, "n_agents")
-    options = with_defaults(cfg.learner, LearnerOptions)
-    n_rows *= max(1, (options.n_steps or 1) // (options.n_minibatches or 1))  # of a minibatch
-    policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic, n_rows)
+    policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
     policy.generator = SeededGenerator(stream_seed(seed, "policy"))
     learner = factory.make_learner(cfg.learner, policy, seed)
     cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)

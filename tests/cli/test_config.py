@@ -206,24 +206,6 @@ def test_out_of_range_values(tree, key):
         assert [path for path, _ in error.value.errors] == [key], value
 
 
-def test_missing_geometry_file_is_told_with_all_else():
-    messages = errors("geometry=files", "geometry.path=nope.npz", "learner.lrr=1")
-    assert set(messages) == {"geometry.path", "learner.lrr"}
-    assert messages["geometry.path"] == "there is no file 'nope.npz'; give an .npz of geometries"
-
-
-def test_parts_of_a_mix():
-    words = "geometry=mixed", "geometry.parts={homes: 3, maze: {n: 2, braid: 1}, bench: 0}"
-    assert compose(*words).geometry.parts == {"homes": 3, "maze": {"n": 2, "braid": 1}, "bench": 0}
-    text = errors("geometry=mixed", "geometry.parts={hoems: 3}")["geometry.parts"]
-    assert text == "'hoems' is not a source; did you mean homes?"
-    text = errors("geometry=mixed", "geometry.parts={homes: 0}")["geometry.parts"]
-    assert text.startswith("its counts sum to 0")
-    words = "run=x", "geometry=suite", "geometry.parts={}"
-    with pytest.raises(ConfigErrors, match="geometry.parts: its counts sum to 0"):
-        compose(*words, script="evaluate")
-
-
 def test_contradicting_settings():
     assert compose("env.n_envs=8", "learner.n_minibatches=8").learner.n_minibatches == 8
     assert errors("geometry=files") == {"geometry.path": "is missing"}

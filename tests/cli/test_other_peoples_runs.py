@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from megastep import engine
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.runs import json_lines
 from megastep.agents.training.closing import close_env
@@ -113,11 +112,3 @@ def test_odd_renderers_are_filmed(here, name, grey):
     assert record.main(words) == 0
     image = (255 * imread(here / "a.png")[..., :3]).round()
     assert (image == grey).all(-1).sum() >= 64  # below a caption, at least the 8 x 8 pixels
-
-
-def test_space_that_is_too_large_is_refused_with_its_size(here, monkeypatch, capsys):
-    monkeypatch.setattr(engine, "free_memory", lambda device: 1e9)
-    assert train.main([*WORDS, env_id("ManyActions"), "samples=64"]) == 2
-    text = "OddManyActions-v0 has 1 numbers to observe and 3,000,000 actions, for which a network"
-    (line,) = capsys.readouterr().err.splitlines()
-    assert text in line and "1.0 GB are free on cpu" in line and not [*here.glob("runs/*")]

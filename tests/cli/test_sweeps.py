@@ -104,11 +104,7 @@ def test_sweep_folders_and_table(here, capsys):
     assert lines[3].split()[1:16:2] == ["1", "1", "3", "done", "12.0", "12.0", "12.0", "12.0"]
     config = yaml.safe_load((here / "mine" / names[0] / "config.yaml").read_text())
     assert config["folder"] == f"mine/{names[0]}"
-    said = capsys.readouterr().out
-    assert "sweep.md" in said and "IQM of episode/return" in "\n".join(lines)
-    rows_of_seeds = [line.split() for line in said.split("IQM of episode/return")[1].splitlines()]
-    (pooled,) = [words for words in rows_of_seeds if words[1:2] == ["env.pay=3"]]
-    assert pooled[1:6:2] == ["env.pay=3", "2", "12"] and "12 to 12" in " ".join(pooled)
+    assert "sweep.md" in capsys.readouterr().out
     assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
