@@ -44,23 +44,10 @@ def rank_info() -> RankInfo | None:
     return RankInfo(*map(int, texts))
 
 
-def token() -> str:
-    """Returns the prefix of this job's keys in a store: torchrun's `--rdzv-id`, or a random name if
-    `ranks=` started the job.
-    """
-    return os.environ.get("TORCHELASTIC_RUN_ID", "")
-
-
 def rank() -> int:
     """Returns the rank of this process, 0 for a single process."""
     info = rank_info()
     return info.rank if info else 0
-
-
-def is_first_here() -> bool:
-    """Returns whether this is the first rank of its machine."""
-    info = rank_info()
-    return info is not None and info.local_rank == 0
 
 
 def hostname() -> str:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, TypeVar
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.environment import hostname, rank_info, token
+from megastep.agents.distributed.environment import hostname, rank_info
 
 if TYPE_CHECKING:
     from torch.distributed import Store, TCPStore  # pyright: ignore[reportPrivateImportUsage]
@@ -161,8 +161,9 @@ def store(name: str, is_shared: bool = True) -> Store:
         is_shared: uses the connection of this process. False opens one for another thread.
     """
     keys = _store()  # where rank 0 hosts it, it must do so first
+    job = os.environ.get("TORCHELASTIC_RUN_ID", "")  # torchrun's --rdzv-id, or a random name
     return distributed.PrefixStore(  # pyright: ignore[reportPrivateImportUsage]
-        f"megastep {token()} {name}", keys if is_shared else _connection()
+        f"megastep {job} {name}", keys if is_shared else _connection()
     )
 
 

@@ -139,7 +139,7 @@ class Team:
         info = environment.rank_info()
         assert info is not None
         self.folder: Path | None = None
-        self.rank, self.n_ranks = info.rank, info.n_ranks
+        self.rank, self.n_ranks, self.is_first_here = info.rank, info.n_ranks, not info.local_rank
         self.is_ours = endings.JOB in os.environ
         self.is_broken = counts.has_left = False
         self.keys = [f"heartbeat {number}" for number in range(info.n_ranks)]
@@ -165,7 +165,7 @@ class Team:
             )
             if seconds > process_group.START_SECONDS:
                 raise UserError(problem)
-            if seconds > NOTICE_SECONDS and not has_warned and environment.is_first_here():
+            if seconds > NOTICE_SECONDS and not has_warned and self.is_first_here:
                 console.warn(f"{problem}. Waiting on")
                 has_warned = True
             time.sleep(0.1)
@@ -275,7 +275,7 @@ class Team:
             f"{os.environ.get('MASTER_ADDR')}, where torchrun keeps the ranks' store, has "
             f"{silence}: torchrun has ended there, or that machine or the network is down"
         )
-        self.end(problem if environment.is_first_here() else None)
+        self.end(problem if self.is_first_here else None)
 
     def end(self, problem: str | None) -> NoReturn:
         """Exits at once, because a rank was lost.
