@@ -78,7 +78,7 @@ def joined() -> "Iterator[Team | None]":
         raise SystemExit(code) from None
     finally:
         _team = None
-    team.leave()
+    team.finish()
     if has_joined:
         process_group.stop()
 

@@ -192,7 +192,14 @@ class Team:
 
     def earlier_folder(self) -> Path | None:
         """Returns the run folder of an earlier attempt, if the ranks were restarted."""
-        return Path(self._job.get("folder").decode()) if self._job.check(["folder"]) else None
+        folder = self._job.get("folder").decode() if self._job.check(["folder"]) else ""
+        return Path(folder) if folder else None
+
+    def finish(self) -> None:
+        """Leaves the run, which is done: another of this process does not continue it."""
+        if self.rank == 0:
+            self._job.set("folder", "")
+        self.leave()
 
     def claim(self) -> bool:
         """Returns True on the first rank that calls this: it reports the error, the others end."""
