@@ -11,13 +11,11 @@ import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard, TypeVar
+from typing import Any, TypeGuard
 
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import settings
 from megastep.agents.launch import gpu, launcher
-
-T = TypeVar("T", bound=settings.Common)
 
 #: Environment variable with the GPUs that a process may use.
 VISIBLE = "CUDA_VISIBLE_DEVICES"
@@ -57,7 +55,7 @@ def check(jobs: Sequence, hydra: Any) -> None:
 
 
 @contextlib.contextmanager
-def taken(cfg: T) -> Iterator[T]:
+def taken(cfg: settings.Common) -> Iterator[settings.Common]:
     """Takes the slot with the fewest jobs for the duration of the context.
 
     Ranks are separate processes and see only the GPUs of their slot. For a job in this process, the

@@ -66,13 +66,14 @@ def joined() -> "Iterator[Team | None]":
             process_group.start()
         yield team
     except (Exception, signals.Interrupted) as error:
-        if loss := _cause(error, process_group.RankLost):
-            with signals.handled(lambda number: None):  # ignores torchrun's SIGTERM
-                team.end_lost(loss)
         is_signal = isinstance(error, signals.Interrupted)
-        reports = info.rank == 0 and team.claim()
-        team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
-        if reports or team.claim():
+        with signals.handled(lambda number: None):  # ignores torchrun's SIGTERM
+            if loss := _cause(error, process_group.RankLost):
+                team.end_lost(loss)
+            reports = info.rank == 0 and team.claim()
+            team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
+            reports = reports or team.claim()
+        if reports:
             raise
         code = 128 + error.args[0] if is_signal else getattr(error, "code", 1)
         raise SystemExit(code) from None
