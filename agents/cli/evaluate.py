@@ -51,6 +51,6 @@ def run(cfg: settings.Evaluate) -> Path:
     return evaluate_run.run(cfg)
 
 
-COMMAND = Command("evaluate", settings.Evaluate, HELP, True, prepare, ready)
+COMMAND = Command("evaluate", settings.Evaluate, HELP, True, prepare, ready, has_ranks=True)
 #: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main
