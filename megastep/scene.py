@@ -23,39 +23,14 @@ TEXEL = 0.05  # metres per texel
 STRIPE = (0.4, 2.0)  # metres, min and max of the period of a wall's stripes
 INTENSITY = (0.5, 1.6)  # min and max of a light's intensity
 PALETTE = (
-    "d9b08c",
-    "a3c1ad",
-    "e0d5b6",
-    "b7a7c9",
-    "9fb8d0",
-    "c98b8b",
-    "d8c27a",
-    "8fae7d",
-    "b0b0b0",
-    "cf9fb5",
-    "7fb0b0",
-    "e8e0d8",
-)
+    "d9b08c a3c1ad e0d5b6 b7a7c9 9fb8d0 c98b8b d8c27a 8fae7d b0b0b0 cf9fb5 7fb0b0 e8e0d8"
+).split()
 # Saturated, unlike walls: an agent's weakest channel has at most a tenth of its light, a wall's at
 # least an eighth. So a pixel shows which of the two it is at any brightness.
 AGENT_PALETTE = (
-    "3b6ea5",
-    "a5523b",
-    "2c9030",
-    "7a3ba5",
-    "a58a3b",
-    "3b9a9a",
-    "a53b74",
-    "6f9a2a",
-    "c87a18",
-    "2438c8",
-    "18a868",
-    "c82cb4",
-    "c8c020",
-    "5018c0",
-    "20a8e0",
-    "804010",
-)
+    "3b6ea5 a5523b 2c9030 7a3ba5 a58a3b 3b9a9a a53b74 6f9a2a "
+    "c87a18 2438c8 18a868 c82cb4 c8c020 5018c0 20a8e0 804010"
+).split()
 FRONT = "ff3020"
 
 

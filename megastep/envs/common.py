@@ -1,7 +1,7 @@
 """Members that the environments share."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import torch
 
@@ -15,10 +15,19 @@ from megastep.types import Env
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DisplayedEnv", "SceneryEnv", "Weight"]
+__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "world_of"]
 
 #: Weight of a part of a reward, a number or a schedule.
 Weight = Annotated[Number, Scheduled(ge=0, le=1000)]
+
+
+def world_of(step: Any, obs: Any, metrics: arrdict | None = None) -> arrdict:
+    """Returns a world with the reward and the flags of an operation's outcome."""
+    names = "reward", "reset", "terminal", "truncated"
+    world = arrdict(obs=obs, **{name: getattr(step, name) for name in names})
+    if metrics is not None:
+        world["metrics"] = metrics
+    return world
 
 
 class DisplayedEnv:

@@ -38,6 +38,20 @@ class FirstPerson(SceneryEnv):
     """N environments of one agent each, which momentum moves. A subclass defines ``_world``, and
     takes the arguments below as ``*shared`` and ``**options``, which it passes on.
 
+    Observation:
+        A dict of float16, for each of C cameras (1) W = ``res / subsample`` pixels (64).
+
+        - ``rgb``: (B, 1, 3, C, W), linear light. A pixel is the mean of ``subsample`` rays.
+        - ``d``: (B, 1, 1, C, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
+        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
+
+    Actions:
+        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
+        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
+
+        With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
+        left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
+
     Args:
         n_envs: number of environments, N.
         geometries: floor plans. Default: generated ones, at most 512.
@@ -140,7 +154,7 @@ class FirstPerson(SceneryEnv):
         """
         raise NotImplementedError
 
-    def _view(self, core: Core | None = None, **seen: torch.Tensor) -> engine.Observation:
+    def _view(self, core: Core | None = None, **seen: Any) -> engine.Observation:
         """Returns what all cameras see, or those of a core. ``seen``: as ``engine.observe``."""
         core = core or self.core
         return engine.observe(core.scenery, core.agents, self.subsample, imu=True, **seen)

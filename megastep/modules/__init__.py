@@ -4,7 +4,6 @@ They are callables. Sensors and movements have a ``.space``.
 """
 
 from megastep.modules.free_points import FreePoints
-from megastep.modules.lanes import to_agents, to_lanes
 from megastep.modules.lifecycle import (
     ENDLESS,
     CounterGenerator,
@@ -17,7 +16,9 @@ from megastep.modules.movement import (
     TURNS,
     MomentumMovement,
     SimpleMovement,
+    to_agents,
     to_global,
+    to_lanes,
     to_local,
 )
 from megastep.modules.objects import COLOURS, Crate, Disc, Door, Objects, doorways

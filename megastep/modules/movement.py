@@ -11,13 +11,24 @@ import torch
 from megastep import engine, spaces
 from megastep.core import Core
 from megastep.engine import checks
-from megastep.modules.lanes import to_agents
 
 # The direction in the agent's frame (forward, left) and the turn of each action:
 # 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
 MOVES = [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0), (0, 0), (0, 0)]
 TURNS = [0, 0, 0, 0, 0, 1, -1]  # turn of each action: 1 left, -1 right
 CONTROLS = [3, 1, 5]  # the actions that a continuous action weights: forward, left, turn left
+
+
+def to_lanes(values: torch.Tensor) -> torch.Tensor:
+    """Returns (N, A, ...) as lanes (B, ...), a view if possible: lane e A + a is agent a of
+    environment e.
+    """
+    return values.flatten(0, 1)
+
+
+def to_agents(values: torch.Tensor, n_agents: int) -> torch.Tensor:
+    """Returns lanes (B,) or (B, 1), or (N, A), as (N, A), a view if possible."""
+    return values.reshape(-1, n_agents)
 
 
 def to_global(angles: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:

@@ -40,47 +40,44 @@ def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 
 
-def _plot_strips(name, state, axes, yaws) -> np.ndarray:
-    """Draws images (A, channels, C, R) as strips, one per agent, with a row per camera."""
-    aspect = plotting.STRIP * np.shape(state)[-2]
-    return plotting.plot_images({name: state}, aspect=aspect, axes=axes, yaws=yaws)
+class _Camera:
+    """Images of every agent's cameras, a mean of ``subsample`` rays per pixel."""
 
-
-class RGB:
-    """RGB images, float32 (N, A, 3, C, R / subsample), in linear light.
-
-    Args:
-        core: the environment's core.
-        subsample: rays per pixel; a pixel is their mean. Divides R.
-    """
+    name: str
+    n_channels: int
 
     def __init__(self, core: Core, subsample: int = 1):
         self.core, self.subsample = core, subsample
         downsample(torch.empty(core.res), subsample)
-        self.space = spaces.MultiImage(
-            core.n_agents, 3, len(core.agents.yaws), core.res // subsample, low=0, high=1
-        )
+        size = len(core.agents.yaws), core.res // subsample
+        self.space = spaces.MultiImage(core.n_agents, self.n_channels, *size, low=0, high=1)
 
     def __call__(self, r: engine.Render | None = None) -> torch.Tensor:
         """Returns the observation of a render. Default: of the current state."""
         r = render(self.core) if r is None else r
-        screen = r.screen.reshape(self.core.n_envs, self.core.n_agents, -1, self.core.res, 3)
-        return downsample(screen.permute(0, 1, 4, 2, 3), self.subsample).mean(-1)
+        shape = self.core.n_envs, self.core.n_agents, self.n_channels, -1, self.core.res
+        return downsample(self._values(r).reshape(shape), self.subsample).mean(-1)
+
+    def _values(self, r) -> torch.Tensor:
+        """Returns what is shown of a render, in the order of (N, A, channels, C, R)."""
+        raise NotImplementedError
 
     def state(self, e: int = 0) -> torch.Tensor:
-        """Returns the images of the agents of environment ``e``: (A, 3, C, R / subsample)."""
+        """Returns the images of environment ``e``: (A, channels, C, R / subsample)."""
         return self()[e]
 
-    @staticmethod
+    @classmethod
     def plot_state(
+        cls,
         state: np.ndarray,
         axes: "Sequence[Area | Axes] | np.ndarray | None" = None,
         yaws: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera.
+        """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera; depth in
+        grey, bright where near.
 
         Args:
-            state: (A, 3, C, R / subsample).
+            state: (A, channels, C, R / subsample).
             axes: one per agent: strips of :func:`megastep.plotting.panels`, or matplotlib axes.
                 Default: those of a new figure.
             yaws: (C,) degrees, shown as the names of the rows.
@@ -88,10 +85,26 @@ class RGB:
         Returns:
             The axes.
         """
-        return _plot_strips("rgb", state, axes, yaws)
+        aspect = plotting.STRIP * np.shape(state)[-2]
+        return plotting.plot_images({cls.name: state}, aspect=aspect, axes=axes, yaws=yaws)
 
 
-class Depth:
+class RGB(_Camera):
+    """RGB images, float32 (N, A, 3, C, R / subsample), in linear light.
+
+    Args:
+        core: the environment's core.
+        subsample: rays per pixel; a pixel is their mean. Divides R.
+    """
+
+    name, n_channels = "rgb", 3
+
+    def _values(self, r) -> torch.Tensor:
+        screen = r.screen.reshape(self.core.n_envs, self.core.n_agents, -1, self.core.res, 3)
+        return screen.permute(0, 1, 4, 2, 3)
+
+
+class Depth(_Camera):
     """Depth images: float32 (N, A, 1, C, R / subsample).
 
     A ray's depth is 1 - clamp((distance - radius) / max_depth, 0, 1): 1 at the agent's edge, 0 at
@@ -103,34 +116,14 @@ class Depth:
         max_depth: metres.
     """
 
+    name, n_channels = "depth", 1
+
     def __init__(self, core: Core, subsample: int = 1, max_depth: float = 10.0):
-        self.core, self.subsample, self.max_depth = core, subsample, max_depth
-        downsample(torch.empty(core.res), subsample)
-        self.space = spaces.MultiImage(
-            core.n_agents, 1, len(core.agents.yaws), core.res // subsample, low=0, high=1
-        )
+        super().__init__(core, subsample)
+        self.max_depth = max_depth
 
-    def __call__(self, r: engine.Render | None = None) -> torch.Tensor:
-        """Returns the observation of a render. Default: of the current state."""
-        r = render(self.core) if r is None else r
-        distances = r.distances.reshape(self.core.n_envs, self.core.n_agents, 1, -1, self.core.res)
-        depth = 1 - ((distances - self.core.agents.radius) / self.max_depth).clamp(0, 1)
-        return downsample(depth, self.subsample).mean(-1)
-
-    def state(self, e: int = 0) -> torch.Tensor:
-        """Returns the images of the agents of environment ``e``: (A, 1, C, R / subsample)."""
-        return self()[e]
-
-    @staticmethod
-    def plot_state(
-        state: np.ndarray,
-        axes: "Sequence[Area | Axes] | np.ndarray | None" = None,
-        yaws: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Draws a numpyified :meth:`state` in grey, bright where near. Arguments and result are
-        those of :meth:`RGB.plot_state`.
-        """
-        return _plot_strips("depth", state, axes, yaws)
+    def _values(self, r) -> torch.Tensor:
+        return 1 - ((r.distances - self.core.agents.radius) / self.max_depth).clamp(0, 1)
 
 
 class IMU:

@@ -15,7 +15,7 @@ from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.geometry import centers, contents
-from megastep.modules.lanes import to_agents
+from megastep.modules.movement import to_agents
 
 CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
 PREFIX = "spawn-points-"  # of the files in the cache

@@ -163,22 +163,18 @@ class Recorder:
             self.buffers.append(Buffer(len(contents), contents))
         return self.index[start]
 
-    def run(
-        self, call: Callable[[], World], keep: bool = True
-    ) -> tuple[Tape, dict[str, torch.Tensor]]:
-        """Calls a function of the environment. Returns its tape and the leaves of its world.
-
-        Args:
-            keep: makes buffers for what it uses.
+    def run(self, call: Callable[[], World]) -> tuple[Tape, dict[str, torch.Tensor]]:
+        """Calls a function of the environment, and makes buffers for what it uses. Returns its tape
+        and the leaves of its world.
         """
-        tape = Tape(self.memory, self.use if keep else lambda start: None)
+        tape = Tape(self.memory, self.use)
         with tape, observed(tape.observe):
             world = call()
         leaves = world_leaves(world)
-        for leaf in leaves.values() if keep else ():
+        for leaf in leaves.values():
             self.use(self.memory.add(leaf))
         computed = {written.start for written in tape.written}
-        for start in tape.made if keep else ():
+        for start in tape.made:
             if start in self.index and start not in computed:
                 i = self.index[start]
                 self.buffers[i] = Buffer(self.buffers[i].n_bytes)
@@ -262,8 +258,10 @@ def record(env: Env) -> Program:
     taken = [actions.clone()]
     expected.append(snapshot(recorder, leaves, kept))
     actions.copy_(draw())
-    again, leaves = recorder.run(lambda: env.step(decision), keep=False)
-    refuse_changes(recorder, (step, again))
+    again = Tape(recorder.memory, lambda start: None)
+    with again, observed(again.observe):
+        leaves = world_leaves(env.step(decision))
+    refuse_changes(recorder.name, step.launches, again.launches)
     taken.append(actions.clone())
     expected.append(snapshot(recorder, leaves, kept))
     for _ in range(N_CHECKED):
@@ -300,30 +298,20 @@ def copies(recorder: Recorder, first, later) -> list[tuple[int, int]]:
     return [*found]
 
 
-def refuse_changes(recorder: Recorder, tapes: tuple[Tape, Tape]) -> None:
-    """Refuses two steps that launch different things."""
-    names = [[launch.operation for launch in tape.launches] for tape in tapes]
+def refuse_changes(name: str, one: list[Launch], other: list[Launch]) -> None:
+    """Refuses two steps that launch different operations, or with different numbers."""
+    names = [[launch.operation for launch in launches] for launches in (one, other)]
     if names[0] != names[1]:
         raise ValueError(
-            f"{recorder.name} cannot be exported: a step launches {', '.join(names[0])}, and the "
-            f"next {', '.join(names[1])}"
+            f"{name} cannot be exported: a step launches {', '.join(names[0])}, and the next "
+            f"{', '.join(names[1])}"
         )
-    orders = [
-        {start: i for i, start in enumerate(start for start in tape.made if start in tape.used)}
-        for tape in tapes
-    ]
-    for launches in zip(*(tape.launches for tape in tapes)):
-        for name in launches[0].values:
-            values = [
-                (order.get(value.buffer, value.buffer), value.offset)
-                if isinstance(value := launch.values[name], Ref)
-                else value
-                for launch, order in zip(launches, orders)
-            ]
-            if values[0] != values[1]:
+    for before, after in zip(one, other):
+        for field, value in before.values.items():
+            if not isinstance(value, Ref) and value != after.values[field]:
                 raise ValueError(
-                    f"{recorder.name} cannot be exported: {name} of {launches[0].operation} "
-                    f"changes from step to step; keep what changes in a tensor that kernels write"
+                    f"{name} cannot be exported: {field} of {before.operation} changes from step "
+                    f"to step; keep what changes in a tensor that kernels write"
                 )
 
 

@@ -16,7 +16,7 @@ from megastep.coefficients import Coefficients
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
-from megastep.envs.common import SceneryEnv
+from megastep.envs.common import SceneryEnv, world_of
 from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.deathmatch_step import (
     MAX_AGENTS,
@@ -259,13 +259,10 @@ class Deathmatch(SceneryEnv):
             **self.rules | rules,
             **self.weights.tensors,
         )
-        world = arrdict(
-            obs=arrdict(by_lane(images(view)), health=step.health_obs),
-            reward=step.reward,
-            reset=step.reset,
-            terminal=step.terminal,
-            truncated=step.truncated,
-            metrics=arrdict(zip(METRICS, step.metrics.unbind())),
+        world = world_of(
+            step,
+            arrdict(by_lane(images(view)), health=step.health_obs),
+            arrdict(zip(METRICS, step.metrics.unbind())),
         )
         if step.sound is not None:
             world.obs["sound"] = step.sound

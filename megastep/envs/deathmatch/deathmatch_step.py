@@ -154,7 +154,8 @@ def deathmatch_step(
     sound = torch.empty_like(health_obs) if hearing else None
     size = n_lanes, 1, privileged_size(a)
     privileged_out = torch.empty(size, device=device) if privileged else None
-    out = DeathmatchStep(reward, *flags, metrics, health_obs, sound, privileged_out)
+    outputs = dict(metrics=metrics, health_obs=health_obs, sound=sound, privileged=privileged_out)
+    out = DeathmatchStep(reward, *flags, **outputs)
     launch(
         *(LIBRARY, "deathmatch_step", device, n),
         **seen,

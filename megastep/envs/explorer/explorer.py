@@ -16,6 +16,7 @@ from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
 from megastep.engine.launch_params import lanes_of, texel_bits, world_params
 from megastep.engine.scenery import Scenery
+from megastep.envs.common import world_of
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.kernel_library import KernelLibrary
@@ -92,7 +93,8 @@ def explorer_step(
         unseen = torch.empty((n_lanes, 1, N_BINS), device=device)
     flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
     reward = torch.empty(n_lanes, device=device)
-    out = ExplorerStep(reward, *flags, coverage_out, episode, unseen)
+    outputs = dict(coverage=coverage_out, episode=episode, unseen=unseen)
+    out = ExplorerStep(reward, *flags, **outputs)
     seen_at, n_words = texel_bits(scenery, "seen", seen, lanes)
     tables = dict(runs=0, run_starts=0, n_visible=0)
     if coverage or privileged:
@@ -118,18 +120,10 @@ class Explorer(FirstPerson):
     """An agent explores a floor plan. New wall texels (5 cm each) that it sees are the reward.
 
     Observation:
-        A dict of float16, W = ``res / subsample`` pixels (64) for each of C cameras (1).
-
-        - ``rgb``: (B, 1, 3, C, W), linear light. A pixel is the mean of ``subsample`` rays.
-        - ``d``: (B, 1, 1, C, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
-        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
+        ``rgb``, ``d`` and ``imu`` of :class:`~megastep.envs.first_person.FirstPerson`.
 
     Actions:
-        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
-        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
-
-        With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
-        left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
+        Those of :class:`~megastep.envs.first_person.FirstPerson`.
 
     Reward:
         Number of texels seen for the first time this episode, divided by 64. The first observation
@@ -182,6 +176,7 @@ class Explorer(FirstPerson):
     def _world(self, free=None) -> arrdict:
         self.spawner(self.ended)
         view = self._view(seen=self.seen, clear_mask=self.ended[:, None])
+        assert view.newly_seen is not None
         step = explorer_step(
             self.core.scenery,
             self.core.agents,
@@ -195,13 +190,7 @@ class Explorer(FirstPerson):
             coverage=self.has_metrics,
             privileged=self.privileged_space is not None,
         )
-        world = arrdict(
-            obs=images(view),
-            reward=step.reward,
-            reset=step.reset,
-            terminal=step.terminal,
-            truncated=step.truncated,
-        )
+        world = world_of(step, images(view))
         if step.coverage is not None:
             world["metrics"] = arrdict(coverage=step.coverage)
         if step.unseen is not None:

@@ -17,7 +17,7 @@ from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
 from megastep.engine.launch_params import lanes_of, object_params, seed_params, world_params
 from megastep.engine.scenery import Scenery
-from megastep.envs.common import Weight
+from megastep.envs.common import Weight, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.envs.keys.episodes import cached_episodes
 from megastep.kernels.build.kernel_library import KernelLibrary
@@ -115,7 +115,8 @@ def keys_step(
     flags = [torch.empty(n, dtype=torch.bool, device=device) for _ in range(3)]
     metrics = torch.empty((len(METRICS), n), device=device)
     keys_obs = torch.empty((n, 1, n_colours), dtype=torch.float16, device=device)
-    out = KeysStep(torch.empty(n, device=device), *flags, metrics, keys_obs, privileged_out)
+    outputs = dict(metrics=metrics, keys_obs=keys_obs, privileged=privileged_out)
+    out = KeysStep(torch.empty(n, device=device), *flags, **outputs)
     f32 = torch.float32, device
     counters = dict(opened=opened, n_draws=n_draws, ages=ages)
     launch(
@@ -149,21 +150,13 @@ class Keys(FirstPerson):
     which stays locked. Every episode can be solved.
 
     Observation:
-        A dict of float16, for each of C cameras (1) W = ``res / subsample`` pixels (64).
-
-        - ``rgb``: (B, 1, 3, C, W), linear light. A pixel is the mean of ``subsample`` rays.
-        - ``d``: (B, 1, 1, C, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
-        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
-        - ``keys``: (B, 1, ``doors``), 1 for each key that the agent carries: red, green, blue,
-          yellow, magenta, cyan.
+        ``rgb``, ``d`` and ``imu`` of :class:`~megastep.envs.first_person.FirstPerson`, and float16
+        ``keys``: (B, 1, ``doors``), 1 for each key that the agent carries: red, green, blue,
+        yellow, magenta, cyan.
 
     Actions:
-        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
-        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`). An agent picks up a
-        key by touching it, and opens a door by touching it with its key, which is used up.
-
-        With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
-        left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
+        Those of :class:`~megastep.envs.first_person.FirstPerson`. An agent picks up a key by
+        touching it, and opens a door by touching it with its key, which is used up.
 
     Reward:
         1 for touching the goal, a violet disc, ``key_reward`` for each key and ``door_reward`` for
@@ -243,13 +236,10 @@ class Keys(FirstPerson):
             privileged=self.privileged_space is not None,
             **self.weights.tensors,
         )
-        world = arrdict(
-            obs=arrdict(images(self._view()), keys=step.keys_obs),
-            reward=step.reward,
-            reset=step.reset,
-            terminal=step.terminal,
-            truncated=step.truncated,
-            metrics=arrdict(zip(METRICS, step.metrics.unbind())),
+        world = world_of(
+            step,
+            arrdict(images(self._view()), keys=step.keys_obs),
+            arrdict(zip(METRICS, step.metrics.unbind())),
         )
         if step.privileged is not None:
             world["privileged"] = arrdict(places=step.privileged)

@@ -19,6 +19,7 @@ from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
 from megastep.engine.launch_params import lanes_of, object_params, seed_params, world_params
 from megastep.engine.scenery import Scenery
+from megastep.envs.common import world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
@@ -105,7 +106,8 @@ def memory_step(
     flags = [torch.empty(n, dtype=torch.bool, device=device) for _ in range(3)]
     reward, metrics = (torch.empty(n, device=device) for _ in range(2))
     cue_obs = torch.empty((n, 1, 3), dtype=torch.float16, device=device)
-    out = MemoryStep(reward, *flags, metrics, cue_obs, goal, places)
+    outputs = dict(metrics=metrics, cue_obs=cue_obs, goal=goal, places=places)
+    out = MemoryStep(reward, *flags, **outputs)
     counters = dict(cue=cue, found=found, n_draws=n_draws, ages=ages)
     shape = len(scenery.layouts), n_arrangements, n_objects, 2
     launch(
@@ -185,19 +187,11 @@ class Memory(FirstPerson):
     finds them faster.
 
     Observation:
-        A dict of float16, for each of C cameras (1) W = ``res / subsample`` pixels (64).
-
-        - ``rgb``: (B, 1, 3, C, W), linear light. A pixel is the mean of ``subsample`` rays.
-        - ``d``: (B, 1, 1, C, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
-        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
-        - ``cue``: (B, 1, 3), linear light, the colour of the object to find, as ``rgb`` shows it.
+        ``rgb``, ``d`` and ``imu`` of :class:`~megastep.envs.first_person.FirstPerson`, and float16
+        ``cue``: (B, 1, 3), linear light, the colour of the object to find, as ``rgb`` shows it.
 
     Actions:
-        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
-        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
-
-        With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
-        left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
+        Those of :class:`~megastep.envs.first_person.FirstPerson`.
 
     Reward:
         1 for touching the object to find, which draws the next one among the others. To touch
@@ -270,13 +264,8 @@ class Memory(FirstPerson):
             reach=REACH,
             privileged=self.privileged_space is not None,
         )
-        world = arrdict(
-            obs=arrdict(images(self._view()), cue=step.cue_obs),
-            reward=step.reward,
-            reset=step.reset,
-            terminal=step.terminal,
-            truncated=step.truncated,
-            metrics=arrdict(found=step.metrics),
+        world = world_of(
+            step, arrdict(images(self._view()), cue=step.cue_obs), arrdict(found=step.metrics)
         )
         if step.goal is not None:
             world["privileged"] = arrdict(goal=step.goal, places=step.places)

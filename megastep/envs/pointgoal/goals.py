@@ -73,14 +73,14 @@ class GoalFields:
         self.cell, self.n_layouts = cell, len(fields)
         self.n_goals, self.n_spawns = len(points[0]), len(spawns[0])
         is_allowed = np.stack(allowed)
-        lengths = np.where(is_allowed, np.stack(lengths), 0.0)  # of others it may be infinite
+        finite = np.where(is_allowed, np.stack(lengths), 0.0)  # of others they may be infinite
         distinct = {id(field): field for field in fields}
         ends = np.cumsum([field.size for field in distinct.values()])
         starts = {key: end - field.size for (key, field), end in zip(distinct.items(), ends)}
         arrays = dict(
             points=np.stack(points).astype(np.float32),
             origins=np.stack(origins).astype(np.float32),
-            lengths=lengths.astype(np.float32),
+            lengths=finite.astype(np.float32),
             fields=np.concatenate([field.reshape(-1) for field in distinct.values()]),
             starts=np.array([starts[id(field)] for field in fields], np.int64),
             shapes=np.array([field.shape[1:] for field in fields], np.int32),
@@ -194,8 +194,9 @@ def _cached(found, geometries, radius, seed) -> list[Geodesics]:
     arrays = cache.arrays(PREFIX, parts, build, MAX_FILES, MAX_BYTES)
     shapes, flat = arrays.pop("shapes"), arrays.pop("flat")
     fields = np.split(flat, shapes.prod(1).cumsum()[:-1])
-    arrays["fields"] = [field.reshape(shape) for field, shape in zip(fields, shapes)]
-    return [Geodesics(*parts) for parts in zip(*(arrays[name] for name in Geodesics._fields))]
+    shaped = [field.reshape(shape) for field, shape in zip(fields, shapes)]
+    rest = [dict(zip(arrays, values)) for values in zip(*arrays.values())]
+    return [Geodesics(fields=field, **parts) for field, parts in zip(shaped, rest, strict=True)]
 
 
 def _with_progress(items: Iterable[T], total: int) -> Iterable[T]:

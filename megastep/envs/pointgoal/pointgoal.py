@@ -19,7 +19,7 @@ from megastep.engine import Resets, checks
 from megastep.engine.agents import Agents, check_on_cpu
 from megastep.engine.launch_params import lanes_of, seed_params, world_params
 from megastep.engine.scenery import Scenery
-from megastep.envs.common import Weight
+from megastep.envs.common import Weight, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.envs.pointgoal.goals import GoalFields, goal_fields
 from megastep.kernels.build.kernel_library import KernelLibrary
@@ -115,7 +115,8 @@ def pointgoal_step(
     metrics = torch.empty((len(METRICS), n_lanes), device=device)
     goal_obs = torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device)
     reward = torch.empty(n_lanes, device=device)
-    out = PointGoalStep(reward, *flags, metrics, goal_obs, privileged_out)
+    outputs = dict(metrics=metrics, goal_obs=goal_obs, privileged=privileged_out)
+    out = PointGoalStep(reward, *flags, **outputs)
     counters = dict(n_draws=n_draws, goal_index=goal_index, ages=ages)
     rows = PROGRESS_ROWS, n_lanes
     launch(
@@ -146,20 +147,12 @@ class PointGoal(FirstPerson):
     """Point-goal navigation: walk to a point given by its distance and bearing.
 
     Observation:
-        A dict of float16, for each of C cameras (1) W = ``res / subsample`` pixels (64).
-
-        - ``rgb``: (B, 1, 3, C, W), linear light. A pixel is the mean of ``subsample`` rays.
-        - ``d``: (B, 1, 1, C, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
-        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
-        - ``goal``: (B, 1, 3), in the agent's frame: straight-line distance / 10 m, cosine and sine
-          of the bearing.
+        ``rgb``, ``d`` and ``imu`` of :class:`~megastep.envs.first_person.FirstPerson`, and float16
+        ``goal``: (B, 1, 3), in the agent's frame: straight-line distance / 10 m, cosine and sine
+        of the bearing.
 
     Actions:
-        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
-        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
-
-        With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
-        left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
+        Those of :class:`~megastep.envs.first_person.FirstPerson`.
 
     Reward:
         Metres by which the shortest path to the goal became shorter, minus ``cost``, minus
@@ -239,13 +232,8 @@ class PointGoal(FirstPerson):
             privileged=self.privileged_space is not None,
             **self.weights.tensors,
         )
-        world = arrdict(
-            obs=arrdict(view, goal=step.goal_obs),
-            reward=step.reward,
-            reset=step.reset,
-            terminal=step.terminal,
-            truncated=step.truncated,
-            metrics=arrdict(zip(METRICS, step.metrics.unbind())),
+        world = world_of(
+            step, arrdict(view, goal=step.goal_obs), arrdict(zip(METRICS, step.metrics.unbind()))
         )
         if step.privileged is not None:
             world["privileged"] = arrdict(way=step.privileged)

@@ -18,7 +18,7 @@ from megastep.engine import checks
 from megastep.engine.agents import check_flag_on_cpu
 from megastep.engine.devices import threads
 from megastep.engine.launch_params import seed_params
-from megastep.envs.common import DisplayedEnv
+from megastep.envs.common import DisplayedEnv, world_of
 from megastep.envs.pong.tracker import LIBRARY, Tracker
 from megastep.kernels.build.launch import launch
 from megastep.settings import MAX_ENVS, checked
@@ -101,7 +101,7 @@ def pong_step(
     speed = checks.number("tracker_speed", tracker_speed, -math.inf, PIXELS[1], "cells per step")
     if speed < 0:
         raise ValueError(f"tracker_speed must be at least 0 cells per step, not {speed:g}")
-    out = PongStep(reward, *flags, points_won, features)
+    out = PongStep(reward, *flags, points_won=points_won, features=features)
     launch(
         *(LIBRARY, "pong_step", device, n),
         games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, device),
@@ -220,13 +220,10 @@ class Pong(DisplayedEnv):
             tracker_speed=self.tracker_speed,
             pixels=self.pixels,
         )
-        return arrdict(
-            obs=step.features if self.pixels is None else self.pixels,
-            reward=step.reward,
-            reset=step.reset,
-            terminal=step.terminal,
-            truncated=step.truncated,
-            metrics=arrdict(points_won=step.points_won),
+        return world_of(
+            step,
+            step.features if self.pixels is None else self.pixels,
+            arrdict(points_won=step.points_won),
         )
 
     def check(self) -> None:

@@ -24,7 +24,6 @@ import torch
 
 from megastep import cache
 from megastep.kernels.build import headers
-from megastep.kernels.build.forks import end_threads_at_forks
 from megastep.kernels.build.kernel_library import KERNELS, WASM_FLAGS, KernelLibrary
 
 if TYPE_CHECKING:
@@ -64,6 +63,21 @@ def cpu(library: KernelLibrary) -> dict[str, Callable[[bytes], None]]:
     for function in functions.values():
         function.argtypes, function.restype = [ctypes.c_char_p], None
     return functions
+
+
+def end_threads_at_forks(library: "CDLL") -> None:
+    """Has the OpenMP runtime of a library end its threads before each ``os.fork``. Parent and child
+    start new ones when they next need them, with the same bits.
+
+    A fork copies only the thread that calls it, and GNU OpenMP does not notice: the first parallel
+    loop of the child would wait forever. Does nothing if the library uses no OpenMP.
+    """
+    pause = getattr(library, "omp_pause_resource_all", None)
+    if pause is not None:
+        os.register_at_fork(before=lambda: pause(1))  # omp_pause_soft: settings stay
+
+
+end_threads_at_forks(ctypes.CDLL(torch._C.__file__))  # PyTorch's, which kernels mostly share
 
 
 def compiler() -> tuple[str, str]:

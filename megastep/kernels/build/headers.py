@@ -46,39 +46,6 @@ def packed(values):
 Fields = list[tuple[str, str]]  # (name, format of the module struct)
 
 
-def struct_fields(sources: Mapping[str, str]) -> dict[str, Fields]:
-    """Returns the fields of every struct ``...Params`` in the headers ``sources`` {name: text}.
-
-    A struct that is a field of another must be declared before it.
-
-    Raises:
-        ValueError: if a field has a type that cannot be packed.
-    """
-    structs, formats = {}, dict(FORMATS)
-    for header, text in sources.items():
-        for name, body in STRUCT.findall(_without_comments(text)):
-            structs[name] = [_field(line, formats, header) for line in body.split(";")[:-1]]
-            aligned = "0P" if _holds_pointer(structs[name]) else "0i"
-            formats[name] = f"{aligned}{packer(structs[name]).size}s"
-    return structs
-
-
-def _field(line, formats, header) -> tuple[str, str]:
-    match = FIELD.fullmatch(line.strip())
-    kind = match[1].replace("const", "").strip() if match else ""
-    is_array = match and match[4]
-    if match and is_array and not match[2] and formats.get(kind, "").endswith("s"):
-        size = int(formats[kind][2:-1])
-        return match[3], f"{formats[kind][:2]}{size * int(match[4])}s"
-    if not match or is_array or not (match[2] or kind in formats):
-        raise ValueError(
-            f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a pointer, "
-            f"an int, an unsigned int, a float, or a struct ...Params declared above or an array "
-            f"of them."
-        )
-    return match[3], "P" if match[2] else formats[kind]
-
-
 class Word(NamedTuple):
     """A pointer or number of a struct.
 
@@ -93,6 +60,17 @@ class Word(NamedTuple):
     offset: int
 
 
+def struct_fields(sources: Mapping[str, str]) -> dict[str, Fields]:
+    """Returns the fields of every struct ``...Params`` in the headers ``sources`` {name: text}.
+
+    A struct that is a field of another must be declared before it.
+
+    Raises:
+        ValueError: if a field has a type that cannot be packed.
+    """
+    return {name: fields for name, (fields, _) in _structs(sources).items()}
+
+
 def words(sources: Mapping[str, str]) -> dict[str, list[Word]]:
     """Returns all pointers and numbers of every struct ``...Params``, in order, those of structs
     that are fields too.
@@ -102,28 +80,49 @@ def words(sources: Mapping[str, str]) -> dict[str, list[Word]]:
     Raises:
         ValueError: as `struct_fields`.
     """
-    structs, found = struct_fields(sources), {}
-    for text in sources.values():
+    return {name: words for name, (_, words) in _structs(sources).items()}
+
+
+def _structs(sources) -> dict[str, tuple[Fields, list[Word]]]:
+    structs, formats = {}, dict(FORMATS)
+    for header, text in sources.items():
         for name, body in STRUCT.findall(_without_comments(text)):
-            found[name], before = [], ""
-            for line, (field, kind) in zip(body.split(";"), structs[name]):
+            fields, found, before = [], [], ""
+            for line in body.split(";")[:-1]:
+                field, kind, inner, count = _field(line, formats, header)
+                fields.append((field, kind))
                 before += kind
-                match = FIELD.fullmatch(line.strip())
-                inner = None if match is None else match[1].replace("const", "").strip()
-                if kind.endswith("s") and inner is not None:
-                    size = int(kind[2:-1])
-                    start, count = struct.calcsize(before) - size, int((match and match[4]) or 0)
-                    for i in range(count or 1):
-                        title = f"{field}.{i}" if count else field
-                        at = start + i * (size // (count or 1))
-                        found[name] += [
-                            Word(f"{title}.{word.name}", word.kind, at + word.offset)
-                            for word in found[inner]
-                        ]
-                else:
-                    offset = struct.calcsize(before) - struct.calcsize(kind)
-                    found[name].append(Word(field, kind, offset))
-    return found
+                start = struct.calcsize(before) - struct.calcsize(kind.removeprefix("0P"))
+                if inner is None:
+                    found.append(Word(field, kind, start))
+                for k in range(count if inner else 0):
+                    title = f"{field}.{k}" if "[" in line else field
+                    at = start + k * (int(kind[2:-1]) // count)
+                    below = structs[inner][1]
+                    found += [Word(f"{title}.{w.name}", w.kind, at + w.offset) for w in below]
+            structs[name] = fields, found
+            aligned = "0P" if _holds_pointer(fields) else "0i"
+            formats[name] = f"{aligned}{packer(fields).size}s"
+    return structs
+
+
+def _field(line, formats, header) -> tuple[str, str, str | None, int]:
+    """Returns the name of a field, its format, and if it is of a struct that one's name, and how
+    many it is an array of.
+    """
+    match = FIELD.fullmatch(line.strip())
+    kind = match[1].replace("const", "").strip() if match else ""
+    known = formats.get(kind, "")
+    if match and not match[2] and known.endswith("s"):
+        count = int(match[4] or 1)
+        return match[3], f"{known[:2]}{int(known[2:-1]) * count}s", kind, count
+    if not match or match[4] or not (match[2] or known):
+        raise ValueError(
+            f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a pointer, "
+            f"an int, an unsigned int, a float, or a struct ...Params declared above or an array "
+            f"of them."
+        )
+    return match[3], "P" if match[2] else known, None, 1
 
 
 def packer(fields: Fields) -> struct.Struct:
