@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from megastep import arrdict, capture, contract, dotdict, spaces, types
+from megastep import arrdict, contract, dotdict, spaces
 
 
 class TinyEnv:
@@ -111,12 +111,6 @@ def test_a_valid_environment_passes():
     assert len(contract.rollout(TinyEnv(), 9)) == 10
 
 
-def test_wrappers_leave_optional_attributes_to_their_defaults():
-    env = capture.Captured(TinyEnv())
-    assert types.n_lanes(env) == 2 and types.optional(env, "fps") == 10
-    contract.rollout(env, 9)
-
-
 def test_a_world_that_is_no_arrdict_is_refused():
     env = TinyEnv()
     env.reset = lambda: (torch.zeros(2), {})
@@ -219,26 +213,6 @@ def test_privileged_is_optional_and_may_be_one_tensor(space):
             return world
 
     contract.rollout(Env(), 9)
-
-
-def test_privileged_needs_a_space():
-    env = TinyEnv()
-    env.privileged_space = None
-    with pytest.raises(contract.ContractError, match="privileged_space is not None"):
-        contract.rollout(env, 0)
-
-
-def test_random_actions_follow_the_space():
-    env = TinyEnv()
-    env.action_space = dict(move=spaces.MultiDiscrete(1, 7), fire=spaces.MultiDiscrete(2, 2))
-    draws = [
-        contract.random_actions(env, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)
-    ]
-    assert draws[0].move.shape == (2, 1) and draws[0].fire.shape == (2, 2)
-    assert contract.same(draws[0], draws[1])
-    generator = torch.Generator().manual_seed(1)
-    many = torch.stack([contract.random_actions(env, generator).move for _ in range(100)])
-    assert many.unique().tolist() == [0, 1, 2, 3, 4, 5, 6]
 
 
 def test_same_compares_keys_and_bits():

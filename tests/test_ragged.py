@@ -28,15 +28,6 @@ def test_class_follows_the_values(kind, ragged):
     assert repr(ragged) == f"{type(ragged).__name__}([3 1 2])"
 
 
-def test_attributes(ragged):
-    assert ragged.vals.tolist() == VALS
-    assert ragged.widths.tolist() == WIDTHS
-    assert ragged.starts.tolist() == [0, 3, 4]
-    assert ragged.ends.tolist() == [3, 4, 6]
-    assert ragged.inverse.tolist() == [0, 0, 0, 1, 2, 2]
-    assert len(ragged) == 3
-
-
 def test_an_integer_index_returns_a_subarray(ragged):
     assert [ragged[i].tolist() for i in range(3)] == [[0, 1, 2], [3], [4, 5]]
     assert ragged[-1].tolist() == [4, 5] and ragged[-3].tolist() == [0, 1, 2]
@@ -118,11 +109,6 @@ def test_values_can_be_written_but_not_replaced(ragged, name):
     ragged.vals[:] = 6
     ragged.vals += 1
     assert ragged[2].tolist() == [7, 7]
-
-
-def test_values_without_an_axis_are_refused(kind):
-    with pytest.raises(ValueError, match="at least one axis"):
-        Ragged(kind(3.0), [1])
 
 
 @pytest.mark.cuda

@@ -137,11 +137,6 @@ def test_each_environment_has_its_own_seed():
     assert not torch.equal(env.reset().obs, env.reset().obs), "a second reset begins other episodes"
 
 
-def test_default_device():
-    env = cart_pole(1, device=None)
-    assert env.device.type == ("cuda" if torch.cuda.is_available() else "cpu")
-
-
 def test_wrappers_and_arguments():
     name = f"{__name__}:Doubled"
     env = Gymnasium(

@@ -83,15 +83,6 @@ def test_count_of_failures_is_in_the_state():
     assert env.pop_restarts() == resumed.pop_restarts() > 0
 
 
-def test_environment_that_is_never_made_anew_counts_nothing():
-    assert make("Odd").pop_restarts() is None
-
-
-def test_own_vector_environment_makes_none_anew():
-    with pytest.raises(ValueError, match="env.restart_failed makes single environments anew"):
-        make("Odd", vectorization="own", restart_failed=1)
-
-
 def test_process_that_ends_is_named_with_its_environments():
     env = make("Exits", 2, vectorization="async")
     env.reset()

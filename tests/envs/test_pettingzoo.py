@@ -96,13 +96,6 @@ def test_each_agent_ends_by_itself_and_the_environment_with_the_last():
     assert (env.state(1).frame == 1).all()
 
 
-def test_constructor_without_a_render_mode():
-    env = PettingZoo(1, id=f"{__name__}:Undrawn", device="cpu")
-    assert env.reset().reset.all()
-    with pytest.raises(ValueError, match="renders no images"):
-        env.state(0)
-
-
 class Habits(Relay):
     """Ends after 3 steps, as `habit` says."""
 
