@@ -229,7 +229,7 @@ class EnvState:
                 array = np.frombuffer(value.cpu().numpy().tobytes(), dtype).reshape(shape)
                 self._set_array(path, now, array.copy())
             else:
-                self._set_tensor(path, now, value, *more, written)
+                self._set_tensor(path, now, value, more[0], written)
 
     def _set_value(self, path, now, value) -> None:
         if isinstance(now, enum.Enum):

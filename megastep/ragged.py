@@ -8,7 +8,6 @@
 """
 
 import operator
-from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, SupportsIndex
 
@@ -39,15 +38,9 @@ class Ragged(SetOnce):
         ValueError: if ``widths`` does not fit.
     """
 
-    vals: Array
-    widths: Array
-    inverse: Array
-    torchify: Callable[[], "RaggedTorch"]
-    numpyify: Callable[[], "RaggedNumpy"]
-    _asarray: Callable[..., Array]
-    _asarray_like: Callable[..., Array]
-    _int64: Callable[..., Array]
-    _cat: Callable[..., Array]
+    vals: Any
+    widths: Any
+    inverse: Any
 
     def __new__(cls, *args: object) -> "Self":
         if cls is Ragged:
@@ -56,10 +49,17 @@ class Ragged(SetOnce):
         return super().__new__(cls)
 
     def __init__(self, vals: Array, widths: Array):
-        self.vals = self._asarray(vals)
-        widths = self._asarray_like(widths)
+        widths = np.zeros(0, int) if len(widths) == 0 else widths
+        if isinstance(self, RaggedTorch):
+            self.vals = torch.as_tensor(vals)
+            widths = torch.as_tensor(widths, device=self.vals.device)
+        else:
+            self.vals = np.asarray(vals)
+            widths = np.asarray(widths.cpu() if isinstance(widths, torch.Tensor) else widths)
         _check(self.vals, widths)
-        self.widths = self._int64(widths)
+        integers: Any = widths
+        is_tensor = isinstance(integers, torch.Tensor)
+        self.widths = integers.long() if is_tensor else integers.astype(np.int64, copy=False)
 
     @cached_property
     def ends(self) -> Array:
@@ -90,10 +90,9 @@ class Ragged(SetOnce):
                     self.vals[starts[selected[0]] : ends[selected[-1]]],
                     self.widths[selected.start : selected.stop],
                 )
-            return Ragged(
-                self._cat([self.vals[starts[i] : ends[i]] for i in selected]),
-                self.widths[list(selected)],
-            )
+            parts = [self.vals[starts[i] : ends[i]] for i in selected]
+            joined = torch.cat if isinstance(self, RaggedTorch) else np.concatenate
+            return Ragged(joined(parts), self.widths[list(selected)])
         i = self._index(index)
         return self.vals[starts[i] : ends[i]]
 
@@ -121,19 +120,6 @@ class RaggedNumpy(Ragged):
 
     vals: np.ndarray
     widths: np.ndarray
-    starts: np.ndarray
-    ends: np.ndarray
-
-    _asarray = staticmethod(np.asarray)
-    _cat = staticmethod(np.concatenate)
-
-    def _asarray_like(self, widths: Array) -> np.ndarray:
-        widths = widths.cpu() if isinstance(widths, torch.Tensor) else widths
-        return np.zeros(0, int) if np.size(widths) == 0 else np.asarray(widths)
-
-    @staticmethod
-    def _int64(widths: np.ndarray) -> np.ndarray:
-        return widths.astype(np.int64, copy=False)
 
     @cached_property
     def inverse(self) -> np.ndarray:
@@ -155,19 +141,6 @@ class RaggedTorch(Ragged):
 
     vals: torch.Tensor
     widths: torch.Tensor
-    starts: torch.Tensor
-    ends: torch.Tensor
-
-    _asarray = staticmethod(torch.as_tensor)
-    _cat = staticmethod(torch.cat)
-
-    def _asarray_like(self, widths: Array) -> torch.Tensor:
-        widths = np.zeros(0, int) if len(widths) == 0 else widths
-        return torch.as_tensor(widths, device=self.vals.device)
-
-    @staticmethod
-    def _int64(widths: torch.Tensor) -> torch.Tensor:
-        return widths.to(torch.int64)
 
     @cached_property
     def inverse(self) -> torch.Tensor:
@@ -216,9 +189,9 @@ def _check(vals: Array, widths: Array) -> None:
         raise ValueError(
             f"the widths of a Ragged need exactly one axis, but have shape {tuple(widths.shape)}"
         )
-    if not _are_integers(widths):
+    listed = np.asarray(widths.tolist() or np.zeros(0, int))
+    if listed.dtype.kind not in "iu":
         raise ValueError(f"the widths of a Ragged must be integers, but are {widths.dtype}")
-    listed = np.array(widths.tolist(), int)
     if (listed < 0).any():
         i = int(listed.argmin())
         raise ValueError(
@@ -229,9 +202,3 @@ def _check(vals: Array, widths: Array) -> None:
             f"the widths of a Ragged must add up to its {len(vals)} vals, but add up to "
             f"{listed.sum()}"
         )
-
-
-def _are_integers(widths: Array) -> bool:
-    if isinstance(widths, torch.Tensor):
-        return not (widths.is_floating_point() or widths.is_complex() or widths.dtype == torch.bool)
-    return np.issubdtype(widths.dtype, np.integer)

@@ -98,7 +98,7 @@ class GuardedEnv(gymnasium.Wrapper):
             result = self._call("step", action) if self.is_watched else self.env.step(action)
             obs, reward, terminated, truncated, info = result
             if self.recorder is not None:
-                self.true_return += self.recorder.recorded_reward
+                self.true_return += float(self.recorder.recorded_reward)
             is_over = terminated or truncated
             news = self._news(info, (), is_over) if is_over or self.has_masks else NO_NEWS
         except Exception as error:
@@ -179,6 +179,7 @@ class HostedEnvs(gymnasium.vector.SyncVectorEnv):
 
     HAS_PLAIN_STATE = True
     max_episode_steps: int | None = None
+    envs: list[Any]  # GuardedEnvs
 
     def __init__(
         self,
