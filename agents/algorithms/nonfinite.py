@@ -230,21 +230,17 @@ def _sizes(floats) -> torch.Tensor:
     n_steps, n_lanes = min(map(len, tensors)), tensors[0].shape[1]
     sizes = tensors[0].new_zeros(n_steps + 1, len(tensors), n_lanes, dtype=torch.float32)
     for i, values in enumerate(tensors):
-        sizes[-len(values) :, i] = _largest(values)
+        numbers = values
+        if values.dim() > 2:
+            numbers = values.flatten(2)
+            if torch.finfo(values.dtype).max < LIMIT:
+                # float16 cannot hold numbers beyond LIMIT but inf, which a sum turns into inf or
+                # NaN; sums are five times as fast as maxima
+                numbers = numbers.sum(-1, dtype=torch.float32)
+            else:
+                numbers = torch.maximum(numbers.amax(-1), -numbers.amin(-1))
+        sizes[-len(values) :, i] = numbers.abs()
     return sizes.flatten(0, 1)
-
-
-def _largest(values) -> torch.Tensor:
-    """Returns the largest magnitude per time and lane, (T, B), NaN where there is a NaN."""
-    if values.dim() > 2:
-        values = values.flatten(2)
-        if torch.finfo(values.dtype).max < LIMIT:
-            # float16 cannot hold numbers beyond LIMIT but inf, which a sum turns into inf or NaN;
-            # sums are five times as fast as maxima
-            values = values.sum(-1, dtype=torch.float32)
-        else:
-            values = torch.maximum(values.amax(-1), -values.amin(-1))
-    return values.abs()
 
 
 def _value_at(floats, rollout, index, size) -> NonFiniteValue:

@@ -147,7 +147,7 @@ class ConcatIntake(nn.Module):
             obs: (..., *shape) per leaf.
             lanes: (M,) int64, lanes to select from leaves (T, B, ...). None: all.
         """
-        return self.projected(self.encode(obs, lanes))
+        return linear(self.encode(obs, lanes), self.project, self.activation)
 
     def projected(self, encoded: torch.Tensor) -> torch.Tensor:
         """Returns the features (..., width) of what `encode` returned."""

@@ -148,7 +148,8 @@ def head_terms(
     if prediction is not None:
         assert encoded is not None
         errors = prediction_error(prediction, features, encoded)
-    logits = output.masked(output(features), mask)
+    logits = output(features)
+    logits = logits if mask is None else output.masked(logits, mask)
     logprobs, entropies = output.terms(logits, actions)
     return logprobs, entropies, errors, critic.from_encoded(features, encoded)
 

@@ -40,6 +40,23 @@ def linear(
     return affine(x, layer.weight, layer.bias, activation)
 
 
+def _fits(x, weight, bias, activation=None) -> bool:
+    dtype, parts = compute_dtype(weight), x if isinstance(x, tuple) else (x,)
+    if activation not in (None, torch.relu):
+        return False
+    if parts[0].is_cuda:
+        return dtype == torch.bfloat16 and not any(part.shape[-1] % 8 for part in parts)
+    are_floats = weight.device.type == "cpu" and dtype == weight.dtype == torch.float32
+    return are_floats and len(weight) >= _MIN_OUTPUTS and is_built_for_cpu()
+
+
+def _by_kernel(x, weight, bias, activation=None) -> torch.Tensor:
+    parts = x if isinstance(x, tuple) else (x,)
+    parts = [part.to(compute_dtype(weight)) for part in parts]
+    return _Layer.apply(weight, bias, activation, *parts)
+
+
+@fused(_by_kernel, _fits)
 def affine(
     x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
     weight: torch.Tensor,
@@ -47,26 +64,8 @@ def affine(
     activation: Activation | None = None,
 ) -> torch.Tensor:
     """Does what `linear` does, for a weight (M, K) and a bias (M,)."""
-    dtype = compute_dtype(weight)
-    parts = [part.to(dtype) for part in (x if isinstance(x, tuple) else (x,))]
-    return _layer(weight, bias, activation, *parts)
-
-
-def _fits(weight, bias, activation, *parts) -> bool:
-    if activation not in (None, torch.relu):
-        return False
-    if parts[0].is_cuda:
-        are_words = not any(part.shape[-1] % 8 for part in parts)
-        return parts[0].dtype == torch.bfloat16 and are_words
-    tensors = weight, bias, *parts
-    are_floats = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
-    return are_floats and len(weight) >= _MIN_OUTPUTS and is_built_for_cpu()
-
-
-@fused(lambda *inputs: _Layer.apply(*inputs), _fits)
-def _layer(weight, bias, activation, *parts) -> torch.Tensor:
-    x = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
-    y = nn.functional.linear(x, weight, bias)
+    x = torch.cat(x, -1) if isinstance(x, tuple) else x
+    y = nn.functional.linear(x.to(compute_dtype(weight)), weight, bias)
     return y if activation is None else activation(y)
 
 
@@ -82,10 +81,13 @@ class _Layer(torch.autograd.Function):
         weight, bias = (cast(leaf, dtype, multiple=8 if on_gpu else 1) for leaf in (weight, bias))
         parts = [part.reshape(-1, part.shape[-1]) for part in parts]
         weights = weight.split([part.shape[1] for part in parts], 1)
-        multiply, last = product if on_gpu else _product_on_cpu, len(parts) - 1
-        y = multiply(parts[0], weights[0], bias, has_relu and not last)
-        for i in range(1, len(parts)):
-            multiply(parts[i], weights[i], None, has_relu and i == last, y)
+        y, last = None, len(parts) - 1
+        for i, (part, its_weight) in enumerate(zip(parts, weights, strict=True)):
+            its_bias, with_relu = bias if i == 0 else None, has_relu and i == last
+            if on_gpu:
+                y = product(part, its_weight, its_bias, with_relu, y)
+            else:
+                y = matmul(part, its_weight.T, y, its_bias, i > 0, with_relu)
         ctx.has_relu, ctx.on_gpu = has_relu, on_gpu
         ctx.save_for_backward(weight, *parts, *[y] * has_relu)
         return y[:, : ctx.n_outputs].view(*lead, ctx.n_outputs)
@@ -259,7 +261,3 @@ def matmul(
         **dict(adds=adds, has_relu=has_relu, n_threads=threads()),
     )
     return out
-
-
-def _product_on_cpu(x, weight, bias, has_relu, onto=None) -> torch.Tensor:
-    return matmul(x, weight.T, onto, bias, adds=onto is not None, has_relu=has_relu)

@@ -388,12 +388,15 @@ def _act_on_gpu(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdi
     return output[None], after
 
 
-def _acts_on_gpu(core, x, *_) -> bool:
-    is_step = len(x) == 1 and x.is_cuda and not torch.is_grad_enabled()
-    return is_step and compute_dtype(core.recurrent.weight) in DTYPES
-
-
-@fused(_act_on_gpu, _acts_on_gpu)
+@fused(
+    _act_on_gpu,
+    lambda core, x, *_: (
+        len(x) == 1
+        and x.is_cuda
+        and not torch.is_grad_enabled()
+        and compute_dtype(core.recurrent.weight) in DTYPES
+    ),
+)
 def lstm(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
     """Does `LSTM.forward`."""
     x = x.to(compute_dtype(core.recurrent.weight) if x.is_cuda else torch.float32)

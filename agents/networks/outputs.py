@@ -181,7 +181,7 @@ class MultiDiscreteOutput(Output):
         self, logits: torch.Tensor, actions: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Does the same as `Output.terms`."""
-        return super().terms(logits, actions)
+        return gather(logits, actions), self.entropy(logits)
 
     def sample(
         self, logits: torch.Tensor, generator: torch.Generator | None = None

@@ -253,7 +253,7 @@ class Rollout:
             value=self.values[:-1],
             last_value=self.values[-1],
             reward=self.reward,
-            reset=self.reset,
+            reset=self.starts[1:],
             terminal=self.terminal,
             truncated=self.truncated,
         )

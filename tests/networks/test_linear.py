@@ -239,7 +239,7 @@ def sum_of_parts(parts, weight, bias, has_relu):
 
 
 def by_kernel(parts, weight, bias, has_relu):
-    return linear._layer(weight, bias, torch.relu if has_relu else None, *parts)
+    return linear.affine(tuple(parts), weight, bias, torch.relu if has_relu else None)
 
 
 def with_gradients(function, lead, sizes, n_outputs, has_relu):
