@@ -29,7 +29,6 @@ __all__ = [
     "OpponentPool",
     "RolloutLike",
     "Row",
-    "RunLogger",
     "RunResult",
     "SaverLike",
     "StateDict",
@@ -236,21 +235,6 @@ class RunResult(NamedTuple):
     numbers: dict[str, float]
     film: Path | None = None
     table: Sequence[Mapping[str, str]] = ()
-
-
-class RunLogger(Protocol):
-    """Writes the metrics of a run: its JSON lines, and each logger that was chosen."""
-
-    def write(
-        self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]
-    ) -> None:
-        """Writes one report after ``step`` environment steps. Without metrics, only ``perf``."""
-
-    def sync(self) -> None:
-        """Flushes to disk what resuming reads. Raises OSError if it cannot be written."""
-
-    def close(self) -> None:
-        """Writes what is buffered and closes files and connections."""
 
 
 class SaverLike(Protocol):

@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.process_group import unhurried
 from megastep.agents.errors import UserError, shortened
 from megastep.agents.training.budget import reaches
+from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
@@ -83,8 +85,15 @@ class Callbacks(list[Any]):
         """Calls a hook. Returns whether no method returned False."""
         return False not in self(hook, *arguments)
 
-    def close(self) -> None:
-        """Calls `close` of those that have it."""
+    def close(self, env: Env) -> None:
+        """Calls `close` of those that have it, once an environment, which may be somebody else's
+        and fail at it, is closed.
+        """
+        try:
+            optional(env, "close")()
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+            warnings.warn(f"The environment could not be closed: {reason}", stacklevel=2)
         for one in self:
             getattr(one, "close", lambda: None)()
 

@@ -13,7 +13,6 @@ from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.runs.saver import NoSaver
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.callbacks import Callbacks, DriftCheck, Losses
-from megastep.agents.training.closing import close_env
 from megastep.agents.training.episodes import Episodes
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import Timing
@@ -241,8 +240,7 @@ class Trainer:
 
     def close(self) -> None:
         """Closes the environment and the callbacks, after training."""
-        close_env(self.env)
-        self.callbacks.close()
+        self.callbacks.close(self.env)
 
     def wait_for_collector(self) -> None:
         """Waits until an async collector has stopped stepping the environment."""

@@ -6,7 +6,6 @@ import pytest
 
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.runs import json_lines
-from megastep.agents.training.closing import close_env
 from megastep.envs.minimal import Minimal
 
 pytest.importorskip("gymnasium")
@@ -71,18 +70,6 @@ def test_environment_that_cannot_be_closed_is_a_warning(here, capsys):
     assert train.main([*words, "finish.evaluate=true", "finish.episodes=4"]) == 0
     assert "warning: The environment could not be closed: " in capsys.readouterr().err
     assert len([*here.glob("run/evaluations/*.json")]) == 1
-
-
-def test_environment_that_hangs_in_close_is_left():
-    class Env:
-        def close(self):
-            while True:
-                pass
-
-    with pytest.warns(
-        UserWarning, match="could not be closed: TimeoutError: it took more than 0.1"
-    ):
-        close_env(Env(), seconds=0.1)
 
 
 def test_evaluation_cuts_endless_episodes_off(here, capsys):

@@ -1,6 +1,6 @@
 """TensorBoard event files."""
 
-import queue
+import importlib
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,13 +14,11 @@ if TYPE_CHECKING:
 
 #: Of the film in TensorBoard, which shows GIFs: pixels, and frames.
 HEIGHT, N_FRAMES = 360, 100
+WRITER = "torch.utils.tensorboard"
 
 
 class TensorBoard:
-    """Writes TensorBoard event files to the folder `tensorboard` of a run.
-
-    A thread writes, and imports what it needs at the first report: training waits for neither. An
-    error of the thread is raised by the next `write` or `close`.
+    """Writes TensorBoard event files to the folder `tensorboard` of a run, in a thread.
 
     At the end of a run it has the settings as hyperparameters with the final numbers, the film, and
     the table of the evaluation.
@@ -32,31 +30,31 @@ class TensorBoard:
     """
 
     def __init__(self, folder: Path, step: int, config: dict | None = None):
-        self.config = config or {}
-        self.folder, self.step, self.error = folder / "tensorboard", step, None
-        self.thread, self.reports = (
-            threading.Thread(target=self._write_reports, daemon=True),
-            queue.SimpleQueue(),
-        )
+        self.folder, self.step, self.config = folder / "tensorboard", step, config or {}
+        self._writer: SummaryWriter | None = None
+        # which takes a second, while the first updates compile
+        self._import = threading.Thread(target=importlib.import_module, args=(WRITER,), daemon=True)
+        self._import.start()
 
-    def _write_reports(self) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-
+    @property
+    def writer(self) -> "SummaryWriter":
+        """The writer, whose own thread writes."""
+        if self._writer is None:
+            self._import.join()
             # which drops the events of that step, too
-            with SummaryWriter(str(self.folder), purge_step=self.step + 1) as writer:
-                while report := self.reports.get():
-                    step, values = report
-                    if isinstance(values, RunResult):
-                        self._finish(writer, step, values)
-                        continue
-                    for name, value in values.items():
-                        if not isinstance(value, str):
-                            writer.add_scalar(name, value, step)
-        except Exception as error:
-            self.error = error
+            purge_step = self.step + 1
+            module = importlib.import_module(WRITER)
+            self._writer = module.SummaryWriter(str(self.folder), purge_step=purge_step)
+        return self._writer
 
-    def _finish(self, writer: "SummaryWriter", step: int, result: RunResult) -> None:
+    def write(self, step: int, values: dict[str, float | str]) -> None:
+        """Writes one report."""
+        for name, value in values.items():
+            if not isinstance(value, str):
+                self.writer.add_scalar(name, value, step)
+
+    def finish(self, step: int, result: RunResult) -> None:
+        """Writes the result of the run."""
         from tensorboard.compat.proto import summary_pb2
 
         Summary = summary_pb2.Summary  # pyright: ignore[reportAttributeAccessIssue]
@@ -66,36 +64,18 @@ class TensorBoard:
             for name, value in spaces.leaves(self.config).items()
         }
         numbers = {f"final/{name}": value for name, value in result.numbers.items()}
-        writer.add_hparams(settings, numbers, run_name=".", global_step=step)
+        self.writer.add_hparams(settings, numbers, run_name=".", global_step=step)
         if result.table:
             head, rows = [*result.table[0]], [[*row.values()] for row in result.table]
-            writer.add_text("evaluation", console.table(head, rows, is_markdown=True), step)
+            self.writer.add_text("evaluation", console.table(head, rows, is_markdown=True), step)
         if result.film is not None:
             gif, (height, width) = video.small_gif(result.film, HEIGHT, N_FRAMES)
             shown = dict(height=height, width=width, colorspace=3, encoded_image_string=gif)
             value = Summary.Value(tag="film", image=Summary.Image(**shown))
-            assert writer.file_writer is not None
-            writer.file_writer.add_summary(Summary(value=[value]), step)
-
-    def finish(self, step: int, result: RunResult) -> None:
-        """Hands the result of the run to the thread."""
-        self._hand_over(step, result)
-
-    def write(self, step: int, values: dict[str, float | str]) -> None:
-        """Hands one report to the thread that writes. Raises what ended that thread."""
-        self._hand_over(step, values)
-
-    def _hand_over(self, step, values) -> None:
-        if self.error:
-            raise self.error
-        if not self.thread.ident:
-            self.thread.start()
-        self.reports.put((step, values))
+            assert self.writer.file_writer is not None
+            self.writer.file_writer.add_summary(Summary(value=[value]), step)
 
     def close(self) -> None:
-        """Waits until everything is written. Raises what ended the thread."""
-        self.reports.put(None)
-        if self.thread.ident:
-            self.thread.join()
-        if self.error:
-            raise self.error
+        """Waits until everything is written."""
+        if self._writer is not None:
+            self._writer.close()
