@@ -159,6 +159,15 @@ class Run:
 
     def train(self) -> None:
         """Trains, and turns what may happen into a sentence."""
+        if process_group.n_ranks() == 1:
+            return self._train()
+        # of a signal to all ranks, the first to get it stops them, and the others get it later
+        with signals.handled(lambda number: None) as numbers:
+            self._train()
+        if numbers:
+            signals.interrupt(numbers[0])
+
+    def _train(self) -> None:
         try:
             with (
                 env_failures.told(self.cfg.env, self.folder, self.saved, process_group.rank()),
