@@ -2,42 +2,41 @@
 
     python scripts/mutate.py --n 200 --seed 1
 
-A mutant is one changed operator, condition, number or return value, or one dropped statement, call
-or keyword; a fifth are in kernels' headers, whose mutants are compiled. On each, in a copy of the
+A mutant is one changed operator, condition, number or return value, or one dropped statement or
+keyword; a fifth are in kernels' headers, whose mutants are compiled. On each, in a copy of the
 checkout, the tests run that execute its line: first those of its folder, then others, the fastest
 first, up to --seconds. So a mutant that only a long test elsewhere finds counts as survived. Which
 tests execute a line is recorded once, in a run of all fast tests that must pass.
 
-With --results FILE, results are appended to a file of JSON lines, and mutants that it says were
-caught are left out: after writing tests a second call runs the survivors, and a longer sample
-continues a shorter one. docs/lab/equivalent_mutants.jsonl lists mutants that no test can find, with
-the reason, as two readers judged them.
-
-Libraries of this kind, mutmut and Cosmic Ray, change Python only.
+A mutant is named by a digest of its file, its line's text and its fault, so edits elsewhere do not
+change its name or its place in the seeded order. docs/lab/equivalent_mutants.jsonl lists those that
+no test can find. Libraries of this kind, mutmut and Cosmic Ray, change Python only.
 """
 
 import argparse
+import ast
 import collections
 import concurrent.futures
+import hashlib
 import itertools
 import json
 import os
 import queue
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
+from typing import NamedTuple
 
-from mutation import executed_lines, mutants
+from mutation import executed_lines
 
-ROOT = mutants.ROOT
+ROOT = Path(__file__).resolve().parents[1]
 EQUIVALENT = ROOT / "docs" / "lab" / "equivalent_mutants.jsonl"
 PYTHON = [f"agents/{name}" for name in "algorithms networks runs storage training selfplay".split()]
 PYTHON += [f"megastep/{name}" for name in "capture.py modules envs geometries engine".split()]
-HEADERS = ["megastep", "agents"]
 #: Ends although a thread that a failed test left still runs. Modules of the current folder do not
 #: come before those of Python, which a test is about.
 PYTEST = (
@@ -47,32 +46,216 @@ PYTEST = (
 #: Seconds: a mutant may run for ever. The same tests without it take a tenth.
 MIN_TIMEOUT, TIMEOUT_FACTOR = 300, 10
 
+SWAPS = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "+": "-", "-": "+"}
+SWAPS |= {"*": "/", "/": "*", "//": "*", "%": "*", "**": "*", "|": "&", "&": "|"}
+SWAPS |= {"and": "or", "or": "and", "&&": "||", "||": "&&"}
+SWAPS |= {"is": "is not", "is not": "is", "in": "not in", "not in": "in"}
+OPERATOR = re.compile(r"is\s+not|not\s+in|\b(?:is|in|and|or)\b|<<|>>|\*\*|//|[<>=!]=|[-<>+*/%|&^@]")
+#: In headers, formatters put blanks around binary operators and around nothing that looks like one.
+HEADER_SITE = re.compile(
+    r"(?<= )(?:[<>=!]=|&&|\|\||[-<>+*/%])(?= )|(?<![\w.])\d+(?:\.\d*f)?(?![\w.])"
+)
+HEADER_NOT_CODE = re.compile(r'//.*|/\*[\s\S]*?\*/|"[^"\n]*"|^#.*', re.M)
 
-def files_in(folders, suffix):
-    """Returns the files of a kind, except those that only a GPU runs."""
-    paths = [ROOT / folder for folder in folders]
-    paths = [path for each in paths for path in ([each] if each.is_file() else each.rglob("*"))]
-    return sorted(
-        str(path.relative_to(ROOT))
-        for path in paths
-        if path.suffix == suffix and "cuda" not in path.name
-    )
+
+# ---- Mutants ----
 
 
-def choose(n, seed, folders):
+class Mutant(NamedTuple):
+    """A fault: in the file at `path`, `after` replaces `before` at `start`.
+
+    `lines` are the first and last of the statement, from 1. The name of equal faults in equal lines
+    is the same but for their number.
+    """
+
+    path: str
+    start: int
+    before: str
+    after: str
+    lines: tuple[int, int]
+    name: str
+    fault: str
+
+    def __str__(self):
+        return f"{self.name} {self.path}:{self.lines[0]}: {self.fault}"
+
+    def text(self, original: str) -> str:
+        """Returns the file's text with the fault."""
+        return original[: self.start] + self.after + original[self.start + len(self.before) :]
+
+
+def mutants_of(path: str, text: str) -> list[Mutant]:
+    """Returns all mutants of a file."""
+    sites = _Sites(text).found if path.endswith(".py") else _header_sites(text)
+    mutants, copies, rows = [], collections.Counter(), text.splitlines()
+    for start, before, after, lines in sites:
+        line = rows[text.count("\n", 0, start)].strip()
+        fault = " ".join(f"{before} -> {after or 'nothing'}: {line}".split())
+        name = hashlib.sha256(f"{path}: {fault}: {copies[fault]}".encode()).hexdigest()[:12]
+        copies[fault] += 1
+        mutants.append(Mutant(path, start, before, after, lines, name, fault))
+    return mutants
+
+
+def _header_sites(text):
+    code = HEADER_NOT_CODE.sub(lambda match: re.sub(r"\S", "_", match[0]), text)
+    for match in HEADER_SITE.finditer(code):
+        before, line = match[0], code.count("\n", 0, match.start()) + 1
+        is_float = before.endswith("f")
+        other = f"{2 * float(before[:-1]) or 1.0}f" if is_float else f"{before}+1"
+        yield match.start(), before, SWAPS.get(before) or other, (line, line)
+
+
+class _Sites(ast.NodeVisitor):
+    """Lists (start, before, after, lines) of a Python file's faults.
+
+    Imports, annotations, decorators, texts and asserts have none.
+    """
+
+    def __init__(self, text):
+        self.text, self.found, self.lines = text, [], (1, 1)
+        rows = text.splitlines(keepends=True)
+        starts = [0, *itertools.accumulate(map(len, rows))]
+        # ast counts bytes
+        self.offset = lambda line, n: starts[line - 1] + len(rows[line - 1].encode()[:n].decode())
+        self.visit(ast.parse(text))
+
+    def add(self, node, after, end=None):
+        start = self.offset(node.lineno, node.col_offset)
+        end = end or self.offset(node.end_lineno, node.end_col_offset)
+        self.found.append((start, self.text[start:end], after, self.lines))
+
+    def swap(self, left, right):
+        """Swaps the operator between two nodes."""
+        start = self.offset(left.end_lineno, left.end_col_offset)
+        match = OPERATOR.search(self.text, start, self.offset(right.lineno, right.col_offset))
+        if match and (after := SWAPS.get(" ".join(match[0].split()))):
+            self.found.append((match.start(), match[0], after, self.lines))
+
+    def visit(self, node):
+        if isinstance(node, ast.stmt):
+            body = getattr(node, "body", None)
+            last = max(node.lineno, body[0].lineno - 1) if body else node.end_lineno
+            self.lines = node.lineno, last
+        super().visit(node)
+
+    def visit_FunctionDef(self, node):
+        for part in (*node.args.defaults, *filter(None, node.args.kw_defaults), *node.body):
+            self.visit(part)
+
+    def visit_Import(self, node):
+        pass
+
+    visit_ImportFrom = visit_Assert = visit_JoinedStr = visit_Import
+
+    def visit_AnnAssign(self, node):
+        if node.value:
+            self.visit(node.value)
+
+    def visit_Raise(self, node):
+        self.add(node, "pass")
+
+    def visit_Expr(self, node):
+        if not isinstance(node.value, ast.Constant):
+            self.add(node, "pass")
+            self.visit(node.value)
+
+    def visit_AugAssign(self, node):
+        self.add(node, "pass")
+        self.visit(node.value)
+
+    def visit_Return(self, node):
+        if node.value:
+            self.add(node.value, "None")
+            self.visit(node.value)
+
+    def visit_If(self, node):
+        if "TYPE_CHECKING" not in ast.unparse(node.test):
+            self.add(node.test, "True")
+            self.add(node.test, "False")
+            self.generic_visit(node)
+
+    visit_IfExp = visit_If
+
+    def visit_Compare(self, node):
+        for left, right in zip([node.left, *node.comparators], node.comparators):
+            self.swap(left, right)
+        self.generic_visit(node)
+
+    def visit_BoolOp(self, node):
+        for left, right in itertools.pairwise(node.values):
+            self.swap(left, right)
+        self.generic_visit(node)
+
+    def visit_BinOp(self, node):
+        self.swap(node.left, node.right)
+        self.generic_visit(node)
+
+    def visit_Constant(self, node):
+        if isinstance(node.value, bool):
+            self.add(node, str(not node.value))
+        elif isinstance(node.value, int):
+            self.add(node, str(node.value + 1))
+        elif isinstance(node.value, float) and not 0 < node.value < 1e-4:  # which guards a divisor
+            self.add(node, str(2 * node.value or 1.0))
+
+    def visit_Call(self, node):
+        for keyword in node.keywords:
+            if keyword.arg:
+                end = self.offset(keyword.end_lineno, keyword.end_col_offset)
+                self.add(keyword, "", re.compile(r",?\s*").match(self.text, end).end())
+        self.generic_visit(node)
+
+
+def in_order(files: dict[str, str], seed: int):
+    """Yields one mutant of each line that has any, in an order of which each start is a sample."""
+
+    def order(mutant):
+        return hashlib.sha256(f"{seed} {mutant.name}".encode()).digest()
+
+    by_line = collections.defaultdict(list)
+    for path, text in files.items():
+        for mutant in mutants_of(path, text):
+            by_line[path, text.count("\n", 0, mutant.start)].append(mutant)
+    for mutant in sorted((min(mutants, key=order) for mutants in by_line.values()), key=order):
+        if not mutant.path.endswith(".py") or _is_another_program(mutant, files[mutant.path]):
+            yield mutant
+
+
+def _is_another_program(mutant, original):
+    try:
+        return ast.dump(ast.parse(mutant.text(original))) != ast.dump(ast.parse(original))
+    except SyntaxError:
+        return False
+
+
+def choose(n: int, seed: int, folders: list[str]) -> list[Mutant]:
     """Returns n mutants: four of Python, then one of a kernel, and so on."""
-    python = mutants.in_order(files_in(folders or PYTHON, ".py"), seed)
-    headers = mutants.in_order(files_in(folders or HEADERS, ".h"), seed)
+
+    def files_in(parts, suffix):
+        """Those of a kind, except those that only a GPU runs."""
+        paths = [ROOT / part for part in parts]
+        paths = [path for one in paths for path in ([one] if one.is_file() else one.rglob("*"))]
+        return {
+            str(path.relative_to(ROOT)): path.read_text()
+            for path in sorted(paths)
+            if path.suffix == suffix and "cuda" not in path.name
+        }
+
+    python = in_order(files_in(folders or PYTHON, ".py"), seed)
+    headers = in_order(files_in(folders or ["megastep", "agents"], ".h"), seed)
     chosen = (next(headers if i % 5 == 4 else python, None) for i in range(n))
     return [mutant for mutant in chosen if mutant]
+
+
+# ---- Tests ----
 
 
 def tests_of(mutant, lines, seconds, limit=float("inf")):
     """Returns files of tests to run on a mutant in turn: ([near ones], [others]). The others are
     the fastest that together take `limit` seconds.
     """
-    executing = lines.get(mutant.path, {})
-    first, last = mutant.lines
+    executing, (first, last) = lines.get(mutant.path, {}), mutant.lines
     tests = {test for line in range(first, last + 1) for test in executing.get(line, ())}
     if not tests and any(line in executing for line in range(first, last + 1)):
         tests = {test for each in executing.values() for test in each}  # it runs at import
@@ -89,12 +272,9 @@ def tests_of(mutant, lines, seconds, limit=float("inf")):
         is_named = any(part in Path(test).stem for part in names)
         return is_named or bool(executing) and Path(test).parent in rooms
 
-    def duration(test):
-        return seconds.get(test, 0.0)
-
-    near = sorted(filter(is_near, tests), key=duration)
-    others = sorted(tests - {*near}, key=duration)
-    totals = itertools.accumulate(map(duration, others))
+    near = sorted(filter(is_near, tests), key=lambda test: seconds.get(test, 0.0))
+    others = sorted(tests - {*near}, key=lambda test: seconds.get(test, 0.0))
+    totals = itertools.accumulate(seconds.get(test, 0.0) for test in others)
     return near, [test for test, total in zip(others, totals) if total <= limit]
 
 
@@ -135,38 +315,22 @@ def run_tests(folder, tests, *options, timeout=None):
     return (None, "") if output is None else (process.returncode, output)
 
 
-def record_lines(folder, into, jobs):
-    """Runs all fast tests and records which lines they execute."""
-    into.mkdir(parents=True)
-    status, output = run_tests(
-        folder, [], f"-n{jobs}", "-p", "mutation.executed_lines", f"--executed-lines={into}"
-    )
-    if status:
-        shutil.rmtree(into)
-        sys.exit(f"The tests fail without any fault:\n{output[-3000:]}")
-
-
 def result_of(mutant, folder, lines, seconds, limit):
-    """Returns "caught", "timeout" or "survived", and the test that failed."""
+    """Returns "caught", "timeout" or "survived"."""
     path = folder / mutant.path
     original = path.read_text()
-    path.write_text(mutant.text())
+    path.write_text(mutant.text(original))
     try:
         for tests in filter(None, tests_of(mutant, lines, seconds, limit)):
             timeout = TIMEOUT_FACTOR * sum(seconds.get(test, 0.0) for test in tests)
-            status, output = run_tests(folder, tests, "-n0", timeout=max(MIN_TIMEOUT, timeout))
+            status, _ = run_tests(folder, tests, "-n0", timeout=max(MIN_TIMEOUT, timeout))
             if status is None:
-                return "timeout", ""
+                return "timeout"
             if status not in (0, 5):  # 5: all of them need a GPU, or are slow
-                failed = [row for row in output.splitlines() if row.startswith(("FAILED", "ERROR"))]
-                return "caught", failed[0] if failed else output[-200:]
+                return "caught"
     finally:
         path.write_text(original)
-    return "survived", ""
-
-
-def read_rows(path):
-    return [json.loads(row) for row in path.read_text().splitlines()] if path.exists() else []
+    return "survived"
 
 
 def main():
@@ -175,21 +339,12 @@ def main():
     parser.add_argument("--n", type=int, default=200, help="number of mutants")
     parser.add_argument("--seed", type=int, default=1, help="of the sample")
     parser.add_argument("--jobs", type=int, default=1, help="mutants tested at a time")
-    parser.add_argument(
-        "--seconds", type=float, default=60, help="of tests of other folders that run on a mutant"
-    )
-    parser.add_argument("--minutes", type=float, help="start no mutant after so many")
-    parser.add_argument("--results", type=Path, help="file that keeps the results")
+    parser.add_argument("--seconds", type=float, default=60, help="of tests of other folders")
     parser.add_argument("--lines", type=Path, help="folder that keeps which lines tests execute")
-    parser.add_argument("--list", action="store_true", help="print the sample and stop")
     options = parser.parse_args()
     sample = choose(options.n, options.seed, options.folders)
-    if options.list:
-        print(*sample, sep="\n")
-        return
-    rows = read_rows(options.results) if options.results else []
-    results = {row["name"]: row["result"] for row in rows}
-    results |= {row["name"]: "equivalent" for row in read_rows(EQUIVALENT)}
+    rows = EQUIVALENT.read_text().splitlines() if EQUIVALENT.exists() else []
+    equivalent, counts = {json.loads(row)["name"] for row in rows}, collections.Counter()
 
     with tempfile.TemporaryDirectory(prefix="mutants-") as base:
         base, copies = Path(base), queue.Queue()
@@ -198,41 +353,25 @@ def main():
             copies.put(copied(base / str(job)))
         record = options.lines or base / "lines"
         if not record.exists():
-            record_lines(base / "0", record, options.jobs)
+            record.mkdir(parents=True)
+            plugin = "-p", "mutation.executed_lines", f"--executed-lines={record}"
+            status, output = run_tests(base / "0", [], f"-n{options.jobs}", *plugin)
+            if status:
+                shutil.rmtree(record)
+                sys.exit(f"The tests fail without any fault:\n{output[-3000:]}")
         seconds, lines = executed_lines.read(record)
-        end = time.monotonic() + 60 * options.minutes if options.minutes else float("inf")
 
         def test(mutant):
-            if results.get(mutant.name, "survived") != "survived" or time.monotonic() > end:
-                return
-            folder, start = copies.get(), time.monotonic()
-            result, failed = result_of(mutant, folder, lines, seconds, options.seconds)
+            folder = copies.get()
+            result = result_of(mutant, folder, lines, seconds, options.seconds)
             copies.put(folder)
-            results[mutant.name] = result
-            row = dict(name=mutant.name, result=result, mutant=str(mutant), failed=failed)
-            row["seconds"] = round(time.monotonic() - start, 1)
-            if options.results:
-                with open(options.results, "a") as file:
-                    file.write(json.dumps(row) + "\n")
+            counts[result] += 1
             print(f"{result:8} {mutant}", flush=True)
 
         with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-            try:
-                list(pool.map(test, sample))
-            except KeyboardInterrupt:  # the mutants that are being tested are the last
-                pool.shutdown(cancel_futures=True)
-    report(sample, results)
-
-
-def report(sample, results):
-    """Prints the survivors and the counts."""
-    counts = collections.Counter(results.get(mutant.name, "not run") for mutant in sample)
-    for mutant in sample:
-        if results.get(mutant.name) == "survived":
-            print(f"SURVIVES {mutant}")
+            [*pool.map(test, [mutant for mutant in sample if mutant.name not in equivalent])]
     caught = counts["caught"] + counts["timeout"]
     decided = caught + counts["survived"]
-    print(", ".join(f"{count} {result}" for result, count in counts.items()))
     print(f"{caught} of {decided} mutants were caught: {caught / max(decided, 1):.1%}")
 
 
