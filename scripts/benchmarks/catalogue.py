@@ -6,14 +6,13 @@ Each is a function of a device that yields measurements. Its docstring is printe
 from collections.abc import Callable, Iterator
 
 from adapter_steps import adapters
-from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
 from nsight_counters import counters
 from populations import copies, members, small_members
-from scaling import ranks, scaling
+from scaling import scaling
 from shortest_paths import paths
-from startup_times import compile_kernels, first_step, startup
+from startup_times import startup
 from training import train
 
 BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
@@ -29,14 +28,10 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "adapters": adapters,
     "pong": pong,
     "paths": paths,
-    "checkpoints": checkpoints,
-    "compile": compile_kernels,
-    "first": first_step,
     "startup": startup,
     "cpu": cpu,
     "train": train,
     "scaling": scaling,
-    "ranks": ranks,
     "members": members,
     "small_members": small_members,
     "copies": copies,

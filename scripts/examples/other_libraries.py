@@ -1,7 +1,7 @@
 """Trains with other libraries on megastep's environments, and compares with random actions.
 
     pip install 'megastep-flatland[sb3,torchrl,rsl-rl,skrl]'
-    python scripts/examples/other_libraries.py sb3 sb3_recurrent torchrl rsl_rl skrl gymnasium
+    python scripts/examples/other_libraries.py sb3 sb3_recurrent torchrl rsl_rl skrl
     python scripts/examples/other_libraries.py rsl_rl --device cuda --scale 10
 
 Each trains for its budget of samples, times `--scale`, and then plays one episode in each of 512
@@ -22,7 +22,6 @@ from megastep import adapters, envs, spaces, toys
 N_EPISODES = 512
 #: Samples of each library's training.
 BUDGETS = dict(
-    gymnasium=1_000_000,
     sb3=500_000,
     sb3_recurrent=120_000,
     torchrl=500_000,
@@ -65,13 +64,6 @@ def score(env, act, metric, seed=1000):
 def flat(obs):
     """Observations, a tensor or a dict of them, as (B, D) float32."""
     return torch.cat([leaf.flatten(1).float() for leaf in spaces.leaves(obs).values()], 1)
-
-
-def train_gymnasium(samples, device):
-    import ppo_gymnasium
-
-    agent = ppo_gymnasium.train(samples=samples, device=device)
-    return lambda obs, starts: agent.policy(obs).sample()
 
 
 def train_sb3(samples, device):

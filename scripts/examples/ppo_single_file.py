@@ -25,7 +25,6 @@ import torch
 
 from megastep import engine
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.learner import check_minibatches
 from megastep.agents.algorithms.masked_stats import (
     explained_variance,
     masked_mean,
@@ -202,7 +201,8 @@ if __name__ == "__main__":
     settings, arguments = parse()
     try:
         env = make_env(settings, arguments)
-        check_minibatches(settings.n_minibatches, n_lanes(env))
+        if n_lanes(env) < settings.n_minibatches:
+            raise ValueError(f"{n_lanes(env)} lanes cannot be split into more minibatches")
     except (ValueError, TypeError, engine.EngineError) as error:
         print(f"ppo_single_file.py: {error}", file=sys.stderr)
         sys.exit(2)

@@ -130,8 +130,6 @@ def test_step_benchmark_measures_explorer_as_trained(tiny_benchmarks, monkeypatc
 @pytest.mark.parametrize(
     ("name", "n_records"),
     [
-        pytest.param("compile", 1, marks=pytest.mark.slow),
-        pytest.param("first", 2, marks=pytest.mark.nightly),
         pytest.param("startup", 1, marks=pytest.mark.nightly),
     ],
 )

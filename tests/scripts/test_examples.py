@@ -41,7 +41,7 @@ def test_command_line(monkeypatch, capsys):
     run(f"--env megastep.envs.pointgoal:PointGoal {small} {homes}")
     for words, sentence in {
         "--env megastep.envs.pong:Pongo": "did you mean Pong?",
-        "--env megastep.envs.pong:Pong --n-envs 3": "3 lanes cannot be split",
+        "--env megastep.envs.pong:Pong --n-envs 3": "3 lanes cannot be split into more minibatches",
         "--env megastep.envs.pong:Pong limit=0": "limit",
         "--device tpu": "tpu",
     }.items():
