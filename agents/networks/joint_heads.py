@@ -106,7 +106,7 @@ class _JointHeads(torch.autograd.Function):
 
 
 def _terms_on_gpu(output, critic, prediction, features, encoded, actions, mask=None) -> Terms:
-    sizes = HeadSizes(len(prediction.weight), *output.shape, features.shape[-1])
+    sizes = HeadSizes(len(prediction.weight), output.shape[0], output.shape[1], features.shape[-1])
     inputs = features, critic.intake.projected(encoded)
     layers = prediction, output.linear, critic.hidden, critic.output.linear
     parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]

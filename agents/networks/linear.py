@@ -88,6 +88,7 @@ class _Layer(torch.autograd.Function):
                 y = product(part, its_weight, its_bias, with_relu, y)
             else:
                 y = matmul(part, its_weight.T, y, its_bias, i > 0, with_relu)
+        assert y is not None
         ctx.has_relu, ctx.on_gpu = has_relu, on_gpu
         ctx.save_for_backward(weight, *parts, *[y] * has_relu)
         return y[:, : ctx.n_outputs].view(*lead, ctx.n_outputs)

@@ -130,6 +130,7 @@ def _backward_in_steps(input_weight, weight, reset, saved, d_outputs, d_cell) ->
             **dict(d_gates=d_gates[t], d_cell=d_cell),
         )
         next_reset, d_hidden = reset[t], d_gates[t] @ weight
+    assert d_hidden is not None
     is_reset = reset[0, :, None]
     d_states = d_hidden.float().masked_fill_(is_reset, 0.0), d_cell.masked_fill_(is_reset, 0.0)
     return Gradients(d_gates, d_gates.flatten(0, 1).sum(0), *d_states)

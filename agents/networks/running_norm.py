@@ -105,10 +105,9 @@ def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
             **dict(is_counted=is_counted, moments=results, n_counted=n_counted, n_lanes=n_lanes),
         )
         pairs = results.split([2 * size for size in sizes])
-        moments += [
-            (n_counted, *(each.view_as(norm.mean) for each in pair.chunk(2)))
-            for norm, pair in zip(norms[part], pairs, strict=True)
-        ]
+        for norm, pair in zip(norms[part], pairs, strict=True):
+            mean, variance = (each.view_as(norm.mean) for each in pair.chunk(2))
+            moments.append((n_counted, mean, variance))
     return moments
 
 

@@ -12,7 +12,7 @@ once its last row has been stored, and until its first row is overwritten.
 import math
 
 import torch
-from torch.utils._pytree import tree_flatten, tree_unflatten
+from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.fused import fused
@@ -53,7 +53,7 @@ _CONVERSIONS = {
 # ---- On a GPU ----
 
 
-def _parts(replay) -> tuple[list[Column], list[int], object]:
+def _parts(replay) -> tuple[list[Column], list[int], TreeSpec]:
     """Returns the columns of a sequence's tensors, how many rows it has of each, and their tree."""
     columns, n_rows = [], []
     tree = arrdict(replay.columns, state=replay.state)

@@ -125,10 +125,6 @@ class Rollout:
         copy_all(self._of_world(t, world))
         return self.world(t)
 
-    def store_transition(self, t: int, world: arrdict) -> None:
-        """Stores reward, episode end and metrics of the world after the action of time t."""
-        copy_all(self._of_transition(t, world))
-
     def store_decision(self, t: int, decision: Mapping) -> None:
         """Stores the actions of time t, and log-probabilities if the decision has them. Call it
         before the environment steps, which may change actions in place.

@@ -279,29 +279,6 @@ def test_bad_settings_raise(settings, cure):
 
 
 @pytest.mark.cuda
-def test_captured_update_matches_eager():
-    ends = []
-    for graph in (False, True):
-        learner, collect = make("cuda", graph=graph, target_period=3, width=32)
-        losses = update(learner, collect, 7)
-        ends.append((weights(learner.policy), losses["loss/q"], losses["loss/priority_mean"]))
-    assert learner.cuda_graph.graph is not None
-    testing.assert_close(ends[1], ends[0], rtol=1e-2, atol=1e-3)  # bfloat16 products
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("width", [32, 256])
-def test_same_seed_gives_same_bits(width):
-    ends = []
-    for _ in range(2):
-        learner, collect = make("cuda", graph=True, width=width, target_period=3)
-        losses = update(learner, collect, 6)
-        ends.append([weights(learner.policy), weights(learner.target), *losses.values()])
-    for one, other in zip(*ends, strict=True):
-        assert torch.equal(one, other)
-
-
-@pytest.mark.cuda
 @pytest.mark.parametrize("core", ["lstm", "gru"])
 def test_fused_update_matches_the_cpus(core):
     """The same minibatch has the same loss, priorities and gradients, but for bfloat16."""

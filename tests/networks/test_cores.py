@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from megastep.agents.networks.cores import CORES, GRU, Stack, make_core, with_residual
+from megastep.agents.networks.cores import CORES, GRU, make_core, with_residual
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 from tests.helpers.recurrent import assert_close as assert_close_by_size
@@ -112,19 +112,6 @@ def test_gradients_stop_at_reset(name, layers, device):
 
 @each_depth
 @each_core
-@pytest.mark.parametrize("call", [run, with_residual])
-def test_gradient_can_be_computed_twice(name, layers, device, call):
-    core, x, reset, state = case(name, layers, device)
-    inputs = [x.requires_grad_(), *(leaf.requires_grad_() for leaf in leaves(state))]
-    outputs, after = call(core, x, reset, state)
-    loss = outputs.square().sum() + sum(leaf.sum() for leaf in leaves(after))
-    inputs += core.parameters()
-    first, second = (torch.autograd.grad(loss, inputs, retain_graph=True) for _ in range(2))
-    assert all(map(torch.equal, first, second))
-
-
-@each_depth
-@each_core
 def test_unroll_matches_steps(name, layers, device):
     core, x, reset, state = case(name, layers, device)
     outputs, after = run(core, x, reset, state)
@@ -186,15 +173,6 @@ def test_residual_connection_around_core(name, layers, device, width):
             assert_close(output[0].float(), results[0][0][t], device)
 
 
-@each_core
-def test_one_layer_is_not_stacked(name):
-    core, alone = case(name, layers=1)[0], CORES[name]
-    assert type(core) is alone and list(core.state_dict()) == list(alone(W).state_dict())
-    stack = make_core(name, W, 2)
-    assert isinstance(stack, Stack) and list(stack.initial(B)) == ["0", "1"]
-    assert list(stack.state_dict()) == [f"{i}.{key}" for i in (0, 1) for key in core.state_dict()]
-
-
 def test_gru_matches_torch():
     core, x, _, state = case("gru", layers=1)
     torch_gru = nn.GRU(W, W)
@@ -209,12 +187,6 @@ def test_gru_matches_torch():
     expected, last = torch_gru(x, state.output[None])
     torch.testing.assert_close(outputs, expected, **CLOSE["cpu"])
     torch.testing.assert_close(after.output, last[0], **CLOSE["cpu"])
-
-
-@each_depth
-def test_feedforward_has_no_hidden_state(layers):
-    core, x, reset, state = case("none", layers)
-    assert not leaves(state) and not leaves(core(x, reset, state)[1])
 
 
 def test_unknown_core_names_nearest():

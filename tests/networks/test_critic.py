@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
 
@@ -104,11 +103,6 @@ def test_initial_actor_weights_do_not_depend_on_critic(critic):
     assert names and all(torch.equal(weights[name], expected[name]) for name in names)
 
 
-def test_unknown_critic_raises():
-    with pytest.raises(ValueError, match="critic: 'foo'.*asymmetric, plain"):
-        policy_of("foo")
-
-
 # ---- The value ----
 
 
@@ -122,20 +116,6 @@ def test_only_asymmetric_critic_sees_privileged():
     values = [plain.value(features, privileged) for privileged in (one, one * math.nan, None)]
     assert torch.equal(values[0], values[1]) and torch.equal(values[0], values[2])
     assert plain.privileged_space is None and not hasattr(plain, "prediction")
-
-
-def test_critics_are_equal_without_privileged_space():
-    asymmetric, plain = (
-        Policy(OBS, MOVES, critic=critic, width=WIDTH) for critic in ("asymmetric", "plain")
-    )
-    weights, expected = asymmetric.state_dict(), plain.state_dict()
-    assert weights.keys() == expected.keys()
-    assert all(torch.equal(weights[name], expected[name]) for name in weights)
-
-
-def test_critic_takes_bare_space():
-    critic = Critic(WIDTH, spaces.MultiVector(1, 3))
-    assert critic(torch.randn(B, WIDTH), torch.randn(B, 1, 3)).shape == (B,)
 
 
 # ---- The auxiliary prediction ----

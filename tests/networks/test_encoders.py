@@ -220,16 +220,6 @@ def test_kernel_reads_parts_of_wider_rows(start, n_columns):
 
 
 @pytest.mark.cuda
-def test_kernel_keeps_nan_to_the_columns_that_see_it():
-    torch.manual_seed(1)
-    weights = weights_of(encoders.Conv(spaces.MultiImage(1, 3, 1, 128)))
-    rows = torch.randn(40, 3, 128).to("cuda", BF16)
-    rows[7, 1, 64] = torch.nan  # hidden columns 16 and 17, columns 8 and 9 of the features
-    isnan = kernels.conv_forward(rows, *weights).unflatten(1, (32, -1)).isnan()
-    assert isnan[7, :, 8:10].all() and isnan.sum() == 2 * 32
-
-
-@pytest.mark.cuda
 @pytest.mark.parametrize("shape", [(1, 3, 1, 128), (2, 1, 2, 64)])
 def test_gradients_through_the_kernel(shape, monkeypatch):
     torch.manual_seed(1)

@@ -4,7 +4,6 @@ Kernels run on a GPU, and on a CPU from the same source (`tests/helpers/cuda_on_
 """
 
 import contextlib
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -435,35 +434,7 @@ def test_cpu_sequence_has_the_same_bits_with_any_number_of_threads():
         assert all(map(torch.equal, results[0], other))
 
 
-def test_large_gates_saturate_on_cpu():
-    # without weights, gates are their biases: input, forget and output 1, candidate 1
-    x, zeros = torch.zeros(1, 1, W), torch.zeros(1, W)
-    weights = torch.zeros(4 * W, W), torch.full((4 * W,), 1e4), torch.zeros(4 * W, W)
-    reset = torch.zeros(1, 1, dtype=torch.bool)
-    outputs, _, cell = lstm_module._by(ON_CPU)(x, *weights, reset, zeros, zeros + 2, False)
-    torch.testing.assert_close(cell, torch.full((1, W), 3.0), **CLOSE)
-    torch.testing.assert_close(outputs[0], torch.full((1, W), 3.0).tanh(), **CLOSE)
-
-
 def test_widths_that_kernels_do_not_take_use_pytorch():
     lstm = LSTM(17)
     output, _ = lstm(torch.zeros(1, 1, 17), torch.zeros(1, 1, dtype=bool), lstm.initial(1))
     assert output.isfinite().all()
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("major, shared_memory", [(12, 101_376), (8, 166_912)])
-def test_gpus_without_clusters_or_memory_take_step_by_step(monkeypatch, major, shared_memory):
-    x = torch.zeros(2, 3, 256, dtype=torch.bfloat16, device="cuda")
-    gpu = SimpleNamespace(major=major, shared_memory_per_block_optin=shared_memory)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
-    assert not lstm_module._fits_clusters(x)
-
-
-@pytest.mark.cuda
-def test_sequence_of_no_lanes():
-    lstm = LSTM(256).cuda()
-    x, reset = torch.zeros(2, 0, 256, device="cuda"), torch.zeros(2, 0, device="cuda").bool()
-    with torch.autocast("cuda", torch.bfloat16), torch.no_grad():
-        outputs, state = lstm(x, reset, lstm.initial(0, "cuda"))
-    assert outputs.shape == (2, 0, 256) and state.cell.shape == (0, 256)

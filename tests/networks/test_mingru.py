@@ -3,8 +3,6 @@
 Kernels run on a GPU, and on a CPU from the same source (`tests/helpers/cuda_on_cpu.py`).
 """
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 from torch.nn import functional
@@ -134,38 +132,6 @@ def test_wrong_shapes_raise():
         core(x, reset, state[:1])
     with pytest.raises(ValueError, match=r"x is \(0, 5, 16\), but a sequence has at least one"):
         core(x[:0], reset[:0], state)
-
-
-@pytest.mark.parametrize("uses", ["outputs", "last", "both"])
-@pytest.mark.parametrize("is_residual", [False, True])
-def test_gradients_match_finite_differences(uses, is_residual):
-    """In float32, along one direction of all inputs and weights together."""
-    torch.manual_seed(1)
-    core, reset, start = MinGRU(W), *case()[1:]
-    x = torch.randn(T, B, W, requires_grad=True)
-    inputs = x, start, *core.parameters()
-    directions = [torch.randn_like(tensor) for tensor in inputs]
-    weights = torch.randn(T, B, W), torch.randn(B, W)
-
-    def loss(step):
-        names = "input.weight", "input.bias"
-        x, start, *parameters = (
-            tensor + step * d for tensor, d in zip(inputs, directions, strict=True)
-        )
-        outputs, after = torch.func.functional_call(
-            core,
-            dict(zip(names, parameters, strict=True)),
-            (x, reset, arrdict(output=start), is_residual),
-        )
-        terms = [(w * y).sum() for w, y in zip(weights, (outputs, after.output), strict=True)]
-        return {"outputs": terms[0], "last": terms[1], "both": sum(terms)}[uses]
-
-    gradients = torch.autograd.grad(loss(0.0), inputs)
-    slope = sum((g * d).sum() for g, d in zip(gradients, directions, strict=True))
-    with torch.no_grad():
-        measured = (loss(1e-3) - loss(-1e-3)) / 2e-3
-    # float32 sums of some 700 terms, and the step's square
-    torch.testing.assert_close(slope, measured, rtol=1e-2, atol=0.1)
 
 
 # ---- The scan ----
@@ -419,19 +385,6 @@ def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
     assert len(calls) == 2
 
 
-def test_the_kernel_takes_one_step_of_the_widths_it_has(monkeypatch):
-    hopper = SimpleNamespace(major=9, shared_memory_per_block_optin=227 * 1024)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: hopper)
-    on_gpu = dict(is_cuda=True, dtype=torch.bfloat16, device="cuda")
-
-    def is_supported(n_steps, width):
-        return mingru_step.fits(SimpleNamespace(shape=(n_steps, B, width), **on_gpu))
-
-    width = mingru_step.WIDTHS[0]
-    assert is_supported(1, width)
-    assert not is_supported(2, width) and not is_supported(1, width + 1)
-
-
 def step_inputs(n_lanes, width, is_exact=False):
     """Returns x (1, B, W), weight, bias, resets (1, B) and a state that is NaN where it is reset.
 
@@ -508,46 +461,3 @@ def test_step_matches_the_plain_form_and_is_repeatable(n_lanes, width, is_residu
     for result, other in zip(results, by_two, strict=True):
         # below the rounding of all gates to 8 bits
         assert (result.float() - other.float()).norm() < 4e-3 * other.float().norm()
-
-
-@pytest.mark.cuda
-def test_step_keeps_nan_to_its_lane():
-    inputs = [leaf.cuda() for leaf in step_inputs(300, 256)]
-    clean = mingru_step.forward(*inputs, True)
-    inputs[0][0, 140, 200] = inputs[4][20, 7] = torch.nan
-    inputs[3][0, 20] = False
-    lanes = torch.arange(300, device="cuda")
-    for result, expected in zip(mingru_step.forward(*inputs, True), clean, strict=True):
-        result, expected = result.view(300, 256), expected.view(300, 256)
-        assert result[140].isnan().all() and result[20, 7].isnan()
-        others = (lanes != 140) & (lanes != 20)
-        assert torch.equal(result[others], expected[others])
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("is_residual", [False, True])
-def test_captured_step_acts_like_the_two_kernels(monkeypatch, is_residual):
-    torch.manual_seed(0)
-    core, n_lanes = MinGRU(256).cuda(), 500
-    x, reset = torch.randn(1, n_lanes, 256, device="cuda"), torch.rand(1, n_lanes).cuda() < 0.3
-    state = arrdict(output=torch.randn(n_lanes, 256, device="cuda"))
-    forward, calls = mingru_step.forward, []
-    monkeypatch.setattr(mingru_step, "forward", lambda *args: calls.append(args) or forward(*args))
-
-    def act():
-        with torch.no_grad(), torch.autocast("cuda", torch.bfloat16):
-            outputs, after = core(x, reset, state, is_residual)
-        return outputs, after.output
-
-    act()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = act()
-    x.normal_()
-    state.output.normal_()
-    reset.logical_not_()
-    graph.replay()
-    assert len(calls) == 2 and all(map(torch.equal, captured, act()))
-    monkeypatch.setattr(mingru_step, "fits", lambda x: False)
-    assert_close(("outputs", "last"), captured, act(), SLACK[torch.bfloat16])
-    assert len(calls) == 3

@@ -88,12 +88,6 @@ def test_burn_in_only_warms_up_the_hidden_state(core, device):
         torch.testing.assert_close(one, other, **close)
 
 
-def test_activation_bytes_count_layers():
-    # 24 float32 per unit, 8 for each further layer
-    sizes = [Policy(OBS, MOVES, width=32, layers=n).activation_bytes for n in (1, 2, 4)]
-    assert sizes == [32 * 4 * 24, 32 * 4 * 32, 32 * 4 * 48]
-
-
 @pytest.mark.parametrize("core", CORES)
 def test_activation_bytes_bound_saved_tensors(core):
     def saved_bytes(policy):
@@ -126,15 +120,6 @@ def test_shapes_of_decision():
     assert state.cell.shape == (B, 32)
 
 
-def test_bare_spaces():
-    policy = Policy(spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3), width=8)
-    world = arrdict(obs=torch.randn(B, 1, 4), reset=torch.ones(B, dtype=torch.bool))
-    decision, _ = policy(world, policy.initial(B), sample=False)
-    assert torch.equal(decision.actions, decision.logits.argmax(-1))
-    samples = [policy(world, policy.initial(B))[0].actions for _ in range(20)]
-    assert len(torch.stack(samples).unique(dim=0)) > 1, "it samples unless it is told not to"
-
-
 def test_seed_determines_weights_and_actions():
     before = torch.get_rng_state()
     first, second, other = (
@@ -145,14 +130,6 @@ def test_seed_determines_weights_and_actions():
     assert torch.equal(first.logits.movement, second.logits.movement)
     assert not torch.equal(first.logits.movement, other.logits.movement)
     assert not torch.equal(first.actions.movement, other.actions.movement)
-
-
-def test_own_generator_determines_actions():
-    policy, world = Policy(OBS, MOVES, width=32), worlds()
-    first, second = (
-        act(policy, world, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2)
-    )
-    assert torch.equal(first.movement, second.movement) and torch.equal(first.fire, second.fire)
 
 
 def test_weights_load_with_weights_only():
@@ -166,11 +143,6 @@ def test_weights_load_with_weights_only():
     outputs, expected = (p.unroll(world.obs, world.reset, p.initial(B)) for p in (policy, twin))
     assert torch.equal(policy.value(outputs.features), twin.value(expected.features))
     assert torch.equal(outputs.logits.fire, expected.logits.fire)
-
-
-def test_zero_width_raises():
-    with pytest.raises(ValueError, match="width: 0"):
-        Policy(OBS, MOVES, width=0)
 
 
 def test_streams_of_a_run_differ_and_repeat():

@@ -6,12 +6,10 @@ import pytest
 import torch
 
 from megastep import contract, envs, geometries, spaces
-from megastep.agents.algorithms.returns import gae
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector, collect, initial_actor_state
 from megastep.agents.storage.rollout import Rollout, without_last
 from megastep.arrdict import arrdict, clone
-from megastep.capture import state_tree
 from megastep.dotdict import leaves
 from tests.helpers import web
 
@@ -200,18 +198,6 @@ def test_collector_continues_between_rollouts():
     assert [leaf.data_ptr() for leaf in leaves(rollout.state)] == addresses
 
 
-def test_collect_reuses_the_rollouts_tensors():
-    """A CUDA graph writes to the memory of its capture, so tensors must not be replaced."""
-    env = LabelledEnv()
-    policy = Policy(env.obs_space, env.action_space, width=16)
-    rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
-    before = state_tree(rollout)
-    collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
-    after = state_tree(rollout)
-    assert before.keys() == after.keys() and ".state['cell']" in after
-    assert all(before[path] is after[path] for path in after)
-
-
 @pytest.mark.parametrize("values", [True, False])
 def test_sequences_select_lanes(values):
     env = MetricsEnv()
@@ -255,29 +241,6 @@ def test_policy_without_critic_or_logprobs():
     assert stored[0].logprobs.all() and not stored[1].logprobs.any()
 
 
-def test_transitions_fit_gae():
-    env, _, rollout, _ = collected(n_rollouts=2)
-    estimates = gae(**rollout.transitions(), gamma=0.0, lambda_=1.0)
-    assert torch.equal(estimates.valid, ~rollout.reset)
-    # with gamma 0 the advantage is the reward minus the value
-    expected = (rollout.reward - rollout.values[:-1]) * ~rollout.reset
-    assert torch.equal(estimates.advantages, expected)
-
-
-def test_same_seed_collects_the_same():
-    (_, _, first, _), (_, _, second, _) = collected(2), collected(2)
-    assert torch.equal(first.actions.move, second.actions.move) and torch.equal(
-        first.values, second.values
-    )
-
-
-def test_default_dtypes():
-    space = arrdict(rgb=spaces.MultiImage(1, 3, 1, 4), team=spaces.MultiDiscrete(1, 5000))
-    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
-    assert rollout.obs.rgb.dtype == torch.float16 and rollout.obs.team.dtype == torch.int64
-    assert rollout.actions.shape == (T, B, 1)
-
-
 def test_dtypes_named_by_spaces():
     space = arrdict(
         sky=spaces.MultiImage(1, 3, 1, 4, dtype=torch.uint8),
@@ -311,11 +274,6 @@ def test_learns_and_metrics_line_up_with_env(n_rollouts):
         assert torch.equal(rollout.metrics.falls[row], env.label(first + row + 1) + 0.5)
 
 
-def test_all_lanes_learn_by_default():
-    _, _, rollout, _ = collected()
-    assert rollout.learns.all() and not rollout.metrics
-
-
 def test_lanes_that_are_not_stored_act_with_0():
     learners = torch.tensor([True, False, True, False])
     args = LabelledEnv.obs_space, LabelledEnv.action_space, arrdict()
@@ -330,15 +288,3 @@ def test_lanes_that_are_not_stored_act_with_0():
 def test_empty_rollout_raises():
     with pytest.raises(ValueError, match="not 0 and 6"):
         Rollout(0, B, LabelledEnv.obs_space, LabelledEnv.action_space, arrdict())
-
-
-@pytest.mark.parametrize("privileged", [None, spaces.MultiVector(1, 3)])
-def test_world_of_a_time_has_what_the_critic_sees_if_it_is_stored(privileged):
-    spaces_of = LabelledEnv.obs_space, LabelledEnv.action_space
-    rollout = Rollout(T, B, *spaces_of, arrdict(), privileged_space=privileged)
-    if privileged is None:
-        assert {*rollout.world(2)} == {"obs", "reset"}
-        return
-    rollout.privileged.copy_(torch.rand_like(rollout.privileged))
-    for t in range(T):
-        assert torch.equal(rollout.world(t).privileged, rollout.privileged[t])
