@@ -48,7 +48,7 @@ F = TypeVar("F", bound=Callable)
 #: 2**26 copies of the smallest environment fill the largest GPU there is; more is a typing error.
 MAX_ENVS = 2**26
 #: Types whose arguments are annotations of their own.
-CONTAINERS = (list, tuple, dict, set, frozenset, abc.Sequence, abc.Mapping)
+CONTAINERS: tuple[Any, ...] = (list, tuple, dict, set, frozenset, abc.Sequence, abc.Mapping)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,8 @@ def _strict(hint) -> Any:
     """Returns an annotation that takes no other type for a number, a word or a boolean, while a
     list may stand for a tuple and 1e6 for an integer.
     """
-    origin, options = typing.get_origin(hint), typing.get_args(hint)
+    origin: Any = typing.get_origin(hint)
+    options = typing.get_args(hint)
     if hint is int:
         return Annotated[int, pydantic.Strict(), pydantic.BeforeValidator(_whole)]
     if hint in (float, bool, str):
@@ -76,7 +77,8 @@ def _strict(hint) -> Any:
     if origin in (typing.Union, types.UnionType):
         return typing.Union[tuple(map(_strict, options))]  # noqa: UP007, of any number of types
     if origin in CONTAINERS and options:
-        return origin[tuple(one if one is ... else _strict(one) for one in options)]
+        inner = tuple(one if one is ... else _strict(one) for one in options)
+        return typing.cast(Any, origin)[inner]
     return hint
 
 
@@ -207,7 +209,7 @@ def _field(hint, default) -> tuple:
     if default is inspect.Parameter.empty:
         return (Any if hint is None else hint,)
     if default is None:
-        return (Any if hint is None else hint | None), None
+        return (Any if hint is None else typing.Optional[hint]), None  # noqa: UP045
     return (type(default) if hint is None else hint), default
 
 

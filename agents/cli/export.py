@@ -34,7 +34,7 @@ class Export:
     run: str
     format: Literal["onnx", "torch", "safetensors", "hub"]
     file: str | None = None
-    member: settings.Member = None
+    member: settings.PopulationMember = None
 
 
 def run(cfg: Export) -> None:

@@ -42,7 +42,7 @@ from megastep.wrappers import Wrapper
 
 if TYPE_CHECKING:
     from megastep.agents import types as agent_types
-    from megastep.agents.factory.settings import Member
+    from megastep.agents.factory.settings import Component
     from megastep.agents.storage.collector import Collector
 
 #: Number of environments in which the memory of one is measured.
@@ -66,7 +66,7 @@ KINDS = (
 errors = functools.partial(user_errors, kinds=KINDS)
 
 
-def construct(settings: "Member", constructor: Callable | None = None, **arguments: Any) -> Any:
+def construct(settings: "Component", constructor: Callable | None = None, **arguments: Any) -> Any:
     """Calls a class or function with those of the settings and arguments that it takes.
 
     A setting that a class passes on to its base class as one of its `**kwargs` is left out if it

@@ -105,7 +105,7 @@ Samples = Annotated[
 #: Names, of which a single one needs no brackets.
 Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 Split = Literal["training", "test", "all"]
-Member = int | Literal["best"] | None
+PopulationMember = int | Literal["best"] | None
 
 
 # ---- Groups ----
@@ -292,7 +292,7 @@ class Train(Common):
     resume: str | None
     rerun: str | None = None
     init: str | None
-    member: Member = None
+    member: PopulationMember = None
 
     def conflicts(self) -> Iterator[tuple[str, str]]:
         return conflicts.of_training(self)
@@ -321,7 +321,7 @@ class Played(Common):
     geometry: Geometry | None = None
     split: Split
     greedy: bool
-    member: Member = None
+    member: PopulationMember = None
 
 
 def _given(run: T | None) -> T:

@@ -134,7 +134,9 @@ def test_resumed_run_wakes_its_own_gpu_alone(installed, monkeypatch, tmp_path):
     from megastep.agents.factory.check import as_tree
 
     config = {"train": as_tree(settings(*TINY)) | {"device": "cuda:3"}, "spaces": {}}
-    checkpoint.save(tmp_path / "run/checkpoints", 32, dict(samples=32, seconds=1.0), config)
+    checkpoint.save(
+        tmp_path / "run/checkpoints", 32, dict(samples=32, seconds=1.0, updates=1), config
+    )
     driver, ran = installed(Driver()), []
     monkeypatch.setattr(train, "run", lambda cfg: ran.append(cfg.device))
     assert train.main([f"resume={tmp_path / 'run'}"]) == 0
