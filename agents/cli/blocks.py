@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.core import plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import Container, DictConfig, OmegaConf
 
 from megastep.agents.factory import check, components
 from megastep.agents.launch import gpu
@@ -106,7 +106,7 @@ def _over(below, above) -> Any:
     return below | {key: _over(below.get(key), value) for key, value in above.items()}
 
 
-def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
+def plain(config: Container, resolve: bool = False) -> check.Tree:
     """Returns a configuration as nested dicts."""
     return cast(check.Tree, OmegaConf.to_container(config, resolve=resolve))
 

@@ -281,7 +281,7 @@ class Composer:
         if "." in last:  # those of components, which are imported for it
             names = [key for key, _ in check.fields_of(self.command.kind, tree)]
         keys = OmegaConf.from_dotlist([f"{key}=null" for key in names])
-        node = {"defaults": [self.name, "_self_"], **OmegaConf.merge(keys, tree)}
+        node = {"defaults": [self.name, "_self_"], **blocks.plain(OmegaConf.merge(keys, tree))}
         STORE.store(name="every-key", node=node)
         self.call_hydra([*flags, *words, "--config-name=every-key"])
 

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 from collections.abc import Iterable, Iterator
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from pydantic import ValidationError
 from pydantic_core import PydanticSerializationError, to_jsonable_python
@@ -47,7 +47,7 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
             errors.setdefault(".".join(path) or "configuration", text)
         raise ConfigErrors(errors.items()) from None
     as_tree(chosen)
-    return chosen
+    return cast(T, chosen)
 
 
 def as_tree(chosen: Any, prefix: str = "") -> Tree:
