@@ -2,7 +2,7 @@
 
 import torch
 
-from megastep import engine
+from megastep import devices
 from megastep.agents.errors import user_errors
 
 
@@ -18,8 +18,8 @@ def make_device(name: str, index: int | None = None) -> torch.device:
     """
     if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
         name = f"cuda:{index}"
-    with user_errors(kinds=(engine.EngineError,)):
-        device = engine.device(name)
+    with user_errors(kinds=(devices.EngineError,)):
+        device = devices.device(name)
     if device.type == "cuda":
         torch.cuda.set_device(device)  # on which graphs are captured
     return device
@@ -29,6 +29,6 @@ def share_threads(width: int) -> None:
     """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
     layers, threads lose more by waiting for each other than they gain.
     """
-    n_threads = engine.threads()
-    engine.set_threads(n_threads)
+    n_threads = devices.threads()
+    devices.set_threads(n_threads)
     torch.set_num_threads(max(1, min(n_threads, width // 128)))

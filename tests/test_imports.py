@@ -28,7 +28,7 @@ SIMULATOR = (
         "workers",
     ),
     ("arrdict", "geometry", "imports", "kernels", "plotting", "ragged"),
-    ("schedules",),
+    ("devices", "schedules"),
     ("coefficients",),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "env_state", "geometries", "scene"),
@@ -42,7 +42,7 @@ SIMULATOR = (
 ENGINE = (
     ("checks", "state_tree", "views"),
     ("objects", "resets"),
-    ("agents", "devices", "scenery"),
+    ("agents", "scenery"),
     ("launch_params",),
     ("operations",),
     ("rendering",),
@@ -64,7 +64,7 @@ AGENTS = (
     ("api",),
 )
 # Modules of the simulator that every room of the learner may import: no environment, no engine.
-THREADS = "megastep.engine.devices"
+THREADS = "megastep.devices"
 SHARED = {
     "megastep",
     "megastep.arrdict",
@@ -95,6 +95,7 @@ UPPER_ROOMS += ("pretrained", "reports")
 SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",
+    "megastep.devices",
     "megastep.engine",
     "megastep.geometries.checks",
     "megastep.geometries.files",
@@ -115,6 +116,7 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
 # The files that may import these modules of ours, as glob patterns.
 OWN_USERS = {
     "megastep.kernels.build.launch": (
+        "megastep/devices.py",
         "megastep/engine/*.py",
         "megastep/envs/*/*.py",
         "megastep/geodesics/path_graph.py",

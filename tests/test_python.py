@@ -13,13 +13,13 @@ import pytest
 import torch
 
 import megastep
+from megastep import devices
 from megastep.agents import api
 from megastep.agents.cli import command, compose
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.launch import signals
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.bots.random import RandomActions
-from megastep.engine import devices
 from tests.helpers import tiny
 from tests.helpers.pages import ROOT, code
 

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from megastep.agents.networks import few_rows
 from megastep.agents.networks.fused import LIBRARY, aligned_rows, fused, is_built_for_cpu
 from megastep.agents.networks.precision import cast, compute_dtype
-from megastep.engine.devices import threads
+from megastep.devices import threads
 from megastep.kernels.build.launch import WARP, Blocks, launch
 
 Activation = Callable[[torch.Tensor], torch.Tensor]

@@ -41,7 +41,7 @@ from megastep.agents.networks.linear import (
 )
 from megastep.agents.networks.precision import cast, cast_joined, compute_dtype
 from megastep.arrdict import arrdict
-from megastep.engine.devices import threads
+from megastep.devices import threads
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 

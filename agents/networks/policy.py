@@ -13,7 +13,6 @@ import torch
 from pydantic import AfterValidator, Field
 from torch import nn
 
-from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, encoders, heads, running_norm
 from megastep.agents.networks.critic import Critic
@@ -343,6 +342,8 @@ class Policy(nn.Module):
             privileged: (B, ...) per leaf, for an asymmetric critic.
             is_counted: () or (B,) bool, lanes to count.
         """
+        from megastep.agents.distributed.pooling import pool_moments  # who acts has no ranks
+
         self.add_moments(pool_moments(*self.moments(obs, privileged, is_counted)))
 
     def moments(

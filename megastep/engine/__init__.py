@@ -8,8 +8,8 @@ The step of a game is an operation too, in the environment's package, for exampl
 :func:`megastep.envs.deathmatch.deathmatch_step`.
 """
 
+from megastep.devices import device, fit, free_memory, set_threads, threads
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_flag
-from megastep.engine.devices import device, fit, free_memory, set_threads, threads
 from megastep.engine.objects import Objects, check_objects
 from megastep.engine.operations import (
     Physics,

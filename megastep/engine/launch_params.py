@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import torch
 
-from megastep.engine import checks, devices
+from megastep import devices
+from megastep.engine import checks
 from megastep.engine.agents import Agents
 from megastep.engine.scenery import Scenery
 from megastep.kernels.build.launch import ENGINE

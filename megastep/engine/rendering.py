@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import torch
 
+from megastep.devices import n_resident_threads
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
-from megastep.engine.devices import n_resident_threads
 from megastep.engine.launch_params import (
     lanes_of,
     object_params,

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from megastep.devices import threads
 from megastep.dotdict import dotdict
-from megastep.engine.devices import threads
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import BLOCK, launch
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from megastep.devices import threads
 from megastep.dotdict import dotdict
-from megastep.engine.devices import threads
 from megastep.geodesics.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
 

@@ -188,7 +188,7 @@ def maze(
         thickness: thickness of the walls, in metres.
         braid: fraction of the dead ends that is opened: 0 leaves a perfect maze.
     """
-    from megastep.engine.devices import fit  # imports PyTorch, which reading settings must not
+    from megastep.devices import fit  # imports PyTorch, which reading settings must not
 
     mazes.validate_lengths(size, corridor, thickness)
     indices = _draw_indices(mazes.COUNT, n, split, seed)
@@ -216,7 +216,7 @@ def memory_maze(
         size: cells per side: 9, 11, 13 or 15.
         cell: side of a cell, in metres, at least 0.5.
     """
-    from megastep.engine.devices import fit  # as in `maze`
+    from megastep.devices import fit  # as in `maze`
 
     memory_mazes.validate(size, cell)
     indices = _draw_indices(memory_mazes.COUNT, n, split, seed)

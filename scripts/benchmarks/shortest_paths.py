@@ -33,5 +33,5 @@ def paths(device: torch.device) -> Iterator[dict]:
                 if device.type == "cuda":
                     torch.cuda.synchronize(device)
                 seconds.append(time.perf_counter() - start)
-    where = f", {engine.devices.threads()} threads" if device.type == "cpu" else ""
+    where = f", {engine.threads()} threads" if device.type == "cpu" else ""
     yield measurement(f"shortest paths in {N_HOMES} homes, nothing cached{where}", "s", seconds)

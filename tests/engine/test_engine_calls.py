@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import capture, cuda, engine, scene, toys
+from megastep import capture, cuda, devices, engine, scene, toys
 from megastep.dotdict import dotdict
-from megastep.engine import devices
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, to_global
 from tests.helpers.synchronisation import no_synchronisation

@@ -353,7 +353,7 @@ def test_largest_home_is_one_of_a_million_cells():
 def test_fields_that_do_not_fit_are_refused_before_they_are_computed(monkeypatch):
     c = core.Core(scene.scenery(3 * [toys.box()], 1, 3, device="cpu"))
     monkeypatch.setattr(module, "all_geodesics", None)
-    monkeypatch.setattr("megastep.engine.devices.free_memory", lambda device: 10**5)
+    monkeypatch.setattr("megastep.devices.free_memory", lambda device: 10**5)
     with pytest.raises(engine.EngineError, match="3 layouts need .* at most 1 fit"):
         goal_fields(3 * [toys.box()], c)
 

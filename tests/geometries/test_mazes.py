@@ -11,9 +11,8 @@ import matplotlib
 import numpy as np
 import pytest
 
-from megastep import contract, envs, geometry, modules
+from megastep import contract, devices, envs, geometry, modules
 from megastep.agents.cli import record
-from megastep.engine import devices
 from megastep.engine.agents import AGENT_RADIUS
 from megastep.geometries import mazes, sample
 from megastep.geometries.homes.portable_generator import PortableGenerator

@@ -5,10 +5,9 @@ import re
 import pytest
 import torch
 
-from megastep import capture
+from megastep import capture, devices
 from megastep.agents.cli import evaluate, train
 from megastep.agents.runs import checkpoint, json_lines
-from megastep.engine import devices
 from megastep.envs.pong.pong import CELL
 from tests.cli.test_duels import PONG, UPDATE
 from tests.cli.test_train import configured

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import torch
 
 from megastep.arrdict import arrdict
+from megastep.devices import threads
 from megastep.engine import checks
-from megastep.engine.devices import threads
 from megastep.envs.deathmatch.deathmatch_step import LIBRARY
 from megastep.kernels.build.launch import WARP, launch
 

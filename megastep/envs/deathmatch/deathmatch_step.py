@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import torch
 
+from megastep.devices import threads
 from megastep.engine import checks
 from megastep.engine.agents import Agents
-from megastep.engine.devices import threads
 from megastep.engine.launch_params import lanes_of, state_params
 from megastep.engine.rendering import Observation
 from megastep.engine.scenery import Scenery

@@ -14,9 +14,9 @@ from pydantic import Field
 
 from megastep import engine, plotting, spaces
 from megastep.arrdict import arrdict, numpyify
+from megastep.devices import threads
 from megastep.engine import checks
 from megastep.engine.agents import check_flag_on_cpu
-from megastep.engine.devices import threads
 from megastep.engine.launch_params import seed_params
 from megastep.envs.common import DisplayedEnv, world_of
 from megastep.envs.pong.tracker import LIBRARY, Tracker

@@ -7,7 +7,6 @@ import warnings
 
 import torch
 
-from megastep.engine import checks
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import BLOCK
 
@@ -82,7 +81,9 @@ def set_threads(n: int | None) -> None:
         ValueError: unless it is from 1 to 1,024, or to the number of processors if that is more.
     """
     global _n_threads
-    _n_threads = None if n is None else checks.integer("n", n, 1, MAX_THREADS)
+    if n is not None and (type(n) is not int or not 1 <= n <= MAX_THREADS):
+        raise ValueError(f"n must be an integer from 1 to {MAX_THREADS}, but {n!r} was given")
+    _n_threads = n
 
 
 def fit(n: int, bytes_each: float, device: torch.device | str, what: str = "environments") -> None:
