@@ -11,14 +11,9 @@ any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one
 """
 
 from megastep import spaces
-from megastep.agents.networks.continuous_outputs import CONTINUOUS_OUTPUTS
-from megastep.agents.networks.duelling_output import DuellingOutput
 from megastep.agents.networks.intakes import ConcatIntake
 from megastep.agents.networks.outputs import DictOutput, MultiDiscreteOutput, Output
 from megastep.types import Space
-
-#: Outputs of integers by name: "softmax" samples by probability, "duelling" by action value.
-OUTPUTS = {"softmax": MultiDiscreteOutput, "duelling": DuellingOutput}
 
 
 def intake(
@@ -49,7 +44,7 @@ def output(space: Space, width: int, kind: str = "softmax", continuous: str = "g
     Args:
         space: action space, a MultiDiscrete, a MultiContinuous or nested dicts.
         width: number of features.
-        kind: a name in `OUTPUTS`.
+        kind: of integers: "softmax" samples by probability, "duelling" by value.
         continuous: a name in `CONTINUOUS_OUTPUTS`, for continuous actions.
 
     Raises:
@@ -59,13 +54,19 @@ def output(space: Space, width: int, kind: str = "softmax", continuous: str = "g
         outputs = {key: output(child, width, kind, continuous) for key, child in space.items()}
         return DictOutput(outputs)
     if isinstance(space, spaces.MultiDiscrete):
-        return OUTPUTS[kind](space, width)
+        if kind == "softmax":
+            return MultiDiscreteOutput(space, width)
+        from megastep.agents.networks.duelling_output import DuellingOutput
+
+        return DuellingOutput(space, width)
     if isinstance(space, spaces.MultiContinuous):
         if kind == "duelling":
             raise ValueError(
                 f"action values (agent.output=duelling, which R2D2 learns) need discrete actions, "
                 f"not {space!r}: use learner=ppo or learner=vtrace with agent.output=softmax"
             )
+        from megastep.agents.networks.continuous_outputs import CONTINUOUS_OUTPUTS
+
         return CONTINUOUS_OUTPUTS[continuous](space, width)
     raise ValueError(
         f"no output is known for the action space {space!r}: use MultiDiscrete, MultiContinuous or "

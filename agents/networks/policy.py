@@ -7,7 +7,7 @@ T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, 
 import copy
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import torch
 from pydantic import AfterValidator, Field
@@ -15,15 +15,16 @@ from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, encoders, heads, running_norm
-from megastep.agents.networks.critic import Critic
-from megastep.agents.networks.joint_heads import head_terms, prediction_error
 from megastep.agents.networks.precision import ComputeDtype
-from megastep.agents.types import Moments
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.imports import known_name
 from megastep.settings import checked
 from megastep.types import Env, Space, Tree, optional
+
+if TYPE_CHECKING:
+    from megastep.agents.networks.critic import Critic
+    from megastep.agents.types import Moments
 
 #: Prefixes of the weights that acting does not need, in a policy's `state_dict`.
 TRAINING_ONLY = ("critic.", "prediction.")
@@ -107,7 +108,11 @@ class Policy(nn.Module):
             self.intake = heads.intake(obs_space, width, encoder, activation)
             self.core = cores.make_core(core, width, layers, activation)
             self.output = heads.output(action_space, width, output, continuous)
-            self.critic = None if critic is None else Critic(width, self.privileged_space)
+            self.critic = None
+            if critic is not None:
+                from megastep.agents.networks.critic import Critic  # who acts has none
+
+                self.critic = Critic(width, self.privileged_space)
             if self.privileged_space:
                 self.prediction = nn.Linear(width, self._critic.intake.n_features)
         if device is not None:
@@ -119,7 +124,7 @@ class Policy(nn.Module):
         return self.intake.project.weight.device  # `parameters` walks through all modules
 
     @property
-    def _critic(self) -> Critic:
+    def _critic(self) -> "Critic":
         assert self.critic is not None
         return self.critic
 
@@ -274,6 +279,8 @@ class Policy(nn.Module):
             privileged: the world's privileged observations.
             lanes: as for `value`.
         """
+        from megastep.agents.networks.joint_heads import prediction_error
+
         with self.compute_dtype():
             encoded = self._critic.encode(privileged, lanes)
             return prediction_error(self.prediction, features, encoded)
@@ -301,6 +308,8 @@ class Policy(nn.Module):
             has_errors: false leaves the errors out, None.
             mask: (T, M, A, n) bool per discrete action space, allowed actions. None: all.
         """
+        from megastep.agents.networks.joint_heads import head_terms
+
         with self.compute_dtype():
             features, _ = self._features(obs, reset, state, lanes)
             encoded = prediction = None
@@ -348,7 +357,7 @@ class Policy(nn.Module):
 
     def moments(
         self, obs: Tree, privileged: Tree | None = None, is_counted: torch.Tensor | bool = True
-    ) -> list[Moments]:
+    ) -> "list[Moments]":
         """Returns the moments of this rank's observations, for `pool_moments` and `add_moments`.
 
         Args:
@@ -360,7 +369,7 @@ class Policy(nn.Module):
         return running_norm.moments_of(self._norms(), observations, is_counted)
 
     def add_moments(
-        self, moments: Sequence[Moments], is_counted: torch.Tensor | None = None
+        self, moments: "Sequence[Moments]", is_counted: torch.Tensor | None = None
     ) -> None:
         """Adds the observations of all ranks to the running statistics.
 

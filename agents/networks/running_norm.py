@@ -5,16 +5,18 @@ B lanes; `...` any further axes.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, fused, is_plain_on_gpu
-from megastep.agents.types import Moments
 from megastep.kernels.build.launch import Blocks, launch
 from megastep.types import Space
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Moments
 
 #: The version of the rules below. A run that began with others cannot continue bit for bit.
 VERSION = 2
@@ -90,7 +92,7 @@ def _parts(n) -> Iterator[slice]:
     return (slice(start, start + MAX_LEAVES) for start in range(0, n, MAX_LEAVES))
 
 
-def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
+def _moments_on_gpu(norms, leaves, is_counted=True) -> "list[Moments]":
     device, n_lanes = leaves[0].device, len(leaves[0])
     is_counted = torch.as_tensor(is_counted, device=device).expand(n_lanes).contiguous()
     moments: list[Moments] = []
@@ -122,7 +124,7 @@ def moments_of(
     norms: Sequence[RunningNorm],
     leaves: Sequence[torch.Tensor],
     is_counted: torch.Tensor | bool = True,
-) -> list[Moments]:
+) -> "list[Moments]":
     """Returns of each norm the number of lanes that count, and the mean and variance of their
     observations.
 
@@ -164,7 +166,9 @@ def _add_on_gpu(norms, moments, is_counted=None) -> None:
 @torch.no_grad()
 @fused(_add_on_gpu, lambda norms, *_: is_plain_on_gpu(*(norm.mean for norm in norms)))
 def add_moments(
-    norms: Sequence[RunningNorm], moments: Sequence[Moments], is_counted: torch.Tensor | None = None
+    norms: Sequence[RunningNorm],
+    moments: "Sequence[Moments]",
+    is_counted: torch.Tensor | None = None,
 ) -> None:
     """Adds moments to the statistics of each norm, the n-th call with weight 1/n. Changes nothing
     if no lane was counted, or if a mean or variance is not finite.
