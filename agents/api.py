@@ -276,7 +276,9 @@ def _plain(value, key) -> Any:
         return int(value)
     if isinstance(value, numbers.Real):
         return float(value)
-    problem = f"{type(value).__name__} is no setting; use numbers, texts, lists, dicts, or a class"
+    problem = (
+        f"{type(value).__name__} is not a setting; use numbers, texts, lists, dicts, or a class"
+    )
     raise ConfigErrors([(key, problem)])
 
 

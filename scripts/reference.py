@@ -43,7 +43,7 @@ from megastep.settings import AtMost, allowed
 SCRIPTS = {"train": settings.Train, "evaluate": settings.Evaluate, "record": settings.Record}
 #: Groups with one class of settings. The others have a class or function per member.
 SINGLE = {"agent": components.POLICY, "opponents": components.OPPONENTS}
-#: Settings that no docstring describes, since they are no arguments of the constructor.
+#: Settings that no docstring describes, since they are not arguments of the constructor.
 ADDED = {
     "env.wrappers": "wrappers around the environment, names or `{name: ..., setting: ...}`; see "
     "[wrappers](../wrappers.md)",

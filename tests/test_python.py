@@ -110,7 +110,7 @@ def test_errors_are_those_of_the_command_line_and_nothing_is_written(here):
     assert unknown.value.errors == [("env", "'explorr' is unknown; did you mean explorer?")]
     with pytest.raises(UserError, match="run folder nor a pretrained agent"):
         megastep.load("explorer_anywere")
-    with pytest.raises(UserError, match="learner.lr: object is no setting"):
+    with pytest.raises(UserError, match="learner.lr: object is not a setting"):
         megastep.train(learner={"lr": object()})
     with pytest.raises(UserError, match="has no import path"):
         megastep.train(env=type("Local", (), {"__qualname__": "f.<locals>.Local"}))

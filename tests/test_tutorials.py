@@ -88,6 +88,6 @@ def test_cuda_of_the_page_on_kernels_has_the_bits_of_its_cpp(tmp_path, monkeypat
 
 
 def blocks(page):
-    """Returns the blocks of a page that are run and are no files."""
+    """Returns the blocks of a page that are run and are not files."""
     found = BLOCK.findall((FOLDER / page).read_text())
     return [body for reason, _, body in found if not reason and not FILE.match(body)]

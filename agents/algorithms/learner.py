@@ -266,7 +266,7 @@ class GradientLearner:
             taken: names of the learner's own metrics.
 
         Raises:
-            UserError: it fails, is no scalar, has the name of another metric, or has no gradient.
+            UserError: it fails, is not a scalar, has no gradient, or the name of another metric.
         """
         name = f"{type(self).__name__}.extra_loss"
         try:

@@ -84,7 +84,7 @@ class SGD:
 
 class Imported(SGD):
     """An optimizer of another package. Its steps read conditions and the learning rate on the host,
-    so an update is no CUDA graph.
+    so an update is not a CUDA graph.
 
     Args:
         make: takes groups of parameters, as dicts with `params`, `lr` and, if not 0,

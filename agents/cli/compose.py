@@ -45,7 +45,7 @@ GUESS = "ppo"
 RESOLVERS = ("now", "oc.dict.keys", "oc.dict.values", "oc.select", "python_version")
 #: What Hydra raises for words that it cannot use.
 HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
-#: What files of configurations raise beside these, where defaults are no list or lead in circles.
+#: What files of configurations raise beside these, where defaults are not a list or are circular.
 FILE_ERRORS = (*HYDRA_ERRORS, ValueError, TypeError, LookupError, RecursionError)
 STORE = config_store.ConfigStore.instance()
 STORE.store(name="open", node=OmegaConf.create(OPEN))

@@ -100,14 +100,14 @@ def _import_own(cfg) -> None:
     """Imports one drawing or map."""
     path = Path(cfg.path)
     if not path.is_file():
-        raise UserError(f"path={path} does not exist, or is no file")
+        raise UserError(f"path={path} does not exist, or is not a file")
     file = Path(cfg.file or f"{path.stem}.npz")
     if file.suffix != ".npz":
         raise UserError(f"file={file} must end with .npz")
     from megastep.geometries import files
     from megastep.geometries.plans import imports, sheets
 
-    with user_errors(f"{path} is no floor plan: "):
+    with user_errors(f"{path} is not a floor plan: "):
         if cfg.source == "svg":
             if cfg.scale is None:
                 raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")

@@ -32,7 +32,7 @@ def run(cfg: Report) -> None:
         folder = Path(cfg.run[0])  # of a sweep
     file = folder / "report.html" if cfg.file is None else Path(cfg.file)
     if file.suffix != ".html":
-        raise UserError(f"file={file} is no page; its name ends with .html")
+        raise UserError(f"file={file} is not a page; its name ends with .html")
     console.say(f"Report: {report.write(paths, file)}")
 
 

@@ -93,7 +93,7 @@ def _values(override: Override) -> list[str | None]:
     """The words that a word of a sweep may become; None where a search leaves it out."""
     key, sweep = override.get_key_element(), cast(Any, override.value())
     if override.is_interval_sweep():
-        # a point inside that is no integer, even if the bounds are 1.0 and 4.0
+        # a point inside that is not an integer, even if the bounds are 1.0 and 4.0
         inside = sweep.start + 0.38 * (sweep.end - sweep.start)
         inside = round(inside) if isinstance(sweep.start + sweep.end, int) else inside
         return [None, *(f"{key}={value}" for value in (sweep.start, sweep.end, inside))]

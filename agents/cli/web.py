@@ -58,7 +58,7 @@ def write(
     own = folders.folder_of(source) / "page.html"
     path = own if file is None else Path(file)
     if path.suffix != ".html":
-        raise UserError(f"file={path} is no page; its name ends with .html")
+        raise UserError(f"file={path} is not a page; its name ends with .html")
     from megastep.agents.export import web  # with PyTorch
     from megastep.atomic_files import write_atomically
 

@@ -40,7 +40,7 @@ def _wrappers(value: object) -> tuple[object, ...]:
         if not isinstance(name, str):
             raise ValueError(f"a wrapper is a name or {{name: ..., setting: ...}}, got {item!r}")
         if ":" not in name and name not in known:
-            raise ValueError(f"{name!r} is no wrapper; {closest(name, known)}, or module:Class")
+            raise ValueError(f"{name!r} is not a wrapper; {closest(name, known)}, or module:Class")
         if name in known or isinstance(item, dict):
             wrapper_settings(item)
     return tuple(items)

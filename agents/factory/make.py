@@ -123,12 +123,12 @@ def _wrappers_of(settings, taken) -> tuple[list[str], list]:
             outside.append(components.wrapper_settings(item))
         elif "wrappers" not in taken:
             raise ValueError(
-                f"env.wrappers: {name} is no megastep.wrappers.Wrapper, and "
+                f"env.wrappers: {name} is not a megastep.wrappers.Wrapper, and "
                 f"{env_name(settings)} takes no wrappers of another package"
             )
         elif isinstance(item, dict):
             raise ValueError(
-                f"env.wrappers: {name} is no megastep.wrappers.Wrapper, so it takes no settings "
+                f"env.wrappers: {name} is not a megastep.wrappers.Wrapper, so it takes no settings "
                 "here; derive a class that has them"
             )
         else:

@@ -82,7 +82,7 @@ def _every(given: int | float | str) -> int | str:
     is_samples = isinstance(given, str) and given.endswith("M")
     if isinstance(given, str) and not isinstance(seconds, str) and not is_samples:
         if not 0 < seconds < 1e9:
-            raise ValueError(f"{given!r} is no time")
+            raise ValueError(f"{given!r} is not a time")
         return f"{seconds}s"
     if isinstance(samples, str) or samples < 1 or samples != int(samples):
         raise ValueError(f"{given!r} is neither samples, such as 1M, nor a time, such as 60s")

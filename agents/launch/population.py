@@ -155,7 +155,7 @@ def check_score(score: str, trainer: Trainer) -> None:
     """Raises ConfigErrors if a trainer's reports have nothing of this name."""
     known = [populations.RUNNING, populations.EVALUATED, *trainer.episodes.names]
     if score not in known:
-        text = f"{score} is no mean over episodes here; {closest(score, known)}"
+        text = f"{score} is not a mean over episodes here; {closest(score, known)}"
         raise ConfigErrors([("population.score", text)])
 
 

@@ -58,7 +58,7 @@ class Callbacks(list[Any]):
         for one in self:
             if not any(hasattr(one, hook) for hook in HOOKS):
                 hooks = ", ".join(HOOKS)
-                raise ValueError(f"{type(one).__name__} is no callback: it has none of {hooks}")
+                raise ValueError(f"{type(one).__name__} is not a callback: it has none of {hooks}")
 
     def __call__(self, hook: str, *arguments: object) -> list[object]:
         """Calls a hook. Returns what the methods do.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from megastep.agents.types import Row
 
 MAX_COLUMNS = 4
-#: Statistics of episodes that are no curves of their own: how many they are of, and their spread.
+#: Statistics of episodes that are not curves of their own: how many they are of, and their spread.
 NOT_DRAWN = ("count", "window", "return_std")
 
 #: Statistics that come first, and the label of what evaluations in training measured.

@@ -93,7 +93,7 @@ class Profiler:
         activities, is_gpu = [torch.profiler.ProfilerActivity.CPU], self.device.type == "cuda"
         if is_gpu:
             activities.append(torch.profiler.ProfilerActivity.CUDA)
-            torch.cuda.synchronize(self.device)  # what was launched before is no part of it
+            torch.cuda.synchronize(self.device)  # what was launched before is not part of it
         os.environ.setdefault("KINETO_LOG_LEVEL", "6")  # it prints a line at each start and stop
         profile = torch.profiler.profile(activities=activities, acc_events=True)
         profile.start()  # takes seconds on a GPU

@@ -72,7 +72,7 @@ def test_weights_of_another_environment_are_refused_by_its_name(capsys):
         (["env.id=CartPol-v1"], "did you mean CartPole-v1?"),
         ([], "env.id is missing; name an environment"),
         (["env.kwargs=3"], "env.kwargs: expected keys with values, got 3"),
-        (["env.wrappers=a"], "env.wrappers: 'a' is no wrapper; there are "),
+        (["env.wrappers=a"], "env.wrappers: 'a' is not a wrapper; there are "),
         (["env.vectorization=syn"], "did you mean sync?"),
     ],
 )

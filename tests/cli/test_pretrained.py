@@ -165,7 +165,7 @@ def test_evaluates_into_a_folder_of_its_own(folder, capsys):
         f"{NAME}.md",
         f"{NAME}.safetensors",
     ]
-    assert folders.known() == [], "its folder is no run"
+    assert folders.known() == [], "its folder is not a run"
 
 
 def test_meets_others_in_duels(exported, capsys):

@@ -218,13 +218,13 @@ def test_rewards_are_scaled_clipped_and_shaped():
 @pytest.mark.parametrize(
     "word, message",
     [
-        ("[frame_stak]", "'frame_stak' is no wrapper; did you mean frame_stack?"),
+        ("[frame_stak]", "'frame_stak' is not a wrapper; did you mean frame_stack?"),
         ("[time_limit]", "time_limit: n: is missing"),
         ("[{name:time_limit,n:0}]", "time_limit: n: 0 is out of range: allowed is from 1"),
         ("[{name:frame_stack,m:3}]", "frame_stack has no setting 'm'; there are n, sensors"),
         ("[{name:drop_sensor,sensor:rgb}]", "there is no sensor 'rgb'; leave sensor out"),
         ("[{n:3}]", "a wrapper is a name or {name: ..., setting: ...}"),
-        ("[os:getcwd]", "os:getcwd is no megastep.wrappers.Wrapper, and minimal takes no wrappers"),
+        ("[os:getcwd]", "os:getcwd is not a megastep.wrappers.Wrapper, and minimal takes"),
         ("[{name:clip_reward,min:1}]", "0 must be between min=1 and max=1"),
         ("[{name:scale_reward,factor:{from:1}}]", "scale_reward: factor: expected a number"),
     ],

@@ -72,9 +72,9 @@ def test_opponents_homes_and_seeds_are_chosen(folder, tmp_path):
     "words, sentence",
     [
         (["file=x.html"], "run is missing"),
-        (["run={}/pong", "file=x.txt"], "file=x.txt is no page; its name ends with .html"),
-        (["run={}/pong", "seed=-1"], "seed: '-1' is no number from 0"),
-        (["run={}/pong", "homes=[a]"], "homes: 'a' is no number from 0"),
+        (["run={}/pong", "file=x.txt"], "file=x.txt is not a page; its name ends with .html"),
+        (["run={}/pong", "seed=-1"], "seed: '-1' is not a number from 0"),
+        (["run={}/pong", "homes=[a]"], "homes: 'a' is not a number from 0"),
         (["run={}/pong", "colour=red"], "colour: no such key"),
         (["run={}/none"], "none"),
         (["run={}/explorer", "homes=[99]"], "There is no home 99: split=test has 1, from 0"),

@@ -2,7 +2,7 @@
 
 import torch
 
-# Bits that no kernel writes: unusual NaNs, and an integer that is no index or count.
+# Bits that no kernel writes: unusual NaNs, and an integer that is not an index or count.
 POISON = {torch.float32: 0x7FC0DEAD, torch.float16: 0x7EAD, torch.int32: -0x21524111}
 
 

@@ -152,7 +152,7 @@ def wait_until(condition, process):
 
 
 def is_running(pid):
-    """Returns whether a process exists, and is no zombie."""
+    """Returns whether a process exists, and is not a zombie."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):

@@ -38,7 +38,7 @@ def test_commit_says_whether_the_checkout_has_changed(checkout):
     folder, commit = checkout
     assert provenance.commit(folder) == commit
     (folder / "new").write_text("2")
-    assert provenance.commit(folder) == commit, "as for git describe, new files are no change"
+    assert provenance.commit(folder) == commit, "as for git describe, new files are not a change"
     (folder / "file").write_text("2")
     assert provenance.commit(folder) == f"{commit}-dirty"
 

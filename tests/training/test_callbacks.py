@@ -92,7 +92,7 @@ def test_a_callback_that_raises_is_named_and_what_was_learnt_is_saved(here, caps
 
 def test_what_is_no_callback_is_refused(here, capsys):
     assert run(Nothing) == 2
-    assert "Nothing is no callback: it has none of on_start, on_collect" in capsys.readouterr().err
+    assert "Nothing is not a callback: it has none of on_start" in capsys.readouterr().err
     assert not [*here.glob("run/checkpoints/*")]
     assert train.main([*TINY, "callbacks=[nowhere:Stop]"]) == 2
     assert "callbacks: nowhere:Stop cannot be imported" in capsys.readouterr().err
