@@ -6,7 +6,6 @@ N environments, one agent each; `...` the shape of a Gymnasium space.
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -51,13 +50,11 @@ def observation(space: Any, path: str = "observation") -> Conversion:
     if isinstance(space, gym.Discrete):
         return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x - space.start)[:, None]
     if isinstance(space, gym.MultiDiscrete):
-        columns, sizes = (-1, space.nvec.size), [int(n) for n in space.nvec.flat]
-        if len({*sizes}) == 1:
-            whole = spaces.MultiDiscrete(len(sizes), sizes[0])
-            return whole, lambda x: (x - space.start).reshape(columns)
-        names = identifiers(range(len(sizes)))
-        return _choices(names, sizes), lambda x: arrdict(
-            zip(names, np.split((x - space.start).reshape(columns), len(names), 1))
+        whole, names = _choices(space.nvec)
+        if not names:
+            return whole, lambda x: (x - space.start).reshape(-1, space.nvec.size)
+        return whole, lambda x: arrdict(
+            zip(names, np.split((x - space.start).reshape(-1, len(names)), len(names), 1))
         )
     if not isinstance(space, (gym.Box, gym.MultiBinary)) or 0 in space.shape:
         raise ValueError(
@@ -92,20 +89,19 @@ def actions(space: Any, path: str = "action") -> Conversion:
         )
     dtype, shape = space.dtype, (-1, *(space.shape or ()))
     if isinstance(space, gym.Discrete):
-        return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x[:, 0] + space.start).astype(
-            dtype
-        )
+        whole = spaces.MultiDiscrete(1, int(space.n))
+        return whole, lambda x: (x[:, 0] + space.start).astype(dtype)
     if isinstance(space, gym.MultiBinary):
-        return spaces.MultiDiscrete(math.prod(space.shape), 2), partial(_reshaped, shape, dtype)
+        whole = spaces.MultiDiscrete(math.prod(space.shape), 2)
+        return whole, lambda x: x.reshape(shape).astype(dtype)
     if isinstance(space, gym.MultiDiscrete):
-        sizes = [int(n) for n in space.nvec.flat]
-        if len({*sizes}) == 1:
-            whole = spaces.MultiDiscrete(len(sizes), sizes[0])
-            return whole, lambda x: (x.reshape(shape) + space.start).astype(dtype)
-        names = identifiers(range(len(sizes)))
-        return _choices(names, sizes), lambda tree: (
-            np.concatenate([tree[name] for name in names], 1).reshape(shape) + space.start
-        ).astype(dtype)
+        whole, names = _choices(space.nvec)
+
+        def joined(tree) -> np.ndarray:
+            array = np.concatenate([tree[name] for name in names], 1) if names else tree
+            return (array.reshape(shape) + space.start).astype(dtype)
+
+        return whole, joined
     if not isinstance(space, gym.Box) or 0 in space.shape:
         raise ValueError(
             f"{path} is {_described(space)}, which no output chooses; give it a wrapper that "
@@ -127,10 +123,6 @@ def actions(space: Any, path: str = "action") -> Conversion:
         # float32 may have rounded beyond a bound of float64
         lambda x: np.clip(rounded(x.reshape(shape)), low, high).astype(dtype),
     )
-
-
-def _reshaped(shape, dtype, array) -> np.ndarray:
-    return array.reshape(shape).astype(dtype)
 
 
 def _image(space) -> Conversion | None:
@@ -205,8 +197,13 @@ def _tree(parts) -> dotdict:
     return dotdict({name: space for name, _, space, _ in parts})
 
 
-def _choices(names, sizes) -> dotdict:
-    return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)})
+def _choices(nvec) -> tuple[Space, list[str]]:
+    """Returns the space of choices, and their names if they have different numbers of options."""
+    sizes = [int(n) for n in nvec.flat]
+    if len({*sizes}) == 1:
+        return spaces.MultiDiscrete(len(sizes), sizes[0]), []
+    names = identifiers(range(len(sizes)))
+    return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)}), names
 
 
 def identifiers(keys: Iterable[object], reserved: Collection[str] = RESERVED) -> list[str]:

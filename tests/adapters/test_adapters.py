@@ -466,4 +466,4 @@ def test_the_code_of_the_page_runs():
             n_run += 1
         except ImportError:
             continue
-    assert n_run >= 2
+    assert n_run >= 1
