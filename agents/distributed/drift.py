@@ -17,40 +17,29 @@ class DriftError(RuntimeError):
     """The ranks' weights differ, so they no longer train one policy."""
 
 
-def first_difference(policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()) -> str | None:
-    """Compares the weights of all ranks. Synchronises, and waits for the other ranks.
+def check_drift(policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()) -> None:
+    """Checks that all ranks have the same weights. Synchronises, and waits for the other ranks.
 
     Args:
         policy: its parameters and buffers are compared.
         extra: what else a learner trains.
 
-    Returns:
-        The first parameter or buffer with different bits, such as `policy.core.bias differs on rank
-        1`; None if all are equal.
+    Raises:
+        DriftError: on all ranks, naming the first parameter or buffer with different bits.
     """
     if n_ranks() == 1:
-        return None
+        return
     tensors = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
     tensors |= {f"extra.{i}": tensor for i, tensor in enumerate(extra)}
     with waiting():
         rows = all_gather(checksums(tensors.values())).T.tolist()
     for name, sums in zip(tensors, rows, strict=True):
         if different := [rank for rank, value in enumerate(sums) if value != sums[0]]:
-            return f"policy.{name} differs on {ranks_named(different)}"
-    return None
-
-
-def check_drift(policy: torch.nn.Module, extra: Sequence[torch.Tensor] = ()) -> None:
-    """Checks that all ranks have the same weights. Synchronises, and waits for the other ranks.
-
-    Raises:
-        DriftError: on all ranks, naming the first parameter or buffer that differs.
-    """
-    if difference := first_difference(policy, extra):
-        raise DriftError(
-            f"The ranks drift apart: {difference}; a learner averages gradients with "
-            "megastep.agents.distributed.pooling.average_gradients"
-        )
+            raise DriftError(
+                f"The ranks drift apart: policy.{name} differs on {ranks_named(different)}; a "
+                "learner averages gradients with "
+                "megastep.agents.distributed.pooling.average_gradients"
+            )
 
 
 def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:

@@ -19,7 +19,7 @@ import torch
 from megastep.agents import factory, package
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
-from megastep.agents.distributed.drift import first_difference, ranks_named
+from megastep.agents.distributed.drift import ranks_named
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import check, settings
 from megastep.agents.launch.watch import Team
@@ -45,14 +45,11 @@ def check_start(cfg: settings.Train) -> None:
 
 
 def check_world(cfg: settings.Train, trainer: Trainer) -> None:
-    """Raises UserError if the ranks differ in geometries, spaces or initial weights."""
+    """Raises UserError if the ranks differ in geometries or spaces."""
     if process_group.n_ranks() > 1:
         homes = factory.homes(cfg.env, cfg.geometry, "training")
-        check_equal(
-            {"the digest of the training homes": digest(homes), **trainer.saver.config["spaces"]}
-        )
-        if difference := first_difference(trainer.policy):
-            raise UserError(f"The ranks start with different weights: {difference}")
+        facts = {"the digest of the training homes": digest(homes)}
+        check_equal(facts | trainer.saver.config["spaces"])
 
 
 def check_equal(facts: dict[str, object]) -> None:
