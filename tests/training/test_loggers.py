@@ -16,7 +16,7 @@ from PIL import Image
 
 from megastep.agents.runs import json_lines
 from megastep.agents.training import loggers
-from megastep.agents.training.curves import panels_of, places_of, plot_curves, smoothed
+from megastep.agents.training.curves import panels_of, plot_curves, smoothed
 from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.loggers.csv import CSV
 from megastep.agents.training.loggers.tensorboard import TensorBoard
@@ -79,18 +79,6 @@ def lines(n, **values):
     return "".join(json.dumps({"samples": i, **values}) + "\n" for i in range(n)).encode()
 
 
-def test_truncate_keeps_the_bytes_up_to_the_step_and_a_file_without_later_lines(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_bytes(lines(9, rate=0.1, none=None))
-    json_lines.truncate_after(path, 4)
-    assert path.read_bytes() == lines(5, rate=0.1, none=None)
-    inode = path.stat().st_ino
-    json_lines.truncate_after(path, 4)
-    assert path.stat().st_ino == inode and path.read_bytes() == lines(5, rate=0.1, none=None)
-    json_lines.truncate_after(tmp_path / "absent.jsonl", 4)
-    assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
-
-
 @pytest.mark.parametrize(
     "damage",
     [b"\xff\xfe{", b'{"samples": 2', b'{"sanples": 2}', b"[]", b"7", b'{"samples": null}', b"\0"],
@@ -138,19 +126,6 @@ def test_full_disk_on_resume_leaves_the_file(tmp_path):
         Loggers(tmp_path, step=900)
     assert path.read_bytes() == lines(1000)
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
-
-
-def test_kill_during_truncation_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "metrics.jsonl"
-    path.write_bytes(lines(9))
-
-    def killed(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "replace", killed)
-    with pytest.raises(KeyboardInterrupt):
-        json_lines.truncate_after(path, 4)
-    assert path.read_bytes() == lines(9)
 
 
 # ---- progress.csv ----
@@ -237,13 +212,6 @@ def failing(*_, **__):
 def with_wandb(folder, step=0):
     make = functools.partial(Wandb, folder, run_name="n", config={}, project="p")
     return Loggers(folder, step, {"wandb": make})
-
-
-def test_wandb_logs_metrics_and_perf(tmp_path, monkeypatch):
-    logged = fake_wandb(monkeypatch)
-    run_loggers = with_wandb(tmp_path)
-    run_loggers.write(5, {"a": 1, "perf/b": 2})
-    assert logged == [(5, {"samples": 5, "a": 1, "perf/b": 2})]
 
 
 def test_resumed_run_continues_its_wandb_run(tmp_path, monkeypatch):
@@ -367,12 +335,6 @@ def test_curves_are_means_in_a_band():
     assert mean[:38].tolist() == [0] * 38 and mean[[0, -1]].tolist() == [0, 1]
     assert mean[38:42] == pytest.approx([0.2, 0.4, 0.6, 0.8])
     assert deviation[39] == pytest.approx(0.24**0.5) and deviation[0] == pytest.approx(0, abs=1e-7)
-    large, *small = places_of(9)
-    cells = {(i, j) for i in range(4) for j in range(4)}
-    taken = [{(i, j) for i in range(4)[rows] for j in range(4)[columns]}
-             for rows, columns in (large, *small)]  # fmt: skip
-    assert len(taken[0]) == 4 and all(len(one) == 1 for one in taken[1:])
-    assert len(set.union(*taken)) == 12 and set.union(*taken) < cells, "none lies on another"
 
 
 def test_curves_leave_out_what_never_changes():

@@ -288,13 +288,6 @@ def test_metrics_are_logged_by_name_and_role_for_lanes_that_learn(tmp_path):
     assert run.latest_stats["episode/age"] == 75
 
 
-def test_training_adds_no_attributes(tmp_path):
-    run = make_trainer(tmp_path, samples=3 * UPDATE)
-    attributes, collect = set(vars(run)), run.collect
-    run.train()
-    assert set(vars(run)) == attributes and run.collect is collect
-
-
 def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
     run, order = make_trainer(tmp_path, samples=3 * UPDATE, every=2), []
     collect = run.collect
