@@ -177,10 +177,13 @@ def test_actions_are_those_of_the_plain_form(to_gpu, n_lanes, shape):
     torch.manual_seed(0)
     output = heads.output(spaces.MultiDiscrete(*shape), 64)
     nn.init.normal_(output.linear.weight, std=0.1)
-    x, generator = torch.randn(n_lanes, 64), torch.Generator()
+    x = torch.randn(n_lanes, 64)
+    on_gpu = to_gpu(x)
+    generator = torch.Generator(on_gpu.device)
+    output, x = output.to(on_gpu.device), x.to(on_gpu.device)
     for sample in (True, False):
         with torch.no_grad():
-            logits, actions, logprobs = output.act(to_gpu(x), sample, generator.manual_seed(1))
+            logits, actions, logprobs = output.act(on_gpu, sample, generator.manual_seed(1))
             with plain_operations():
                 plain = output.act(x, sample, generator.manual_seed(1))
         torch.testing.assert_close(logits, plain[0], rtol=0, atol=1e-5)
