@@ -131,10 +131,12 @@ class HeadSizes(NamedTuple):
 
     @property
     def first_score(self) -> int:
+        """Index of the first column of scores."""
         return _padded(self.n_predicted)
 
     @property
     def first_hidden(self) -> int:
+        """Index of the first column of the critic's hidden layer."""
         return self.first_score + _padded(self.n_agents * self.n_choices)
 
 
