@@ -431,42 +431,7 @@ def test_sound_matches_twin(n_agents, device):
     assert n_silent or n_agents == 16
 
 
-def test_sound_by_hand(device):
-    """Three metres ahead and to the right behind a wall; and out of hearing."""
-    ring = Ring(device, (2.0, 3.5, 0.0), (5.0, 3.5, 90.0), geometry=toys.column(), hearing=4)
-    assert ring.env.obs_space.sound.dim == 3
-    heard = ring.step().obs.sound[:, 0].tolist()
-    assert heard[0] == pytest.approx([0.25, 1, 0], abs=2e-3)
-    assert heard[1] == pytest.approx([0.25, 0, 1], abs=2e-3)
-    ring.env.rules["hearing"] = 2.9
-    assert ring.step().obs.sound.tolist() == [[[0, 0, 0]]] * 2
-
-
-def test_privileged_observation_by_hand(device):
-    ring = Ring(device, (2, 3.5, 0), (4, 4.5, 90), privileged=True)
-    ring.env.health.copy_(torch.tensor([0.75, 0.5]))
-    world = ring.step()
-    assert world.privileged.shape == (2, 1, 6)
-    first, second = world.privileged[:, 0].tolist()
-    assert first == pytest.approx([0.75, 0.5, 0.2, 0.1, 0, 1], abs=1e-6)
-    assert second == pytest.approx([0.5, 0.75, -0.1, 0.2, 0, -1], abs=1e-6)
-
-
 # ---- Images ----
-
-
-def test_agents_and_walls_differ_in_colour(device):
-    """The weakest channel has at most 0.12 of an agent's light, and more of a wall's, in any light.
-    Pixels are single rays here, since the mean over an agent and a wall lies in between.
-    """
-    homes = sample("homes", 16)
-    env = envs.Deathmatch(64, homes, n_agents=16, device=device, res=256, subsample=1)
-    world, shown = env.reset(), engine.render(env.core.scenery, env.core.agents).indices
-    rgb = world.obs.rgb[:, 0, :, 0].float()
-    weakest = (rgb.amin(1) / rgb.sum(1)).view(64, 16, 256)
-    is_agent, lit = (shown >= 0) & (shown < 128), rgb.sum(1).view(64, 16, 256) > 0.01
-    assert (is_agent & lit).sum() > 100
-    assert weakest[is_agent & lit].max() < 0.12 < weakest[~is_agent & lit].min()
 
 
 # ---- Bad settings ----

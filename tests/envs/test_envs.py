@@ -3,7 +3,6 @@
 import inspect
 import math
 
-import numpy as np
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -66,15 +65,6 @@ def make(name, device="cpu", n_envs=12, seed=1, **settings):
     if "geometries" in inspect.signature(cls).parameters:
         settings["geometries"] = sample("homes" if name.startswith("keys") else "bench", 4)
     return cls(n_envs, seed=seed, device=device, **{**SHORT[name], **settings})
-
-
-@pytest.mark.parametrize("name", ["minimal", "explorer", "memory", "deathmatch", "pointgoal"])
-def test_few_environments_are_spread_over_all_homes(name):
-    """Three environments and seven rooms, 4 to 10 m wide."""
-    rooms = [toys.box(width) for width in range(4, 11)]
-    env = envs.ENVS[name](3, rooms, device="cpu", **SHORT[name])
-    walls = [env.core.scenery.layouts.lines[d] for d in env.layout.tolist()]
-    assert [round(float(np.ptp(lines[..., 0].numpy()))) for lines in walls] == [4, 6, 8]
 
 
 def idle(env):
@@ -383,17 +373,6 @@ def test_display_draws_the_current_state(name, monkeypatch):
     assert written[0].startswith("step 0")
 
 
-def test_explorer_without_metrics_is_the_same_otherwise():
-    names = ("explorer", "explorer, privileged")
-    expected = [contract.rollout(make(name), 10) for name in names]
-    for name, worlds in zip(names, expected):
-        env = make(name, metrics=False)
-        for world, plain in zip(worlds, contract.rollout(env, 10)):
-            del world["metrics"]
-            assert contract.same(world, plain)
-        assert hasattr(env, "visible") == ("privileged" in name)
-
-
 def test_explorer_resamples_homes_at_resets_only(device):
     env, generator = make("explorer", device, resample=True), torch.Generator().manual_seed(1)
     env.reset()
@@ -409,14 +388,3 @@ def test_explorer_resamples_homes_at_resets_only(device):
 
 
 # ---- Minimal ----
-
-
-def test_minimal_moves_one_metre_per_step():
-    env = envs.Minimal(1, device="cpu")
-    env.reset()
-    env.core.agents.positions[:] = 3.0
-    env.core.agents.angles[:] = 90.0
-    env.step(arrdict.arrdict(actions=torch.tensor([[3]])))
-    assert np.allclose(env.core.agents.positions.tolist(), [[[3.0, 4.0]]], atol=1e-5), (
-        "10 m/s for a tenth of a second, along +y"
-    )

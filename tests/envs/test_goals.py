@@ -2,8 +2,6 @@
 
 import math
 import re
-import resource
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +13,7 @@ from megastep import core, engine, envs, geometry, modules, scene, toys
 from megastep.envs.pointgoal import goals as module
 from megastep.envs.pointgoal.goals import GoalFields, goal_fields
 from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS, pointgoal_step
-from megastep.geodesics import geodesics, n_cells
+from megastep.geodesics import geodesics
 from megastep.geometries import sample
 from tests.helpers.outputs import Poison
 
@@ -173,21 +171,6 @@ def test_bad_indices_are_named_and_other_lanes_continue(which, number, device):
     assert all(torch.equal(a[..., :3, :, :], b[..., :3, :, :]) for a, b in zip(out[5:], right[5:]))
 
 
-def test_fp16_fields_are_read_as_pytorch_reads_them(device):
-    """Every positive fp16 number, as the value of a constant field; infinity leaves the old 0."""
-    halves = torch.arange(0x7C01, dtype=torch.int32).to(torch.int16).view(torch.float16)
-    c = core.Core(scene.scenery([toys.box(3)], 1, len(halves), device=device), res=8)
-    c.agents.positions.fill_(1.05)
-    arguments = fields_of(np.random.default_rng(1), 1, len(halves), 1)
-    fields = np.repeat(halves.numpy()[:, None], 4, 1).reshape(-1, 2, 2)
-    arguments |= dict(fields=[fields], origins=[np.ones(2)])
-    goal_index = torch.arange(len(halves), dtype=torch.int32, device=device)[:, None]
-    goals = GoalFields(**arguments, cell=CELL, device=device)
-    distances = step(c, goals, goal_index)[1].progress[2].cpu()
-    torch.testing.assert_close(distances[:-1], halves[:-1].float(), rtol=1e-6, atol=0)
-    assert distances[-1] == 0
-
-
 def test_goals_of_other_layouts_are_refused():
     goals = GoalFields(**fields_of(np.random.default_rng(1), 2), cell=CELL)
     with pytest.raises(ValueError, match="goals .* 3 layouts .* 2 on cpu"):
@@ -217,17 +200,6 @@ def test_drawn_goals_are_in_range(n_agents, device):
         assert (goals.points[d, goal].cpu().numpy() == truth[d].goals[goal]).all()
         drawn.add((d, goal))
     assert len(drawn) > 40, "of 64"
-
-
-def test_goals_are_from_1_to_15_metres_away_by_default():
-    homes = [toys.box(4), toys.box(20)]
-    c = core.Core(scene.scenery(homes, 1, 1000, device="cpu"), res=8)
-    goals = goal_fields(homes, c)
-    spawner = modules.RandomSpawns(homes, c, resample=True, points=goals.spawns)
-    spawner(c.agent_full(True))
-    _, state = step(c, goals, torch.zeros_like(spawner.point_index), spawner.point_index)
-    lengths = state.progress[4]
-    assert 1 <= lengths.min() < 1.2 and 14.5 < lengths.max() <= 15
 
 
 @pytest.mark.parametrize(
@@ -291,16 +263,6 @@ def test_a_damaged_cache_is_rebuilt(fault, folder):
     assert all((a == b).all() for a, b in zip(right[0], again[0]))
 
 
-def test_cached_files_are_limited_in_size(folder, monkeypatch):
-    one = all_of([toys.box(3)])
-    size = next(folder.glob("geodesics-*")).stat().st_size
-    assert one and module.MAX_BYTES == 10**9
-    monkeypatch.setattr(module, "MAX_BYTES", 2.5 * size)
-    for width in (3.1, 3.2, 3.3):
-        all_of([toys.box(width)])
-    assert len(list(folder.glob("geodesics-*"))) == 2
-
-
 def test_many_layouts_show_progress(folder, capfd):
     all_of([toys.box(2 + 0.01 * i) for i in range(module.MIN_PROGRESS)])
     assert "48 layouts" in capfd.readouterr().err
@@ -331,23 +293,6 @@ def square_home(side, walls=True):
     masks = geometry.masks(lines, [np.array(outline, float)] if walls else [])
     masks = masks if walls else np.ones((40, 40), np.int16)
     return toys.box() | dict(id=7, walls=lines, lights=np.array([[2.0, 2.0]]), masks=masks)
-
-
-def test_home_of_198_metres_takes_little_time_and_memory():
-    home = geometry.validate_geometry(square_home(198.0))
-    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
-    for env in (envs.Explorer, envs.Deathmatch):
-        env(4, [home], device="cpu").reset()
-    with pytest.raises(ValueError, match="^geometry 7 is 198 m x 198 m, but .* at most 10,000 m2"):
-        envs.PointGoal(4, [home], device="cpu")
-    assert time.process_time() - start < 5
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500 * 1024  # kB
-
-
-def test_largest_home_is_one_of_a_million_cells():
-    assert n_cells(square_home(99.7)) == 999**2
-    with pytest.raises(ValueError, match="geometry 7 is 100 m x 100 m"):
-        n_cells(square_home(100.0))
 
 
 def test_fields_that_do_not_fit_are_refused_before_they_are_computed(monkeypatch):

@@ -141,17 +141,6 @@ def test_keys_open_doors_of_their_colours_and_the_goal_ends_the_episode(device):
     assert world.reset.all() and not world.reward.any() and not doors.open.any()
 
 
-def test_a_key_that_is_not_used_is_wasted():
-    env = make_env(limit=2)
-    env.reset()
-    keys = env.objects["key"]
-    colour = keys.visible.int().argmax(1)
-    visit(env, keys.positions[torch.arange(5), colour])
-    world = env.step(still(env))
-    assert world.truncated.all() and (world.metrics.wasted == 1).all()
-    assert not world.metrics.success.any() and not world.metrics.doors.any()
-
-
 def test_contract(device):
     contract.rollout(make_env(device, limit=12, resample=True, privileged=True), 40)
 

@@ -113,19 +113,6 @@ def test_threads_exchange_numbers(exchange, body, expected, order):
     np.testing.assert_array_equal(exchange(body, NUMBERS, order), np.ravel(expected))
 
 
-def test_a_missing_barrier_shows_in_one_of_two_orders(exchange):
-    body = """
-    extern __shared__ int shared[];
-    shared[threadIdx.x] = x;
-    x = shared[threadIdx.x ^ 1];
-    """
-    expected = NUMBERS.reshape(-1, 2)[:, ::-1].ravel()
-    results = [exchange(body, NUMBERS, order) for order in ("forward", "reversed")]
-    assert any((result != expected).any() for result in results)
-    with_barrier = body.replace("= x;", "= x; __syncwarp();", 1)
-    np.testing.assert_array_equal(exchange(with_barrier, NUMBERS), expected)
-
-
 COPY = """
 extern __shared__ int shared[];
 if (lane % 4 == 0)
