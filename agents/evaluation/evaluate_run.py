@@ -43,7 +43,7 @@ def run(cfg: settings.Evaluate) -> Path:
     geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
     homes = factory.homes(env_settings, geometry, cfg.split)
     folder, rank = folders.folder_of(loaded.path), process_group.rank()
-    with env_failures.told(env_settings, folder, rank=rank):
+    with env_failures.caught(env_settings, folder, rank=rank):
         if cfg.ratings:
             duels = Duels(cfg, loaded, env_settings, homes, device)
             path = ratings.write(duels, tables.labels(duels.where, geometry, cfg.split))

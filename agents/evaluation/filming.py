@@ -101,7 +101,7 @@ def film(
         problem = f"The video {path} could not be made: "
         look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail", "axes")}
         with (
-            env_failures.told(env_settings, folder),
+            env_failures.caught(env_settings, folder),
             user_errors(problem, (Exception,)),
         ):
             recording.film_all(players, path, cfg.steps, cfg.greedy, cfg.seed, **look)

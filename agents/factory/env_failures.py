@@ -19,7 +19,7 @@ METHODS = "__init__", "reset", "step", "check", "desync"
 
 
 @contextlib.contextmanager
-def told(
+def caught(
     env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
 ) -> Iterator[None]:
     """Turns an error of an environment into one sentence, and writes its traceback into a file.
@@ -38,13 +38,13 @@ def told(
     except Exception as error:
         if not (failure := _failure(error, env)):
             raise
-        is_told = isinstance(error, UserError)  # that a video could not be made because of it
-        text = [str(error if is_told else failure).rstrip(".")]
+        is_sentence = isinstance(error, UserError)  # that a video could not be made because of it
+        text = [str(error if is_sentence else failure).rstrip(".")]
         if failure.trace:
             name = f"rank_{rank}_{FILE}" if rank else FILE
             text.append(f"Its traceback is in {_write(folder, name, failure.trace)}")
         may_pass = not isinstance(failure, BadValue)
-        if getattr(env, "restart_failed", None) == 0 and may_pass and not is_told:
+        if getattr(env, "restart_failed", None) == 0 and may_pass and not is_sentence:
             text.append("env.restart_failed=3 would make it anew up to 3 times")
         raise EnvFailed(". ".join(filter(None, [*text, saved()]))) from error
 
@@ -55,10 +55,10 @@ def _failure(error, env) -> EnvError | None:
         return error
     if isinstance(error, UserError):
         return _failure_below(error.__cause__)
-    is_told = isinstance(error, engine.EngineError)
+    is_sentence = isinstance(error, engine.EngineError)
     if isinstance(error, (MemoryError, RuntimeError)):
-        is_told |= memory_problem(error) is not None
-    if is_told or env.name.startswith("megastep."):
+        is_sentence |= memory_problem(error) is not None
+    if is_sentence or env.name.startswith("megastep."):
         return None
     codes = {_code(import_object(env.name), name) for name in METHODS} - {None}
     frames = error.__traceback__

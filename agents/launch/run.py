@@ -99,7 +99,7 @@ class Run:
             token = rank_checks.check_shared(self.folder)
             if self.team:
                 self.team.set_folder(self.folder)
-            told = env_failures.told(self.cfg.env, self.folder, rank=process_group.rank())
+            told = env_failures.caught(self.cfg.env, self.folder, rank=process_group.rank())
             try:
                 together(told(lambda: self.make(source, token)))
             except EnvFailed:
@@ -170,7 +170,7 @@ class Run:
     def _train(self) -> None:
         try:
             with (
-                env_failures.told(self.cfg.env, self.folder, self.saved, process_group.rank()),
+                env_failures.caught(self.cfg.env, self.folder, self.saved, process_group.rank()),
                 signals.handled() as numbers,
                 self.around(),
                 self.progress if self.is_first else contextlib.nullcontext(),
