@@ -174,6 +174,10 @@ def test_wandb_group_of_a_sweep(here, monkeypatch):
         def __init__(self, group):
             groups.append(group)
 
+        def write(self, step, values): ...
+
+        def close(self): ...
+
     monkeypatch.setattr("megastep.agents.training.loggers.wandb.Wandb", Wandb)
     own = [*SHORT, "logger=[csv,wandb]", "logger.wandb.mode=offline"]
     assert train.main([*own, "-m", "seed=1", "hydra.sweep.dir=mine"]) == 0

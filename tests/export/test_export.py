@@ -1,7 +1,6 @@
 """A policy as a file of another runtime acts as it does in megastep."""
 
 import json
-import re
 from pathlib import Path
 
 import pytest
@@ -174,20 +173,19 @@ def test_a_core_that_cannot_be_exported_is_one_sentence(tmp_path):
 @pytest.mark.parametrize(
     "words, text",
     [
-        (["format=onnx"], "run is missing; run=latest takes the newest run"),
-        (["run=explorer_anywhere"], "format is missing; format=onnx, torch, safetensors, hub"),
+        (["format=onnx"], "run: is missing"),
+        (["run=explorer_anywhere"], "format: is missing"),
         (["run=explorer_anywhere", "format=onx"], "format: 'onx' is unknown; did you mean onnx"),
         (["run=nowhere", "format=onnx"], "nowhere is neither a run folder nor a pretrained agent"),
         (["run=explorer_anywhere", "format=onnx", "file=a.pt"], "file=a.pt must end with .onnx"),
     ],
 )
-def test_bad_words_are_one_sentence(words, text, here):
-    with pytest.raises(UserError, match=re.escape(text)):
-        export.main(words)
+def test_bad_words_are_one_sentence(words, text, here, capsys):
+    assert export.main(words) == 2 and text in capsys.readouterr().err
     assert not any(here.iterdir())
 
 
-def test_a_folder_for_a_hub(here, monkeypatch):
+def test_a_folder_for_a_hub(here, monkeypatch, capsys):
     assert train.main([*TINY, *SHORT_EPISODES, "samples=256", "folder=run"]) == 0
     parts = "geometry.parts={bench: 2, braided: {source: maze, n: 2, braid: 1}}"
     assert evaluate.main(["run=run", "geometry=suite", parts, "episodes=8"]) == 0
@@ -203,5 +201,5 @@ def test_a_folder_for_a_hub(here, monkeypatch):
     assert "# run" in card and "## Limits" in card
     policy, env = pretrained.load_with_env("mine/agent.safetensors", "cpu")
     assert policy(env.reset(), policy.initial(n_lanes(env)))[0]["actions"].shape == (1, 1)
-    with pytest.raises(UserError, match="The folder mine is not empty"):
-        export.main(["run=run", "format=hub", "file=mine"])
+    assert export.main(["run=run", "format=hub", "file=mine"]) == 2
+    assert "The folder mine is not empty" in capsys.readouterr().err
