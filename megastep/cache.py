@@ -13,11 +13,12 @@ import io
 import math
 import os
 import stat
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from megastep.atomic_files import write_atomically
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,7 +43,7 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
     body = build()
     if problem is None:
         try:
-            _write(path, body)
+            write_atomically(path, body + _digest(path.name, body), mode=0o600)
             return body, path
         except OSError as error:
             problem = f"{path.parent} cannot be written ({error.strerror})"
@@ -156,15 +157,3 @@ def _is_private(status) -> bool:
     """True if only this user and root can write to the file."""
     ours = status.st_uid in (os.geteuid(), 0)
     return ours and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-
-
-def _write(path, body) -> None:
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(body)
-            file.write(_digest(path.name, body))
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise

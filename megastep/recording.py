@@ -34,6 +34,7 @@ from numpy.typing import ArrayLike
 
 from megastep import plotting, workers
 from megastep.arrdict import clone, numpyify
+from megastep.atomic_files import write_atomically
 from megastep.types import Tree, n_lanes, optional
 from megastep.video import GifWriter, Mp4Writer, as_image
 
@@ -346,18 +347,7 @@ def _html(content: bytes, ending: str) -> str:
 def _write(path: Film, content: bytes) -> Film:
     """Writes a file atomically, in a folder that is made if it is missing. Returns the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(
-        dir=path.parent, prefix=f".{path.stem}-", suffix=".tmp", delete=False
-    ) as file:
-        try:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-            os.chmod(file.name, 0o644)  # temporary files are readable by their owner only
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
+    write_atomically(path, content)
     return path
 
 

@@ -5,18 +5,16 @@ Files may come from strangers: sizes are limited, pickled objects are refused, a
 ValueError that names file and geometry.
 """
 
-import os
 import re
-import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from megastep import geometry
+from megastep.atomic_files import replacing
 from megastep.dotdict import dotdict
 
 KEYS = ("walls", "lights", "masks", "res", "id")
@@ -150,19 +148,5 @@ def save(path: str | Path, geometries: Sequence[dict]) -> None:
             f"walls are too many for a file: the limits are {MAX_UNPACKED:,} bytes and "
             f"{MAX_LENGTHS:,} m."
         )
-    write_whole(path, lambda file: np.savez_compressed(file, **arrays))
-
-
-def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Writes a file, by `write(file)`, under another name, and renames it once it is whole."""
-    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(partial, 0o644)
-        os.replace(partial, path)
-    except BaseException:
-        Path(partial).unlink(missing_ok=True)
-        raise
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)

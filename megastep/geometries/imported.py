@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from megastep.atomic_files import write_atomically
 from megastep.dotdict import dotdict
-from megastep.geometries.files import write_whole
 from megastep.geometries.homes import database
 
 __all__ = ["NAMES", "folder", "load", "pick", "probe", "write"]
@@ -55,9 +55,9 @@ def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Pa
     digest = hashlib.sha256(content).hexdigest()
     folder().mkdir(parents=True, exist_ok=True)
     path = folder() / f"{name}-{digest[:12]}.npz"
-    write_whole(path, lambda file: file.write(content))
+    write_atomically(path, content)
     line = f"{digest}  {path.name}\n".encode()
-    write_whole(folder() / f"{name}.sha256", lambda file: file.write(line))
+    write_atomically(folder() / f"{name}.sha256", line)
     for old in folder().glob(f"{name}-*.npz"):
         if old != path:
             old.unlink(missing_ok=True)
