@@ -8,7 +8,6 @@ import pytest
 import reference
 
 from megastep import envs
-from megastep.agents.cli import command
 from tests.helpers.pages import MAINS, ROOT
 
 DOCS = ROOT / "docs"
@@ -41,7 +40,6 @@ def commands():
 )
 def test_command_composes(page, script, arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command, "_show", lambda *_: None)  # which composes it again
     code = MAINS[script]([*shlex.split(arguments), "--cfg", "job"])
     assert code == 0, capsys.readouterr().err
 
