@@ -1,7 +1,5 @@
 """The state of several ranks in one checkpoint, with the ranks' savers in this process."""
 
-import json
-
 import pytest
 import torch
 
@@ -110,15 +108,6 @@ def test_files_of_earlier_starts_are_deleted(folder):
     assert names(folder) == {".rank1-before-1"}
     savers(folder)
     assert not names(folder)
-
-
-def test_one_process_writes_the_files_that_it_always_has(folder):
-    saver = Saver(folder, {})
-    saver(8, state(0))
-    saver.wait()
-    manifest = json.loads((folder / "step_8/manifest.json").read_bytes())
-    assert {*manifest["files"]} == {"config.json", "state.pt", "world.pt", "replay.pt"}
-    assert manifest["format"] == checkpoint.FORMAT
 
 
 def test_new_rank_has_rank_0s_optimizer_and_its_own_generators(tmp_path):
