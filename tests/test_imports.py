@@ -164,7 +164,6 @@ OUTSIDE_USERS = {
     "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
     "rsl_rl": ("megastep/adapters/rsl_rl.py",),
     "shapely": ("megastep/geometries/plans/*.py",),
-    "skimage": ("megastep/geometries/plans/*.py",),
     "stable_baselines3": ("megastep/adapters/sb3.py",),
     "svgelements": ("megastep/geometries/plans/*.py",),
     "tensorboard": ("agents/training/loggers/tensorboard.py",),

@@ -63,7 +63,7 @@ KEYS = {
     "svg": ("file", "scale", "walls", "doors"),
     "map": ("file", "metres_per_pixel"),
 }
-NEEDED = ("shapely", "defusedxml", "svgelements", "skimage")
+NEEDED = ("shapely", "defusedxml", "svgelements")
 
 
 Metres = Annotated[float, Field(gt=0, lt=1e6)]

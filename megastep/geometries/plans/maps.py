@@ -4,15 +4,17 @@ images, in which white is floor.
 
 import io
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
 import yaml
+from contourpy import contour_generator
 from PIL import Image
+from scipy import ndimage
 from shapely import affinity
-from skimage import filters, measure, morphology
 
+from megastep import geometry
 from megastep.geometries.plans import outlines
 from megastep.geometries.plans.outlines import Drawing
 
@@ -103,13 +105,15 @@ def read(grid: Map) -> tuple[Drawing, list[str]]:
     if extent > 10 * outlines.MAX_EXTENT:
         raise ValueError(f"the map is {extent:,.0f} m long; check the resolution")
     n_cells = max(2, round(SPECKLE / resolution**2))
-    free = filters.rank.majority(grid.free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    free = morphology.remove_small_holes(free, max_size=n_cells)
-    free = morphology.remove_small_objects(free, max_size=n_cells)
+    around = [
+        ndimage.convolve(c.astype(int), np.ones((3, 3)), mode="constant")
+        for c in (grid.free, ~grid.free)
+    ]
+    free = ~_without_specks(around[0] <= around[1], n_cells)
+    free = _without_specks(free, n_cells)
     warnings = []
-    labels = np.asarray(measure.label(free, connectivity=1))
-    border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    is_drawing = bool(border.any()) and not grid.unknown.any()
+    on_border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]])
+    is_drawing = bool(on_border.any()) and not grid.unknown.any()
     floor = _area(~free if is_drawing else free, resolution)
     angle = skew(floor)
     if MIN_ANGLE < abs(angle) <= MAX_ANGLE:
@@ -118,7 +122,7 @@ def read(grid: Map) -> tuple[Drawing, list[str]]:
     floor = shapely.simplify(floor, max(TOLERANCE, STEP * resolution))
     if is_drawing:
         return outlines.enclosed(outlines.polygons(floor), []), warnings
-    edge = morphology.dilation(free, np.ones((3, 3))) & grid.unknown
+    edge = ndimage.binary_dilation(free, np.ones((3, 3))) & grid.unknown
     if (length := edge.sum() * resolution) > 0.5:
         warnings.append(f"about {length:.1f} m of the floor's edge is unknown, and is a wall now")
     parts = [part for part in outlines.polygons(floor) if part.area >= outlines.MIN_AREA]
@@ -129,12 +133,20 @@ def read(grid: Map) -> tuple[Drawing, list[str]]:
     return Drawing([], outlines.rooms_of(floor), [], [], floor), warnings
 
 
+def _without_specks(cells, n_cells) -> np.ndarray:
+    """Returns cells (H, W) without the connected ones that are at most `n_cells`."""
+    labels, _ = geometry.components(cells)
+    is_large = np.bincount(labels.ravel()) > n_cells
+    is_large[0] = False
+    return is_large[labels]
+
+
 def _area(cells, resolution) -> shapely.geometry.base.BaseGeometry:
     """Returns the area of cells (H, W) in metres, its contours smoothed by a cell."""
-    smooth = filters.gaussian(np.pad(cells, 2).astype(float), 0.7)
+    smooth = ndimage.gaussian_filter(np.pad(cells, 2).astype(float), 0.7, mode="nearest")
     area = shapely.Polygon()
-    rings = [ring for ring in measure.find_contours(smooth, 0.5) if len(ring) >= 4]
-    parts = [part for ring in rings for part in outlines.ring(ring[:, ::-1] * (1, -1))]
+    rings: Any = contour_generator(z=smooth).lines(0.5)
+    parts = [part for ring in rings for part in outlines.ring(ring * (1, -1))]
     for part in sorted(parts, key=lambda part: -part.area):  # a hole after what it is in
         inside = area.contains(part.representative_point())
         area = area.difference(part) if inside else area.union(part)
