@@ -68,14 +68,8 @@ def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Pa
 def _arrays(name, listing, modified) -> tuple[dict, np.ndarray]:
     """Returns the arrays of a database and the index at which each geometry's begin."""
     cure = f"run megastep import source={name} path=... again"
-    try:
-        digest, file = listing.read_text().split()
-        content = (listing.parent / Path(file).name).read_bytes()
-    except (OSError, ValueError) as error:
-        raise ValueError(f"the imported {name} cannot be read ({error}); {cure}") from error
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise ValueError(f"the imported {name} is damaged (wrong sha256); {cure}")
-    return database.unpack(content, MAX_GEOMETRIES, cure, ("files",))
+    what = f"The imported plans of {name}"
+    return database.read(listing.parent, listing, MAX_GEOMETRIES, what, cure, ("files",))
 
 
 def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
@@ -93,16 +87,10 @@ def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
     arrays, starts = _arrays(name, listing, listing.stat().st_mtime_ns)
     files = np.unique(arrays["files"])
     order = np.random.RandomState(0).permutation(len(files))  # numpy never changes what it draws
-    n_training = len(files) - max(1, round(len(files) / 10)) if len(files) > 1 else 1
-    parts = {
-        "training": order[:n_training],
-        "test": order[n_training:] if len(files) > 1 else order,
-        "all": order,
-    }
-    members = np.flatnonzero(np.isin(arrays["files"], files[parts[split]]))
-    members = members[np.random.RandomState(seed % 2**32).permutation(len(members))][:n]
-    drawn = [database.geometry_at(arrays, starts, int(i), int(i)) for i in members]
-    return [drawn[i % len(drawn)] for i in range(n)]
+    of_split = files[order[[*database.split_range(len(files), split)]]]
+    members = database.draw(np.flatnonzero(np.isin(arrays["files"], of_split)), n, seed)
+    drawn = {i: database.geometry_at(arrays, starts, i, i) for i in members}
+    return [drawn[i] for i in members]
 
 
 def load(path: Path) -> list[dotdict]:

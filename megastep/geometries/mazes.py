@@ -11,6 +11,7 @@ bottom.
 """
 
 import functools
+import itertools
 import math
 import numbers
 
@@ -104,10 +105,8 @@ def passages(size: int, braid: float, generator: PortableGenerator) -> list[list
             cell = exits[cell]
 
     dead_ends = [cell for cell, exits in enumerate(opened) if len(exits) == 1]
-    for k in range(int(braid * len(dead_ends) + 0.5)):
-        at = k + generator.below(len(dead_ends) - k)
-        dead_ends[k], dead_ends[at] = dead_ends[at], dead_ends[k]
-        cell = dead_ends[k]
+    n_opened = int(braid * len(dead_ends) + 0.5)
+    for cell in itertools.islice(generator.shuffled(dead_ends), n_opened):
         if len(opened[cell]) == 1:  # False if a neighbour was opened to it before
             closed = [beside for beside in neighbours[cell] if beside not in opened[cell]]
             join(cell, closed[generator.below(len(closed))])

@@ -122,10 +122,7 @@ def _join(regions, generator) -> None:
         and 0 != regions[i + y, j + x] != regions[i - y, j - x] != 0
     ]  # fmt: skip
     part = list(range(regions.max() + 1))
-    for k in range(len(doors)):
-        at = k + generator.below(len(doors) - k)
-        doors[k], doors[at] = doors[at], doors[k]
-        i, j, *sides = doors[k]
+    for i, j, *sides in generator.shuffled(doors):
         a, b = (part[regions[i, j]] for i, j in (sides[:2], sides[2:]))
         if a != b:
             part = [a if p == b else p for p in part]

@@ -39,24 +39,9 @@ SUITE = {  # the parts of `suite`
 }
 
 
-def _split_range(count, split) -> range:
-    """Returns the indices of a split, as a range into a database of `count` geometries. A single
-    geometry is in every split.
-    """
-    training = count - max(1, round(count / 10)) if count > 1 else 1
-    return {
-        "training": range(training),
-        "test": range(training if count > 1 else 0, count),
-        "all": range(count),
-    }[split]
-
-
 def _draw_indices(count, n, split, seed) -> list[int]:
     """Returns n indices into a database of `count`: a random permutation of the split, repeated."""
-    members = _split_range(count, split)
-    random = np.random.RandomState(seed % 2**32)  # numpy never changes what it draws
-    order = random.permutation(len(members))
-    return [members[order[i % len(members)]] for i in range(n)]
+    return database.draw(database.split_range(count, split), n, seed)
 
 
 def box(n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.0) -> list[dotdict]:
@@ -167,6 +152,17 @@ def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[d
     return imported.pick("houseexpo", n, split, seed)
 
 
+def _generated(module, n, split, seed, n_bytes, size, **options) -> list[dotdict]:
+    """Returns mazes that a module generates, of `n_bytes` each."""
+    from megastep.devices import fit  # imports PyTorch, which reading settings must not
+
+    indices = _draw_indices(module.COUNT, n, split, seed)
+    unique = dict.fromkeys(indices)
+    fit(len(unique), n_bytes, "cpu", f"mazes of {size} x {size} cells")
+    generated = {i: module.generate(i, size, **options) for i in unique}
+    return [generated[i] for i in indices]
+
+
 @checked
 def maze(
     n: Count = 512,
@@ -188,15 +184,10 @@ def maze(
         thickness: thickness of the walls, in metres.
         braid: fraction of the dead ends that is opened: 0 leaves a perfect maze.
     """
-    from megastep.devices import fit  # imports PyTorch, which reading settings must not
-
     mazes.validate_lengths(size, corridor, thickness)
-    indices = _draw_indices(mazes.COUNT, n, split, seed)
-    unique = dict.fromkeys(indices)
-    what = f"mazes of {size} x {size} cells"
-    fit(len(unique), mazes.bytes_each(size, corridor, thickness), "cpu", what)
-    generated = {i: mazes.generate(i, size, corridor, thickness, braid) for i in unique}
-    return [generated[i] for i in indices]
+    n_bytes = mazes.bytes_each(size, corridor, thickness)
+    lengths = dict(corridor=corridor, thickness=thickness, braid=braid)
+    return _generated(mazes, n, split, seed, n_bytes, size=size, **lengths)
 
 
 @checked
@@ -216,15 +207,9 @@ def memory_maze(
         size: cells per side: 9, 11, 13 or 15.
         cell: side of a cell, in metres, at least 0.5.
     """
-    from megastep.devices import fit  # as in `maze`
-
     memory_mazes.validate(size, cell)
-    indices = _draw_indices(memory_mazes.COUNT, n, split, seed)
-    unique = dict.fromkeys(indices)
-    what = f"mazes of {size} x {size} cells"
-    fit(len(unique), memory_mazes.bytes_each(size, cell), "cpu", what)
-    generated = {i: memory_mazes.generate(i, size, cell) for i in unique}
-    return [generated[i] for i in indices]
+    n_bytes = memory_mazes.bytes_each(size, cell)
+    return _generated(memory_mazes, n, split, seed, n_bytes, size=size, cell=cell)
 
 
 class _Part(NamedTuple):

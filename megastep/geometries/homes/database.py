@@ -32,22 +32,52 @@ SEEDS_EACH = 50  # homes per process at least; to start one takes as long as abo
 REMEDY = "install megastep again, or run scripts/make_homes.py"
 
 
-@functools.lru_cache(maxsize=1)
-def _arrays(path) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Returns the arrays of a database and the index at which each home's begin.
+def split_range(count: int, split: str) -> range:
+    """Returns the indices of a split, as a range into a database of `count` geometries. A single
+    geometry is in every split.
+    """
+    training = count - max(1, round(count / 10)) if count > 1 else 1
+    return {
+        "training": range(training),
+        "test": range(training if count > 1 else 0, count),
+        "all": range(count),
+    }[split]
 
-    Raises ValueError unless the file's sha256 is the one in the file beside it.
+
+def draw(members: Sequence[int], n: int, seed: int) -> list[int]:
+    """Returns n of the members: a random permutation of them, repeated."""
+    random = np.random.RandomState(seed % 2**32)  # numpy never changes what it draws
+    order = random.permutation(len(members))
+    return [int(members[order[i % len(members)]]) for i in range(n)]
+
+
+def read(
+    path: Path, listing: Path, n_homes: int, what: str, remedy: str, further: Sequence[str] = ()
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Returns what `unpack` returns of a file, or of the file in its folder that `listing` names.
+
+    Args:
+        path: the file, or its folder.
+        listing: a file of the sha256 and the name.
+        what: the database's name in errors, which end with the remedy.
+
+    Raises:
+        ValueError: if the file cannot be read or has another sha256.
     """
     try:
-        content = path.read_bytes()
-        expected = path.with_suffix(".sha256").read_text().split()[0]
-    except (OSError, IndexError) as error:
-        raise ValueError(
-            f"The homes in {str(path)!r} cannot be read ({error}); {REMEDY}."
-        ) from error
-    if hashlib.sha256(content).hexdigest() != expected:
-        raise ValueError(f"The homes in {str(path)!r} are damaged (wrong sha256); {REMEDY}.")
-    return unpack(content, COUNT)
+        digest, name = listing.read_text().split()
+        content = (path / Path(name).name if path.is_dir() else path).read_bytes()
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{what} cannot be read ({error}); {remedy}") from error
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise ValueError(f"{what} are damaged (wrong sha256); {remedy}")
+    return unpack(content, n_homes, remedy, further)
+
+
+@functools.lru_cache(maxsize=1)
+def _arrays(path) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    what = f"The homes in {str(path)!r}"
+    return read(path, path.with_suffix(".sha256"), COUNT, what, REMEDY)
 
 
 def pack(

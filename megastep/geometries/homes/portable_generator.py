@@ -7,7 +7,10 @@ library's, whose last bit differs between systems. `sum` of floats is avoided, s
 changed its rounding.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeVar
+
+T = TypeVar("T")
 
 MASK = 2**64 - 1
 GOLDEN = 0x9E3779B97F4A7C15
@@ -70,6 +73,14 @@ class PortableGenerator:
     def lognormal(self, median: float, sigma: float) -> float:
         """Returns median * e^(sigma z), where z is nearly normal."""
         return median * exp(sigma * self.normal())
+
+    def shuffled(self, items: Sequence[T]) -> Iterator[T]:
+        """Yields items in a random order, each drawn when it is taken."""
+        rest = [*items]
+        for k in range(len(rest)):
+            at = k + self.below(len(rest) - k)
+            rest[k], rest[at] = rest[at], rest[k]
+            yield rest[k]
 
     def pick(self, weights: Iterable[float]) -> int:
         """Returns the index of one of `weights`, with probability proportional to it."""
