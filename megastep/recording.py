@@ -16,7 +16,6 @@ import base64
 import collections
 import contextlib
 import functools
-import importlib
 import inspect
 import itertools
 import os
@@ -41,7 +40,6 @@ from megastep.video import GifWriter, Mp4Writer, as_image
 if TYPE_CHECKING:
     from IPython.display import HTML  # pyright: ignore[reportMissingImports]
     from loky import ProcessPoolExecutor
-    from typing_extensions import Self
 
     from megastep.types import Env, PolicyLike, World
 
@@ -228,21 +226,16 @@ def _is_ready(image: np.ndarray | Future) -> bool:
     return isinstance(image, np.ndarray) or image.done()
 
 
-class _frame_errors:
-    """A context that adds the frame's number to an exception. Signals pass unchanged."""
-
-    def __init__(self, number: int):
-        self.number = number
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind, error, trace) -> None:
-        if isinstance(error, Exception):
-            first_line = next(iter(str(error).splitlines()), "")
-            raise RuntimeError(
-                f"frame {self.number} could not be recorded: {kind.__name__}: {first_line}"
-            ) from error
+@contextlib.contextmanager
+def _frame_errors(number: int) -> Iterator[None]:
+    """Adds the frame's number to an exception. Signals pass unchanged."""
+    try:
+        yield
+    except Exception as error:
+        first_line = next(iter(str(error).splitlines()), "")
+        raise RuntimeError(
+            f"frame {number} could not be recorded: {type(error).__name__}: {first_line}"
+        ) from error
 
 
 # ---- Drawing ----
@@ -351,16 +344,6 @@ def _write(path: Film, content: bytes) -> Film:
     return path
 
 
-def _check_packages(*names: str) -> None:
-    """Raises ImportError if a package that films need cannot be imported, saying why."""
-    for name in names:
-        try:
-            importlib.import_module(name)
-        except Exception as error:  # also of a backend that MPLBACKEND names
-            reason = next(iter(str(error).splitlines()), "")
-            raise ImportError(f"drawing needs {name}, which fails: {reason}") from error
-
-
 def check_path(path: str | os.PathLike) -> None:
     """Raises ValueError if no film or picture can have this name."""
     if pathlib.Path(path).suffix not in ENDINGS:
@@ -452,7 +435,6 @@ def film_all(
         raise ValueError(f"{path} is a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
-    _check_packages("matplotlib", *["av"] * (path.suffix[1:] in WRITERS))
     moments = _moments(players, steps, greedy, seed, trail)
     with plotting.styled(theme=theme, dpi=dpi, axes=axes):
         if path.suffix[1:] in WRITERS:

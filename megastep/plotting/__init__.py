@@ -13,18 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 from megastep.colour import gamma_decode, gamma_encode
 from megastep.plotting.images import STRIP, camera_colours, plot_bars, plot_images
-from megastep.plotting.plans import (
+from megastep.plotting.marks import (
     plot_agent,
     plot_goal,
     plot_object,
-    plot_scenery,
     plot_shot,
     plot_trail,
     plot_view,
-    texel_segments,
     view_polygon,
-    wall_colours,
 )
+from megastep.plotting.plans import plot_scenery, wall_colours
 from megastep.plotting.styles import AGENTS, Style, current, styled
 
 if TYPE_CHECKING:
@@ -67,7 +65,6 @@ __all__ = [
     "rasterise",
     "side_by_side",
     "styled",
-    "texel_segments",
     "view_polygon",
     "wall_colours",
 ]

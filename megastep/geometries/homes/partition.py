@@ -196,7 +196,8 @@ def _leaf_aspect(region, kind) -> float | None:
         jogs = [abs(a - c), abs(b - d), p - x0, x1 - p]
         if regions.area(region) < MIN_FILL * short * long or any(0 < jog < MIN_JOG for jog in jogs):
             return None
-        if min(abs(a - c), abs(b - d)) > 0 or regions.narrowest(region) < 90 + ALLOWANCE:
+        crossings = [b - a, d - c, *(length for *_, length in regions.bands(region, 1))]
+        if min(abs(a - c), abs(b - d)) > 0 or min(crossings) < 90 + ALLOWANCE:
             return None
         x0, y0, x1, y1 = regions.widest(region)
         clear = min(x1 - x0, y1 - y0)

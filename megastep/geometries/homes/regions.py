@@ -101,22 +101,6 @@ def connected(region: Region, portal: int) -> bool:
     return not rest
 
 
-def narrowest(region: Region) -> int:
-    """Returns the length in cm of the shortest line along x or y across a region."""
-    shortest = min(y1 - y0 for _, y0, _, y1 in region)
-    levels = sorted({y for r in region for y in (r[1], r[3])})
-    for low, high in zip(levels, levels[1:]):
-        row = sorted((r[0], r[2]) for r in region if r[1] <= low and r[3] >= high)
-        runs = []
-        for x0, x1 in row:
-            if runs and runs[-1][1] == x0:
-                runs[-1][1] = x1
-            else:
-                runs.append([x0, x1])
-        shortest = min([shortest, *(x1 - x0 for x0, x1 in runs)])
-    return shortest
-
-
 def widest(region: Region) -> tuple[int, int, int, int]:
     """Returns the rectangle in a region with the longest short side; of equal ones, the largest."""
     best = max(region, key=_breadth)

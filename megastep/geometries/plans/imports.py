@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
@@ -124,17 +125,6 @@ def _read_all(options, members) -> list[Plan]:
     return [read(options, member) for member in members]
 
 
-def _batches(members) -> Iterator[list[safe.Member]]:
-    batch = []
-    for member in members:
-        batch.append(member)
-        if len(batch) == BATCH:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
-
-
 def run(
     options: Options, path: Path, show: Callable[[int], None], processes: int | None = None
 ) -> tuple[list[Plan], list[safe.Member]]:
@@ -151,7 +141,8 @@ def run(
         ValueError: if there is no file, it is damaged, or none of the files is a plan.
     """
     n_processes = loky.cpu_count() if processes is None else processes
-    batches = _batches(safe.members(path, READERS[options.source].SUFFIX))
+    members = safe.members(path, READERS[options.source].SUFFIX)
+    batches = iter(lambda: [*itertools.islice(members, BATCH)], [])
     plans: list[Plan] = []
     shown: list[safe.Member] = []
 

@@ -87,9 +87,12 @@ def _too_large(size) -> str:
     return f"it has {size:,} bytes, but the limit is {MAX_BYTES:,}"
 
 
-def _is_outside(name) -> bool:
+def _refusal(name, size) -> str:
+    """Returns why an archive's file is refused, if it is."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
-    return ".." in parts or name.startswith(("/", "\\")) or ":" in name[:3]
+    if ".." in parts or name.startswith(("/", "\\")) or ":" in name[:3]:
+        return "its name leads out of the archive"
+    return _too_large(size) if size > MAX_BYTES else ""
 
 
 def _of_zip(path, suffix) -> Iterator[Member]:
@@ -100,10 +103,8 @@ def _of_zip(path, suffix) -> Iterator[Member]:
             raise ValueError(f"has more than {MAX_MEMBERS:,} files or {MAX_TOTAL:,} bytes")
         entries = [one for one in entries if one.filename.endswith(suffix) and not one.is_dir()]
         for entry in sorted(entries, key=lambda entry: entry.filename):
-            if _is_outside(entry.filename):
-                yield Member(entry.filename, None, "its name leads out of the archive")
-            elif entry.file_size > MAX_BYTES:
-                yield Member(entry.filename, None, _too_large(entry.file_size))
+            if refusal := _refusal(entry.filename, entry.file_size):
+                yield Member(entry.filename, None, refusal)
             else:
                 try:
                     with archive.open(entry) as file:  # `read` of the archive unpacks all there is
@@ -122,10 +123,8 @@ def _of_tar(path, suffix) -> Iterator[Member]:
             archive.members = []  # type: ignore[misc]  # which would keep all names
             if not entry.isfile() or not entry.name.endswith(suffix):
                 continue
-            if _is_outside(entry.name):
-                yield Member(entry.name, None, "its name leads out of the archive")
-            elif entry.size > MAX_BYTES:
-                yield Member(entry.name, None, _too_large(entry.size))
+            if refusal := _refusal(entry.name, entry.size):
+                yield Member(entry.name, None, refusal)
             else:
                 file = archive.extractfile(entry)
                 content = file.read() if file else b""
@@ -173,6 +172,14 @@ def xml(content: bytes) -> ElementTree.Element:
         ) from error
     except ElementTree.ParseError as error:
         raise ValueError(f"it is no XML, or cut short ({error})") from error
+
+
+def svg(content: bytes) -> ElementTree.Element:
+    """Returns the root of an SVG. Raises ValueError as `xml`, or for other XML."""
+    root = xml(content)
+    if name_of(root) != "svg":
+        raise ValueError(f"it is no SVG: its first element is {name_of(root)[:40]!r}")
+    return root
 
 
 def name_of(element: ElementTree.Element) -> str:

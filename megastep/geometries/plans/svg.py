@@ -32,9 +32,7 @@ def read(content: bytes, scale: float, walls: str = "wall", doors: str = "door")
     Raises:
         ValueError: saying what is wrong with the file.
     """
-    root = safe.xml(content)
-    if safe.name_of(root) != "svg":
-        raise ValueError(f"it is no SVG: its first element is {safe.name_of(root)[:40]!r}")
+    root = safe.svg(content)
     marks = {"walls": walls, "doors": doors}
     shapes: dict[str, list[BaseGeometry]] = {key: [] for key in marks}
     _collect(root, Matrix(), {FILL: "black", STROKE: "none", WIDTH: "1"}, "", marks, shapes, scale)
