@@ -81,14 +81,6 @@ def test_observations_are_channels_first_with_one_panel_per_agent():
     assert axes[1, 0].images[0].get_clim() == (0, 1) and not axes[1, 1].axison
 
 
-def test_images_are_drawn_on_given_axes():
-    figure, _, strips = plotting.panels(2)
-    axes = plotting.plot_images(
-        {"rgb": np.zeros((1, 3, 1, 8)), "d": np.zeros((1, 1, 1, 8), np.float16)}, axes=strips
-    )
-    assert list(axes[:, 0]) == strips and all(ax.get_figure() is figure for ax in strips)
-
-
 @pytest.fixture
 def words(monkeypatch):
     """Collects what is written: (area, words, colour)."""

@@ -148,33 +148,6 @@ def test_workers_have_one_thread_and_no_gpu(tmp_path):
     assert facts == ["Agg", "1", "False", "", "arrdict", "ndarray"]
 
 
-def test_at_most_two_frames_per_worker_are_pending(monkeypatch):
-    submitted = []
-
-    class Future:
-        def __init__(self):
-            self.read = False
-
-        def done(self):
-            return False
-
-        def result(self):
-            self.read = True
-            return np.zeros((SIZE, SIZE, 3), np.uint8)
-
-    def submit(*args):
-        submitted.append(Future())
-        return submitted[-1]
-
-    with ParallelEncoder(plot_grey, n_workers=3) as encoder:
-        pool = types.SimpleNamespace(submit=submit, shutdown=lambda **how: None)
-        monkeypatch.setattr(encoder, "_pool", pool)
-        for i in range(20):
-            encoder(arrdict(i=i))
-            assert sum(not future.read for future in submitted) == min(i + 1, 6)
-    assert all(future.read for future in submitted)
-
-
 @pytest.mark.parametrize(
     "plot_state", [Env.plot_class, Env().plot_class, Env.plot_static, Env().plot_static]
 )
@@ -296,21 +269,17 @@ def test_bad_images_are_refused(array, error):
         encoder.frame(array)
 
 
-def test_video_without_frames_is_refused(tmp_path):
-    encoder = record(plot_grey, [])
-    with pytest.raises(ValueError, match="no frames"):
-        encoder.save(tmp_path / "video.mp4")
-    with pytest.raises(ValueError, match="no frames"):
-        encoder.notebook()
-    assert not os.listdir(tmp_path)
-
-
-def test_frames_inside_the_block_and_save_after_it(tmp_path):
+def test_frames_are_added_inside_the_block_and_saved_after_it(tmp_path):
     encoder = ParallelEncoder(plot_grey)
     with pytest.raises(RuntimeError, match="inside the with block"):
         encoder(arrdict(i=0, grey=0))
     with encoder, pytest.raises(RuntimeError, match="after it"):
         encoder.save(tmp_path / "video.mp4")
+    with pytest.raises(ValueError, match="no frames"):
+        encoder.save(tmp_path / "video.mp4")
+    with pytest.raises(ValueError, match="no frames"):
+        encoder.notebook()
+    assert not os.listdir(tmp_path)
 
 
 @pytest.mark.parametrize("settings", [dict(fps=0), dict(fps=float("nan")), dict(n_workers=0)])
