@@ -17,21 +17,22 @@ RADIUS = 0.15 / 2**0.5  # metres; of an agent
 SPAWN = 0.15  # metres; each room has a point this far from all walls
 NEAR = 1e-3  # metres; points nearer than this are the same
 PARALLEL = 1e-6  # sine of an angle below which two walls are parallel
+LIMIT = 0.3  # metres; the largest clearance that is measured
 CHUNK = 256  # walls compared with all others at a time
 
 
-def clearance(g: dotdict, limit: float = 0.3, cell: float = FINE) -> np.ndarray:
-    """Returns the metres, at most `limit`, from each cell's centre on a raster to the nearest wall.
+def clearance(g: dotdict, cell: float = FINE) -> np.ndarray:
+    """Returns the metres, at most 0.3, from each cell's centre on a raster to the nearest wall.
 
     `cell` divides the side of the cells of the masks, and the raster has the masks' extent.
     """
     ratio = round(g.res / cell)
-    height, width = g.masks.shape[0] * ratio, g.masks.shape[1] * ratio
-    distance = np.full((height, width), limit)
+    height, width = (n * ratio for n in g.masks.shape)
+    distance = np.full((height, width), LIMIT)
     x, y = (np.arange(width) + 0.5) * cell, (height - np.arange(height) - 0.5) * cell
     for (ax, ay), (bx, by) in g.walls.astype(float):
-        columns = slice(*np.searchsorted(x, (min(ax, bx) - limit, max(ax, bx) + limit)))
-        rows = slice(*np.searchsorted(-y, (-max(ay, by) - limit, -min(ay, by) + limit)))
+        columns = slice(*np.searchsorted(x, (min(ax, bx) - LIMIT, max(ax, bx) + LIMIT)))
+        rows = slice(*np.searchsorted(-y, (-max(ay, by) - LIMIT, -min(ay, by) + LIMIT)))
         px, py = x[None, columns] - ax, y[rows, None] - ay
         dx, dy = bx - ax, by - ay
         along = np.clip((px * dx + py * dy) / max(dx * dx + dy * dy, 1e-12), 0, 1)
@@ -142,7 +143,7 @@ def errors(g: dotdict, fine: float = FINE) -> list[str]:
     return messages
 
 
-def fine_rooms(g: dotdict, fine: float) -> tuple[np.ndarray, np.ndarray, float]:
+def fine_rooms(g: dotdict, fine: float = FINE) -> tuple[np.ndarray, np.ndarray, float]:
     """Returns the clearance and the rooms of a geometry on a raster, and the side of its cells in
     metres: `fine`, more if the geometry is so large that the raster would have too many.
     """

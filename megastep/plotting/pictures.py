@@ -273,17 +273,15 @@ def _word(word, size, bold, colour, dpi) -> tuple[np.ndarray, float, int]:
 
 def panels(
     n_strips: int = 0,
-    width: float = WIDTH,
     title: str | None = None,
     n_cameras: int = 1,
     columns: int = 1,
 ) -> tuple[Picture, Area, list[Area]]:
-    """Makes a picture with a floor plan, a line of numbers above it, and strips for images below.
+    """Makes a picture with a floor plan, a line of numbers above it, and strips for images below:
+    640 pixels wide and 720 high (at a :attr:`Style.dpi` of 100), or higher for many strips.
 
     Args:
         n_strips: number of strips.
-        width: of the picture, in inches of 100 pixels (:attr:`Style.dpi`). Its height is 9/8 of
-            that, or more if there are many strips.
         title: the line of numbers, such as "step 3 · 2 kills".
         n_cameras: rows of pixels per strip; a strip is as high as its rows.
         columns: strips side by side.
@@ -296,7 +294,7 @@ def panels(
     n_rows = -(-n_strips // columns)
     below = MARGIN / 2 + n_rows * (strip + GAP)
     head = HEAD + TITLE * (style.title is not None)
-    height = max(width * HEIGHT / WIDTH, head + LEAST_PLAN + below)
+    width, height = WIDTH, max(HEIGHT, head + LEAST_PLAN + below)
     picture = Picture(figsize=(width, height), dpi=style.dpi, facecolor=style.colours.page)
     _write_head(picture, height, title)
     tall = height - head - below - MARGIN / 2

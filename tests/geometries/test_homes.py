@@ -67,7 +67,7 @@ def test_a_partition_covers_its_footprint_once(seed):
         rooms = plan.programme(7, generator)
         footprint = plan.footprint(sum(size for _, size in rooms), generator)
         try:
-            placed, _ = partition.partition(footprint, rooms, generator)
+            placed, _ = partition.partition(footprint, rooms, generator, plan.style(1))
             break
         except partition.Failure:
             pass

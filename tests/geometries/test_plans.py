@@ -364,7 +364,7 @@ def test_lights_hang_in_their_rooms():
     wall = inner.buffer(0.1, join_style="mitre") & home
     outer, door = home - wall, shapely.box(3, 1.9, 4, 2)
     drawing = outlines.Drawing([wall - inner], [inner, outer], [door], [])
-    g, notes = outlines.geometry_of(drawing, 0)
+    g, notes = outlines.geometry_of(drawing)
     assert notes.n_reachable == 2 and checks.errors(g) == []
     lights = g.lights.astype(float) - g.walls.min((0, 1))
     np.testing.assert_allclose(lights[0], (3.5, 4), atol=0.04)  # slits of 3 cm are closed

@@ -103,7 +103,7 @@ def _metres(segments, shift) -> np.ndarray:
     return ((np.reshape(segments, (-1, 2, 2)) + shift) / 100).astype(np.float32)
 
 
-def generate(seed: int, outer: bool = True, density: float = 1, clutter: float = 0) -> dotdict:
+def generate(seed: int, density: float = 1, clutter: float = 0) -> dotdict:
     """Returns the home of a seed.
 
     Args:
@@ -113,7 +113,6 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
             lights off the middle of their rooms.
         clutter: from 0 to 1, at which many pieces of furniture leave narrow gaps, 24 to 46 cm wide:
             to walls, to other furniture, and in doorways, which they half block.
-        outer: if False, leave out the envelope's outer face, which cannot be seen from indoors.
 
     Returns:
         A geometry with further keys: `rooms`, the kind of each room in the order of the masks'
@@ -164,7 +163,7 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
     )
     return dotdict(
         id=seed,
-        walls=lines[: len(lines) if outer else len(inside)].astype(np.float32),
+        walls=lines.astype(np.float32),
         lights=((np.array(lights) + shift) / 100).astype(np.float32),
         masks=masks,
         res=geometry.RES,
@@ -172,5 +171,5 @@ def generate(seed: int, outer: bool = True, density: float = 1, clutter: float =
         areas=walls.areas(grid, [room.region for room in rooms]),
         doors=_metres(doors, shift),
         openings=_metres(open_, shift),
-        n_outer=len(outside) if outer else 0,
+        n_outer=len(outside),
     )

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
-from megastep.geometries.homes.plan import NORMAL, Style
+from megastep.geometries.homes.plan import Style
 from megastep.geometries.homes.portable_generator import PortableGenerator
 
 if TYPE_CHECKING:
@@ -161,7 +161,7 @@ def opening(
     span: tuple[int, int],
     kinds: tuple[str, str],
     generator: PortableGenerator,
-    style: Style = NORMAL,
+    style: Style,
 ) -> Opening:
     """Returns a random Opening within the clear span (low, high) of a contact between rooms of two
     kinds.

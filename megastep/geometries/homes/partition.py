@@ -7,7 +7,7 @@ from itertools import accumulate
 from typing import NamedTuple
 
 from megastep.geometries.homes import regions
-from megastep.geometries.homes.plan import ALLOWANCE, KINDS, NORMAL, Style
+from megastep.geometries.homes.plan import ALLOWANCE, KINDS, Style
 from megastep.geometries.homes.portable_generator import PortableGenerator, exp
 
 PORTAL = 120  # cm; the minimum neck between the parts of a region that is still to be cut
@@ -60,7 +60,7 @@ def partition(
     region: regions.Region,
     rooms: Sequence[tuple[str, int]],
     generator: PortableGenerator,
-    style: Style = NORMAL,
+    style: Style,
 ) -> tuple[list[Room], dict]:
     """Lays out rooms, a list of (kind, area in cm2), in a region.
 

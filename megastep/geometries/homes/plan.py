@@ -43,9 +43,6 @@ class Style(NamedTuple):
     half_blocked: float = 0.0  # fraction of doorways with a narrow way in
 
 
-NORMAL = Style()
-
-
 def style(density: float, clutter: float = 0.0) -> Style:
     """Returns the style of homes of a density from 1, as real homes have, to `DENSEST`, and a
     clutter from 0 to 1.
@@ -98,7 +95,7 @@ MIN_NECK = 220  # cm between two notches, or a notch and the side across
 STEP = 10  # cm; the lattice of outlines
 
 
-def room_count(generator: PortableGenerator, style: Style = NORMAL) -> int:
+def room_count(generator: PortableGenerator, style: Style) -> int:
     """Draws the number of rooms of a home."""
     count = int(generator.lognormal(MEDIAN_ROOMS * style.rooms, SIGMA_ROOMS * style.sigma) + 0.5)
     return min(max(count, MIN_ROOMS), style.max_rooms)

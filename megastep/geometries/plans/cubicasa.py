@@ -17,6 +17,7 @@ from megastep.geometries.plans.outlines import Drawing
 
 SUFFIX = ".svg"
 UNITS = 100  # a metre
+TOLERANCE = outlines.GRID / 2  # metres, by which contours are simplified
 SKIPPED = ("defs", "script", "foreignObject", "use", "text", "symbol", "clipPath", "mask")
 
 

@@ -47,48 +47,38 @@ class Options(NamedTuple):
     sealed: bool = True
 
 
-def drawings(options: Options, content: bytes) -> list[Drawing]:
-    """Returns the drawings of a file. Raises ValueError."""
-    return READERS[options.source].read(content, options.per)
-
-
-def geometry_of(options: Options, drawing: Drawing) -> tuple[dotdict, Notes]:
-    """Returns the geometry of a drawing, and notes. Raises ValueError."""
-    tolerance = getattr(READERS[options.source], "TOLERANCE", outlines.GRID / 2)
-    return outlines.geometry_of(drawing, 0, options.sealed, tolerance)
-
-
-def _home(options, drawing) -> tuple[dotdict, Notes]:
-    """Does what `geometry_of` does. Raises ValueError also for a geometry that is no home."""
+def _home(drawing, sealed=True, tolerance=outlines.CURVED) -> tuple[dotdict, Notes]:
+    """Returns the geometry of a drawing, and notes. Raises ValueError if it is no home."""
     with _refused():
-        g, notes = geometry_of(options, drawing)
-        if (sentences := checks.errors(g)) and options.sealed:
+        g, notes = outlines.geometry_of(drawing, sealed, tolerance)
+        if (sentences := checks.errors(g)) and sealed:
             raise ValueError("; ".join(sentences))
         return g, notes
 
 
 def first_home(options: Options, member: safe.Member) -> tuple[Drawing, dotdict]:
     """Returns the first floor of a file that is a home, and its geometry."""
-    for drawing in drawings(options, member.content or b""):
+    reader = READERS[options.source]
+    for drawing in reader.read(member.content or b"", options.per):
         with contextlib.suppress(ValueError):
-            return drawing, _home(options, drawing)[0]
+            return drawing, _home(drawing, options.sealed, reader.TOLERANCE)[0]
     raise ValueError(f"{member.name!r} has no home")
 
 
 def read(options: Options, member: safe.Member) -> Plan:
     """Returns the plan of a file. A floor that is no home is a warning if another floor is one."""
-    name = member.name
+    name, reader = member.name, READERS[options.source]
     if member.content is None:
         return Plan(name, [], [], member.refusal)
     made, refusals = [], []
     try:
         with _refused():
-            floors = drawings(options, member.content)
+            floors = reader.read(member.content, options.per)
     except ValueError as error:
         return Plan(name, [], [], _line(error))
     for drawing in floors:
         try:
-            made.append(_home(options, drawing))
+            made.append(_home(drawing, options.sealed, reader.TOLERANCE))
         except ValueError as error:
             refusals.append(_line(error))
     if not made:
@@ -199,7 +189,8 @@ def own_svg(path: Path, scale: float, walls: str = "wall", doors: str = "door") 
         raise ValueError(member.refusal)
     with _refused():
         drawing = svg.read(member.content, scale, walls, doors)
-        return _own(drawing, drawing, [])
+    g, notes = _home(drawing)
+    return Own(drawing, g, notes.warnings)
 
 
 def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
@@ -207,15 +198,9 @@ def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
     with _refused():
         grid = maps.load(path, metres_per_pixel)
         drawing, warnings = maps.read(grid)
-        image = np.where(grid.free, 254, np.where(grid.unknown, 205, 0)).astype(np.uint8)
-        return _own(image, drawing, warnings)
-
-
-def _own(original, drawing, warnings) -> Own:
-    g, notes = outlines.geometry_of(drawing, 0, tolerance=outlines.CURVED)
-    if sentences := checks.errors(g):
-        raise ValueError("; ".join(sentences))
-    return Own(original, g, warnings + notes.warnings)
+    image = np.where(grid.free, 254, np.where(grid.unknown, 205, 0)).astype(np.uint8)
+    g, notes = _home(drawing)
+    return Own(image, g, warnings + notes.warnings)
 
 
 # ---- Statistics ----
@@ -226,7 +211,7 @@ def statistics(g: dotdict) -> dict[str, float]:
     vectors = (g.walls[:, 1] - g.walls[:, 0]).astype(float)
     lengths = np.hypot(*vectors.T)
     is_straight = np.abs(vectors).min(1) <= np.sin(np.radians(1)) * lengths
-    distance, rooms, cell = checks.fine_rooms(g, checks.FINE)
+    distance, rooms, cell = checks.fine_rooms(g)
     return {
         "floor area of rooms, m²": float((rooms > 0).sum() * cell**2),
         "rooms": int(g.masks.max()),

@@ -78,7 +78,7 @@ def check_extent(shapes: Sequence[BaseGeometry]) -> None:
 
 
 def geometry_of(
-    drawing: Drawing, number: int, sealed: bool = True, tolerance: float = GRID / 2
+    drawing: Drawing, sealed: bool = True, tolerance: float = GRID / 2
 ) -> tuple[dotdict, Notes]:
     """Returns the geometry of a drawing, and notes.
 
@@ -87,7 +87,6 @@ def geometry_of(
 
     Args:
         drawing: the floor plan.
-        number: the geometry's id.
         sealed: False: outer doors are open, rooms outdoors are rooms, as in the original megastep.
         tolerance: metres by which contours are simplified.
 
@@ -136,7 +135,7 @@ def geometry_of(
     inside = [[_moved(part, shift) for part in parts] for parts in inside if parts]
     doors = [line for door in openings if (line := _across(door, floor)) is not None]
     result = dotdict(
-        id=number,
+        id=0,
         walls=walls.astype(np.float32),
         lights=np.zeros((0, 2), np.float32),
         masks=_masks(walls, inside),
@@ -228,7 +227,7 @@ def _across(door, floor) -> np.ndarray | None:
 
 def _reachable(g, rooms, n_sealed, warnings) -> tuple[dotdict, Notes]:
     """Returns a geometry whose rooms are those that an agent can reach, with a light in each."""
-    distance, fine, cell = checks.fine_rooms(g, checks.FINE)
+    distance, fine, cell = checks.fine_rooms(g)
     labels, _ = geometry.components(distance > checks.RADIUS - 1e-3)
     can_spawn = (fine > 0) & (distance >= checks.SPAWN)
     if not can_spawn.any():
