@@ -6,7 +6,6 @@ equal arguments. A source of many different geometries keeps a tenth of them for
 in the same order (the same objects, not copies).
 """
 
-import difflib
 import inspect
 
 import numpy as np
@@ -17,22 +16,13 @@ from megastep.geometries import mazes as mazes
 from megastep.geometries import sources
 from megastep.geometries import toys as toys
 from megastep.geometry import centers, indices, masks
+from megastep.settings import closest
 
 __all__ = ["SOURCES", "SPLITS", "centers", "indices", "masks", "sample"]
 
 SPLITS = ("training", "test", "all")  # parts of a source
 #: The sources by name.
 SOURCES = {name: getattr(sources, name) for name in sources.__all__}
-
-
-def _require_known(kind, name, allowed) -> None:
-    """Raises ValueError, with the nearest allowed name, unless `name` is one of `allowed`."""
-    if name not in allowed:
-        nearest = difflib.get_close_matches(str(name), allowed, 1, 0)
-        hint = f"Did you mean {nearest[0]!r}? " if nearest else ""
-        raise ValueError(
-            f"Unknown {kind} {name!r}. {hint}Available: {', '.join(allowed) or 'none'}."
-        )
 
 
 def sample(
@@ -54,11 +44,15 @@ def sample(
         ValueError: for an unknown name, split or option, or a value that the source cannot use.
         EngineError: if mazes do not fit into memory.
     """
-    _require_known("geometry source", name, SOURCES)
-    _require_known("split", split, SPLITS)
+    if name not in SOURCES:
+        raise ValueError(f"Unknown geometry source {name!r}; {closest(name, SOURCES)}")
+    if split not in SPLITS:
+        raise ValueError(f"Unknown split {split!r}; {closest(split, SPLITS)}")
     allowed = list(inspect.signature(SOURCES[name]).parameters)[3:]
     for option in options:
-        _require_known(f"option of geometry source {name!r}:", option, allowed)
+        if option not in allowed:
+            hint = closest(option, allowed) if allowed else "it has none"
+            raise ValueError(f"Unknown option of geometry source {name!r}: {option!r}; {hint}")
     if not isinstance(n, (int, np.integer)) or isinstance(n, bool) or n < 1:
         raise ValueError(f"n={n!r} geometries: take an integer of at least 1.")
     if name == "files" and options.get("path") is None:

@@ -189,11 +189,11 @@ def test_a_mix_of_wrong_parts_is_refused(parts, message):
 @pytest.mark.parametrize(
     "arguments, options, message",
     [
-        (("hoems", 1), {}, "geometry source 'hoems'.*mean 'homes'"),
-        (("homes", 1, "train"), {}, "split 'train'.*mean 'training'"),
+        (("hoems", 1), {}, "geometry source 'hoems'.*mean homes"),
+        (("homes", 1, "train"), {}, "split 'train'.*mean training"),
         (("homes", 0), {}, "n=0 "),
         (("homes", 1.5), {}, "n=1.5 "),
-        (("column", 1), {"pilar": 1}, "option .*'pilar'.*mean 'pillar'"),
+        (("column", 1), {"pilar": 1}, "option .*'pilar'.*mean pillar"),
         (("files", 1), {}, "files.*path="),
         (("files", 1), {"path": None}, "files.*path="),
         (("files", 1), {"path": "nowhere.npz"}, "no geometry file 'nowhere.npz'"),

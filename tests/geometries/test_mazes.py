@@ -205,7 +205,7 @@ def test_the_test_split_of_mazes_is_the_last_seeds():
         (dict(thickness=0), "^thickness.* 0 "),
         (dict(corridor=0.3), "^corridor=0.3 .*too narrow.* 0.32"),
         (dict(size=30, corridor=7.0), "size=30, corridor=7, .*too large.*200 m"),
-        (dict(sise=3), "'sise'.*mean 'size'"),
+        (dict(sise=3), "'sise'.*mean size"),
     ],
 )
 def test_mazes_of_wrong_size_are_refused(options, message):

@@ -31,16 +31,16 @@ SPARSE, FULL, CLUTTERED = 0.4, 0.8, 0.38
 class Style(NamedTuple):
     """How homes of a density differ from those of density 1."""
 
-    rooms: float = 1.0  # factor of the median number of rooms
-    sigma: float = 1.0  # factor of the standard deviation of its logarithm
-    max_rooms: int = 18
-    corridor: tuple[int, int] = (110, 150)  # cm of clear width
-    narrow: float = 0.0  # how far small widths of doors are preferred, up to 1
-    open_plan: float = 1.0  # factor of the probability that a connection has no door
-    furniture: float = 0.0  # pieces tried per m2
-    off_centre: float = 0.0  # fraction of lights that are anywhere in their room
-    clutter: float = 0.0  # fraction of furniture that leaves narrow gaps
-    half_blocked: float = 0.0  # fraction of doorways with a narrow way in
+    rooms: float  # factor of the median number of rooms
+    sigma: float  # factor of the standard deviation of its logarithm
+    max_rooms: int
+    corridor: tuple[int, int]  # cm of clear width
+    narrow: float  # how far small widths of doors are preferred, up to 1
+    open_plan: float  # factor of the probability that a connection has no door
+    furniture: float  # pieces tried per m2
+    off_centre: float  # fraction of lights that are anywhere in their room
+    clutter: float  # fraction of furniture that leaves narrow gaps
+    half_blocked: float  # fraction of doorways with a narrow way in
 
 
 def style(density: float, clutter: float = 0.0) -> Style:
