@@ -16,6 +16,7 @@ import base64
 import collections
 import contextlib
 import functools
+import importlib
 import inspect
 import itertools
 import os
@@ -34,14 +35,15 @@ from numpy.typing import ArrayLike
 from megastep import plotting, workers
 from megastep.arrdict import clone, numpyify
 from megastep.atomic_files import write_atomically
-from megastep.types import Tree, n_lanes, optional
+from megastep.moments import film_moments
+from megastep.types import Tree, optional
 from megastep.video import GifWriter, Mp4Writer, as_image
 
 if TYPE_CHECKING:
     from IPython.display import HTML  # pyright: ignore[reportMissingImports]
     from loky import ProcessPoolExecutor
 
-    from megastep.types import Env, PolicyLike, World
+    from megastep.types import Env, PolicyLike
 
 __all__ = ["Film", "ParallelEncoder", "Player", "draw", "film", "film_all"]
 
@@ -56,7 +58,6 @@ ENDINGS = {  # of films and pictures: their types, and how pages show them
     ".svg": ("image/svg+xml", IMAGE),
     ".pdf": ("application/pdf", '<embed width="100%" height="720" {}>'),
 }
-MAX_RETURNS = 4  # of as many agents, one by one
 
 
 class ParallelEncoder:
@@ -344,6 +345,16 @@ def _write(path: Film, content: bytes) -> Film:
     return path
 
 
+def _check_packages(*names: str) -> None:
+    """Raises ImportError if a package that films need cannot be imported, saying why."""
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except Exception as error:  # also of a backend that MPLBACKEND names
+            reason = next(iter(str(error).splitlines()), "")
+            raise ImportError(f"drawing needs {name}, which fails: {reason}") from error
+
+
 def check_path(path: str | os.PathLike) -> None:
     """Raises ValueError if no film or picture can have this name."""
     if pathlib.Path(path).suffix not in ENDINGS:
@@ -435,7 +446,8 @@ def film_all(
         raise ValueError(f"{path} is a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
-    moments = _moments(players, steps, greedy, seed, trail)
+    _check_packages("matplotlib", *["av"] * (path.suffix[1:] in WRITERS))
+    moments = film_moments(players, steps, greedy, seed, trail)
     with plotting.styled(theme=theme, dpi=dpi, axes=axes):
         if path.suffix[1:] in WRITERS:
             fps = optional(players[0].env, "fps") * speed
@@ -490,107 +502,3 @@ def _still(players, moments, format) -> bytes:
         if len(players) > 1 or not hasattr(drawing, "savefig"):
             drawing = plotting.framed(_image(players, moments))
         return plotting.encoded(drawing, format)
-
-
-class _Moment(NamedTuple):
-    """A frame to be: a numpyified state, and the return so far."""
-
-    state: Tree
-    note: str
-
-
-def _moments(players, steps, greedy, seed, trail) -> Iterator[list]:
-    """The `_Moment`s of all players, until the last of them is at the end."""
-    by_env = collections.defaultdict(list)
-    for player in players:
-        by_env[id(player.env)].append(player)
-    streams = {}
-    for same in by_env.values():
-        for player, worlds in zip(same, itertools.tee(_worlds(same[0], greedy, seed), len(same))):
-            streams[id(player)] = _moments_of(player, worlds, steps, trail)
-        del worlds  # which would keep those that a player at the end does not take
-    latest = [None] * len(players)
-    for moments in itertools.zip_longest(*(streams.pop(id(player)) for player in players)):
-        latest = [new or old for new, old in zip(moments, latest, strict=True)]
-        yield latest
-
-
-def _worlds(player, greedy, seed) -> Iterator[World]:
-    env, policy = player.env, player.policy
-    world, hidden = env.reset(), policy.initial(n_lanes(env), env.device)
-    generator = torch.Generator(env.device).manual_seed(seed)
-    while True:
-        yield world
-        decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
-        world = env.step(decision)
-
-
-def _moments_of(player, worlds, steps, trail) -> Iterator[_Moment]:
-    env: Any = player.env
-    n_agents, past = optional(env, "n_agents"), _Past(trail)
-    e, agent = divmod(player.lane, n_agents)
-    lanes = slice(e * n_agents, (e + 1) * n_agents)
-    returns = np.zeros(n_agents, np.float32)
-    for world in itertools.islice(worlds, player.steps or steps):
-        rewards, starts = (
-            world[key][lanes].cpu().numpy().reshape(n_agents) for key in ("reward", "reset")
-        )
-        returns = np.where(starts, np.float32(0), returns + rewards)
-        state = past(numpyify(clone(env.state(e))), starts)
-        yield _Moment(state, _returns(returns))
-    if player.expected is not None and not np.isclose(returns[agent], player.expected, rtol=1e-4):
-        raise ValueError(
-            f"its return is {returns[agent]:.6g} and not {player.expected:.6g}: film it on the "
-            "device that it was evaluated on (device=); or the environment has changed since, or "
-            "draws what no seed decides"
-        )
-
-
-def _returns(returns) -> str:
-    if len(returns) > MAX_RETURNS:
-        return f"mean return {returns.mean():.1f}"
-    return "return " + ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in returns)
-
-
-class _Past:
-    """Adds to states, where ``state["core"]`` is a core's, where agents were in this episode and
-    what they saw: see :meth:`megastep.core.Core.state`.
-
-    Args:
-        trail: number of steps.
-    """
-
-    def __init__(self, trail: int):
-        self._trail, self._views, self._n_views = collections.deque(maxlen=trail + 1), None, 0
-
-    def __call__(self, state: Tree, starts: np.ndarray) -> Any:
-        """Returns the state; ``starts`` (A,) says whose episodes begin."""
-        core = state.get("core") if isinstance(state, dict) else None
-        if not isinstance(core, dict) or "distances" not in core:
-            return state
-        for positions in self._trail:
-            positions[starts] = np.nan
-        self._trail.append(np.array(core["positions"], float))
-        core["trail"] = np.stack(self._trail)
-        views = [
-            [
-                plotting.view_polygon(position, angle + yaw, core["fov"], distances)
-                for yaw, distances in zip(core["yaws"], of_agent, strict=True)
-            ]
-            for position, angle, of_agent in zip(
-                core["positions"], core["angles"], core["distances"], strict=True
-            )
-        ]
-        core["views"] = self._with(np.array(views, np.float32), starts.all())
-        return state
-
-    def _with(self, views, is_start) -> np.ndarray:
-        """Returns the views of this episode, the last included: part of an array that grows."""
-        self._n_views = 0 if is_start else self._n_views
-        if self._views is None or is_start:
-            self._views = np.empty((64, *views.shape), np.float32)
-        if self._n_views == len(self._views):
-            self._views = np.concatenate([self._views, np.empty_like(self._views)])
-        self._views[self._n_views] = views
-        self._n_views += 1
-        return self._views[: self._n_views]

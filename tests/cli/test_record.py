@@ -132,7 +132,7 @@ def test_runs_side_by_side_begin_alike(trained, filmed, tmp_path):
     ],
 )
 def test_film_that_cannot_be(trained, here, monkeypatch, capsys, words, text):
-    monkeypatch.setattr(recording, "_moments", lambda *_: pytest.fail("it is drawn"))
+    monkeypatch.setattr(recording, "film_moments", lambda *_: pytest.fail("it is drawn"))
     assert record.main([f"run={trained}", "steps=1", "device=cpu", *words]) == 2
     assert re.search(text, capsys.readouterr().err) and not os.listdir()
 
@@ -199,7 +199,7 @@ def test_several_cameras(env, tmp_path):
 )
 def test_video_that_cannot_be_made(trained, here, monkeypatch, capsys, file, text):
     (here / "folder.mp4").mkdir()
-    monkeypatch.setattr(recording, "_moments", lambda *_: pytest.fail("it is drawn"))
+    monkeypatch.setattr(recording, "film_moments", lambda *_: pytest.fail("it is drawn"))
     assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
     assert text in capsys.readouterr().err and os.listdir() == ["folder.mp4"]
 

@@ -8,7 +8,7 @@ import shutil
 import pytest
 import torch
 
-from megastep import recording
+from megastep import moments
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.evaluation import playing, replay
 from megastep.agents.evaluation.eval_env import EvalEnv
@@ -38,8 +38,8 @@ def rows_of(folder):
 @pytest.fixture
 def returns(monkeypatch):
     """Returns the returns that a film shows, a list of each player's in each frame."""
-    shown, original = [], recording._returns
-    monkeypatch.setattr(recording, "_returns", lambda r: shown.append(float(r[0])) or original(r))
+    shown, original = [], moments._returns
+    monkeypatch.setattr(moments, "_returns", lambda r: shown.append(float(r[0])) or original(r))
     return shown
 
 
