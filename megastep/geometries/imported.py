@@ -88,7 +88,7 @@ def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
     files = np.unique(arrays["files"])
     order = np.random.RandomState(0).permutation(len(files))  # numpy never changes what it draws
     of_split = files[order[[*database.split_range(len(files), split)]]]
-    members = database.draw(np.flatnonzero(np.isin(arrays["files"], of_split)), n, seed)
+    members = database.draw(np.isin(arrays["files"], of_split).nonzero()[0].tolist(), n, seed)
     drawn = {i: database.geometry_at(arrays, starts, i, i) for i in members}
     return [drawn[i] for i in members]
 

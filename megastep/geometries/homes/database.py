@@ -48,7 +48,7 @@ def draw(members: Sequence[int], n: int, seed: int) -> list[int]:
     """Returns n of the members: a random permutation of them, repeated."""
     random = np.random.RandomState(seed % 2**32)  # numpy never changes what it draws
     order = random.permutation(len(members))
-    return [int(members[order[i % len(members)]]) for i in range(n)]
+    return [members[order[i % len(members)]] for i in range(n)]
 
 
 def read(
