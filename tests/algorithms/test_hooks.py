@@ -160,7 +160,7 @@ def test_a_run_follows_and_logs_schedules(words, here):
         "learner.warmup=2",
     ]
     assert train.main([*words, *schedules[:2], "samples=9", "learner.lr={from:1,to:-1}"]) == 2
-    words += [*schedules, f"samples={n_samples}", "logging.every=1", "folder=run"]
+    words = [*words, *schedules, f"samples={n_samples}", "logging.every=1", "folder=run"]
     assert train.main(words) == 0
     rows = json_lines.read("run/metrics.jsonl")
     spent = [i / 8 for i in range(8)]

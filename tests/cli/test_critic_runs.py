@@ -6,7 +6,7 @@ import torch
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.runs import checkpoint
-from megastep.envs.explorer import env as explorer_env
+from megastep.envs.explorer import explorer as explorer_env
 from tests.cli.test_train import configured
 from tests.helpers import tiny
 from tests.helpers.weights import of_run as weights

@@ -100,6 +100,6 @@ def test_value_outside_its_space_is_named(here, capsys):
     words = [*WORDS, "env.id=tests.helpers.learning_wrappers:Seven-v0", "folder=run"]
     assert train.main(words) == 4
     error = capsys.readouterr().err
-    assert "Seven-v0: environment 0: step() returned an observation that is not in its" in error
-    assert "it is 7, and the space is Discrete(4)" in error and "env.check=false" in error
+    assert "Seven-v0: an observation is not in its space: it has 7 in lane 0" in error
+    assert "Discrete(4)" in error and "env.check=false" in error
     assert "restart_failed" not in error and "Traceback" not in error

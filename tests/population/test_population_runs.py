@@ -336,7 +336,7 @@ BAD = {
     "size": (["population.size=1"], "needs several members"),
     "evaluated": (["population.score=evaluated"], "evaluation.every"),
     "score": (["population.score=lenght"], "did you mean length"),
-    "league": (["population.score=won/league"], "no mean over episodes here"),
+    "league": (["population.score=won/league"], "is not a mean over episodes here"),
     "ranks": (["ranks=4"], "more than population.size=3"),
     "member": (["population.member=1"], "is set by a population"),
     "file": (["population.size=1", "population.vary={}", "population.schedule=x"], "no file 'x'"),

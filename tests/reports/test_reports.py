@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 
 import pytest
 
-from megastep.agents import errors
 from megastep.agents.cli import compare, evaluate, report, train
 from megastep.agents.reports import homes, runs
 from megastep.agents.runs import json_lines
@@ -131,22 +130,21 @@ def test_comparison_is_a_plot_and_its_numbers(here, capsys):
 @pytest.mark.parametrize(
     "main, words, sentence",
     [
-        (report.main, ["file=x.html"], "run is missing"),
-        (report.main, ["run=a", "file=x.pdf"], "no page; its name ends with .html"),
+        (report.main, ["file=x.html"], "run: is missing"),
+        (report.main, ["run=a", "file=x.pdf"], "not a page; its name ends with .html"),
         (report.main, ["run=nowhere"], "is neither a run folder nor a pretrained agent"),
         (report.main, ["run=a", "fiel=x.html"], "did you mean file?"),
-        (report.main, ["a"], "'a' is not key=value; the keys are run, file"),
-        (report.main, ["run=a", "run=b"], "run is given twice"),
+        (report.main, ["run=a", "run=b"], "run: is given twice"),
         (report.main, ["run=a", "file=/proc/x/y.html"], "cannot be written"),
         (compare.main, ["run=a", "file=x.mp4"], "is no plot; its name ends with .pdf, .svg, .png"),
         (compare.main, ["run=[a,b]", "metric=loss/entropi"], "did you mean loss/entropy?"),
-        (compare.main, ["run=a", "metric=x,y"], "not all of these runs report 'x,y'"),
+        (compare.main, ["run=a", "metric=x,y"], "metric: takes one value"),
     ],
 )
-def test_refused(here, main, words, sentence):
+def test_refused(here, main, words, sentence, capsys):
     before = {*here.rglob("*")}
-    with pytest.raises(errors.UserError, match=re.escape(sentence)):
-        main(words)
+    assert main(words) == 2
+    assert sentence in capsys.readouterr().err
     assert {*here.rglob("*")} == before
 
 
