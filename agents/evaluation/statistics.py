@@ -17,7 +17,9 @@ def resamples(n: int, n_resamples: int = 2000, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).integers(n, size=(n_resamples, n))
 
 
-def bounds(resampled: ArrayLike, level: float = 0.95, axis: int | None = None) -> np.ndarray:
+def bounds(
+    resampled: np.ndarray | list[float], level: float = 0.95, axis: int | None = None
+) -> np.ndarray:
     """Returns the lower and upper bound of a percentile bootstrap; NaN is left out."""
     return np.nanquantile(resampled, [(1 - level) / 2, (1 + level) / 2], axis=axis)
 

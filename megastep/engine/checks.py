@@ -4,7 +4,7 @@ import math
 import numbers
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar, cast
 
 import torch
 
@@ -174,7 +174,7 @@ def ragged(name: str, value: Any, shape: Sequence, device: torch.device | None) 
     """
     if not isinstance(value, Ragged) and not hasattr(value, "torchify"):
         _refuse(name, "a Ragged", value, TypeError)
-    value = value.torchify()
+    value = cast("RaggedTorch", value).torchify()
     return RaggedTorch(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
 
 

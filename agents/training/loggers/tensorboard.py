@@ -45,6 +45,7 @@ class TensorBoard:
             purge_step = self.step + 1
             module = importlib.import_module(WRITER)
             self._writer = module.SummaryWriter(str(self.folder), purge_step=purge_step)
+        assert self._writer is not None
         return self._writer
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
