@@ -171,7 +171,7 @@ def test_wandb_group_of_a_sweep(here, monkeypatch):
     groups = []
 
     class Wandb:
-        def __init__(self, group):
+        def __init__(self, group: str | None = None, mode: str = "online"):
             groups.append(group)
 
         def write(self, step, values): ...
