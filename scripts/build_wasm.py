@@ -10,7 +10,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from megastep.agents.networks.web import LIBRARY as POLICY
-from megastep.envs.deathmatch.deathmatch_step import LIBRARY as DEATHMATCH
+from megastep.envs.deathmatch.bot import LIBRARY as DEATHMATCH
 from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
 from megastep.envs.keys.keys import LIBRARY as KEYS
 from megastep.envs.memory.memory import LIBRARY as MEMORY

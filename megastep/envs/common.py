@@ -1,6 +1,6 @@
 """Members that the environments share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import torch
@@ -15,18 +15,37 @@ from megastep.types import Env
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "world_of"]
+__all__ = ["DisplayedEnv", "SceneryEnv", "Weight", "step_outputs", "world_of"]
+
+FLAGS = "reset", "terminal", "truncated"
 
 #: Weight of a part of a reward, a number or a schedule.
 Weight = Annotated[Number, Scheduled(ge=0, le=1000)]
 
 
-def world_of(step: Any, obs: Any, metrics: arrdict | None = None) -> arrdict:
-    """Returns a world with the reward and the flags of an operation's outcome."""
-    names = "reward", "reset", "terminal", "truncated"
-    world = arrdict(obs=obs, **{name: getattr(step, name) for name in names})
-    if metrics is not None:
-        world["metrics"] = metrics
+def step_outputs(env: Any, n_metrics: int, obs: Mapping, critic: Mapping) -> dict[str, Any]:
+    """Returns empty tensors for what the kernel of a game's step writes: ``reward``, the flags,
+    ``metrics`` (n_metrics, B), and (B, 1, size) of each {name: size} that policies observe, in
+    float16, or a critic, in float32. None where a size is 0.
+    """
+    n, device = env.n_envs * env.n_agents, env.device
+    flags = {name: torch.empty(n, dtype=torch.bool, device=device) for name in FLAGS}
+    metrics = torch.empty((n_metrics, n), device=device) if n_metrics else None
+    outputs = dict(reward=torch.empty(n, device=device), **flags, metrics=metrics)
+    for sizes, dtype in ((obs, torch.float16), (critic, torch.float32)):
+        for name, size in sizes.items():
+            empty = torch.empty((n, 1, size), dtype=dtype, device=device) if size else None
+            outputs[name] = empty
+    return outputs
+
+
+def world_of(outputs: Mapping, obs: Any, metrics: Sequence[str], **privileged: Any) -> arrdict:
+    """Returns the world of a step's outputs, with names of its metrics."""
+    world = arrdict(obs=obs, **{name: outputs[name] for name in ("reward", *FLAGS)})
+    if outputs["metrics"] is not None:
+        world["metrics"] = arrdict(zip(metrics, outputs["metrics"].unbind()))
+    if privileged:
+        world["privileged"] = arrdict(privileged)
     return world
 
 

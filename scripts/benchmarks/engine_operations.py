@@ -8,7 +8,6 @@ from random_walks import random_actions, walk_four_agents, walk_in_homes
 from timing import graph_seconds_per_call, measurement, rate, seconds_per_call
 
 from megastep import core, engine, modules
-from megastep.envs.explorer.explorer import explorer_step
 
 N_AGENTS = {"cuda": (4096, 8192, 262_144), "cpu": (2048,)}
 N_ARENAS = {"cuda": 65_536, "cpu": 1024}  # homes of four agents each
@@ -31,14 +30,9 @@ def operations(n: int, device: torch.device) -> Iterator[tuple[str, Callable[[in
         "`observe` as Explorer does, 256 rays to 64 pixels",
         lambda i: engine.observe(scenery, agents, 4, imu=True, seen=env.seen, clear_mask=ended),
     )
-    newly_seen, episodes = torch.zeros_like(ended, dtype=torch.int32), env
-    yield (
-        "`explorer_step` with a privileged observation",
-        lambda i: explorer_step(
-            scenery, agents, newly_seen, env.seen, env.runs, episodes.ages, episodes.limits,
-            episodes.ended, coverage=True, privileged=True,
-        ),
-    )  # fmt: skip
+    newly_seen = torch.zeros_like(ended, dtype=torch.int32)
+    env.privileged_space = env.privileged_space or True
+    yield "`explorer_step` with a privileged observation", lambda i: env._judge(newly_seen)
     yield "`render`, 256 rays, all fields", lambda i: engine.render(scenery, agents)
     minimal, _ = walk_in_homes("minimal", n, device)
     yield (

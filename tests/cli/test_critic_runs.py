@@ -6,7 +6,7 @@ import torch
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.runs import checkpoint
-from megastep.envs.explorer import explorer as explorer_env
+from megastep.envs import Explorer
 from tests.cli.test_train import configured
 from tests.helpers import tiny
 from tests.helpers.weights import of_run as weights
@@ -23,13 +23,13 @@ def trained(*overrides):
 def refuse_privileged(monkeypatch):
     """Has Explorer raise a TypeError if it computes a privileged observation."""
 
-    def plain_step(*args, privileged, **settings):
-        if privileged:
+    def plain_judge(env, newly_seen):
+        if env.privileged_space is not None:
             raise TypeError("a privileged observation is computed")
-        return step(*args, **settings)
+        return judge(env, newly_seen)
 
-    step = explorer_env.explorer_step
-    monkeypatch.setattr(explorer_env, "explorer_step", plain_step)
+    judge = Explorer._judge
+    monkeypatch.setattr(Explorer, "_judge", plain_judge)
 
 
 @pytest.mark.parametrize("critic", ["asymmetric", "plain"])

@@ -4,15 +4,11 @@ read out of bounds; they set a flag, and ``engine.check`` names the environment.
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
-from megastep import core, engine, scene, toys
-from megastep.envs.explorer.explorer import explorer_step
-from megastep.envs.explorer.texel_runs import TexelRuns
-from megastep.envs.pointgoal.goals import GoalFields
-from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS, pointgoal_step
+from megastep import core, engine, envs, scene, toys
+from megastep.geometries import sample
 
 LAST = 3  # of four environments, so that the buffers end with it
 
@@ -43,46 +39,6 @@ def geometry(c):
     return c.scenery.agent_light
 
 
-def pointgoal(c):
-    goals = GoalFields(
-        points=2 * [np.ones((1, 2))],
-        fields=2 * [np.arange(36, dtype=np.float16).reshape(1, 6, 6)],
-        origins=2 * [np.ones(2)],
-        spawns=2 * [np.ones((1, 2))],
-        lengths=2 * [np.ones((1, 1))],
-        allowed=2 * [np.ones((1, 1), bool)],
-        cell=1.0,
-        device=c.device,
-    )
-    n, on = (LAST + 1) * c.n_agents, dict(device=c.device)
-    goal_index, ages, n_draws = (torch.zeros(n, dtype=torch.int32, **on) for _ in range(3))
-    result = pointgoal_step(
-        c.scenery,
-        c.agents,
-        goals,
-        goal_index,
-        torch.zeros((PROGRESS_ROWS, n), **on),
-        ages,
-        torch.zeros(n, dtype=torch.bool, **on),
-        n_draws,
-        torch.zeros((LAST + 1, c.n_agents), dtype=torch.int32, **on),
-    )
-    return result.reward.view(LAST + 1, -1)
-
-
-def explorer(c):
-    layouts, lanes, n = c.scenery.layouts, (LAST + 1, c.n_agents), (LAST + 1) * c.n_agents
-    words = -(-layouts.max_texels // 32)
-    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
-    seen = torch.zeros((*lanes, words), dtype=torch.int32, device=c.device)
-    ages, limits = (torch.ones(n, dtype=torch.int32, device=c.device) for _ in range(2))
-    result = explorer_step(
-        c.scenery, c.agents, torch.zeros(lanes, dtype=torch.int32, device=c.device), seen,
-        TexelRuns(c.scenery, visible), ages, limits, ages.bool(), coverage=True, privileged=True,
-    )  # fmt: skip
-    return result.unseen.view(LAST + 1, -1)
-
-
 def spawn(c):
     n, a, device = c.scenery.n_envs, c.n_agents, c.scenery.device
     mask = torch.ones((n, a), dtype=torch.bool, device=device)
@@ -94,9 +50,7 @@ def spawn(c):
 
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
-@pytest.mark.parametrize(
-    "operation", [physics, render, observe, geometry, explorer, pointgoal, spawn]
-)
+@pytest.mark.parametrize("operation", [physics, render, observe, geometry, spawn])
 def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
     c = boxes(device, n_agents)
@@ -111,7 +65,7 @@ def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents
     engine.check(c.agents)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, geometry, explorer, spawn])
+@pytest.mark.parametrize("operation", [physics, render, observe, geometry, spawn])
 def test_on_a_cpu_an_operation_raises_before_it_returns(operation):
     c = boxes("cpu", 2)
     c.scenery.layout[LAST] = 2
@@ -119,7 +73,7 @@ def test_on_a_cpu_an_operation_raises_before_it_returns(operation):
         operation(c)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, explorer, pointgoal])
+@pytest.mark.parametrize("operation", [physics, render, observe])
 @pytest.mark.parametrize("field", ["positions", "angles"])
 def test_nonfinite_pose_is_named_by_every_operation(operation, field, device):
     expected = operation(boxes(device, 2))
@@ -130,6 +84,23 @@ def test_nonfinite_pose_is_named_by_every_operation(operation, field, device):
         result = operation(c)
         engine.check(c.agents)
     assert torch.equal(result[:LAST], expected[:LAST])
+
+
+@pytest.mark.parametrize("make", [envs.Explorer, envs.PointGoal, envs.Memory, envs.Keys])
+@pytest.mark.parametrize("what", ["layout", "position"])
+def test_rules_of_games_name_the_environment(make, what, device):
+    homes = sample("homes", 2)
+    env = make(LAST + 1, homes, device=device, res=8, subsample=1, privileged=True)
+    env.reset()
+    env.check()
+    if what == "layout":
+        env.layout[LAST] = 2
+    else:
+        env.core.agents.positions[LAST] = math.nan
+    arguments = dict(Explorer=[torch.zeros_like(env.ages)], PointGoal=[None])
+    with pytest.raises(engine.EngineError, match=f"(?i)environment {LAST} "):
+        env._judge(*arguments.get(make.__name__, []))
+        env.check()
 
 
 @pytest.mark.parametrize("action", [7, -1, 2**40])

@@ -10,7 +10,6 @@ import torch
 from megastep import arrdict, contract, core, engine, envs, modules, scene, toys
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine.rendering import Observation
-from megastep.envs.deathmatch.deathmatch_step import actions_of_live, deathmatch_step
 from megastep.geometries import sample
 from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned, sound
 
@@ -46,45 +45,48 @@ ALL = dict(
 )
 
 
-# ---- deathmatch_step against its twin ----
+# ---- A step's rules against their twin ----
 
 
 NOTHING = Observation(*len(Observation._fields) * [None])
+STATE = "health", "tally", "ages", "ended"
 
 
-def fight(device, n_envs, n_agents, steps=30, rounds=False, **rules):
+def fight(device, n_envs, n_agents, steps=30, rounds=False, search_reward=0.0, **rules):
     """Yields steps with random views, half of which show an agent: (inputs, outputs, positions,
     angles), with `rounds` as long as an episode.
     """
-    random = np.random.default_rng(n_agents)
-    scenery = scene.scenery([toys.box()], n_agents, n_envs, device=device)
-    c, n, lanes = core.Core(scenery, res=512, fov=70), n_envs * n_agents, (n_envs, n_agents)
-    state = dict(
-        health=torch.ones(n, device=device),
-        tally=torch.zeros((4, n), device=device),
-        ages=torch.zeros(n, dtype=torch.int32, device=device),
-        ended=torch.ones(n, dtype=torch.bool, device=device),
+    random, lanes = np.random.default_rng(n_agents), (n_envs, n_agents)
+    env = envs.Deathmatch(
+        n_envs, [toys.box()], n_agents=n_agents, device=device, resample=rounds, privileged=True
     )
+    rules = ALL | rules
+    env.weights.set(**{name: rules[name] for name in env.weights.values})
+    env.rules |= {name: rules[name] for name in env.rules.keys() & rules.keys()}
+    env.rules["search_reward"] = search_reward
+    env.ended.fill_(True)
+    state = {name: getattr(env, name) for name in STATE}
     if rounds:
-        state["round_ages"] = torch.full((n_envs,), -1, dtype=torch.int32, device=device)
+        state["round_ages"] = env.round_ages.fill_(-1)
     for _ in range(steps):
         line = random.integers(-1, 16 * n_agents, lanes).astype(np.int32)
         ray = random.integers(-1, 512, lanes).astype(np.int32)
         positions, angles = random.uniform(-9, 9, (*lanes, 2)), random.uniform(-180, 180, lanes)
         newly_seen = random.integers(0, 99, lanes).astype(np.int32)
-        c.agents.positions.copy_(torch.from_numpy(positions))
-        c.agents.angles.copy_(torch.from_numpy(angles))
+        agents = env.core.agents
+        agents.positions.copy_(torch.from_numpy(positions))
+        agents.angles.copy_(torch.from_numpy(angles))
         view = NOTHING._replace(
             centre_line=torch.from_numpy(line).to(device),
-            agent_ray=torch.from_numpy(ray).to(device),
-            newly_seen=torch.from_numpy(newly_seen).to(device),
+            agent_ray=torch.from_numpy(ray).to(device) if rules["aim_reward"] else None,
+            newly_seen=torch.from_numpy(newly_seen).to(device) if search_reward else None,
         )
         inputs = dict(line=line, ray=ray, newly_seen=newly_seen)
         inputs |= dict(**{k: v.cpu().numpy().copy() for k, v in state.items()})
-        out = deathmatch_step(scenery, c.agents, view, **state, **rules, privileged=True)._asdict()
+        out = env._judge(view, {})
         outputs = {k: v.cpu().numpy().copy() for k, v in (out | state).items() if v is not None}
         outputs |= dict(zip(METRICS, outputs["metrics"], strict=True))
-        yield inputs, outputs, c.agents.positions.cpu().numpy(), c.agents.angles.cpu().numpy()
+        yield inputs, outputs, agents.positions.cpu().numpy(), agents.angles.cpu().numpy()
 
 
 @pytest.mark.parametrize("n_agents", [2, 3, 16])
@@ -142,11 +144,15 @@ def test_rounds_and_search_match_pytorch_on_every_bit(device):
 
 
 def test_actions_of_ended_lanes_are_nothing(device):
-    ended = torch.tensor([False, True, True, False], device=device)
-    actions = torch.tensor([[3], [4], [0], [6]], device=device)
-    assert actions_of_live(actions, ended).tolist() == [[3], [0], [0], [6]]
+    env = envs.Deathmatch(2, [toys.box()], n_agents=2, device=device)
+    env.reset()
+    env.ended.copy_(torch.tensor([False, True, True, False]))
+    taken = []
+    env.movement = lambda decision: taken.extend(decision["actions"].tolist())
+    env.step(dict(actions=torch.tensor([[3], [4], [0], [6]], device=device)))
+    assert taken == [[3], [0], [0], [6]]
     with pytest.raises(ValueError, match="actions"):
-        actions_of_live(actions[:3], ended)
+        env.step(dict(actions=torch.zeros((3, 1), dtype=torch.int64, device=device)))
 
 
 # ---- engine.observe's agent_ray ----

@@ -1,12 +1,13 @@
 """Explorer's step as one operation, against its twin in plain PyTorch."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from megastep import contract, core, engine, envs, modules, scene, toys
 from megastep.arrdict import arrdict
-from megastep.envs.explorer.explorer import explorer_step
-from megastep.envs.explorer.texel_runs import TexelRuns
+from megastep.envs.explorer.texel_runs import texel_runs
 from megastep.geometries import sample
 from tests.helpers import explorer_twin, random_scenery
 from tests.helpers.outputs import Poison
@@ -37,6 +38,18 @@ def random_state(c, seed, density):
     return seen, visible, integers(0, 90).view(lanes), state
 
 
+def judge(c, newly_seen, seen, runs, state, coverage=False, privileged=False):
+    """Returns Explorer's outcome for a core in any scenery."""
+    env = SimpleNamespace(
+        **dict(core=c, n_envs=c.n_envs, n_agents=c.n_agents, device=c.device),
+        **dict(seen=seen, runs=runs, **state, patience=7),
+        **dict(has_metrics=coverage, privileged_space=privileged or None),
+    )
+    out = envs.Explorer._judge(env, newly_seen)
+    metrics = out.pop("metrics")
+    return out | dict(coverage=None if metrics is None else metrics[0])
+
+
 def check_step(c, seed, density, monkeypatch):
     """Compares all outputs and the new state with the twin, bit by bit, and counts of unseen texels
     with its bounds. Returns how many episodes start and end.
@@ -45,16 +58,14 @@ def check_step(c, seed, density, monkeypatch):
     expected = explorer_twin.explorer_step(
         c.scenery, newly_seen, seen, visible, **state, patience=7
     )
-    runs, poison = TexelRuns(c.scenery, visible), Poison(torch.empty)
+    runs, poison = texel_runs(c.scenery, visible), Poison(torch.empty)
     for wanted in ((True, True), (True, False), (False, True), (False, False)):
         coverage, privileged = wanted
         now = {name: tensor.clone() for name, tensor in state.items()}
         with monkeypatch.context() as patch:
             patch.setattr(torch, "empty", poison.allocate)
-            out = explorer_step(
-                c.scenery, c.agents, newly_seen, seen, runs if any(wanted) else None, **now,
-                patience=7, coverage=coverage, privileged=privileged,
-            )._asdict()  # fmt: skip
+            args = c, newly_seen, seen, runs if any(wanted) else None, now
+            out = judge(*args, coverage, privileged)
         assert (out["coverage"] is None, out["unseen"] is None) == (not coverage, not privileged)
         unseen = out.pop("unseen")
         if privileged:
@@ -152,11 +163,10 @@ def square(device):
 def counts_of(c, seen, visible):
     """The unseen texels in each (band, sector)."""
     lane = torch.zeros(1, dtype=torch.int32, device=c.device)
-    runs = TexelRuns(c.scenery, visible)
-    out = explorer_step(
-        c.scenery, c.agents, lane[:, None], seen, runs, lane, lane + 1, lane.bool(), privileged=True
-    )
-    return (64 * out.unseen.square()).round().int().view(3, 16)
+    state = dict(ages=lane, limits=lane + 1, ended=lane.bool())
+    runs = texel_runs(c.scenery, visible)
+    unseen = judge(c, lane[:, None], seen, runs, state, privileged=True)["unseen"]
+    return (64 * unseen.square()).round().int().view(3, 16)
 
 
 @pytest.mark.parametrize(
@@ -173,37 +183,24 @@ def test_sectors_follow_the_heading(angle, sector, device):
     assert counts[0, sector] == counts.sum() == 32
 
 
-# ---- TexelRuns by hand ----
+# ---- Runs of texels by hand ----
 
 
 def test_runs_of_a_box():
     """Four walls of 1.6 m have one word of 32 texels each."""
     scenery = scene.scenery([toys.box(1.6)], 1, device="cpu")
-    runs = TexelRuns(scenery, torch.tensor([[-1, 0b1101, 0, 1 << 31 - 31]], dtype=torch.int32))
+    runs = texel_runs(scenery, torch.tensor([[-1, 0b1101, 0, 1 << 31 - 31]], dtype=torch.int32))
     middles = scenery.layouts.lines.vals.mean(1)
-    assert torch.equal(runs.table[:, :2], middles[[0, 1, 3]])
-    assert runs.table[:, 2:].contiguous().view(torch.int32).tolist() == [[0, -1], [1, 13], [3, 1]]
-    assert runs.starts.tolist() == [0, 3] and runs.n_visible.tolist() == [36]
+    assert torch.equal(runs.runs[:, :2], middles[[0, 1, 3]])
+    assert runs.runs[:, 2:].contiguous().view(torch.int32).tolist() == [[0, -1], [1, 13], [3, 1]]
+    assert runs.run_starts.tolist() == [0, 3] and runs.n_visible.tolist() == [36]
 
 
 def test_a_run_never_crosses_a_wall_or_a_word():
     """Walls of 2 m have 40 texels: a word and a quarter, a half and a half, ..."""
     scenery = scene.scenery([toys.box(2)], 1, device="cpu")
-    runs = TexelRuns(scenery, torch.full((1, 5), -1, dtype=torch.int32))
-    words, bits = runs.table[:, 2:].contiguous().view(torch.int32).T.tolist()
+    runs = texel_runs(scenery, torch.full((1, 5), -1, dtype=torch.int32))
+    words, bits = runs.runs[:, 2:].contiguous().view(torch.int32).T.tolist()
     counts = [bin(word & 0xFFFFFFFF).count("1") for word in bits]
     assert words == [0, 1, 1, 2, 2, 3, 3, 4] and counts == [32, 8, 24, 16, 16, 24, 8, 32]
     assert runs.n_visible.tolist() == [160]
-
-
-def test_runs_of_other_layouts_are_refused():
-    c, other = (
-        core.Core(scene.scenery([toys.box(size)], 1, device="cpu"), res=8) for size in (1.6, 5)
-    )
-    runs = TexelRuns(other.scenery, seen_of(other)[0])
-    lane = torch.zeros(1, dtype=torch.int32)
-    arguments = c.scenery, c.agents, lane[:, None], seen_of(c), runs, lane, lane, lane.bool()
-    with pytest.raises(ValueError, match="runs must be of the scenery's 1 layouts of 4 words"):
-        explorer_step(*arguments, coverage=True)
-    with pytest.raises(TypeError, match="runs must be a TexelRuns"):
-        explorer_step(*arguments[:4], None, *arguments[5:], privileged=True)

@@ -10,10 +10,11 @@ import torch
 from test_geodesics import room
 
 from megastep import core, engine, envs, geometry, modules, scene, toys
+from megastep.coefficients import Coefficients
 from megastep.envs.pointgoal import goals as module
-from megastep.envs.pointgoal.goals import GoalFields, goal_fields
-from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS, pointgoal_step
-from megastep.geodesics import geodesics
+from megastep.envs.pointgoal.goals import goal_fields, packed
+from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS
+from megastep.geodesics import Geodesics, geodesics
 from megastep.geometries import sample
 from tests.helpers.outputs import Poison
 
@@ -26,23 +27,26 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-# ---- GoalFields, distance and bearing ----
+# ---- Distance and bearing ----
 
 
 def fields_of(random, n_layouts=3, n_goals=5, n_spawns=4, holes=0.2):
-    """Arguments of GoalFields: random fields with holes, of a different size in each layout."""
-    arguments = {key: [] for key in ("points", "fields", "origins", "spawns", "lengths", "allowed")}
+    """Random fields with holes, of a different size in each layout."""
+    layouts = []
     for d in range(n_layouts):
-        height, width = 2 + 3 * d, 7 - 2 * d
-        field = random.uniform(0, 20, (n_goals, height, width))
+        field = random.uniform(0, 20, (n_goals, 2 + 3 * d, 7 - 2 * d))
         field[random.random(field.shape) < holes] = np.inf
-        arguments["fields"].append(field.astype(np.float16))
-        arguments["points"].append(random.uniform(1, 4, (n_goals, 2)))
-        arguments["origins"].append(random.uniform(1, 2, 2).astype(np.float32))
-        arguments["spawns"].append(random.uniform(1, 4, (n_spawns, 2)))
-        arguments["lengths"].append(random.uniform(1, 9, (n_spawns, n_goals)))
-        arguments["allowed"].append(np.ones((n_spawns, n_goals), bool))
-    return arguments
+        points = random.uniform(1, 4, (n_goals, 2))
+        origin = random.uniform(1, 2, 2).astype(np.float32)
+        spawns = random.uniform(1, 4, (n_spawns, 2))
+        lengths = random.uniform(1, 9, (n_spawns, n_goals))
+        layouts.append(Geodesics(origin, field.astype(np.float16), spawns, points, lengths))
+    return layouts
+
+
+def goals_of(layouts, device="cpu"):
+    """All of the layouts' goals, each of which may be drawn."""
+    return packed(layouts, [np.ones(layout.lengths.shape, bool) for layout in layouts], device)
 
 
 def boxes(device, n_envs, n_agents=1):
@@ -57,18 +61,20 @@ def step(c, goals, goal_index, spawn_index=None, **settings):
     Returns (outputs, state).
     """
     n, on = goal_index.numel(), dict(device=c.device)
-    state = dict(
+    is_start = spawn_index is not None
+    spawn_index = spawn_index if is_start else torch.zeros_like(goal_index)
+    env = SimpleNamespace(
+        **dict(core=c, n_envs=c.n_envs, n_agents=c.n_agents, device=c.device, goals=goals),
+        **dict(limit=500, seed=1, privileged_space=True) | settings,
+        weights=Coefficients(c.device, bonus=5.0, cost=0.02, walk_cost=0.0),
+        spawner=SimpleNamespace(point_index=spawn_index),
         goal_index=goal_index.flatten().clone(),
         progress=torch.zeros((PROGRESS_ROWS, n), **on),
         ages=torch.zeros(n, dtype=torch.int32, **on),
-        ended=torch.full((n,), spawn_index is not None, **on),
+        ended=torch.full((n,), is_start, **on),
         n_draws=torch.zeros(n, dtype=torch.int32, **on),
     )
-    spawn_index = torch.zeros_like(goal_index) if spawn_index is None else spawn_index
-    out = pointgoal_step(
-        c.scenery, c.agents, goals, **state, spawn_index=spawn_index, privileged=True, **settings
-    )
-    return out, SimpleNamespace(**state)
+    return SimpleNamespace(**envs.PointGoal._judge(env, None)), env
 
 
 def expected(point, field, origin, x, y, angle):
@@ -106,7 +112,7 @@ def test_goal_and_distance_match_the_definition(n_agents, device, monkeypatch):
     c.agents.positions.copy_(torch.as_tensor(random.uniform(0.8, 2.8, (*shape, 2))))
     c.agents.angles.copy_(torch.as_tensor(random.uniform(-180, 180, shape)))
     goal_index = torch.as_tensor(random.integers(5, size=shape), dtype=torch.int32, device=device)
-    goals = GoalFields(**arguments, cell=CELL, device=device)
+    goals = goals_of(arguments, device)
     poison = Poison(torch.empty)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "empty", poison.allocate)
@@ -119,8 +125,7 @@ def test_goal_and_distance_match_the_definition(n_agents, device, monkeypatch):
         d, g = int(c.scenery.layout[e]), int(goal_index[e, a])
         x, y = c.agents.positions[e, a].tolist()
         straight, way, distance, descent = expected(
-            *(arguments[key][d][g] for key in ("points", "fields")),
-            arguments["origins"][d],
+            *(arguments[d].goals[g], arguments[d].fields[g], arguments[d].origin),
             x,
             y,
             float(c.agents.angles[e, a]),
@@ -140,10 +145,8 @@ def test_goal_ahead_left_behind_and_right(device):
     c.agents.angles.copy_(torch.tensor([[0.0], [90.0], [180.0], [270.0]]))
     arguments = fields_of(np.random.default_rng(1), n_goals=1)
     field = 10 - np.arange(30, dtype=np.float16)[:, None] / 10 + np.zeros((1, 30, 30), np.float16)
-    arguments |= dict(
-        points=3 * [np.array([[1.5, 3.5]])], fields=3 * [field], origins=3 * [np.ones(2)]
-    )
-    goals = GoalFields(**arguments, cell=CELL, device=device)
+    new = dict(goals=np.array([[1.5, 3.5]]), fields=field, origin=np.ones(2))
+    goals = goals_of([layout._replace(**new) for layout in arguments], device)
     goal_index = torch.zeros((4, 1), dtype=torch.int32, device=device)
     out, state = step(c, goals, goal_index)
     turned = [[0, 1], [1, 0], [0, -1], [-1, 0]]
@@ -160,7 +163,7 @@ def test_goal_ahead_left_behind_and_right(device):
 def test_bad_indices_are_named_and_other_lanes_continue(which, number, device):
     c = boxes(device, 4)
     c.agents.positions.fill_(1.5)
-    goals = GoalFields(**fields_of(np.random.default_rng(1)), cell=CELL, device=device)
+    goals = goals_of(fields_of(np.random.default_rng(1)), device)
     zeros = torch.zeros((4, 1), dtype=torch.int32, device=device)
     wrong = zeros.clone()
     wrong[3] = number
@@ -168,13 +171,8 @@ def test_bad_indices_are_named_and_other_lanes_continue(which, number, device):
     with pytest.raises(engine.EngineError, match="environment 3 has a goal or a spawn point that"):
         out = step(c, goals, *((wrong, None) if which == "goal" else (zeros, wrong)))[0]
         engine.check(c.agents)
-    assert all(torch.equal(a[..., :3, :, :], b[..., :3, :, :]) for a, b in zip(out[5:], right[5:]))
-
-
-def test_goals_of_other_layouts_are_refused():
-    goals = GoalFields(**fields_of(np.random.default_rng(1), 2), cell=CELL)
-    with pytest.raises(ValueError, match="goals .* 3 layouts .* 2 on cpu"):
-        step(boxes("cpu", 2), goals, torch.zeros((2, 1), dtype=torch.int32))
+    for name in ("goal_obs", "privileged"):
+        assert torch.equal(getattr(out, name)[:3], getattr(right, name)[:3])
 
 
 # ---- Goals that are drawn ----
@@ -184,8 +182,8 @@ def test_goals_of_other_layouts_are_refused():
 def test_drawn_goals_are_in_range(n_agents, device):
     homes, n = [*sample("homes", 3), toys.column()], 300
     c = core.Core(scene.scenery(homes, n_agents, n, device=device), res=8)
-    goals = goal_fields(homes, c, nearest=2.0, furthest=4.0)
-    spawner = modules.RandomSpawns(homes, c, resample=True, points=goals.spawns)
+    goals, spawns = goal_fields(homes, c, nearest=2.0, furthest=4.0)
+    spawner = modules.RandomSpawns(homes, c, resample=True, points=spawns)
     truth = geodesics_of(homes, c.seed)
     drawn = set()
     spawner(c.agent_full(True))

@@ -7,7 +7,7 @@ import torch
 from megastep import contract, envs, toys
 from megastep.arrdict import arrdict
 from megastep.envs.first_person import images
-from megastep.envs.memory.memory import arrangements, memory_step
+from megastep.envs.memory.memory import arrangements
 from megastep.geometries import sample
 from megastep.modules.objects import REACH
 from tests.helpers import memory_twin
@@ -102,7 +102,7 @@ def test_cameras_see_the_cue_s_colour():
 def test_step_matches_twin_on_every_bit(n_agents_seed, device, monkeypatch):
     """Some environments start an episode, some end one; agents stand on any object, or on none."""
     random = torch.Generator().manual_seed(n_agents_seed)
-    env = make_env(device, n_envs=77, objects=3 + n_agents_seed, privileged=True)
+    env = make_env(device, n_envs=77, objects=3 + n_agents_seed, privileged=True, limit=10)
     env.reset()
     n_hits = 0
     for step in range(8):
@@ -123,11 +123,7 @@ def test_step_matches_twin_on_every_bit(n_agents_seed, device, monkeypatch):
         poison = Poison(torch.empty)
         with monkeypatch.context() as patch:
             patch.setattr(torch, "empty", poison.allocate)
-            out = memory_step(
-                env.core.scenery, env.core.agents, env.arrangements,
-                *(getattr(env, name) for name in STATE),
-                seed=env.seed, limit=10, reach=REACH, privileged=True,
-            )._asdict()  # fmt: skip
+            out = env._judge()
         poison.check(**{name: x for name, x in out.items() if x.dtype != torch.bool})
         ours = {name: getattr(env, name) for name in STATE} | dict(at=objects.positions)
         ours |= {name: out[name] for name in expected}

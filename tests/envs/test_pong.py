@@ -10,7 +10,6 @@ import torch
 from megastep import arrdict, contract, envs
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine import EngineError
-from megastep.envs.pong.pong import pong_step
 from tests.helpers.pong_twins import PythonPong
 
 N, STEPS = 40, 500
@@ -211,13 +210,6 @@ def test_bad_action_is_named(action, device):
         env.step(arrdict.arrdict(actions=actions))
         env.check()
     env.check()
-
-
-def test_unaligned_pixels_are_refused(device):
-    env = envs.Pong(1, pixels=True, device=device)
-    odd = torch.zeros(1201, dtype=torch.uint8, device=device)[1:].view(1, 1, 1, 30, 40)
-    with pytest.raises(ValueError, match="pixels .* multiple of 8 bytes"):
-        pong_step(env.games, env.no_actions, env.error_flag, 1, pixels=odd)
 
 
 # ---- Learning ----

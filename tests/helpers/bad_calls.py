@@ -14,17 +14,10 @@ import math
 import sys
 from types import SimpleNamespace
 
-import numpy as np
 import torch
 
 from megastep import core, cuda, engine, modules, scene, toys
 from megastep.engine.scenery import Layouts, Scenery
-from megastep.envs.deathmatch.deathmatch_step import TALLY_ROWS, deathmatch_step
-from megastep.envs.explorer.explorer import explorer_step
-from megastep.envs.explorer.texel_runs import TexelRuns
-from megastep.envs.pointgoal.goals import GoalFields
-from megastep.envs.pointgoal.pointgoal import PROGRESS_ROWS, pointgoal_step
-from megastep.envs.pong.pong import GAME_FIELDS, PIXELS, pong_step
 from megastep.ragged import Ragged
 
 ALLOWED = (ValueError, TypeError, AttributeError, IndexError, engine.EngineError)
@@ -50,39 +43,8 @@ def fixture(device):
         seen=torch.zeros((N, A, words), dtype=torch.int32, device=device),
         moves=torch.zeros((7, 3), device=device),
         weights=torch.zeros((N, A, 7), device=device),
-        visible=torch.zeros((D, words), dtype=torch.int32, device=device),
         points=torch.full((D, 4, 2), 3.0, device=device),
         out=torch.zeros((N * A, 4), device=device),
-        games=torch.zeros((GAME_FIELDS, N), dtype=torch.int32, device=device),
-        rounds=torch.zeros(N, dtype=torch.int32, device=device),
-        actions=torch.zeros((N, 1), dtype=torch.int64, device=device),
-        error_flag=torch.zeros(1, dtype=torch.int32, device=device),
-        goals=GoalFields(**goal_fields(scenery.device)),
-        numbers=torch.zeros(N * A, dtype=torch.int32, device=device),
-        progress=torch.zeros((PROGRESS_ROWS, N * A), device=device),
-        free=torch.ones((N, A), device=device),
-        pixels=torch.zeros((N, 1, 1, *PIXELS), dtype=torch.uint8, device=device),
-        one_camera=(one_camera := core.Core(scenery, res=16)).agents,
-        view=engine.observe(scenery, one_camera.agents, centre_line=True, agent_ray=True),
-        health=torch.ones(N * A, device=device),
-        tally=torch.zeros((TALLY_ROWS, N * A), device=device),
-        ages=torch.zeros(N * A, dtype=torch.int32, device=device),
-        ended=torch.zeros(N * A, dtype=torch.bool, device=device),
-        runs=TexelRuns(scenery, torch.zeros((D, words), dtype=torch.int32, device=device)),
-    )
-
-
-def goal_fields(device):
-    """Arguments of `GoalFields`."""
-    return dict(
-        points=D * [np.ones((2, 2))],
-        fields=D * [np.ones((2, 3, 3), np.float16)],
-        origins=D * [np.ones(2)],
-        spawns=D * [np.ones((4, 2))],
-        lengths=D * [np.ones((4, 2))],
-        allowed=D * [np.ones((4, 2), bool)],
-        cell=1.0,
-        device=device,
     )
 
 
@@ -162,10 +124,6 @@ def seeds(good):
     return [*integers(0)(good)][:6]
 
 
-def limits(good):
-    return integers(1, 2**31 - 1)(1)
-
-
 def numbers(*more):
     def wrong(good):
         yield from [("None", None), ("a string", "1"), ("NaN", math.nan), ("infinite", math.inf)]
@@ -181,13 +139,6 @@ def flags(good):
 
 def objects(good):
     yield from [("None", None), ("a number", 3), ("a string", "x"), ("another", SimpleNamespace())]
-
-
-def views(good):
-    yield from objects(good)
-    for name in ("centre_line", "agent_ray"):
-        for label, wrong in tensors(getattr(good, name)):
-            yield f"{name} {label}", good._replace(**{name: wrong})
 
 
 def ids(good):
@@ -239,78 +190,10 @@ def operations(f):
         ),
     )  # fmt: skip
     yield (
-        pointgoal_step,
-        dict(
-            both, goals=f.goals, goal_index=f.numbers, progress=f.progress, ages=f.ages,
-            ended=f.ended, n_draws=f.numbers, spawn_index=f.counts, free=f.free, seed=1,
-        ),
-        dict(
-            OPERANDS,
-            goals=objects,
-            **dict.fromkeys(("goal_index", "progress", "ages", "ended", "n_draws"), tensors),
-            spawn_index=tensors,
-            free=optional_tensors,
-            seed=seeds,
-            **dict.fromkeys(("reach", "bonus", "cost", "walk_cost"), numbers()),
-            limit=limits,
-            privileged=flags,
-        ),
-    )  # fmt: skip
-    yield (
         engine.uniform,
         dict(counts=f.counts.view(-1), mask=f.mask.view(-1), seed=1, out=f.out),
         dict(counts=tensors, mask=tensors, seed=seeds, out=tensors),
     )
-    yield (
-        explorer_step,
-        dict(
-            both, newly_seen=f.counts, seen=f.seen, runs=f.runs, ages=f.ages, limits=f.numbers,
-            ended=f.ended, coverage=True, privileged=True,
-        ),
-        dict(
-            OPERANDS,
-            runs=objects,
-            **dict.fromkeys(("newly_seen", "seen", "ages", "limits", "ended"), tensors),
-            patience=limits,
-            coverage=flags,
-            privileged=flags,
-        ),
-    )  # fmt: skip
-    yield TexelRuns, dict(scenery=f.scenery, visible=f.visible), dict(visible=tensors)
-    yield (
-        pong_step,
-        dict(games=f.games, actions=f.actions, error_flag=f.error_flag, seed=1, pixels=f.pixels),
-        dict(
-            **dict.fromkeys(("games", "actions"), tensors),
-            error_flag=lambda good: [c for c in tensors(good) if c[0] != "not contiguous"],
-            seed=seeds,
-            points=limits,
-            limit=limits,
-            tracker_speed=numbers(-0.1, 40),
-            pixels=optional_tensors,
-        ),
-    )
-    yield (
-        deathmatch_step,
-        dict(
-            scenery=f.scenery, agents=f.one_camera, view=f.view, health=f.health, tally=f.tally,
-            ages=f.ages, ended=f.ended, round_ages=f.rounds, limit=9, aim_reward=1.0,
-            privileged=True,
-        ),
-        dict(
-            OPERANDS,
-            view=views,
-            **dict.fromkeys(("health", "tally", "ages", "ended"), tensors),
-            **dict.fromkeys(
-                ("damage", "recovery", "drain", "health_per_hit", "hearing"), numbers(-0.1)
-            ),
-            **dict.fromkeys(("hit_reward", "wound_cost", "kill_reward", "death_cost"), numbers()),
-            **dict.fromkeys(("aim_reward", "search_reward"), numbers()),
-            round_ages=optional_tensors,
-            limit=limits,
-            privileged=flags,
-        ),
-    )  # fmt: skip
     yield (
         modules.visible_texels,
         dict(scenery=f.scenery, points=f.points),

@@ -17,7 +17,7 @@ AROUND = torch.cartesian_prod(*2 * [torch.tensor([-1.0, 0.0, 1.0])])
 
 
 def explorer_step(scenery, newly_seen, seen, visible, ages, limits, ended, *, patience=200):
-    """Returns {name: tensor} of all outputs of `megastep.envs.explorer.explorer_step` but
+    """Returns {name: tensor} of all outputs of a step of `megastep.envs.Explorer` but
     ``unseen``, and of the new ``ages``, ``limits`` and ``ended``, on the CPU. Changes nothing.
     """
     newly_seen, ages, limits, reset = (x.cpu() for x in (newly_seen, ages, limits, ended))

@@ -53,7 +53,7 @@ def keys_step(
         positions: (N, 2) metres, the agents'; `radius` of them.
         things: {name: (N, O, ...)} of `THINGS`.
         layout: (N,).
-        tables: {name: (D, M, ...)}, as the arguments of `megastep.envs.keys.keys_step`.
+        tables: {name: (D, M, ...)}, as `megastep.envs.Keys` has them.
         state: {name: tensor (N,)}, likewise.
     """
     positions = positions.clone()

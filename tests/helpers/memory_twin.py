@@ -23,7 +23,7 @@ def memory_step(positions, radius, at, sizes, layout, arrangements, state, *, se
         radius: of the agents.
         at: (N, O, 2) metres, the objects; `sizes` (N, O) their radii.
         layout: (N,), `arrangements` (D, M, O, 2).
-        state: {name: tensor (N,)}, as the arguments of `megastep.envs.memory.memory_step`.
+        state: {name: tensor (N,)}, as `megastep.envs.Memory` has them.
     """
     n, n_objects = at.shape[:2]
     at, state = at.clone(), {name: tensor.clone() for name, tensor in state.items()}

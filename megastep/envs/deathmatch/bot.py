@@ -2,16 +2,17 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import torch
 
 from megastep.arrdict import arrdict
 from megastep.devices import threads
 from megastep.engine import checks
-from megastep.envs.deathmatch.deathmatch_step import LIBRARY
+from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import WARP, launch
 
-_STATE = dict(lost=torch.int64, side=torch.int64, around=torch.int64, pushed=torch.bool)
+LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 LOOK = LIBRARY.constants["LOOK"]
 
 
@@ -70,23 +71,17 @@ class Bot:
         before = {name: leaf.contiguous() for name, leaf in state.items()}
         after = arrdict({name: torch.empty_like(leaf) for name, leaf in before.items()})
         actions = torch.empty(n_lanes, 1, dtype=torch.int64, device=device)
-        rgb, depth, imu = (
-            checks.address(name, images[name], (n_lanes, *shape), torch.float16, device)
-            for name, shape in shapes.items()
-        )
-        reset, lanes = reset.contiguous(), (n_lanes,)
+        half = torch.float16
         launch(
             *(LIBRARY, "bot", device, WARP * n_lanes),
-            rgb=rgb,
-            depth=depth,
-            imu=imu,
-            reset=checks.address("reset", reset, lanes, torch.bool, device),
             **{
-                name: checks.address(f"state.{name}", before[name], lanes, dtype, device)
-                for name, dtype in _STATE.items()
+                field: checks.address(name, images[name], (n_lanes, *shapes[name]), half, device)
+                for field, name in (("rgb", "rgb"), ("depth", "d"), ("imu", "imu"))
             },
+            reset=reset.contiguous(),
+            **before,
             actions=actions,
-            **{f"next_{name}": after[name] for name in _STATE},
+            **{f"next_{name}": leaf for name, leaf in after.items()},
             slope=math.tan(math.radians(self.fov / 2)),
             n_lanes=n_lanes,
             n_pixels=n_pixels,

@@ -14,18 +14,14 @@ from megastep import geometries as sources
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.core import Core
+from megastep.devices import threads
 from megastep.dotdict import dotdict
 from megastep.engine import checks
-from megastep.envs.common import SceneryEnv, world_of
-from megastep.envs.deathmatch.bot import Bot
-from megastep.envs.deathmatch.deathmatch_step import (
-    MAX_AGENTS,
-    TALLY_ROWS,
-    actions_of_live,
-    deathmatch_step,
-    privileged_size,
-)
+from megastep.engine.launch_params import state_params
+from megastep.envs.common import SceneryEnv, step_outputs, world_of
+from megastep.envs.deathmatch.bot import LIBRARY, Bot
 from megastep.envs.first_person import images
+from megastep.kernels.build.launch import launch
 from megastep.scene import scenery, spread
 from megastep.schedules import Number, Scheduled
 from megastep.settings import MAX_ENVS, checked
@@ -38,6 +34,9 @@ __all__ = ["Deathmatch"]
 
 METRICS = "kills", "deaths", "damage", "accuracy"
 MIN_SPAWNS = 128  # spawn points per layout, as in other environments
+MAX_AGENTS = LIBRARY.constants["MAX_AGENTS"]  # per environment
+#: Rows of ``tally``: kills, damage and hits of the episode so far; aim in the last step.
+TALLY_ROWS = LIBRARY.constants["TALLY_ROWS"]
 SPAWNS_PER_AGENT = 16  # at least, so that one is likely hidden from the other agents
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -164,7 +163,8 @@ class Deathmatch(SceneryEnv):
             hidden=True,
         )
         self.movement = modules.MomentumMovement(self.core)
-        pixels, n_privileged = res // subsample, privileged_size(n_agents)
+        pixels = res // subsample
+        n_privileged = 1 + LIBRARY.constants["PRIVILEGED_PER_OPPONENT"] * (n_agents - 1)
         self.obs_space = dotdict(
             rgb=spaces.MultiImage(1, 3, 1, pixels, low=0, high=1),
             d=spaces.MultiImage(1, 1, 1, pixels, low=0, high=1),
@@ -231,10 +231,17 @@ class Deathmatch(SceneryEnv):
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
-        n_lanes = len(self.ended)
-        actions = checks.lanes("actions", decision["actions"], n_lanes, self.device)
-        actions = actions.reshape(n_lanes, 1).long().contiguous()
-        self.movement(dict(actions=actions_of_live(actions, self.ended)))
+        n_lanes, device = len(self.ended), self.device
+        actions = checks.lanes("actions", decision["actions"], n_lanes, device)
+        live = torch.empty((n_lanes, 1), dtype=torch.int64, device=device)
+        launch(
+            *(LIBRARY, "actions_of_live", device, n_lanes),
+            actions=actions.reshape(-1).long().contiguous(),
+            ended=self.ended,
+            out=live,  # 0 where an episode has ended
+            n_lanes=n_lanes,
+        )
+        self.movement(dict(actions=live))
         return self._resets.keep(self._world())
 
     def _world(self, **rules) -> arrdict:
@@ -246,29 +253,46 @@ class Deathmatch(SceneryEnv):
         if self.seen is not None:  # counts newly seen texels
             search = dict(seen=self.seen, clear_mask=self.ended.view(self.n_envs, self.n_agents))
         view = self._view(**search)
-        step = deathmatch_step(
-            self.core.scenery,
-            self.core.agents,
-            view,
-            self.health,
-            self.tally,
-            self.ages,
-            self.ended,
-            self.round_ages,
-            privileged=self.privileged_space is not None,
+        out = self._judge(view, rules)
+        obs = arrdict(by_lane(images(view)), health=out["health_obs"])
+        if out["sound"] is not None:
+            obs["sound"] = out["sound"]
+        world = world_of(out, obs, METRICS)
+        if out["privileged"] is not None:
+            world["privileged"] = out["privileged"]
+        return world
+
+    def _judge(self, view, rules) -> dict:
+        """Lets each agent hit whoever is at the centre of its view."""
+        core, n_privileged = self.core, 0
+        if self.privileged_space is not None:
+            n_privileged = self.privileged_space.dim
+        hears = self.rules["hearing"] > 0
+        sizes = dict(health_obs=3, sound=3 * hears), dict(privileged=n_privileged)
+        outputs, poses = step_outputs(self, len(METRICS), *sizes), dict(positions=0, angles=0)
+        if hears or n_privileged:
+            poses = state_params(core.scenery, core.agents, "positions", "angles")
+        launch(
+            *(LIBRARY, "deathmatch_step", self.device, self.n_envs),
+            centre_line=view.centre_line,
+            agent_ray=view.agent_ray,
+            newly_seen=view.newly_seen,
+            **poses,
+            health=self.health,
+            tally=self.tally,
+            ages=self.ages,
+            ended=self.ended,
+            round_ages=self.round_ages,
+            **outputs,
             **self.rules | rules,
             **self.weights.tensors,
+            res=core.res,
+            n_envs=self.n_envs,
+            n_agents=self.n_agents,
+            n_model=len(core.scenery.model),
+            n_threads=threads(),
         )
-        world = world_of(
-            step,
-            arrdict(by_lane(images(view)), health=step.health_obs),
-            arrdict(zip(METRICS, step.metrics.unbind())),
-        )
-        if step.sound is not None:
-            world.obs["sound"] = step.sound
-        if step.privileged is not None:
-            world["privileged"] = step.privileged
-        return world
+        return outputs
 
     def _view(self, core=None, **search) -> engine.Observation:
         core = core or self.core

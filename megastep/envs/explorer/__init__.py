@@ -1,5 +1,5 @@
-"""Explorer: the environment, and its step as one operation with its kernel."""
+"""Explorer: the environment, with the kernel of its step."""
 
-from megastep.envs.explorer.explorer import Explorer, ExplorerStep, explorer_step
+from megastep.envs.explorer.explorer import Explorer
 
-__all__ = ["Explorer", "ExplorerStep", "explorer_step"]
+__all__ = ["Explorer"]

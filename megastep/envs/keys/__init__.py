@@ -1,5 +1,5 @@
-"""Keys: the environment, and its step as one operation with its kernel."""
+"""Keys: the environment, with the kernel of its step."""
 
-from megastep.envs.keys.keys import Keys, KeysStep, keys_step
+from megastep.envs.keys.keys import Keys
 
-__all__ = ["Keys", "KeysStep", "keys_step"]
+__all__ = ["Keys"]

@@ -1,10 +1,7 @@
-"""Keys: open the doors of a home to reach a goal. A step is one operation, :func:`keys_step`.
-
-N environments of one agent, D layouts, M episodes per layout, C colours, K doorways.
-"""
+"""Keys: open the doors of a home to reach a goal."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -13,11 +10,9 @@ from megastep import modules, spaces
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.dotdict import dotdict
-from megastep.engine import checks
-from megastep.engine.agents import Agents, check_on_cpu
-from megastep.engine.launch_params import lanes_of, object_params, seed_params, world_params
-from megastep.engine.scenery import Scenery
-from megastep.envs.common import Weight, world_of
+from megastep.engine.agents import check_on_cpu
+from megastep.engine.launch_params import object_params, seed_params, world_params
+from megastep.envs.common import Weight, step_outputs, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.envs.keys.episodes import cached_episodes
 from megastep.kernels.build.kernel_library import KernelLibrary
@@ -29,7 +24,7 @@ from megastep.settings import checked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Keys", "KeysStep", "keys_step"]
+__all__ = ["Keys"]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 METRICS = "success", "doors", "wasted"
@@ -38,109 +33,6 @@ N_EPISODES = 32  # per layout
 MAX_DOORS = 6
 LOCKED = "606060"  # doors without a key
 GOAL = "violet"
-
-
-class KeysStep(NamedTuple):
-    """The outcome of a step, one row per environment."""
-
-    reward: torch.Tensor  # (N,)
-    reset: torch.Tensor  # (N,) bool
-    terminal: torch.Tensor  # (N,) bool
-    truncated: torch.Tensor  # (N,) bool
-    metrics: torch.Tensor  # (3, N): success, doors opened, keys wasted, where an episode ends
-    keys_obs: torch.Tensor  # (N, 1, C) fp16: 1 for each key that the agent carries
-    privileged: torch.Tensor | None  # (N, 1, 2 C + 3) for a critic: tens of metres ahead and to the
-    # left to each key that lies about and to the goal; fraction of the steps that is left
-
-
-def keys_step(
-    scenery: Scenery,
-    agents: Agents,
-    starts: torch.Tensor,
-    keys: torch.Tensor,
-    goals: torch.Tensor,
-    doors: torch.Tensor,
-    doorways: torch.Tensor,
-    opened: torch.Tensor,
-    n_draws: torch.Tensor,
-    ages: torch.Tensor,
-    ended: torch.Tensor,
-    *,
-    seed: int = 1,
-    limit: int = 1000,
-    reach: float = 0.05,
-    key_reward: float | torch.Tensor = 0.0,
-    door_reward: float | torch.Tensor = 0.0,
-    privileged: bool = False,
-) -> KeysStep:
-    """Has each agent pick up the keys and open the doors that it touches, and ends its episode at
-    the goal. Where an episode starts, puts agent and objects where a random one of the layout's
-    episodes has them. Call it before the environment is rendered. See
-    :class:`~megastep.envs.Keys`.
-
-    Args:
-        scenery: whose objects are C keys, the goal, and K doors.
-        starts: (D, M, 2) float32 metres, where agents begin.
-        keys: (D, M, C, 2) float32 metres, NaN of a key that there is not.
-        goals: (D, M, 2) float32 metres.
-        doors: (D, M, K) int32: -1 for no door, the colour of a door, or C for one that stays
-            locked.
-        doorways: (D, K, 4) float32: x and y in metres, angle in degrees, half the length in metres.
-        opened: (N,) int32, doors opened in this episode, updated in place as all that follow.
-        n_draws: (N,) int32, numbers drawn so far, the generator's counter.
-        ages: (N,) int32, steps since the first observation.
-        ended: (N,) bool. In: environments that start an episode in this step. Out: those whose
-            episode ends in this step.
-        seed: the generator's key.
-        limit: steps after which an episode is truncated.
-        reach: metres between surfaces at which an agent touches an object.
-        key_reward: for a key that is picked up; a number, or a tensor () on the device.
-        door_reward: for a door that is opened, likewise.
-        privileged: compute the privileged observation.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
-        EngineError: on the CPU, if a position is NaN.
-    """
-    n, _ = lanes_of(scenery, agents)
-    checks.integer("agents per environment", scenery.n_agents, 1, 1)
-    device, d, m = scenery.device, len(scenery.layouts), checks.length("starts", starts, axis=1)
-    n_colours, n_doorways = checks.length("keys", keys, 2), checks.length("doors", doors, 2)
-    objects = scenery.objects
-    n_objects = objects.n_objects if objects is not None else 0
-    checks.integer("objects", n_objects, n_colours + 1 + n_doorways, n_colours + 1 + n_doorways)
-    privileged_out = None
-    if checks.flag("privileged", privileged):
-        privileged_out = torch.empty((n, 1, 2 * n_colours + 3), device=device)
-    flags = [torch.empty(n, dtype=torch.bool, device=device) for _ in range(3)]
-    metrics = torch.empty((len(METRICS), n), device=device)
-    keys_obs = torch.empty((n, 1, n_colours), dtype=torch.float16, device=device)
-    outputs = dict(metrics=metrics, keys_obs=keys_obs, privileged=privileged_out)
-    out = KeysStep(torch.empty(n, device=device), *flags, **outputs)
-    f32 = torch.float32, device
-    counters = dict(opened=opened, n_draws=n_draws, ages=ages)
-    launch(
-        *(LIBRARY, "keys_step", device, n),
-        **world_params(scenery, agents, "positions", "angles"),
-        objects=object_params(scenery),
-        **checks.addresses((d, m, 2), *f32, starts=starts, goals=goals),
-        keys=checks.address("keys", keys, (d, m, n_colours, 2), *f32),
-        doorways=checks.address("doorways", doorways, (d, n_doorways, 4), *f32),
-        doors=checks.address("doors", doors, (d, m, n_doorways), torch.int32, device),
-        **checks.addresses((n,), torch.int32, device, **counters),
-        ended=checks.address("ended", ended, (n,), torch.bool, device),
-        **out._asdict(),
-        **seed_params(seed),
-        n_episodes=m,
-        n_colours=n_colours,
-        n_doorways=n_doorways,
-        limit=checks.integer("limit", limit, 1, 2**31 - 1),
-        reach=checks.number("reach", reach, 0, checks.LIMIT, "metres"),
-        key_reward=checks.weight("key_reward", key_reward, device),
-        door_reward=checks.weight("door_reward", door_reward, device),
-    )
-    check_on_cpu(agents)
-    return out
 
 
 class Keys(FirstPerson):
@@ -222,28 +114,37 @@ class Keys(FirstPerson):
 
     def _world(self, free=None) -> arrdict:
         self.spawner(self.ended)
-        step = keys_step(
-            self.core.scenery,
-            self.core.agents,
+        out = self._judge()
+        obs = arrdict(images(self._view()), keys=out["keys_obs"])
+        critic = {} if out["privileged"] is None else dict(places=out["privileged"])
+        return world_of(out, obs, METRICS, **critic)
+
+    def _judge(self) -> dict:
+        """Has agents pick up keys, open doors and reach goals, before anything is rendered."""
+        core, n_colours = self.core, self.n_colours
+        n_privileged = 2 * n_colours + 3 if self.privileged_space is not None else 0
+        sizes = dict(keys_obs=n_colours), dict(privileged=n_privileged)
+        outputs = step_outputs(self, len(METRICS), *sizes)
+        launch(
+            *(LIBRARY, "keys_step", self.device, self.n_envs),
+            **world_params(core.scenery, core.agents, "positions", "angles"),
+            objects=object_params(core.scenery),
             **self.tables,
             opened=self.opened,
             n_draws=self.n_draws,
             ages=self.ages,
             ended=self.ended,
-            seed=self.seed,
-            reach=REACH,
+            **outputs,
+            **seed_params(self.seed),
+            n_episodes=N_EPISODES,
+            n_colours=n_colours,
+            n_doorways=len(self.objects["door"]),
             limit=self.limit,
-            privileged=self.privileged_space is not None,
+            reach=REACH,
             **self.weights.tensors,
         )
-        world = world_of(
-            step,
-            arrdict(images(self._view()), keys=step.keys_obs),
-            arrdict(zip(METRICS, step.metrics.unbind())),
-        )
-        if step.privileged is not None:
-            world["privileged"] = arrdict(places=step.privileged)
-        return world
+        check_on_cpu(core.agents)
+        return outputs
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""

@@ -1,5 +1,5 @@
-"""Memory: the environment, and its step as one operation with its kernel."""
+"""Memory: the environment, with the kernel of its step."""
 
-from megastep.envs.memory.memory import Memory, MemoryStep, memory_step
+from megastep.envs.memory.memory import Memory
 
-__all__ = ["Memory", "MemoryStep", "memory_step"]
+__all__ = ["Memory"]

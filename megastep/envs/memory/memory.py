@@ -1,12 +1,8 @@
-"""Memory: find coloured objects in a maze, again and again. A step is one operation,
-:func:`memory_step`.
-
-N environments of one agent, D layouts, M arrangements per layout, O objects.
-"""
+"""Memory: find coloured objects in a maze, again and again."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -15,11 +11,9 @@ from pydantic import Field
 from megastep import geometry, modules, spaces
 from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
-from megastep.engine import checks
-from megastep.engine.agents import Agents, check_on_cpu
-from megastep.engine.launch_params import lanes_of, object_params, seed_params, world_params
-from megastep.engine.scenery import Scenery
-from megastep.envs.common import world_of
+from megastep.engine.agents import check_on_cpu
+from megastep.engine.launch_params import object_params, seed_params, world_params
+from megastep.envs.common import step_outputs, world_of
 from megastep.envs.first_person import FirstPerson, images
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
@@ -31,7 +25,7 @@ from megastep.settings import checked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Memory", "MemoryStep", "memory_step"]
+__all__ = ["Memory"]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 N_GOAL = LIBRARY.constants["N_GOAL"]  # numbers that a critic sees of the object to find
@@ -40,91 +34,6 @@ N_ARRANGEMENTS = 64  # of objects, per layout
 N_POINTS = 512  # drawn per layout, for arrangements
 ROUNDS = 20  # of drawing arrangements; then the search ends
 PLAIN = 0.4  # linear light, the grey of walls of one colour
-
-
-class MemoryStep(NamedTuple):
-    """The outcome of a step, one row per environment."""
-
-    reward: torch.Tensor  # (N,) 1 where the object to find was touched, else 0
-    reset: torch.Tensor  # (N,) bool
-    terminal: torch.Tensor  # (N,) bool, always False
-    truncated: torch.Tensor  # (N,) bool
-    metrics: torch.Tensor  # (N,) objects found where an episode ends
-    cue_obs: torch.Tensor  # (N, 1, 3) fp16, linear light: the colour of the object to find
-    # for a critic, None if not wanted: (N, 1, 4) tens of metres to the object to find, ahead, to
-    # the left and in a straight line; fraction of the steps that is left
-    goal: torch.Tensor | None
-    places: torch.Tensor | None  # (N, 1, 2 O) tens of metres ahead and to the left to each object
-
-
-def memory_step(
-    scenery: Scenery,
-    agents: Agents,
-    arrangements: torch.Tensor,
-    cue: torch.Tensor,
-    found: torch.Tensor,
-    n_draws: torch.Tensor,
-    ages: torch.Tensor,
-    ended: torch.Tensor,
-    *,
-    seed: int = 1,
-    limit: int = 1000,
-    reach: float = 0.05,
-    privileged: bool = False,
-) -> MemoryStep:
-    """Rewards each agent that touches the object to find, and draws the next among the others.
-    Where an episode starts, puts objects where a random arrangement has them. Call it before the
-    environment is rendered. See :class:`~megastep.envs.Memory`.
-
-    Args:
-        scenery: with two objects or more.
-        arrangements: (D, M, O, 2) float32 metres, where objects may lie.
-        cue: (N,) int32, the object to find, updated in place as all that follow.
-        found: (N,) int32, objects found in this episode.
-        n_draws: (N,) int32, numbers drawn so far, the generator's counter.
-        ages: (N,) int32, steps since the first observation.
-        ended: (N,) bool. In: environments that start an episode in this step. Out: those whose
-            episode ends in this step.
-        seed: the generator's key.
-        limit: steps after which an episode is truncated.
-        reach: metres between surfaces at which an agent touches an object.
-        privileged: compute the privileged observation.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
-        EngineError: on the CPU, if a position is NaN or an object to find does not exist.
-    """
-    n, _ = lanes_of(scenery, agents)
-    checks.integer("agents per environment", scenery.n_agents, 1, 1)
-    objects, device = scenery.objects, scenery.device
-    n_objects = checks.integer("objects", objects.n_objects if objects is not None else 0, 2)
-    n_arrangements = checks.length("arrangements", arrangements, axis=1)
-    goal = places = None
-    if checks.flag("privileged", privileged):
-        goal = torch.empty((n, 1, N_GOAL), device=device)
-        places = torch.empty((n, 1, 2 * n_objects), device=device)
-    flags = [torch.empty(n, dtype=torch.bool, device=device) for _ in range(3)]
-    reward, metrics = (torch.empty(n, device=device) for _ in range(2))
-    cue_obs = torch.empty((n, 1, 3), dtype=torch.float16, device=device)
-    outputs = dict(metrics=metrics, cue_obs=cue_obs, goal=goal, places=places)
-    out = MemoryStep(reward, *flags, **outputs)
-    counters = dict(cue=cue, found=found, n_draws=n_draws, ages=ages)
-    shape = len(scenery.layouts), n_arrangements, n_objects, 2
-    launch(
-        *(LIBRARY, "memory_step", device, n),
-        **world_params(scenery, agents, "positions", "angles"),
-        objects=object_params(scenery),
-        arrangements=checks.address("arrangements", arrangements, shape, torch.float32, device),
-        **checks.addresses((n,), torch.int32, device, **counters),
-        ended=checks.address("ended", ended, (n,), torch.bool, device),
-        **out._asdict(),
-        **seed_params(seed),
-        n_arrangements=checks.integer("the number of arrangements", n_arrangements, 1),
-        limit=checks.integer("limit", limit, 1, 2**31 - 1),
-        reach=checks.number("reach", reach, 0, checks.LIMIT, "metres"),
-    )
-    check_on_cpu(agents)
-    return out
 
 
 def arrangements(
@@ -250,26 +159,34 @@ class Memory(FirstPerson):
 
     def _world(self, free=None) -> arrdict:
         self.spawner(self.ended)
-        step = memory_step(
-            self.core.scenery,
-            self.core.agents,
-            self.arrangements,
-            self.cue,
-            self.found,
-            self.n_draws,
-            self.ages,
-            self.ended,
-            seed=self.seed,
+        out = self._judge()
+        obs = arrdict(images(self._view()), cue=out["cue_obs"])
+        critic = {} if out["goal"] is None else dict(goal=out["goal"], places=out["places"])
+        return world_of(out, obs, ["found"], **critic)
+
+    def _judge(self) -> dict:
+        """Rewards agents for objects that they touch, before anything is rendered."""
+        core, is_wanted = self.core, self.privileged_space is not None
+        critic = dict(goal=N_GOAL * is_wanted, places=2 * self.n_objects * is_wanted)
+        outputs = step_outputs(self, 1, dict(cue_obs=3), critic)
+        launch(
+            *(LIBRARY, "memory_step", self.device, self.n_envs),
+            **world_params(core.scenery, core.agents, "positions", "angles"),
+            objects=object_params(core.scenery),
+            arrangements=self.arrangements,
+            cue=self.cue,
+            found=self.found,
+            n_draws=self.n_draws,
+            ages=self.ages,
+            ended=self.ended,
+            **outputs,
+            **seed_params(self.seed),
+            n_arrangements=N_ARRANGEMENTS,
             limit=self.limit,
             reach=REACH,
-            privileged=self.privileged_space is not None,
         )
-        world = world_of(
-            step, arrdict(images(self._view()), cue=step.cue_obs), arrdict(found=step.metrics)
-        )
-        if step.goal is not None:
-            world["privileged"] = arrdict(goal=step.goal, places=step.places)
-        return world
+        check_on_cpu(core.agents)
+        return outputs
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""

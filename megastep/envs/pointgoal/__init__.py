@@ -1,5 +1,5 @@
-"""PointGoal: the environment, and its step as one operation with its kernel."""
+"""PointGoal: the environment, with the kernel of its step."""
 
-from megastep.envs.pointgoal.pointgoal import PointGoal, PointGoalStep, pointgoal_step
+from megastep.envs.pointgoal.pointgoal import PointGoal
 
-__all__ = ["PointGoal", "PointGoalStep", "pointgoal_step"]
+__all__ = ["PointGoal"]

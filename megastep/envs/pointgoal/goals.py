@@ -1,12 +1,10 @@
-"""Goals of layouts, and the lengths of the shortest paths to them, computed once per layout and
-cached.
-
-D layouts, S spawn points and G goals per layout, H x W cells.
+"""Goals of layouts, and the lengths of the shortest paths to them. D layouts, S spawn points and G
+goals per layout, H x W cells.
 """
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -14,7 +12,7 @@ import torch
 from megastep import cache, engine, geodesics
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.geodesics import CELL, Geodesics
+from megastep.geodesics import Geodesics
 from megastep.geometry import contents
 from megastep.kernels.build.kernel_library import KERNELS
 from megastep.modules import spawning
@@ -35,83 +33,56 @@ N_GOALS = 16  # per layout
 N_SPAWNS = 128
 
 
-class GoalFields:
-    """The goals of a scenery's layouts, as :func:`~megastep.envs.pointgoal.pointgoal_step` reads
-    them.
-
-    Args:
-        points: D arrays (G, 2) metres, the goals.
-        fields: D arrays (G, H, W) float16 of at least 2 x 2 square cells, row 0 at the bottom:
-            metres to each goal from the centre of a cell by the shortest path, infinite if there is
-            none. Layouts may share an array.
-        origins: D arrays (2,) metres, the centre of the first cell.
-        spawns: D arrays (S, 2) metres, the spawn points.
-        lengths: D arrays (S, G) metres, of the shortest paths from spawn points to goals.
-        allowed: D arrays (S, G) bool, the goals that may be drawn; at least one per spawn point.
-        cell: side of a cell in metres.
-        device: where to put the tensors.
-
-    Attributes:
-        points: (D, G, 2) float32.
-        spawns: (D, S, 2) float32.
-        addresses: {field of PointgoalStepParams: address}.
-    """
+class GoalFields(NamedTuple):
+    """The goals of a scenery's layouts, as the kernel reads them."""
 
     IS_STATELESS = True  # nothing of it changes
 
-    def __init__(
-        self,
-        points: Sequence[np.ndarray],
-        fields: Sequence[np.ndarray],
-        origins: Sequence[np.ndarray],
-        spawns: Sequence[np.ndarray],
-        lengths: Sequence[np.ndarray],
-        allowed: Sequence[np.ndarray],
-        cell: float = CELL,
-        device: torch.device | str = "cpu",
-    ):
-        self.cell, self.n_layouts = cell, len(fields)
-        self.n_goals, self.n_spawns = len(points[0]), len(spawns[0])
-        is_allowed = np.stack(allowed)
-        finite = np.where(is_allowed, np.stack(lengths), 0.0)  # of others they may be infinite
-        distinct = {id(field): field for field in fields}
-        ends = np.cumsum([field.size for field in distinct.values()])
-        starts = {key: end - field.size for (key, field), end in zip(distinct.items(), ends)}
-        arrays = dict(
-            points=np.stack(points).astype(np.float32),
-            origins=np.stack(origins).astype(np.float32),
-            lengths=finite.astype(np.float32),
-            fields=np.concatenate([field.reshape(-1) for field in distinct.values()]),
-            starts=np.array([starts[id(field)] for field in fields], np.int64),
-            shapes=np.array([field.shape[1:] for field in fields], np.int32),
-            in_range=np.argsort(~is_allowed, axis=2, kind="stable").astype(np.int32),
-            n_in_range=is_allowed.sum(2, dtype=np.int32),
-        )
-        self._tensors = {name: torch.from_numpy(a).to(device) for name, a in arrays.items()}
-        self.points = self._tensors["points"]
-        self.spawns = torch.from_numpy(np.stack(spawns).astype(np.float32)).to(device)
-        self.device = self.points.device
+    points: torch.Tensor  # (D, G, 2) float32 metres, the goals
+    origins: torch.Tensor  # (D, 2) float32 metres, the centre of the first cell
+    lengths: torch.Tensor  # (D, S, G) float32 metres, from spawn points by the shortest path
+    #: float16 metres to each goal from the centres of a layout's (G, H, W) cells, row 0 at the
+    #: bottom, by the shortest path; infinite if there is none. Layouts may share them.
+    fields: torch.Tensor
+    starts: torch.Tensor  # (D,) int64, of each layout's fields
+    shapes: torch.Tensor  # (D, 2) int32, (H, W)
+    in_range: torch.Tensor  # (D, S, G) int32, goals; first those that may be drawn
+    n_in_range: torch.Tensor  # (D, S) int32, how many these are
 
-    @property
-    def addresses(self) -> dict[str, int]:
-        return {name: tensor.data_ptr() for name, tensor in self._tensors.items()}
+
+def packed(
+    layouts: Sequence[Geodesics], allowed: Sequence[np.ndarray], device: torch.device
+) -> GoalFields:
+    """Returns the goals of layouts, of which (S, G) bool each may be drawn; at least one per spawn
+    point.
+    """
+    fields = [layout.fields for layout in layouts]
+    points, origins, lengths = (
+        np.stack([getattr(layout, name) for layout in layouts])
+        for name in ("goals", "origin", "lengths")
+    )
+    is_allowed = np.stack(allowed)
+    distinct = {id(field): field for field in fields}
+    ends = np.cumsum([field.size for field in distinct.values()])
+    starts = {key: end - field.size for (key, field), end in zip(distinct.items(), ends)}
+    arrays = GoalFields(
+        points.astype(np.float32),
+        origins.astype(np.float32),
+        np.where(is_allowed, lengths, 0.0).astype(np.float32),  # of others they may be infinite
+        np.concatenate([field.reshape(-1) for field in distinct.values()]),
+        np.array([starts[id(field)] for field in fields], np.int64),
+        np.array([field.shape[1:] for field in fields], np.int32),
+        np.argsort(~is_allowed, axis=2, kind="stable").astype(np.int32),
+        is_allowed.sum(2, dtype=np.int32),
+    )
+    return GoalFields(*(torch.from_numpy(array).to(device) for array in arrays))
 
 
 def goal_fields(
-    geometries: Sequence[dotdict],
-    core: Core,
-    nearest: float = 1.0,
-    furthest: float = 15.0,
-    seed: int | None = None,
-) -> GoalFields:
-    """Returns the goals of a core's layouts.
-
-    Args:
-        geometries: those that the scenery was made from.
-        core: with the scenery and the agents.
-        nearest: minimum length of the shortest path to a goal, in metres.
-        furthest: maximum length of the shortest path to a goal, in metres.
-        seed: of goals and spawn points. Default: the core's.
+    geometries: Sequence[dotdict], core: Core, nearest: float = 1.0, furthest: float = 15.0
+) -> tuple[GoalFields, torch.Tensor]:
+    """Returns the goals of a core's layouts, by shortest paths of ``nearest`` to ``furthest``
+    metres, and (D, S, 2) float32, spawn points from which there are some.
 
     Raises:
         ValueError: naming the geometry, if one has no goal in that range, no walls or is too large.
@@ -122,35 +93,29 @@ def goal_fields(
             f"goals need 0 <= nearest < furthest metres, but {nearest:g} and {furthest:g} were "
             f"given"
         )
-    seed = core.seed if seed is None else seed
     device = core.device
     geometries = geometries[: len(core.scenery.layouts)]
     n_bytes = [2 * N_GOALS * geodesics.n_cells(g) for g in geometries]  # of fields in fp16
     engine.fit(len(geometries), float(np.mean(n_bytes)), device, "layouts")
-    layouts = all_geodesics(geometries, core.agents.radius, seed, device)
-    spawns, lengths, allowed = zip(
-        *[_in_range(*pair, nearest, furthest) for pair in zip(layouts, geometries, strict=True)]
-    )
-    points, fields, origins = (
-        [getattr(layout, name) for layout in layouts] for name in ("goals", "fields", "origin")
-    )
-    return GoalFields(points, fields, origins, spawns, lengths, allowed, CELL, device)
+    layouts = all_geodesics(geometries, core.agents.radius, core.seed, device)
+    for d, (layout, g) in enumerate(zip(layouts, geometries, strict=True)):
+        indices = _in_range(layout, nearest, furthest).any(1).nonzero()[0]
+        if not len(indices):
+            raise ValueError(
+                f"geometry {g.id} has no goal from {nearest:g} to {furthest:g} m from where agents "
+                f"spawn: its shortest paths are {layout.lengths.min():.1f} to "
+                f"{layout.lengths.max():.1f} m long. Change nearest or furthest, or leave it out"
+            )
+        indices = np.resize(indices, len(layout.spawns))
+        spawns, lengths = layout.spawns[indices], layout.lengths[indices]
+        layouts[d] = layout._replace(spawns=spawns, lengths=lengths)
+    allowed = [_in_range(layout, nearest, furthest) for layout in layouts]
+    spawns = np.stack([layout.spawns for layout in layouts]).astype(np.float32)
+    return packed(layouts, allowed, device), torch.from_numpy(spawns).to(device)
 
 
-def _in_range(layout, g, nearest, furthest) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns spawn points (S, 2) with a goal in range, the lengths (S, G) of their shortest paths,
-    and (S, G) bool, true where a length is in range.
-    """
-    allowed = (layout.lengths >= nearest) & (layout.lengths <= furthest)
-    indices = allowed.any(1).nonzero()[0]
-    if not len(indices):
-        raise ValueError(
-            f"geometry {g.id} has no goal from {nearest:g} to {furthest:g} m from where agents "
-            f"spawn: its shortest paths are {layout.lengths.min():.1f} to "
-            f"{layout.lengths.max():.1f} m long. Change nearest or furthest, or leave it out"
-        )
-    indices = np.resize(indices, len(layout.spawns))
-    return layout.spawns[indices], layout.lengths[indices], allowed[indices]
+def _in_range(layout, nearest, furthest) -> np.ndarray:
+    return (layout.lengths >= nearest) & (layout.lengths <= furthest)
 
 
 # ---- The cache ----

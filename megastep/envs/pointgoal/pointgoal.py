@@ -1,12 +1,8 @@
-"""PointGoal: navigate to a point given by its distance and bearing. A step is one operation,
-:func:`pointgoal_step`.
-
-N environments, A agents each, B = N A lanes. The environment has one agent.
-"""
+"""PointGoal: navigate to a point given by its distance and bearing."""
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
 from pydantic import Field
@@ -15,13 +11,13 @@ from megastep import modules, spaces
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.dotdict import dotdict
-from megastep.engine import Resets, checks
-from megastep.engine.agents import Agents, check_on_cpu
-from megastep.engine.launch_params import lanes_of, seed_params, world_params
-from megastep.engine.scenery import Scenery
-from megastep.envs.common import Weight, world_of
+from megastep.engine import Resets
+from megastep.engine.agents import check_on_cpu
+from megastep.engine.launch_params import seed_params, world_params
+from megastep.envs.common import Weight, step_outputs, world_of
 from megastep.envs.first_person import FirstPerson, images
-from megastep.envs.pointgoal.goals import GoalFields, goal_fields
+from megastep.envs.pointgoal.goals import goal_fields
+from megastep.geodesics import CELL
 from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
 from megastep.modules.lifecycle import derived_seed
@@ -30,117 +26,13 @@ from megastep.settings import checked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["PointGoal", "PointGoalStep", "pointgoal_step"]
+__all__ = ["PointGoal"]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
 PROGRESS_ROWS = LIBRARY.constants["PROGRESS_ROWS"]  # numbers that describe an episode so far
 N_PRIVILEGED = LIBRARY.constants["N_PRIVILEGED"]  # numbers that a critic sees
 METRICS = "success", "spl", "soft_spl", "collisions"
 REACH = 0.2  # metres from the goal that count as success
-
-
-class PointGoalStep(NamedTuple):
-    """The outcome of a step, one row per lane."""
-
-    reward: torch.Tensor  # (B,)
-    reset: torch.Tensor  # (B,) bool
-    terminal: torch.Tensor  # (B,) bool
-    truncated: torch.Tensor  # (B,) bool
-    metrics: torch.Tensor  # (4, B): success, SPL, soft SPL, collisions where an episode ends
-    goal_obs: torch.Tensor  # (B, 1, 3) fp16: distance / 10 m, cosine and sine of the bearing
-    privileged: torch.Tensor | None  # (B, 1, 4) for a critic; None if not wanted
-
-
-def pointgoal_step(
-    scenery: Scenery,
-    agents: Agents,
-    goals: GoalFields,
-    goal_index: torch.Tensor,
-    progress: torch.Tensor,
-    ages: torch.Tensor,
-    ended: torch.Tensor,
-    n_draws: torch.Tensor,
-    spawn_index: torch.Tensor,
-    free: torch.Tensor | None = None,
-    *,
-    seed: int = 1,
-    reach: float = 0.2,
-    bonus: float | torch.Tensor = 5.0,
-    cost: float | torch.Tensor = 0.02,
-    walk_cost: float | torch.Tensor = 0.0,
-    limit: int = 500,
-    privileged: bool = False,
-) -> PointGoalStep:
-    """Rewards each agent for getting closer to its goal by the shortest path, and observes the
-    goal. An agent that starts an episode draws a goal. See :class:`~megastep.envs.PointGoal`.
-
-    Args:
-        goals: of the scenery's layouts.
-        goal_index: (B,) int32, each agent's goal among its layout's, updated in place.
-        progress: (7, B) float32, updated in place. Rows: x and y one step ago; metres to go by the
-            shortest path, now and at the start; length of the shortest path from the start; metres
-            walked; collisions.
-        ages: (B,) int32, steps since the first observation, updated in place.
-        ended: (B,) bool, updated in place. In: lanes that start an episode in this step. Out: lanes
-            whose episode ends in this step.
-        n_draws: (B,) int32, goals drawn so far, the generator's counter, updated in place.
-        spawn_index: (N, A) int32, the spawn points of lanes that start an episode.
-        free: (N, A) float32, ``progress`` of :func:`~megastep.engine.physics`, or None if no step
-            was taken.
-        seed: the generator's key.
-        reach: metres; an agent this close to its goal succeeds.
-        bonus: reward for success; as the costs a number, or a tensor () on the device.
-        cost: subtracted from the reward of every step.
-        walk_cost: subtracted from the reward per metre walked.
-        limit: steps after which an episode is truncated.
-        privileged: compute the privileged observation: tens of metres to go, the slope of that
-            distance ahead and to the left, and the fraction of the steps that is left.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
-        EngineError: on the CPU, if a position is NaN or an index is out of range.
-    """
-    n, a = lanes = lanes_of(scenery, agents)
-    device, n_lanes = scenery.device, n * a
-    checks.instance("goals", goals, GoalFields)
-    if goals.n_layouts != len(scenery.layouts) or goals.device != device:
-        raise ValueError(
-            f"goals must be for the {len(scenery.layouts)} layouts of the scenery, on {device}, "
-            f"but they are for {goals.n_layouts} on {goals.device}"
-        )
-    privileged_out = None
-    if checks.flag("privileged", privileged):
-        privileged_out = torch.empty((n_lanes, 1, N_PRIVILEGED), device=device)
-    flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
-    metrics = torch.empty((len(METRICS), n_lanes), device=device)
-    goal_obs = torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device)
-    reward = torch.empty(n_lanes, device=device)
-    outputs = dict(metrics=metrics, goal_obs=goal_obs, privileged=privileged_out)
-    out = PointGoalStep(reward, *flags, **outputs)
-    counters = dict(n_draws=n_draws, goal_index=goal_index, ages=ages)
-    rows = PROGRESS_ROWS, n_lanes
-    launch(
-        *(LIBRARY, "pointgoal_step", device, n_lanes),
-        **world_params(scenery, agents, "positions", "angles"),
-        free=checks.optional("free", free, lanes, torch.float32, device),
-        spawn_index=checks.address("spawn_index", spawn_index, lanes, torch.int32, device),
-        **goals.addresses,
-        **checks.addresses((n_lanes,), torch.int32, device, **counters),
-        progress=checks.address("progress", progress, rows, torch.float32, device),
-        ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
-        **out._asdict(),
-        **seed_params(seed),
-        per_cell=1 / goals.cell,
-        reach=checks.number("reach", reach, -math.inf, math.inf),
-        bonus=checks.weight("bonus", bonus, device),
-        cost=checks.weight("cost", cost, device),
-        walk_cost=checks.weight("walk_cost", walk_cost, device),
-        limit=checks.integer("limit", limit, 1, 2**31 - 1),
-        n_goals=goals.n_goals,
-        n_spawns=goals.n_spawns,
-    )
-    check_on_cpu(agents)
-    return out
 
 
 class PointGoal(FirstPerson):
@@ -204,40 +96,50 @@ class PointGoal(FirstPerson):
         if privileged:
             self.privileged_space = dotdict(way=spaces.MultiVector(1, N_PRIVILEGED))
         self.goal_index, self.n_draws = self._integers(), self._integers()
+        # x and y one step ago; metres to go by the shortest path, now and at the start; length of
+        # the shortest path from the start; metres walked; collisions
         self.progress = torch.zeros((PROGRESS_ROWS, self.n_envs), device=self.device)
         self._resets = Resets(lanes_last=("progress",))
 
     def _furnish(self, geometries, resample) -> modules.RandomSpawns:
-        self.goals = goal_fields(geometries, self.core, *self.range)
-        points = self.goals.spawns
+        self.goals, points = goal_fields(geometries, self.core, *self.range)
         return modules.RandomSpawns(geometries, self.core, resample=resample, points=points)
 
     def _world(self, free=None) -> arrdict:
         self.spawner(self.ended)
         view = images(self._view())
-        step = pointgoal_step(
-            self.core.scenery,
-            self.core.agents,
-            self.goals,
-            self.goal_index,
-            self.progress,
-            self.ages,
-            self.ended,
-            self.n_draws,
-            self.spawner.point_index,
-            free,
-            seed=self.seed,
+        out = self._judge(free)
+        critic = {} if out["privileged"] is None else dict(way=out["privileged"])
+        return world_of(out, arrdict(view, goal=out["goal_obs"]), METRICS, **critic)
+
+    def _judge(self, free) -> dict:
+        """Rewards agents for getting closer to their goals, and draws those of new episodes."""
+        core, n_lanes = self.core, len(self.ended)
+        n_privileged = N_PRIVILEGED if self.privileged_space is not None else 0
+        sizes = dict(goal_obs=3), dict(privileged=n_privileged)
+        outputs = step_outputs(self, len(METRICS), *sizes)
+        launch(
+            *(LIBRARY, "pointgoal_step", self.device, n_lanes),
+            **world_params(core.scenery, core.agents, "positions", "angles"),
+            free=free,
+            spawn_index=self.spawner.point_index,
+            **self.goals._asdict(),
+            n_draws=self.n_draws,
+            goal_index=self.goal_index,
+            ages=self.ages,
+            progress=self.progress,
+            ended=self.ended,
+            **outputs,
+            **seed_params(self.seed),
+            per_cell=1 / CELL,
             reach=REACH,
-            limit=self.limit,
-            privileged=self.privileged_space is not None,
             **self.weights.tensors,
+            limit=self.limit,
+            n_goals=self.goals.points.shape[1],
+            n_spawns=self.goals.lengths.shape[1],
         )
-        world = world_of(
-            step, arrdict(view, goal=step.goal_obs), arrdict(zip(METRICS, step.metrics.unbind()))
-        )
-        if step.privileged is not None:
-            world["privileged"] = arrdict(way=step.privileged)
-        return world
+        check_on_cpu(core.agents)
+        return outputs
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""

@@ -1,12 +1,10 @@
 """Pong: two paddles return a ball, on a court of 40 x 30 cells.
 
-N environments. B lanes: N, the left paddles, or 2 N with self-play. There is no geometry; a step is
-one operation, :func:`pong_step`.
+N environments. B lanes: N, the left paddles, or 2 N with self-play. There is no geometry.
 """
 
-import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import torch
@@ -18,7 +16,7 @@ from megastep.devices import threads
 from megastep.engine import checks
 from megastep.engine.agents import check_flag_on_cpu
 from megastep.engine.launch_params import seed_params
-from megastep.envs.common import DisplayedEnv, world_of
+from megastep.envs.common import DisplayedEnv, step_outputs, world_of
 from megastep.envs.pong.tracker import LIBRARY, Tracker
 from megastep.kernels.build.launch import launch
 from megastep.settings import MAX_ENVS, checked
@@ -26,7 +24,7 @@ from megastep.settings import MAX_ENVS, checked
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Pong", "PongStep", "pong_step"]
+__all__ = ["Pong"]
 
 CELL = LIBRARY.constants["CELL"]  # units of position per cell; a cell is one pixel
 FEATURES = LIBRARY.constants["N_FEATURES"]  # of an observation
@@ -39,86 +37,6 @@ PADDLE_ROWS, TRAIL_GREY, PADDLE_GREY, BALL_GREY = (
 LIMITS = 1, 1, 1, 1, 1, 1, 2, 2  # of the features' magnitudes
 N_DRAWS, ENDED = 11, 12  # rows of a game's state
 TEXT = {0: " ", TRAIL_GREY: ".", PADDLE_GREY: "|", BALL_GREY: "o"}  # character of each grey
-
-
-class PongStep(NamedTuple):
-    """The outcome of a step, one row per lane."""
-
-    reward: torch.Tensor  # (B,): 1 for a point won, -1 for a point lost
-    reset: torch.Tensor  # (B,) bool
-    terminal: torch.Tensor  # (B,) bool
-    truncated: torch.Tensor  # (B,) bool
-    points_won: torch.Tensor  # (B,): where a game ends, the fraction of its points won; else 0
-    features: torch.Tensor | None  # (B, 1, 8) fp16; None if pixels are written instead
-
-
-def pong_step(
-    games: torch.Tensor,
-    actions: torch.Tensor,
-    error_flag: torch.Tensor,
-    seed: int,
-    *,
-    points: int = 1,
-    limit: int = 1000,
-    tracker_speed: float = 0.5,
-    pixels: torch.Tensor | None = None,
-) -> PongStep:
-    """Plays one step of N games of Pong. A game that ended in the last step starts anew instead.
-
-    Args:
-        games: (13, N) int32, the state, updated in place. The last row starts a game anew if it is
-            not 0.
-        actions: (B, 1) int64, 0 nothing, 1 up, 2 down. B = N: the left paddle of each game; B = 2
-            N: the left and the right paddle.
-        error_flag: (1,) int32, see :func:`~megastep.engine.check_flag`.
-        seed: the generator's key; each serve draws once.
-        points: points that win a game.
-        limit: steps after which a game is truncated.
-        tracker_speed: maximum speed, in cells per step, of the right paddle if it is not a lane.
-        pixels: (B, 1, 1, 30, 40) uint8, written instead of features.
-
-    Raises:
-        TypeError, ValueError: naming the argument that does not fit.
-        EngineError: on the CPU, if an action is out of range.
-    """
-    n, device = checks.length("games", games, axis=1), games.device
-    n_lanes = checks.length("actions", actions)
-    if n_lanes not in (n, 2 * n) or actions.device != device:
-        raise ValueError(
-            f"actions must have one or two lanes for each of the {n} games, on {device}, but "
-            f"{n_lanes} lanes on {actions.device} were given"
-        )
-    flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
-    reward, points_won = (torch.empty(n_lanes, device=device) for _ in range(2))
-    features, pixels_at = None, 0
-    if pixels is None:
-        features = torch.empty((n_lanes, 1, FEATURES), dtype=torch.float16, device=device)
-    else:
-        shape = n_lanes, 1, 1, *PIXELS
-        pixels_at = checks.address("pixels", pixels, shape, torch.uint8, device)
-        if pixels_at % 8:
-            raise ValueError("pixels must start at a multiple of 8 bytes, as a whole tensor does")
-    speed = checks.number("tracker_speed", tracker_speed, -math.inf, PIXELS[1], "cells per step")
-    if speed < 0:
-        raise ValueError(f"tracker_speed must be at least 0 cells per step, not {speed:g}")
-    out = PongStep(reward, *flags, points_won=points_won, features=features)
-    launch(
-        *(LIBRARY, "pong_step", device, n),
-        games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, device),
-        actions=checks.address("actions", actions, (n_lanes, 1), torch.int64, device),
-        **out._asdict(),
-        pixels=pixels_at,
-        error_flag=checks.address("error_flag", error_flag, (1,), torch.int32, device),
-        **seed_params(seed),
-        n_envs=n,
-        n_sides=n_lanes // n,
-        points=checks.integer("points", points, 1, 2**31 - 1),
-        limit=checks.integer("limit", limit, 1, 2**31 - 1),
-        tracker_speed=round(CELL * speed),
-        n_threads=threads(),
-    )
-    check_flag_on_cpu(error_flag)
-    return out
 
 
 class Pong(DisplayedEnv):
@@ -210,21 +128,27 @@ class Pong(DisplayedEnv):
         return self._resets.keep(self._world(actions))
 
     def _world(self, actions) -> arrdict:
-        step = pong_step(
-            self.games,
-            actions,
-            self.error_flag,
-            self.seed,
+        sizes = dict(features=0 if self.pixels is not None else FEATURES), {}
+        outputs = step_outputs(self, 1, *sizes)
+        out = {("points_won" if name == "metrics" else name): x for name, x in outputs.items()}
+        launch(
+            *(LIBRARY, "pong_step", self.device, self.n_envs),
+            games=self.games,
+            actions=actions.contiguous(),
+            **out,
+            pixels=self.pixels,
+            error_flag=self.error_flag,
+            **seed_params(self.seed),
+            n_envs=self.n_envs,
+            n_sides=self.n_agents,
             points=self.points,
             limit=self.limit,
-            tracker_speed=self.tracker_speed,
-            pixels=self.pixels,
+            tracker_speed=round(CELL * self.tracker_speed),
+            n_threads=threads(),
         )
-        return world_of(
-            step,
-            step.features if self.pixels is None else self.pixels,
-            arrdict(points_won=step.points_won),
-        )
+        check_flag_on_cpu(self.error_flag)
+        obs = outputs["features"] if self.pixels is None else self.pixels
+        return world_of(outputs, obs, ["points_won"])
 
     def check(self) -> None:
         """Raises EngineError if the engine flagged an error on the device since the last check.
