@@ -111,7 +111,6 @@ class Core:
             names = "records", "lines", "texels"
             own = {name: getattr(objects, name)[:1].clone() for name in names}
             vars(objects).update(own, n_envs=1)
-            vars(objects).pop("_packed", None)  # the addresses of all environments'
             scenery.objects = objects
         return Core(scenery, self.res, self.fov, self.fps, self.agents.yaws.tolist(), self.seed)
 

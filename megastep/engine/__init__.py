@@ -3,9 +3,6 @@
 ``bake``, ``physics``, ``render``, ``observe``, ``spawn`` and ``uniform`` check their arguments,
 allocate their outputs and launch one kernel each. None of them synchronises host and device. An
 argument that does not fit raises a TypeError or ValueError that names it.
-
-The step of a game is an operation too, in the environment's package, for example
-:func:`megastep.envs.deathmatch.deathmatch_step`.
 """
 
 from megastep.devices import device, fit, free_memory, set_threads, threads

@@ -4,12 +4,11 @@ import math
 import numbers
 import operator
 from collections.abc import Iterable, Sequence
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, NoReturn, TypeVar
 
 import torch
 
-from megastep.coefficients import on_device
-from megastep.ragged import Ragged, RaggedTorch
+from megastep.ragged import RaggedTorch
 from megastep.read_only import ReadOnlyTensor
 
 T = TypeVar("T")
@@ -27,19 +26,14 @@ def _refuse(name, wanted, value, kind: type[Exception] = ValueError) -> NoReturn
 
 def integer(name: str, value: object, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
-    number = value if type(value) is int else _index(value)
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)  # pyright: ignore
+    except (TypeError, RuntimeError, ValueError):
+        number = None
     if number is None or not min <= number <= max:
         range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
         _refuse(name, f"an integer {range_}", value)
     return number
-
-
-def _index(value) -> int | None:
-    """Returns a value as an int, or None if it is none."""
-    try:
-        return None if isinstance(value, bool) else operator.index(value)
-    except (TypeError, RuntimeError, ValueError):
-        return None
 
 
 def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: str = "") -> float:
@@ -52,16 +46,6 @@ def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: 
         range_ = range_ if min > -math.inf else "that is finite"
         _refuse(name, f"{kind} {range_}{hint}", value)
     return float(value)
-
-
-def weight(name: str, value: object, device: torch.device) -> torch.Tensor:
-    """Returns a finite number, or a tensor () float32 with one, as such a tensor, which a kernel
-    reads when it runs. TypeError or ValueError for anything else.
-    """
-    if isinstance(value, torch.Tensor):
-        address(name, value, (), torch.float32, device)
-        return value
-    return on_device(number(name, value, -math.inf, math.inf), device)
 
 
 def flag(name: str, value: object) -> bool:
@@ -109,20 +93,11 @@ def device(name: str, value: Any) -> torch.device:
 def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) -> torch.Tensor:
     """Returns ``value`` as a contiguous float32 tensor on ``device``.
 
-    Args:
-        shape: sizes; a string stands for any size.
-
     Raises:
-        ValueError: unless it is an array of that shape whose numbers are below 1e9.
+        ValueError: unless it is an array of that shape, in which a string stands for any size, and
+            its numbers are below 1e9.
     """
-    try:
-        tensor = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
-        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
-        is_real = not tensor.is_complex() and tensor.layout is torch.strided
-        is_real &= not tensor.is_meta
-        tensor = tensor.to(device=device, dtype=torch.float32) if is_real else None
-    except (TypeError, ValueError, RuntimeError, NotImplementedError):
-        tensor = None
+    tensor = _converted(value, device, torch.float32)
     if tensor is None or not _fits(tensor, shape):
         _refuse(name, f"an array of numbers of shape ({_sizes(shape)})", value)
     if not bool((tensor.abs() < LIMIT).all()):
@@ -135,28 +110,28 @@ def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) 
 def integers(
     name: str, value: Any, size: int | str, min: int, max: int, device: torch.device
 ) -> torch.Tensor:
-    """Returns a copy of ``value`` as an int64 tensor of shape (size,) on ``device``.
-
-    Args:
-        size: a string stands for any size.
-
-    Raises:
-        ValueError: unless all are integers from ``min`` to ``max``.
+    """Returns ``value`` as an int64 tensor of shape (size,) on ``device``. ValueError unless all
+    are integers from ``min`` to ``max``. A string stands for any size.
     """
-    try:
-        tensor = torch.as_tensor(value).detach()
-        is_integer = tensor.dtype in _INTEGERS or not tensor.numel()
-        tensor = tensor.clone().to(device=device, dtype=torch.int64) if is_integer else None
-    except (TypeError, ValueError, RuntimeError, NotImplementedError):
-        tensor = None
-    if tensor is None or not _fits(tensor, (size,)):
+    tensor = _converted(value, device, None)
+    is_integer = tensor is not None and (tensor.dtype in _INTEGERS or not tensor.numel())
+    if tensor is None or not is_integer or not _fits(tensor, (size,)):
         _refuse(name, f"an array of integers of shape ({size},)", value)
     outside = tensor[(tensor < min) | (tensor > max)]
     if len(outside):
         raise ValueError(
             f"{name} must hold integers from {min} to {max}, but one is {int(outside[0])}"
         )
-    return tensor
+    return tensor.long()
+
+
+def _converted(value, device, dtype) -> torch.Tensor | None:
+    try:
+        tensor = torch.as_tensor(value)
+        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
+        return tensor.to(device=device, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError, NotImplementedError):
+        return None
 
 
 def _fits(tensor, shape) -> bool:
@@ -166,15 +141,12 @@ def _fits(tensor, shape) -> bool:
 
 
 def ragged(name: str, value: Any, shape: Sequence, device: torch.device | None) -> RaggedTorch:
-    """Returns a Ragged with vals (*shape) as a RaggedTorch on ``device``.
-
-    Raises:
-        TypeError: unless it is a Ragged.
-        ValueError: unless its vals pass :func:`floats`.
+    """Returns a Ragged with vals (*shape) as a RaggedTorch on ``device``. TypeError unless it is a
+    Ragged, ValueError unless its vals pass :func:`floats`.
     """
-    if not isinstance(value, Ragged) and not hasattr(value, "torchify"):
+    if not hasattr(value, "torchify"):
         _refuse(name, "a Ragged", value, TypeError)
-    value = cast("RaggedTorch", value).torchify()
+    value = value.torchify()
     return RaggedTorch(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
 
 
@@ -193,11 +165,8 @@ def length(name: str, value: object, axis: int = 0) -> int:
 def address(
     name: str, value: Any, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> int:
-    """Returns a tensor's address.
-
-    Raises:
-        TypeError: unless it is a tensor.
-        ValueError: unless it is contiguous, on ``device``, of that shape and dtype.
+    """Returns a tensor's address. TypeError unless it is a tensor, ValueError unless it is
+    contiguous, on ``device``, of that shape and dtype.
     """
     try:
         fits = (
@@ -212,13 +181,6 @@ def address(
         wanted = f"a contiguous {dtype} tensor of shape {tuple(shape)} on {device}"
         _refuse_tensor(name, wanted, value)
     return value.data_ptr()
-
-
-def addresses(
-    shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, **tensors: Any
-) -> dict[str, int]:
-    """Returns {name: :func:`address`} of tensors that are alike."""
-    return {name: address(name, one, shape, dtype, device) for name, one in tensors.items()}
 
 
 def optional(
@@ -239,25 +201,18 @@ def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Tensor:
+def lanes(name: str, value: Any, n_lanes: int, device: torch.device, dim: int = 0) -> torch.Tensor:
     """Returns ``value``. TypeError or ValueError unless it is a tensor on ``device``, of any shape,
-    with one integer per lane.
+    with one integer per lane, or ``dim`` float32 numbers.
     """
-    fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
-    if not fits or value.dtype not in _INTEGERS:
-        wanted = f"a tensor of integers, one for each of the {n_lanes} lanes, on {device}"
-        _refuse_tensor(name, wanted, value)
-    return value
-
-
-def vectors(name: str, value: Any, n_lanes: int, dim: int, device: torch.device) -> torch.Tensor:
-    """Returns ``value``. TypeError or ValueError unless it is a float32 tensor on ``device`` with
-    ``dim`` numbers per lane along its last axis.
-    """
-    fits = isinstance(value, torch.Tensor) and value.shape[-1:] == (dim,)
-    fits = fits and value.numel() == n_lanes * dim and value.device == device
-    if not fits or value.dtype != torch.float32:
-        wanted = f"a tensor of float32 numbers, {dim} for each of the {n_lanes} lanes, on {device}"
+    is_right = isinstance(value, torch.Tensor) and value.device == device
+    if dim:
+        is_right = is_right and value.shape[-1:] == (dim,) and value.dtype == torch.float32
+    else:
+        is_right = is_right and value.dtype in _INTEGERS
+    if not is_right or value.numel() != n_lanes * (dim or 1):
+        kind = f"float32 numbers, {dim}" if dim else "integers, one"
+        wanted = f"a tensor of {kind} for each of the {n_lanes} lanes, on {device}"
         _refuse_tensor(name, wanted, value)
     return value
 

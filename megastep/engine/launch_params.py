@@ -1,7 +1,5 @@
 """The fields that many launches share: tensors' addresses, checked without synchronisation."""
 
-from collections.abc import Callable
-
 import torch
 
 from megastep import devices
@@ -15,34 +13,15 @@ _address = torch.Tensor.data_ptr
 _STATE = dict(positions=(2,), angles=(), velocity=(2,), angvelocity=())
 
 
-class _Packed:
-    """A packed struct, and what it was packed from. Has no ``__dict__``, so that
-    :func:`~megastep.engine.state_tree.state_tree` does not look inside.
-    """
-
-    __slots__ = ("tensors", "inputs", "params")
-
-    def __init__(self, *tensors: torch.Tensor):
-        self.tensors, self.inputs, self.params = tensors, [], b""
-
-    def get(self, pack: Callable[[], bytes], *numbers: float) -> bytes:
-        """Returns the struct; packs it anew if a tensor has moved or a number is another one."""
-        inputs = [*map(_address, self.tensors), *numbers]
-        if inputs != self.inputs:
-            self.params, self.inputs = pack(), inputs
-        return self.params
-
-
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
     """Returns the packed SceneryParams of a scenery. Its tensors cannot be replaced."""
-    packed = vars(scenery).get("_packed")
-    if packed is None:
-        parts = scenery.layouts
-        vals = parts.lines.vals, parts.lights.vals, parts.texels, parts.agent_textures
-        moving = scenery.layout, scenery.agent_lines, scenery.agent_light
-        packed = vars(scenery)["_packed"] = _Packed(*vals, *moving)
     n_threads = devices.threads()
-    return packed.get(lambda: _pack_scenery(scenery, radius, n_threads), radius, n_threads)
+    # a copy's tensors lie elsewhere
+    key = _address(scenery.layout), _address(scenery.layouts.texels), radius, n_threads
+    packed = vars(scenery).get("_packed")
+    if packed is None or packed[0] != key:
+        packed = vars(scenery)["_packed"] = key, _pack_scenery(scenery, radius, n_threads)
+    return packed[1]
 
 
 def _pack_scenery(scenery, radius, n_threads) -> bytes:
@@ -85,11 +64,9 @@ def object_params(scenery: Scenery) -> bytes:
     o = scenery.objects
     if o is None:
         return _NO_OBJECTS
-    packed = vars(o).get("_packed")
-    if packed is None:
-        packed = vars(o)["_packed"] = _Packed(o.records, o.lines, o.texels, o.palette)
-    return packed.get(
-        lambda: ENGINE.params.ObjectsParams(
+    key, packed = (_address(o.records), _address(o.palette)), vars(o).get("_packed")
+    if packed is None or packed[0] != key:
+        struct = ENGINE.params.ObjectsParams(
             shapes=o.shapes,
             line_starts=o.line_starts,
             line_object=o.line_object,
@@ -105,13 +82,13 @@ def object_params(scenery: Scenery) -> bytes:
             lit=int(o.lit),
             ends=o.ends,
         )
-    )
+        packed = vars(o)["_packed"] = key, struct
+    return packed[1]
 
 
 class _Checked:
-    """The agents' tensors that were last checked for a scenery: {name: (tensor, address)}.
-
-    Has no ``__dict__``, as :class:`_Packed`.
+    """The agents' tensors that were last checked for a scenery: {name: (tensor, address)}. Without
+    a ``__dict__``, so that :func:`~megastep.engine.state_tree.state_tree` does not look inside.
     """
 
     __slots__ = ("scenery", "tensors")

@@ -15,7 +15,6 @@ import torch
 
 from megastep.engine import checks, views
 from megastep.engine.objects import Objects
-from megastep.engine.views import JoinedRagged
 from megastep.kernels.build.launch import ENGINE
 from megastep.ragged import Ragged, RaggedTorch
 from megastep.read_only import ReadOnlyTensor, SetOnce
@@ -237,17 +236,17 @@ class Scenery(SetOnce):
         self.reach = float(model.norm(dim=-1).max()) if len(model) else 0.0
 
     @property
-    def lines(self) -> JoinedRagged:
+    def lines(self) -> RaggedTorch:
         """The lines (l, 2, 2) of each environment, agents' first, as last rendered. Read-only."""
         return views.lines(self)
 
     @property
-    def lights(self) -> JoinedRagged:
+    def lights(self) -> RaggedTorch:
         """The lights (l, 3) of each environment. Read-only."""
         return views.lights(self)
 
     @property
-    def textures(self) -> JoinedRagged:
+    def textures(self) -> RaggedTorch:
         """The texels (w, 3) of each line of all environments. Read-only.
 
         Line l of environment e has the index ``lines.starts[e] + l``.
@@ -255,7 +254,7 @@ class Scenery(SetOnce):
         return views.textures(self)
 
     @property
-    def baked(self) -> JoinedRagged:
+    def baked(self) -> RaggedTorch:
         """The light (w,) on each line of all environments, indexed as ``textures``. Read-only."""
         return views.baked(self)
 

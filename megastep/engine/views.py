@@ -1,142 +1,81 @@
-"""Scenery by environment: read-only views that join its agents, its objects and its layout.
+"""Scenery by environment: read-only copies that join its agents, its objects and its layout.
 
 N environments, A agents per environment, M lines of the agent model, K texels of one environment's
-agents, W walls of all layouts, L lines of all environments.
+agents, L lines of all environments.
 """
-
-from functools import cached_property
 
 import torch
 
-from megastep.ragged import Ragged, RaggedNumpy, RaggedTorch
+from megastep.ragged import RaggedTorch
 from megastep.read_only import ReadOnlyTensor
 
-__all__ = ["JoinedRagged", "baked", "lights", "lines", "textures"]
-
-_SHARED = "which reaches every environment that shows the layout"
-LINES = (
-    "scenery.lines is a read-only copy: write walls into scenery.layouts.lines, "
-    f"{_SHARED}, and call bake; agents' lines follow agents.positions at each render"
-)
-LIGHTS = (
-    "scenery.lights is a read-only copy: write into scenery.layouts.lights, "
-    f"{_SHARED}, and call bake"
-)
-TEXTURES = (
-    "scenery.textures is a read-only copy: write walls' into scenery.layouts.textures and agents' "
-    f"into scenery.layouts.agent_textures, {_SHARED}"
-)
-BAKED = (
-    "scenery.baked is a read-only copy: write walls' light into scenery.layouts.baked, "
-    f"{_SHARED}; agents' light is computed at each render"
-)
+__all__ = ["baked", "lights", "lines", "textures"]
 
 
-class JoinedRagged(RaggedTorch):
-    """A read-only Ragged whose subarrays join pieces of several tensors, computed when read.
+def _joined(
+    name: str, *parts: tuple[torch.Tensor, torch.Tensor, torch.Tensor], cure: str = ""
+) -> RaggedTorch:
+    """Returns a Ragged whose subarrays each join pieces [start, start + width) of some tensors.
 
     Args:
-        refusal: message of the ValueError that a write raises.
-        parts: (vals (V, ...), starts (D,), widths (D,)) each: the tensor, and the pieces of it.
+        name: of the attribute, for errors.
+        parts: (vals (V, ...), starts (D,), widths (D,)) of each tensor.
+        cure: more words for errors.
     """
-
-    def __init__(self, refusal: str, *parts: tuple[torch.Tensor, torch.Tensor, torch.Tensor]):
-        self._message, self._parts = refusal, parts
-        self.widths = self._guarded(sum(widths for _, _, widths in parts))
-
-    def _guarded(self, tensor) -> torch.Tensor:
-        return ReadOnlyTensor(tensor, self._message)
-
-    @cached_property
-    def vals(self) -> torch.Tensor:
-        """(V, ...) a copy of all subarrays, concatenated."""
-        vals, starts, widths = zip(*self._parts)
-        lengths = torch.tensor([0, *map(len, vals)])
-        starts = torch.stack([s + int(before) for s, before in zip(starts, lengths.cumsum(0))], 1)
-        return self._guarded(
-            torch.cat(vals)[_ranges(starts.flatten(), torch.stack(widths, 1).flatten())]
-        )
-
-    @cached_property
-    def ends(self) -> torch.Tensor:
-        return self._guarded(self.widths.cumsum(0))
-
-    @cached_property
-    def starts(self) -> torch.Tensor:
-        return self._guarded(self.ends - self.widths)
-
-    @cached_property
-    def inverse(self) -> torch.Tensor:
-        subarrays = torch.arange(len(self), device=self.device)
-        return self._guarded(torch.repeat_interleave(subarrays, self.widths))
-
-    @property
-    def device(self) -> torch.device:
-        """The device of the tensors."""
-        return self._parts[0][0].device
-
-    def __getitem__(self, index: int | slice) -> torch.Tensor | Ragged:
-        if isinstance(index, slice):
-            indices = range(len(self))[index]
-            pieces = [self._subarray(i) for i in indices] or [self._parts[0][0][:0]]
-            return Ragged(
-                self._guarded(torch.cat(pieces)), self._guarded(self.widths[list(indices)])
-            )
-        return self._guarded(self._subarray(self._index(index)))
-
-    def _subarray(self, i: int) -> torch.Tensor:
-        pieces = [vals[int(s[i]) : int(s[i]) + int(w[i])] for vals, s, w in self._parts]
-        return torch.cat(pieces)
-
-    def numpyify(self) -> RaggedNumpy:
-        """Returns a writable copy with numpy arrays."""
-        return self.clone().numpyify()
-
-
-def _ranges(starts, widths) -> torch.Tensor:
-    """Returns the indices of the ranges [start, start + width), concatenated."""
-    offsets = widths.cumsum(0) - widths
-    return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(
-        starts - offsets, widths
+    refusal = (
+        f"scenery.{name} is a read-only copy: write into scenery.layouts.{name}, which reaches "
+        f"every environment that shows the layout{cure}"
+    )
+    vals, starts, widths = zip(*parts)
+    before = torch.tensor([0, *map(len, vals)]).cumsum(0).tolist()
+    starts = torch.stack([start + n for start, n in zip(starts, before)], 1).flatten()
+    of_pieces = torch.stack(widths, 1).flatten()
+    first = torch.repeat_interleave(starts - (of_pieces.cumsum(0) - of_pieces), of_pieces)
+    index = torch.arange(len(first), device=first.device) + first
+    return RaggedTorch(
+        ReadOnlyTensor(torch.cat(vals)[index], refusal), ReadOnlyTensor(sum(widths), refusal)
     )
 
 
-def lines(scenery) -> JoinedRagged:
+def lines(scenery) -> RaggedTorch:
     """Returns the lines (l, 2, 2) of each environment as last rendered: its agents', then its
     objects', then walls.
     """
     layout, walls = scenery.layout.long(), scenery.layouts.lines
     moving = [scenery.agent_lines, *([scenery.objects.lines] if scenery.objects else [])]
     e = torch.arange(scenery.n_envs, device=scenery.device)
-    return JoinedRagged(
-        LINES,
+    return _joined(
+        "lines",
         *((x.flatten(0, 1), e * x.shape[1], torch.full_like(e, x.shape[1])) for x in moving),
         (walls.vals, walls.starts[layout], walls.widths[layout]),
+        cure=", and call bake; agents' lines follow agents.positions at each render",
     )
 
 
-def lights(scenery) -> JoinedRagged:
+def lights(scenery) -> RaggedTorch:
     """Returns the lights (l, 3) of each environment."""
     layout, lights = scenery.layout.long(), scenery.layouts.lights
-    return JoinedRagged(LIGHTS, (lights.vals, lights.starts[layout], lights.widths[layout]))
+    part = lights.vals, lights.starts[layout], lights.widths[layout]
+    return _joined("lights", part, cure=", and call bake")
 
 
-def textures(scenery) -> JoinedRagged:
+def textures(scenery) -> RaggedTorch:
     """Returns the texels (w, 3) of each line of all environments."""
-    agents = scenery.layouts.agent_textures
+    agents, texels = scenery.layouts.agent_textures, scenery.layouts.textures.vals
     starts = scenery.layout.long() * agents.shape[1]
-    texels = scenery.layouts.textures.vals
-    return _by_line(scenery, TEXTURES, agents.flatten(0, 1), starts, texels, slice(3))
+    cure = "; agents' are in scenery.layouts.agent_textures"
+    return _by_line(scenery, "textures", agents.flatten(0, 1), starts, texels, slice(3), cure)
 
 
-def baked(scenery) -> JoinedRagged:
+def baked(scenery) -> RaggedTorch:
     """Returns the light (w,) on each line of all environments."""
-    agents = scenery.agent_light
+    agents, light = scenery.agent_light, scenery.layouts.baked.vals
     starts = torch.arange(scenery.n_envs, device=scenery.device) * agents.shape[1]
-    return _by_line(scenery, BAKED, agents.flatten(), starts, scenery.layouts.baked.vals, 3)
+    cure = "; agents' light is computed at each render"
+    return _by_line(scenery, "baked", agents.flatten(), starts, light, 3, cure)
 
 
-def _by_line(scenery, refusal, agents, agent_starts, texels, channels) -> JoinedRagged:
+def _by_line(scenery, name, agents, agent_starts, texels, channels, cure) -> RaggedTorch:
     """Returns texels by line. In ``agents``, those of environment e start at ``agent_starts[e]``;
     an object's are ``channels`` of its texel.
 
@@ -153,21 +92,16 @@ def _by_line(scenery, refusal, agents, agent_starts, texels, channels) -> Joined
     line = torch.arange(len(e), device=scenery.device) - (n_lines.cumsum(0) - n_lines)[e]
     agent_line = line.clamp(max=n_agents_lines)
     wall = torch.where(line < n_moving, n_walls, walls.starts[layout[e]] + line - n_moving)
-    parts = []
+    parts = [(agents, agent_starts[e] + bounds[agent_line], _with_zero(bounds.diff())[agent_line])]
     if objects:
         of_object = (line >= n_agents_lines) & (line < n_moving)
         at = (line - n_agents_lines).clamp(0, len(objects.line_object) - 1)
         index = objects.line_object.long()[at]
         vals = objects.texels[..., channels].flatten(0, 1)
-        parts = [(vals, e * objects.n_objects + index, of_object.long())]
-    return JoinedRagged(
-        refusal,
-        (agents, agent_starts[e] + bounds[agent_line], _with_zero(bounds.diff())[agent_line]),
-        *parts,
-        (texels, _with_zero(wall_texels.starts)[wall], _with_zero(wall_texels.widths)[wall]),
-    )
+        parts.append((vals, e * objects.n_objects + index, of_object.long()))
+    of_wall = _with_zero(wall_texels.starts)[wall], _with_zero(wall_texels.widths)[wall]
+    return _joined(name, *parts, (texels, *of_wall), cure=cure)
 
 
 def _with_zero(table) -> torch.Tensor:
-    """Returns a table with a zero appended."""
     return torch.cat([table, table.new_zeros(1)])

@@ -75,7 +75,7 @@ class _Movement:
         n_agents, device = self.core.n_agents, self.core.device
         n_lanes, actions = self.core.n_envs * n_agents, decision["actions"]
         if self.control == "continuous":
-            actions = checks.vectors("actions", actions, n_lanes, len(CONTROLS), device)
+            actions = checks.lanes("actions", actions, n_lanes, device, len(CONTROLS))
             actions = actions.reshape(-1, *self.space.shape).contiguous()
         else:
             actions = checks.lanes("actions", actions, n_lanes, device)

@@ -106,15 +106,10 @@ def statements():
         "vals[:]": lambda view: view.vals.__setitem__(slice(None), 1),
         "vals.mul_": lambda view: view.vals.mul_(2),
         "vals +=": lambda view: add(view.vals),
-        "vals.data": lambda view: view.vals.data.zero_(),
-        "vals.resize_": lambda view: view.vals.resize_(0),
-        "vals.numpy()": lambda view: view.vals.numpy().fill(0),
         "out=": lambda view: torch.add(view.vals, 1, out=view.vals),
         "[0][:]": lambda view: view[0].__setitem__(slice(None), 0),
         "[1:3].vals": lambda view: view[1:3].vals.zero_(),
-        "torchify": lambda view: view.torchify().vals.zero_(),
         "widths": lambda view: view.widths.zero_(),
-        "inverse": lambda view: view.inverse.zero_(),
     }
 
 
