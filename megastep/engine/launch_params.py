@@ -13,15 +13,27 @@ _address = torch.Tensor.data_ptr
 _STATE = dict(positions=(2,), angles=(), velocity=(2,), angvelocity=())
 
 
+class _Packed:
+    """A packed struct, and the addresses and numbers that it was packed with. Without a
+    ``__dict__``, so that checkpoints and :mod:`~megastep.engine.state_tree` do not look inside.
+    """
+
+    __slots__ = ("key", "params")
+
+    def __init__(self, key: tuple, params: bytes):
+        self.key, self.params = key, params
+
+
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
     """Returns the packed SceneryParams of a scenery. Its tensors cannot be replaced."""
     n_threads = devices.threads()
     # a copy's tensors lie elsewhere
     key = _address(scenery.layout), _address(scenery.layouts.texels), radius, n_threads
     packed = vars(scenery).get("_packed")
-    if packed is None or packed[0] != key:
-        packed = vars(scenery)["_packed"] = key, _pack_scenery(scenery, radius, n_threads)
-    return packed[1]
+    if packed is None or packed.key != key:
+        packed = _Packed(key, _pack_scenery(scenery, radius, n_threads))
+        vars(scenery)["_packed"] = packed
+    return packed.params
 
 
 def _pack_scenery(scenery, radius, n_threads) -> bytes:
@@ -65,7 +77,7 @@ def object_params(scenery: Scenery) -> bytes:
     if o is None:
         return _NO_OBJECTS
     key, packed = (_address(o.records), _address(o.palette)), vars(o).get("_packed")
-    if packed is None or packed[0] != key:
+    if packed is None or packed.key != key:
         struct = ENGINE.params.ObjectsParams(
             shapes=o.shapes,
             line_starts=o.line_starts,
@@ -82,13 +94,13 @@ def object_params(scenery: Scenery) -> bytes:
             lit=int(o.lit),
             ends=o.ends,
         )
-        packed = vars(o)["_packed"] = key, struct
-    return packed[1]
+        packed = vars(o)["_packed"] = _Packed(key, struct)
+    return packed.params
 
 
 class _Checked:
     """The agents' tensors that were last checked for a scenery: {name: (tensor, address)}. Without
-    a ``__dict__``, so that :func:`~megastep.engine.state_tree.state_tree` does not look inside.
+    a ``__dict__``, as :class:`_Packed`.
     """
 
     __slots__ = ("scenery", "tensors")
