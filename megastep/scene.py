@@ -34,7 +34,7 @@ AGENT_PALETTE = (
 FRONT = "ff3020"
 
 
-def _linear(palette) -> np.ndarray:
+def linear(palette) -> np.ndarray:
     """Returns the linear light, (n, 3), of hexadecimal colours."""
     return gamma_decode(
         np.array([[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in palette])
@@ -63,7 +63,7 @@ def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
     (A M,). Agents have different colours (16, then they repeat) and a red front.
     """
     widths = texel_widths(model)
-    bodies, front = _linear(AGENT_PALETTE), _linear([FRONT])[0]
+    bodies, front = linear(AGENT_PALETTE), linear([FRONT])[0]
     colours = np.repeat(bodies[np.arange(n_agents) % len(bodies), None], len(model), 1)
     colours[:, model.mean(1)[:, 0].argmax()] = front
     widths = np.tile(widths, n_agents)
@@ -75,7 +75,7 @@ def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray
 
     A wall has two colours in stripes of random period, phase and duty cycle.
     """
-    n, palette = len(widths), _linear(PALETTE)
+    n, palette = len(widths), linear(PALETTE)
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
     stripe = palette[random.integers(len(palette), size=n)] * random.uniform(0.2, 0.8, (n, 1))
     period = random.uniform(*STRIPE, n)

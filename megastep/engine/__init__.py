@@ -29,35 +29,8 @@ from megastep.engine.scenery import Layouts, Scenery
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import without_early_starts
 
-__all__ = [
-    "AGENT_RADIUS",
-    "AGENT_WIDTH",
-    "MAX_RES",
-    "Agents",
-    "EngineError",
-    "Layouts",
-    "Objects",
-    "Observation",
-    "Physics",
-    "Render",
-    "Resets",
-    "Scenery",
-    "bake",
-    "check",
-    "check_flag",
-    "check_objects",
-    "device",
-    "fit",
-    "free_memory",
-    "observe",
-    "physics",
-    "place_objects",
-    "render",
-    "set_threads",
-    "spawn",
-    "threads",
-    "uniform",
-    "update_agent_geometry",
-    "update_objects",
-    "without_early_starts",
-]
+__all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents", "EngineError", "Layouts", "Objects"]
+__all__ += ["Observation", "Physics", "Render", "Resets", "Scenery", "bake", "check", "check_flag"]
+__all__ += ["check_objects", "device", "fit", "free_memory", "observe", "physics", "place_objects"]
+__all__ += ["render", "set_threads", "spawn", "threads", "uniform", "update_agent_geometry"]
+__all__ += ["update_objects", "without_early_starts"]

@@ -1,6 +1,5 @@
-"""The lifecycle of episodes: when each lane begins and ends one.
-
-Axes: N environments, A agents, B = N A lanes.
+"""The lifecycle of episodes: when each lane begins and ends one. N environments, A agents, B = N A
+lanes.
 """
 
 import torch
@@ -50,14 +49,8 @@ class CounterGenerator:
 
 
 def random_ages(limits: torch.Tensor, seed: int) -> torch.Tensor:
-    """Draws ages at which lanes could be in the middle of an episode.
-
-    Args:
-        limits: (B,) int32, age at which each lane's episode is truncated.
-        seed: of the draws, from 0 to 2**63 - 1.
-
-    Returns:
-        (B,) int32, uniform in [0, limit); 0 where the limit is ``ENDLESS``.
+    """Returns ages (B,) int32 at which lanes could be in the middle of an episode that is truncated
+    at an age of ``limits`` (B,) int32: uniform in [0, limit), and 0 where that is ``ENDLESS``.
     """
     generator = CounterGenerator(len(limits), derived_seed(seed, "ages"), limits.device)
     uniform = generator(torch.ones_like(limits, dtype=torch.bool))[:, 0]
@@ -128,7 +121,7 @@ class Lifecycle:
         self._never = torch.zeros_like(self.ended)
 
     def start_all(self) -> torch.Tensor:
-        """Returns the ``reset`` mask, (B,) bool, of ``env.reset``: True in every lane."""
+        """Returns the ``reset`` mask, (B,) bool, of ``env.reset``."""
         return torch.ones_like(self.ended)
 
     def start_ended(self) -> torch.Tensor:
@@ -136,10 +129,8 @@ class Lifecycle:
         return self.ended.clone()
 
     def desync(self) -> None:
-        """Gives every lane a random age below its limit, for the ``desync`` of an environment.
-
-        Call it after ``env.reset``. Without it, lanes with equal limits begin and end their
-        episodes in the same steps.
+        """Gives every lane a random age below its limit, so that episodes do not end together. Call
+        it after ``env.reset``.
         """
         self.ages.copy_(random_ages(self.limits, self.seed))
 

@@ -1,6 +1,5 @@
-"""Movement by actions, and vectors between the global frame and agents' frames.
-
-Axes: N environments, A agents, B = N A lanes.
+"""Movement by actions, and vectors between the global frame and agents' frames. N environments, A
+agents, B = N A lanes.
 """
 
 import math
@@ -32,9 +31,8 @@ def to_agents(values: torch.Tensor, n_agents: int) -> torch.Tensor:
 
 
 def to_global(angles: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """Rotates vectors (..., 2) from agents' frames into the global frame.
-
-    ``angles`` (...) are the agents' headings in degrees.
+    """Rotates vectors (..., 2) from the frames of agents that head along ``angles`` (...), in
+    degrees, into the global frame.
     """
     radians = torch.deg2rad(angles)
     s, c = radians.sin(), radians.cos()
@@ -43,17 +41,18 @@ def to_global(angles: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
 
 
 def to_local(angles: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """Rotates vectors (..., 2) from the global frame into agents' frames.
-
-    ``angles`` (...) are the agents' headings in degrees.
-    """
+    """Rotates vectors (..., 2) from the global frame into agents' frames."""
     return to_global(-angles, vectors)
 
 
 class _Movement:
     """A step first removes the fraction ``damping`` of the velocity, then adds the action's."""
 
-    def __init__(self, core: Core, speed: float, ang_speed: float, damping: float, control: str):
+    def __init__(self, core: Core, numbers: dict, damping: float, control: str, scale: float = 1.0):
+        values = (
+            checks.number(name, value, -math.inf, math.inf) for name, value in numbers.items()
+        )
+        speed, ang_speed = (value / scale for value in values)
         self.core, self.damping = core, damping
         self.control = checks.word("control", control, ("discrete", "continuous"))
         self.moves = torch.tensor(
@@ -105,9 +104,7 @@ class SimpleMovement(_Movement):
         *,
         control: str = "discrete",
     ):
-        speed = checks.number("speed", speed, -math.inf, math.inf)
-        ang_speed = checks.number("ang_speed", ang_speed, -math.inf, math.inf)
-        super().__init__(core, speed, ang_speed, 1.0, control)
+        super().__init__(core, dict(speed=speed, ang_speed=ang_speed), 1.0, control)
 
 
 class MomentumMovement(_Movement):
@@ -118,9 +115,7 @@ class MomentumMovement(_Movement):
         accel: m/s^2, along an axis of the agent.
         ang_accel: deg/s^2.
         decay: fraction of both velocities that is lost per step.
-        control: discrete for seven actions (MultiDiscrete), or continuous for three numbers from
-            -1 to 1 (MultiContinuous): fractions of the acceleration ahead, to the left, and of the
-            turn to the left. Numbers beyond are clipped.
+        control: as of :class:`SimpleMovement`, but of accelerations.
     """
 
     def __init__(
@@ -132,7 +127,6 @@ class MomentumMovement(_Movement):
         *,
         control: str = "discrete",
     ):
-        accel = checks.number("accel", accel, -math.inf, math.inf)
-        ang_accel = checks.number("ang_accel", ang_accel, -math.inf, math.inf)
         decay = checks.number("decay", decay, -math.inf, math.inf)
-        super().__init__(core, accel / core.fps, ang_accel / core.fps, decay, control)
+        rates = dict(accel=accel, ang_accel=ang_accel)
+        super().__init__(core, rates, decay, control, core.fps)

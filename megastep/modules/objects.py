@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from megastep import engine
-from megastep.colour import gamma_decode
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
@@ -18,6 +17,7 @@ from megastep.engine.objects import MAX_OBJECTS, NUMBERS
 from megastep.modules.lifecycle import derived_seed
 from megastep.modules.spawning import MAX_SPAWNS, cached_points
 from megastep.ragged import RaggedNumpy
+from megastep.scene import linear
 
 __all__ = ["COLOURS", "Crate", "Disc", "Door", "Kind", "Objects", "doorways"]
 
@@ -41,48 +41,31 @@ _INTO_WALL = 0.001  # metres that a door is longer than its opening, on either s
 
 
 class Disc(NamedTuple):
-    """A kind of round objects.
+    """A kind of round objects."""
 
-    Attributes:
-        count: objects per environment.
-        radius: metres.
-        solid: whether they stop agents.
-    """
-
-    count: int
-    radius: float = 0.1
-    solid: bool = False
+    count: int  # per environment
+    radius: float = 0.1  # metres
+    solid: bool = False  # they stop agents
 
 
 class Crate(NamedTuple):
-    """A kind of square objects.
+    """A kind of square objects."""
 
-    Attributes:
-        count: objects per environment.
-        side: metres.
-        solid: whether they stop agents.
-    """
-
-    count: int
-    side: float = 0.3
-    solid: bool = True
+    count: int  # per environment
+    side: float = 0.3  # metres
+    solid: bool = True  # they stop agents
 
 
 class Door(NamedTuple):
-    """A kind of solid objects that close the doorways of homes, one each.
+    """A kind of solid objects that close the doorways of homes, one each."""
 
-    Attributes:
-        count: of an environment at most; further doorways have no door. None: as many as the home
-            with the most doorways has.
-    """
-
+    #: Of an environment at most; further doorways have no door. None: as many as the home with the
+    #: most doorways has.
     count: int | None = None
 
 
 def doorways(geometries: Sequence[dotdict]) -> RaggedNumpy:
-    """Returns the segments (2, 2) across the doorways of each geometry, float32 metres; none of one
-    without the key `doors`.
-    """
+    """Returns the segments (2, 2) float32 metres across the doorways of each geometry."""
     segments = [np.reshape(g.get("doors", ()), (-1, 2, 2)).astype(np.float32) for g in geometries]
     return RaggedNumpy(np.concatenate(segments), np.array([len(s) for s in segments]))
 
@@ -121,27 +104,30 @@ class Objects:
         n_points: int = 128,
         seed: int | None = None,
     ):
-        self.core = core
-        geometries = geometries[: len(core.scenery.layouts)]
+        if core.scenery.objects is not None:
+            raise ValueError("core has objects: give all kinds to one Objects")
         if not checks.instance("kinds", kinds, Mapping):
             raise ValueError("kinds must hold at least one kind of objects, but is empty")
+        self.core = core
+        geometries = geometries[: len(core.scenery.layouts)]
         shapes, sizes, solid, names, slots = [], [], [], [], {}
         openings = doorways(geometries)
         for name, kind in kinds.items():
             kind = Disc(kind) if isinstance(kind, int) else kind
             count = _count(name, kind, openings)
-            size = {Disc: "radius", Crate: "side"}.get(type(kind))
-            length = checks.number(f"{size} of {name}", getattr(kind, size), 0, 100) if size else 0
+            size = 0.0  # of doors, whose openings say it
+            if isinstance(kind, Disc):
+                size = checks.number(f"radius of {name}", kind.radius, 0, 100)
+            elif isinstance(kind, Crate):
+                size = checks.number(f"side of {name}", kind.side, 0, 100) / 2
             slots[name] = slice(len(shapes), len(shapes) + count)
             shapes += [type(kind).__name__.lower()] * count
-            sizes += [length / 2 if size == "side" else length] * count
+            sizes += [size] * count
             solid += [getattr(kind, "solid", True)] * count
             names += [f"{name} {k}" for k in range(count)]
         self.all = engine.Objects(core.n_envs, shapes, _palette(colours), lit, names, core.device)
         self.all.sizes.copy_(torch.tensor(sizes))
         self.all.solid.copy_(torch.tensor(solid))
-        if core.scenery.objects is not None:
-            raise ValueError("core has objects: give all kinds to one Objects")
         core.scenery.objects = self.all
 
         seed = core.seed if seed is None else checks.integer("seed", seed, 0)
@@ -154,24 +140,14 @@ class Objects:
         self.counts = torch.zeros_like(self.all.carriers)
         self._mask = torch.zeros_like(self.all.carriers, dtype=torch.bool)
         self.kinds = {
-            name: (Doors if isinstance(kinds[name], Door) else Kind)(self, name, slots[name])
-            for name in kinds
+            name: Doors(self, name, slots[name], openings)
+            if isinstance(kind, Door)
+            else Kind(self, name, slots[name])
+            for name, kind in kinds.items()
         }
-        for kind in self.kinds.values():
-            if isinstance(kind, Doors):
-                kind.set_openings(openings)
 
     def __getitem__(self, name: str) -> "Kind":
         return self.kinds[name]
-
-    def place(self, mask: torch.Tensor) -> None:
-        """Puts objects where they fit, as :func:`megastep.engine.place_objects`.
-
-        Args:
-            mask: (N, O) bool.
-        """
-        core = self.core
-        engine.place_objects(core.scenery, core.agents, mask, self.points, self.counts, self.seed)
 
 
 class Kind:
@@ -208,11 +184,12 @@ class Kind:
             mask: (N,) or (N, K) bool.
             colours: (N, K) or (K,) integers, or one; their new colours. Default: they keep theirs.
         """
-        mask, whole = self._broadcast(mask), self._objects._mask
+        mask, objects = self._broadcast(mask), self._objects
         self._paint(mask, colours)
-        whole.zero_()
-        whole[:, self.slots] = mask
-        self._objects.place(whole)
+        objects._mask.zero_()
+        objects._mask[:, self.slots] = mask
+        core, points = objects.core, (objects.points, objects.counts)
+        engine.place_objects(core.scenery, core.agents, objects._mask, *points, objects.seed)
 
     def remove(self, mask: torch.Tensor) -> None:
         """Has objects vanish where ``mask``, (N,) or (N, K) bool, is True."""
@@ -247,9 +224,8 @@ class Kind:
         core, n_agent_lines = self._objects.core, self._objects.core.scenery.agent_lines.shape[1]
         objects = self._objects.all.at_lines(centre_line, n_agent_lines)
         objects = objects.view(core.n_envs, core.n_agents, -1, 1)
-        return (objects == torch.arange(self.slots.start, self.slots.stop, device=core.device)).any(
-            2
-        )
+        own = torch.arange(self.slots.start, self.slots.stop, device=core.device)
+        return (objects == own).any(2)
 
     def carry(self, mask: torch.Tensor) -> None:
         """Has agents pick up objects where ``mask``, (N, A, K) bool, is True.
@@ -275,11 +251,8 @@ class Kind:
 
     def _broadcast(self, mask) -> torch.Tensor:
         n, k = self.visible.shape
-        if (
-            not isinstance(mask, torch.Tensor)
-            or mask.dtype != torch.bool
-            or mask.shape not in (*((n,), (n, 1), (n, k)),)
-        ):
+        is_mask = isinstance(mask, torch.Tensor) and mask.dtype == torch.bool
+        if not is_mask or mask.shape not in ((n,), (n, 1), (n, k)):
             raise ValueError(
                 f"mask must be a bool tensor of shape ({n},) or ({n}, {k}), one per environment or "
                 f"per {self.name}"
@@ -301,8 +274,8 @@ class Doors(Kind):
         poses: (D, K, 4) float32, of each: x and y in metres, angle in degrees, half the length.
     """
 
-    def set_openings(self, openings: RaggedNumpy) -> None:
-        """Takes the doorways (2, 2) of each layout."""
+    def __init__(self, objects: Objects, name: str, slots: slice, openings: RaggedNumpy):
+        super().__init__(objects, name, slots)
         shape, device = (len(openings), len(self)), self.positions.device
         poses = np.zeros((*shape, 4), np.float32)
         for d in range(len(openings)):
@@ -315,23 +288,16 @@ class Doors(Kind):
         self.n_doorways = torch.as_tensor(openings.widths, device=device).clamp(max=len(self))
 
     def place(self, mask: torch.Tensor, colours: torch.Tensor | int | None = None) -> None:
-        """Puts a shut door into each doorway of the layout that an environment shows.
-
-        Args:
-            mask: (N,) or (N, K) bool.
-            colours: (N, K) or (K,) integers, or one; their new colours. Default: they keep theirs.
+        """Puts a shut door into each doorway of the layout that an environment shows. Arguments as
+        of :meth:`Kind.place`.
         """
         mask = self._broadcast(mask)
         self._paint(mask, colours)
         layout = self._objects.core.scenery.layout.long()
         poses = self.poses[layout]
-        for tensor, values in (
-            (self.positions, poses[..., :2]),
-            (self.angles, poses[..., 2]),
-            (self.sizes, poses[..., 3]),
-        ):
-            where = mask if values.ndim == 2 else mask[..., None]
-            tensor.copy_(torch.where(where, values, tensor))
+        self.positions.copy_(torch.where(mask[..., None], poses[..., :2], self.positions))
+        self.angles.copy_(torch.where(mask, poses[..., 2], self.angles))
+        self.sizes.copy_(torch.where(mask, poses[..., 3], self.sizes))
         exists = torch.arange(len(self), device=layout.device) < self.n_doorways[layout][:, None]
         self.visible.copy_(torch.where(mask, exists, self.visible))
         self.open.logical_and_(~mask)
@@ -353,13 +319,7 @@ def _count(name, kind, openings) -> int:
 
 def _palette(colours) -> np.ndarray:
     try:
-        names = checks.items("colours", colours)
-        hexadecimal = [COLOURS.get(name) or name for name in names]
-        return gamma_decode(
-            np.array(
-                [[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in hexadecimal]
-            )
-        )
+        return linear([COLOURS.get(name) or name for name in checks.items("colours", colours)])
     except (ValueError, TypeError, AttributeError):
         raise ValueError(
             f"colours must be of {', '.join(COLOURS)}, or hexadecimal such as 'e6194b', but "

@@ -1,7 +1,7 @@
-"""Sensors: RGB, depth and inertia. A call returns the observation of every agent.
+"""Sensors: RGB, depth and inertia. A call returns the observation of every agent. Each has a
+``space``, the ``state`` of one environment, and ``plot_state``, which draws a numpyified state.
 
-Each has a ``space``, the ``state`` of one environment, and ``plot_state``, which draws a numpyified
-state. Axes: N environments, A agents, C cameras per agent, R rays per camera.
+N environments, A agents, C cameras per agent, R rays per camera.
 """
 
 from collections.abc import Sequence
@@ -27,12 +27,8 @@ def render(core: Core) -> engine.Render:
 
 
 def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
-    """Groups neighbouring rays: (..., R) to (..., R / subsample, subsample).
-
-    Take a mean or minimum over the last axis to get pixels.
-
-    Raises:
-        ValueError: if ``subsample`` does not divide R.
+    """Groups neighbouring rays, (..., R) to (..., R / subsample, subsample), for a mean or minimum
+    over the last axis. ValueError if ``subsample`` does not divide R.
     """
     n_rays = screen.shape[-1]
     if n_rays % checks.integer("subsample", subsample, 1):
@@ -74,16 +70,13 @@ class _Camera:
         yaws: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera; depth in
-        grey, bright where near.
+        grey, bright where near. Returns the axes.
 
         Args:
-            state: (A, channels, C, R / subsample).
+            state: from :meth:`state`.
             axes: one per agent: strips of :func:`megastep.plotting.panels`, or matplotlib axes.
                 Default: those of a new figure.
             yaws: (C,) degrees, shown as the names of the rows.
-
-        Returns:
-            The axes.
         """
         aspect = plotting.STRIP * np.shape(state)[-2]
         return plotting.plot_images({cls.name: state}, aspect=aspect, axes=axes, yaws=yaws)

@@ -1,6 +1,5 @@
-"""Spawning: a search for points where agents fit, and a module that puts agents there.
-
-Axes: N environments, A agents, D layouts, P points, M walls.
+"""Spawning: a search for points where agents fit, and a module that puts agents there. N
+environments, A agents, D layouts, P points, M walls.
 """
 
 import itertools
@@ -51,9 +50,7 @@ def candidates(g, n, random) -> Iterator[np.ndarray]:
 
 def _assign(points, owners, candidates, n_agents, size, gap) -> tuple[np.ndarray, np.ndarray]:
     """Gives candidate points (F, 2) to agents in turn, at most ``size`` each, none nearer than
-    ``gap`` to a point of another agent.
-
-    Returns ``points`` (P, 2) and ``owners`` (P,), the agent of each, with the new ones appended.
+    ``gap`` to a point of another agent. Returns all points, and the agent of each.
     """
     if n_agents == 1:
         points = np.concatenate([points, candidates])[:size]
@@ -75,13 +72,8 @@ def spawn_points(
     g: dotdict, n: int, n_agents: int, radius: float, random: np.random.Generator
 ) -> np.ndarray:
     """Returns points in the rooms of a geometry, (n_agents * (n // n_agents), 2) float64, those of
-    agent 0 first.
-
-    A disc of ``radius`` metres around a point is 5 cm clear of every wall and of the discs around
-    other agents' points. If fewer points fit, some are repeated.
-
-    Raises:
-        ValueError: if an agent has no point.
+    agent 0 first. A disc of ``radius`` metres around each is 5 cm clear of every wall and of other
+    agents' discs. If fewer fit, some are repeated. ValueError if an agent has none.
     """
     size, points, owners = n // n_agents, np.empty((0, 2)), np.empty(0, int)
     from_wall, apart = radius + CLEARANCE, 2 * radius + CLEARANCE
@@ -155,7 +147,9 @@ class RandomSpawns:
             torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
             for _ in range(2)
         )
-        self._weights: torch.Tensor | None = None
+        #: (D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``. None:
+        #: every layout is as likely.
+        self.cumulative: torch.Tensor | None = None
 
     def __call__(self, reset: torch.Tensor) -> None:
         """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
@@ -182,25 +176,17 @@ class RandomSpawns:
         """
         if not self.resample:
             raise ValueError("environments keep their homes: use resample=True to draw them anew")
-        if self._weights is None:
+        if self.cumulative is None:
             n, device = self._n_layouts, self.core.device
-            self._weights = torch.arange(1, n + 1, dtype=torch.int32, device=device)
-        return self._weights
-
-    @property
-    def cumulative(self) -> torch.Tensor | None:
-        """(D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``; None
-        before `weigh_layouts`: every layout is as likely.
-        """
-        return self._weights
+            self.cumulative = torch.arange(1, n + 1, dtype=torch.int32, device=device)
+        return self.cumulative
 
 
 def cached_points(
     geometries: Sequence[dotdict], n: int, n_agents: int, radius: float, seed: int
 ) -> np.ndarray:
-    """Returns the :func:`spawn_points` of every layout, (D, n_agents * (n // n_agents), 2) float32.
-
-    Keeps those of many layouts in the cache.
+    """Returns the :func:`spawn_points` of every layout, (D, n_agents * (n // n_agents), 2) float32,
+    for many layouts by the cache.
     """
 
     def build() -> dict[str, np.ndarray]:

@@ -1,7 +1,4 @@
-"""The texels of each layout that can be seen from its spawn points.
-
-Axes: D layouts, P points.
-"""
+"""The texels of each layout that can be seen from its spawn points. D layouts, P points."""
 
 from pathlib import Path
 
@@ -26,16 +23,8 @@ TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
 
 def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
     """Returns a bitmap, (D, n_words) int32, of the wall texels that are visible from any of the
-    layout's points with cameras all round. Bits are set as :func:`megastep.engine.observe` does.
-
-    On the CPU two thousand homes take seconds, so bitmaps of many layouts are cached.
-
-    Args:
-        scenery: scenery with at least one agent per environment, which looks around.
-        points: (D, P, 2) metres, points to look from.
-
-    Raises:
-        ValueError: if an argument does not fit.
+    layout's points (D, P, 2) with cameras all round. Bits are set as
+    :func:`megastep.engine.observe` does. The scenery needs an agent per environment to look round.
     """
     checks.instance("scenery", scenery, Scenery)
     checks.integer("scenery.n_agents", scenery.n_agents, 1)

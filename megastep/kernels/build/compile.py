@@ -97,11 +97,7 @@ def compiler() -> tuple[str, str]:
 
 
 def _run(command, **env) -> subprocess.CompletedProcess[str]:
-    """Runs a compiler in a new session, so that Ctrl-C reaches Python's handlers only.
-
-    Raises:
-        EngineError: if a signal stopped it.
-    """
+    """Runs a compiler in a new session, so that Ctrl-C reaches Python's handlers only."""
     process = subprocess.run(
         command, capture_output=True, text=True, start_new_session=True, env={**os.environ, **env}
     )
@@ -117,13 +113,10 @@ def _run(command, **env) -> subprocess.CompletedProcess[str]:
 
 def _processor() -> str:
     """Returns the CPU's features, which -march=native depends on."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(
-            (line for line in lines if line.startswith(("flags", "Features"))), platform.machine()
-        )
-    except OSError:
-        return platform.machine() + platform.processor()
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    features = (line for line in lines if line.startswith(("flags", "Features")))
+    return next(features, platform.machine() + platform.processor())
 
 
 def _build_cpu(library, command) -> bytes:
@@ -185,20 +178,11 @@ def wasm(
     operations: Mapping[KernelLibrary, Sequence[str]], flags: tuple[str, ...] = WASM_FLAGS
 ) -> bytes:
     """Returns CPU operations of several libraries as one WebAssembly module, which imports nothing,
-    and exports them, `malloc` and its memory.
-
-    It computes the same bits as the CPU. Structs hold pointers of 4 bytes, see
-    :func:`~megastep.kernels.build.headers.words`.
-
-    Raises:
-        EngineError: if clang or its libraries for WebAssembly are missing, or cannot build them.
+    and exports them, `malloc` and its memory. It computes the same bits as the CPU. EngineError if
+    clang or its libraries for WebAssembly are missing, or cannot build them.
     """
     command, version = wasm_tools()
     keys = {name: wasm_key(library) for library, names in operations.items() for name in names}
-    if len(keys) < sum(map(len, operations.values())):
-        names = sorted(name for names in operations.values() for name in names)
-        twice = next(name for name, other in zip(names, names[1:]) if name == other)
-        raise EngineError(f"Two kernel libraries define the operation {twice}: rename one.")
     key = _key(json.dumps(keys), *flags, command, version)
     return cache.fetch(f"wasm-{key}.wasm", lambda: _build_wasm(operations, command, flags, keys))[0]
 
@@ -211,18 +195,11 @@ def wasm_keys(module: bytes) -> dict[str, str]:
 
 
 def wasm_tools() -> tuple[str, str]:
-    """Returns the path of a clang++ that builds WebAssembly, and its version as text.
-
-    Raises:
-        EngineError: if there is none.
-    """
-    folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
-    names = {"clang++": 0, **{f"clang++-{version}": version for version in range(14, 40)}}
-    found = [folder / name for name in names for folder in folders if (folder / name).is_file()]
-    for path in found:
-        suffix = path.name.removeprefix("clang++")
-        if any(shutil.which(name) for name in (f"wasm-ld{suffix}", "wasm-ld")):
-            return str(path), _run([str(path), "--version"]).stdout
+    """Returns the path of a clang++ that builds WebAssembly, and its version as text."""
+    for suffix in ("", *(f"-{version}" for version in range(14, 40))):
+        path = shutil.which(f"clang++{suffix}")
+        if path and any(map(shutil.which, (f"wasm-ld{suffix}", "wasm-ld"))):
+            return path, _run([path, "--version"]).stdout
     raise EngineError(
         "Kernels for a browser are built by clang, and clang++ or wasm-ld is missing: install them "
         "with WebAssembly's libraries (Debian: apt install clang lld wasi-libc libc++-dev-wasm32 "
@@ -288,9 +265,7 @@ def cuda(library: KernelLibrary, index: int) -> dict[str, object]:
 
 
 def build_cuda(library: KernelLibrary, architecture: str) -> bytes:
-    """Returns a library's kernels for GPUs of an architecture, such as ``sm_90``, from the cache if
-    they are there. Needs NVRTC, but no GPU.
-    """
+    """Returns a library's kernels for GPUs of an architecture, such as ``sm_90``. Needs no GPU."""
     _, nvrtc = bindings()
     files = library.sources(".h", ".cu")
     flags = (*library.cuda_flags, f"--gpu-architecture={architecture}")
@@ -323,10 +298,8 @@ def bindings() -> tuple[Any, Any]:
 
 
 def check_status(result: tuple, action: str) -> Any:
-    """Returns the results of a call of cuda.bindings, without its status.
-
-    Raises:
-        EngineError: if the status is an error. ``action`` names what failed.
+    """Returns the results of a call of cuda.bindings, without its status. EngineError if that is an
+    error; ``action`` names what failed.
     """
     status, *values = result
     if int(status):

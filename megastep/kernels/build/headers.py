@@ -47,38 +47,25 @@ Fields = list[tuple[str, str]]  # (name, format of the module struct)
 
 
 class Word(NamedTuple):
-    """A pointer or number of a struct.
+    """A pointer or number of a struct."""
 
-    Attributes:
-        name: of the field, such as `radius`, or `scenery.radius` in a struct that is a field.
-        kind: its format, of the module struct.
-        offset: in bytes, with pointers of this machine.
-    """
-
-    name: str
-    kind: str
-    offset: int
+    name: str  # of the field, such as `radius`, or `scenery.radius` in a struct that is a field
+    kind: str  # its format, of the module struct
+    offset: int  # in bytes, with pointers of this machine
 
 
 def struct_fields(sources: Mapping[str, str]) -> dict[str, Fields]:
-    """Returns the fields of every struct ``...Params`` in the headers ``sources`` {name: text}.
-
-    A struct that is a field of another must be declared before it.
-
-    Raises:
-        ValueError: if a field has a type that cannot be packed.
+    """Returns the fields of every struct ``...Params`` in the headers ``sources`` {name: text}. A
+    struct that is a field of another must be declared before it. ValueError if a field has a type
+    that cannot be packed.
     """
     return {name: fields for name, (fields, _) in _structs(sources).items()}
 
 
 def words(sources: Mapping[str, str]) -> dict[str, list[Word]]:
     """Returns all pointers and numbers of every struct ``...Params``, in order, those of structs
-    that are fields too.
-
-    Where pointers take 4 bytes, as in WebAssembly, a struct is an array of them, 4 bytes each.
-
-    Raises:
-        ValueError: as `struct_fields`.
+    that are fields too. Where pointers take 4 bytes, as in WebAssembly, a struct is an array of
+    them, 4 bytes each.
     """
     return {name: words for name, (_, words) in _structs(sources).items()}
 
@@ -107,9 +94,7 @@ def _structs(sources) -> dict[str, tuple[Fields, list[Word]]]:
 
 
 def _field(line, formats, header) -> tuple[str, str, str | None, int]:
-    """Returns the name of a field, its format, and if it is of a struct that one's name, and how
-    many it is an array of.
-    """
+    """Returns a field's name, its format, its struct's name if any, and the length of an array."""
     match = FIELD.fullmatch(line.strip())
     kind = match[1].replace("const", "").strip() if match else ""
     known = formats.get(kind, "")
@@ -137,12 +122,9 @@ def _holds_pointer(fields) -> bool:
 
 
 def builder(name: str, fields: Fields) -> Callable[[Mapping[str, object]], bytes]:
-    """Returns a function of {field: value} that packs the struct ``name``.
-
-    A pointer is a tensor, an address, or None for null. An array is the joined bytes of its
-    structs; those that are missing at its end are zeros.
-
-    The function raises a TypeError unless it gets each field, and no other.
+    """Returns a function of {field: value} that packs the struct ``name``, or raises a TypeError
+    unless it gets each field, and no other. A pointer is a tensor, an address, or None for null. An
+    array is the joined bytes of its structs; those that are missing at its end are zeros.
     """
     address = "x if (x := values[{!r}]).__class__ is int else 0 if x is None else x.data_ptr()"
     items = [
@@ -154,11 +136,8 @@ def builder(name: str, fields: Fields) -> Callable[[Mapping[str, object]], bytes
 
 
 def constants(sources: Mapping[str, str]) -> dict[str, Any]:
-    """Returns the constants of all files called ``constants.h``.
-
-    Raises:
-        ValueError: naming file and line, if one is not a plain number, if two have the same name,
-            or if a line is neither a constant nor an include guard.
+    """Returns the constants of all files called ``constants.h``. ValueError, naming file and line,
+    if one is not a plain number, has the name of another, or is no constant.
     """
     numbers = {}
     for header, text in sources.items():
@@ -180,18 +159,14 @@ def constants(sources: Mapping[str, str]) -> dict[str, Any]:
 
 def operations(sources: Mapping[str, str]) -> dict[str, str]:
     """Returns {operation: name of its struct} for the KERNELs that these sources define, and for
-    EACH in headers.
-
-    Raises:
-        ValueError: naming file and line, if one cannot be read.
+    EACH in headers. ValueError, naming file and line, if one cannot be read.
     """
     return {match[1]: match[2] for match in _kernels(sources)}
 
 
 def early_operations(sources: Mapping[str, str]) -> frozenset[str]:
-    """Returns the operations whose first statement is ``wait_for_previous();``, as that of EACH is.
-
-    One that is defined several times, behind ``#if``, must have it every time.
+    """Returns the operations whose first statement, in each definition behind ``#if``, is
+    ``wait_for_previous();``, as that of EACH is.
     """
     waits = [
         (match[1], match.re is EACH or bool(WAITS.match(match.string, match.end())))

@@ -17,40 +17,20 @@ __all__ = [
 KERNELS = Path(__file__).parents[1]
 #: The C++ compiler's flags. No fused multiply-adds, as below.
 CPU_FLAGS = (
-    "-std=c++17",
-    "-O3",
-    "-march=native",
-    "-ffp-contract=off",
-    "-fno-tree-slp-vectorize",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fopenmp",
-    "-shared",
-    "-fPIC",
+    *("-std=c++17", "-O3", "-march=native", "-ffp-contract=off", "-fno-tree-slp-vectorize"),
+    *("-fno-math-errno", "-fno-trapping-math", "-fopenmp", "-shared", "-fPIC"),
 )
 #: clang's flags for WebAssembly without vectors. As the CPU's, with one thread, and small.
 SCALAR_WASM_FLAGS = (
-    "--target=wasm32-wasi",
-    "-std=c++17",
-    "-Os",
-    "-ffp-contract=off",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fopenmp-simd",
-    "-fno-exceptions",
-    "-fno-rtti",
-    "-w",
+    *("--target=wasm32-wasi", "-std=c++17", "-Os", "-ffp-contract=off", "-fno-math-errno"),
+    *("-fno-trapping-math", "-fopenmp-simd", "-fno-exceptions", "-fno-rtti", "-w"),
 )
 #: The same with vectors of 128 bits. Never relaxed ones, whose results depend on the processor.
 WASM_FLAGS = (*SCALAR_WASM_FLAGS, "-msimd128")
 #: NVRTC's flags, without the architecture. No fused multiply-adds and IEEE division, so that the
 #: GPU computes the same bits as the CPU.
 CUDA_FLAGS = (
-    "--std=c++17",
-    "--fmad=false",
-    "--prec-div=true",
-    "--prec-sqrt=true",
-    "--ftz=false",
+    *("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true", "--ftz=false"),
     "--generate-line-info",
 )
 #: NVRTC's flags where no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
@@ -73,16 +53,9 @@ class KernelLibrary:
 
     Attributes:
         constants: {name: number} from ``constants.h``, the folder's and the common one.
-        words: {struct: its pointers and numbers}, as
-            :func:`~megastep.kernels.build.headers.words` returns them.
-        packers: {struct: function of {field: value} that packs one}, as
-            :func:`~megastep.kernels.build.headers.builder` returns it.
         params: a function for each struct; ``params.RowParams(n=64, ...)`` packs one that is a
             field of another.
-        cpu_operations: {operation: struct} for the CPU.
-        cuda_operations: {operation: struct} for the GPU.
-        early_operations: those that a GPU may start before the previous kernel has ended: their
-            first statement is ``wait_for_previous();`` of ``common/dependent_launch.h``.
+        cpu_operations, cuda_operations: {operation: struct} for the CPU and the GPU.
     """
 
     def __init__(
@@ -102,18 +75,19 @@ class KernelLibrary:
 
     @cached_property
     def words(self) -> dict[str, list[headers.Word]]:
+        """{struct: its pointers and numbers}."""
         return headers.words(self.sources(".h"))
 
     @cached_property
     def packers(self) -> dict[str, Callable[[Mapping[str, object]], bytes]]:
+        """{struct: function of {field: value} that packs one}."""
         structs = headers.struct_fields(self.sources(".h"))
         return {name: headers.builder(name, fields) for name, fields in structs.items()}
 
     @cached_property
     def params(self) -> SimpleNamespace:
-        return SimpleNamespace(
-            **{name: partial(_pack, packer) for name, packer in self.packers.items()}
-        )
+        packed = {name: partial(_pack, packer) for name, packer in self.packers.items()}
+        return SimpleNamespace(**packed)
 
     @cached_property
     def cpu_operations(self) -> dict[str, str]:
@@ -125,6 +99,7 @@ class KernelLibrary:
 
     @cached_property
     def early_operations(self) -> frozenset[str]:
+        """Those that a GPU may start before the previous kernel has ended."""
         return headers.early_operations(self.sources(".h", ".cu"))
 
     def sources(self, *suffixes: str) -> dict[str, str]:

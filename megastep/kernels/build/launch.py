@@ -30,18 +30,12 @@ _n_without_early_starts = 0
 
 
 class Blocks(NamedTuple):
-    """The blocks of a launch on a GPU.
+    """The blocks of a launch on a GPU."""
 
-    Attributes:
-        x, y: number of blocks along each axis.
-        threads: of a block.
-        shared: dynamic shared memory of a block, in bytes.
-    """
-
-    x: int
+    x: int  # number of blocks along each axis
     y: int = 1
-    threads: int = BLOCK
-    shared: int = 0
+    threads: int = BLOCK  # of a block
+    shared: int = 0  # dynamic shared memory of a block, in bytes
 
 
 def launch(
@@ -150,11 +144,8 @@ def _can_start_early(index: int) -> bool:
 def _config(blocks: tuple[int, int, int, int], stream: int, is_early: bool) -> object:
     """Returns what a launch needs beside its kernel and struct.
 
-    Args:
-        blocks: as `Blocks`.
-        is_early: whether the kernel may start before the one before it has ended. Only for a
-            kernel that waits for that one: nothing else would keep the two apart. If something
-            else comes before, such as a copy, an event or a graph, the kernel starts after it.
+    If it ``is_early``, it may start before the kernel before it has ended, for which it must wait
+    itself. After a copy, an event or a graph, it starts when that has ended.
     """
     driver, _ = bindings()
     config = driver.CUlaunchConfig()
