@@ -1,10 +1,8 @@
 """Core: scenery, agents and camera settings in one object."""
 
 import copy
-import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -23,12 +21,6 @@ if TYPE_CHECKING:
     from megastep.plotting import Area
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]
-
-
-#: What moves of agents.
-STATE = "positions", "angles", "velocity", "angvelocity"
-#: The copies that `Core.alone` returns, outside of the cores, whose state is saved.
-_ALONE: "WeakKeyDictionary[Core, Core]" = WeakKeyDictionary()
 
 
 class Core:
@@ -60,15 +52,8 @@ class Core:
         self.scenery = checks.instance("scenery", scenery, engine.Scenery)
         self.seed = checks.integer("seed", seed, 0)
         self.n_envs, self.n_agents, self.device = scenery.n_envs, scenery.n_agents, scenery.device
-        self.agents = engine.Agents(
-            self.n_envs,
-            self.n_agents,
-            res=res,
-            fov=fov,
-            fps=fps,
-            cameras=cameras,
-            device=self.device,
-        )
+        size = self.n_envs, self.n_agents
+        self.agents = engine.Agents(*size, res, fov, fps, cameras, device=self.device)
         self.res, self.fov, self.fps = self.agents.res, self.agents.fov, self.agents.fps
 
     def agent_full(self, value: float) -> torch.Tensor:
@@ -81,45 +66,26 @@ class Core:
 
     def alone(self, e: int) -> "Core":
         """Returns a copy of environment ``e`` as the only one of a core, whose layouts are shared
-        with this one. The next call changes it. Takes the same time however many environments there
-        are.
+        with this one. Takes the same time however many environments there are.
         """
-        one = _ALONE.get(self)
-        if one is None or (one.scenery.objects is None) != (self.scenery.objects is None):
-            one = _ALONE[self] = self._one()
-        pairs = [(one.agents, self.agents, STATE), (one.scenery, self.scenery, ("layout",))]
-        if self.scenery.objects is not None:
-            of_objects = "records", "lines", "texels"
-            pairs.append((one.scenery.objects, self.scenery.objects, of_objects))
-        for own, shared, names in pairs:
-            for name in names:
-                getattr(own, name).copy_(getattr(shared, name)[[e]])
-        return one
-
-    def _one(self) -> "Core":
         shared = self.scenery
-        widths = shared.model_texels.tolist()
-        scenery = engine.Scenery.of_layouts(
-            self.n_agents,
-            shared.layouts,
-            shared.model,
-            [end - start for start, end in itertools.pairwise(widths)],
-            shared.layout[:1],
-        )
+        widths, layout = shared.model_texels.diff(), shared.layout[[e]]
+        scenery = engine.Scenery(self.n_agents, shared.layouts, shared.model, widths, layout)
         if shared.objects is not None:
             objects = copy.copy(shared.objects)
-            names = "records", "lines", "texels"
-            own = {name: getattr(objects, name)[:1].clone() for name in names}
+            own = {name: getattr(objects, name)[[e]] for name in ("records", "lines", "texels")}
             vars(objects).update(own, n_envs=1)
             scenery.objects = objects
-        return Core(scenery, self.res, self.fov, self.fps, self.agents.yaws.tolist(), self.seed)
+        yaws = self.agents.yaws.tolist()
+        one = Core(scenery, self.res, self.fov, self.fps, yaws, self.seed)
+        for name in ("positions", "angles", "velocity", "angvelocity"):
+            getattr(one.agents, name).copy_(getattr(self.agents, name)[[e]])
+        return one
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`: walls and their lit texels, lights,
-        agents' poses and how far their cameras see, objects.
-
-        A film adds ``trail``, (T, A, 2), and ``views``, (T, A, C, R + 1, 2), where agents were in
-        this episode and what they saw; see :func:`megastep.recording.film`.
+        agents' poses and how far their cameras see, objects. A film adds ``trail``, (T, A, 2), and
+        ``views``, (T, A, C, R + 1, 2); see :func:`megastep.recording.film`.
         """
         core = self.alone(e)
         agents, scenery, objects = core.agents, core.scenery, core.scenery.objects
@@ -159,31 +125,23 @@ class Core:
         state: arrdict, ax: "Area | Axes | None" = None, seen: np.ndarray | None = None
     ) -> "Area | Axes":
         """Draws a numpyified :meth:`state` from above: rooms, walls, objects, agents in their
-        colours with what they see, and in films where they were.
+        colours with what they see, and in films where they were. Returns what it is drawn on.
 
         Args:
             state: from :meth:`state`, as numpy arrays.
             ax: an area of :func:`megastep.plotting.panels`, or matplotlib axes. Default: new axes.
             seen: (T,) bool, wall texels that count as seen. The others are grey, and floor that no
                 agent saw is hatched in films.
-
-        Returns:
-            What it is drawn on.
         """
         from megastep import plotting
 
         split = state.widths.cumsum()[:-1]
         trail, views = state.get("trail"), state.get("views")
-        drawn_on = plotting.plot_scenery(
-            state.lines,
-            np.split(state.texels, split),
-            state.lights,
-            None if seen is None else np.split(seen, split),
-            ax,
-            views.reshape(-1, *views.shape[-2:])
-            if seen is not None and views is not None
-            else None,
-        )
+        of_walls = None if seen is None else np.split(seen, split)
+        if views is not None:
+            views = None if seen is None else views.reshape(-1, *views.shape[-2:])
+        texels = np.split(state.texels, split)
+        drawn_on = plotting.plot_scenery(state.lines, texels, state.lights, of_walls, ax, views)
         area = plotting.Area.on(drawn_on)
         objects, names = (
             state.get("objects", arrdict(shapes=())),

@@ -59,8 +59,8 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
 
 
 def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the texels of an environment's agents, (K, 3), and the number of texels per line,
-    (A M,). Agents have different colours (16, then they repeat) and a red front.
+    """Returns the texels of an environment's agents, (K, 3), in 16 colours with a red front, and the
+    number of texels per line, (A M,).
     """
     widths = texel_widths(model)
     bodies, front = linear(AGENT_PALETTE), linear([FRONT])[0]
@@ -71,9 +71,8 @@ def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Returns the texels, (T, 3), of walls with ``widths``, (W,), texels each.
-
-    A wall has two colours in stripes of random period, phase and duty cycle.
+    """Returns the texels, (T, 3), of walls with ``widths``, (W,), texels each, in two colours: stripes
+    of random period, phase and duty cycle.
     """
     n, palette = len(widths), linear(PALETTE)
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
@@ -129,10 +128,8 @@ def _first_layouts(n_envs, n_layouts) -> torch.Tensor:
 
 
 def spread(geometries: Sequence, n_envs: int) -> list:
-    """Returns the geometries that ``n_envs`` environments start in, each once, in order.
-
-    That is all of them, or ``n_envs`` evenly spaced ones if there are more. Environments that never
-    change their layout need no others.
+    """Returns the geometries that ``n_envs`` environments start in, each once, in order: all of
+    them, or ``n_envs`` evenly spaced ones if there are more.
     """
     n_envs = checks.integer("n_envs", n_envs, 1)
     n_geometries = len(checks.items("geometries", geometries))
@@ -147,12 +144,9 @@ def scenery(
     seed: int = 1,
     device: torch.device | str | None = None,
 ) -> Scenery:
-    """Returns the baked :class:`~megastep.engine.Scenery` of ``n_envs`` environments.
-
-    Each geometry becomes a layout: a floor plan with random textures and light intensities. A
-    geometry that is listed twice becomes two layouts. Environment e of N starts with layout
-    ``e % D`` of the D geometries; with more geometries than environments, with ``e * D // N``, so
-    that environments are spread over all geometries.
+    """Returns the baked :class:`~megastep.engine.Scenery` of ``n_envs`` environments. Each geometry
+    becomes a layout: a floor plan with random textures and light intensities. Environment e of N
+    starts with layout ``e % D`` of D; with more layouts than environments, with ``e * D // N``.
 
     Args:
         geometries: floor plans.
@@ -192,22 +186,17 @@ def scenery(
         device=device,
     )
     layout = _first_layouts(n_envs, len(geometries))
-    result = Scenery.of_layouts(n_agents, layouts, model, model_widths, layout)
+    result = Scenery(n_agents, layouts, model, model_widths, layout)
     engine.bake(result)
     return result
 
 
 def display(scenery: Scenery, e: int = 0, ax: "Area | Axes | None" = None) -> "Area | Axes":
-    """Draws environment ``e`` in its lit colours, with its lights and agents.
-
-    Returns what it is drawn on.
+    """Draws environment ``e`` in its lit colours, with its lights and agents. Returns what it is
+    drawn on.
     """
     from megastep import plotting
 
     lines, colours, lights = scenery.env(e)
-    return plotting.plot_scenery(
-        lines.cpu().numpy(),
-        [texels.cpu().numpy() for texels in colours],
-        lights.cpu().numpy(),
-        ax=ax,
-    )
+    texels = [of_line.cpu().numpy() for of_line in colours]
+    return plotting.plot_scenery(lines.cpu().numpy(), texels, lights.cpu().numpy(), ax=ax)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -11,9 +10,6 @@ from megastep.engine.objects import check_objects
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
-
-if TYPE_CHECKING:
-    from megastep.engine.objects import Objects
 
 AGENT_WIDTH = 0.15  # metres, of the square that an agent is drawn as
 AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # metres, of the disc around a square of that width
@@ -95,9 +91,8 @@ _ERRORS = {ENGINE.constants[name]: message for name, message in _MESSAGES.items(
 
 
 def check(agents: Agents) -> None:
-    """Raises the error that the device flagged since the last check, if any.
-
-    Synchronises host and device, so do not call it inside a step.
+    """Raises the error that the device flagged since the last check, if any. Synchronises host and
+    device, so do not call it inside a step.
 
     Raises:
         EngineError: naming an environment with a non-finite position, angle or velocity, with an
@@ -105,15 +100,14 @@ def check(agents: Agents) -> None:
             an object, see :func:`check_objects`.
     """
     check_flag(checks.instance("agents", agents, Agents).error_flag)
-    if objects := _objects_of(agents):
-        check_objects(objects)
+    checked = vars(agents).get("_checked")  # the scenery that the agents were last in
+    if checked and checked.scenery.objects:
+        check_objects(checked.scenery.objects)
 
 
 def check_flag(error_flag: torch.Tensor) -> None:
-    """Does what :func:`check` does, for an environment without :class:`Agents`.
-
-    Args:
-        error_flag: (1,) int32, cleared by this call.
+    """Does what :func:`check` does, for an environment without :class:`Agents`, whose flag,
+    (1,) int32, it clears.
     """
     flag = error_flag.item()
     if flag:
@@ -124,18 +118,5 @@ def check_flag(error_flag: torch.Tensor) -> None:
 
 def check_on_cpu(agents: Agents) -> None:
     """Does what :func:`check` does if the agents are on the CPU, where nothing synchronises."""
-    check_flag_on_cpu(agents.error_flag)
-    if agents.error_flag.is_cpu and (objects := _objects_of(agents)):
-        check_objects(objects)
-
-
-def _objects_of(agents) -> "Objects | None":
-    """Returns the objects in the scenery that the agents were last in, or None."""
-    checked = vars(agents).get("_checked")
-    return checked and checked.scenery.objects
-
-
-def check_flag_on_cpu(error_flag: torch.Tensor) -> None:
-    """Does what :func:`check_flag` does if the flag is on the CPU, where nothing synchronises."""
-    if error_flag.is_cpu:
-        check_flag(error_flag)
+    if agents.error_flag.is_cpu:
+        check(agents)

@@ -1,7 +1,6 @@
 """Operations of one launch: light, movement, spawning, objects, random numbers. Randomness comes
-from the counter-based generator Philox 4x32-10.
-
-N environments, A agents and O objects per environment, D layouts, B lanes.
+from the counter-based generator Philox 4x32-10. N environments, A agents and O objects per
+environment, D layouts, B lanes.
 """
 
 import math
@@ -58,9 +57,7 @@ def _owners(widths, total) -> torch.Tensor:
 class Physics(NamedTuple):
     """The outcome of a step of physics."""
 
-    # (N, A): free fraction of the step; below 1, the agent hit something and its velocities are now
-    # 0
-    progress: torch.Tensor
+    progress: torch.Tensor  # (N, A): free fraction of the step; below 1, the agent hit something
 
 
 def physics(
@@ -102,10 +99,12 @@ def physics(
         else:
             actions_at = checks.address("actions", actions, lanes, torch.int64, device)
     progress = torch.empty(lanes, device=device)
-    kernel = _physics_kernel(n, device)
-    if scenery.objects is not None:
-        kernel = kernel.replace("physics", "physics_objects")
-    threads_per_env = _threads_per_env(n, device)
+    # with more registers per thread until environments are many, by what is faster on an H200
+    is_many = GROUPS[-1] * n > n_resident_threads(device)
+    kernel = "physics" if scenery.objects is None else "physics_objects"
+    kernel = kernel if is_many else f"{kernel}_unspilled"
+    room = n_resident_threads(device, UNSPILLED_BLOCKS)
+    threads_per_env = next((size for size in GROUPS if size * n <= room), GROUPS[-1])
     launch(
         *(ENGINE, kernel, device, threads_per_env * n),
         **world_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
@@ -121,19 +120,6 @@ def physics(
     )
     check_on_cpu(agents)
     return Physics(progress)
-
-
-def _physics_kernel(n_envs, device) -> str:
-    """Returns the kernel that moves agents: with more registers per thread until environments are
-    many, by what is faster on an H200.
-    """
-    n_threads = GROUPS[-1] * n_envs
-    return "physics_unspilled" if n_threads <= n_resident_threads(device) else "physics"
-
-
-def _threads_per_env(n_envs, device) -> int:
-    room = n_resident_threads(device, UNSPILLED_BLOCKS)
-    return next((size for size in GROUPS if size * n_envs <= room), GROUPS[-1])
 
 
 def spawn(
@@ -199,17 +185,9 @@ def spawn(
 
 
 def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tensor) -> torch.Tensor:
-    """Draws four uniform numbers in [0, 1) for each masked lane.
-
-    Args:
-        counts: (B,) int32, numbers drawn so far: with the lane, the generator's counter. Advanced
-            by one where ``mask``.
-        mask: (B,) bool, lanes that draw.
-        seed: the generator's key.
-        out: (B, 4) float32, written where ``mask``.
-
-    Returns:
-        ``out``.
+    """Draws four uniform numbers in [0, 1) for each lane of ``mask``, (B,) bool, into ``out``,
+    (B, 4) float32, which it returns. ``counts``, (B,) int32, are the numbers drawn so far, advanced
+    by one where ``mask``: with the lane, the generator's counter. Its key is the seed.
     """
     n, device = checks.length("counts", counts), counts.device
     launch(

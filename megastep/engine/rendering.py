@@ -1,7 +1,6 @@
-"""Rendering: what cameras see, at full resolution or as observations for training.
-
-N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
-R rays per camera, P = R / subsample pixels.
+"""Rendering: what cameras see, at full resolution or as observations. N environments, A agents per
+environment, C cameras per agent (the axis is dropped if there is one), R rays per camera, P = R /
+subsample pixels.
 """
 
 import math
@@ -75,13 +74,12 @@ def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) ->
 
 
 def render(scenery: Scenery, agents: Agents) -> Render:
-    """Renders every camera at full resolution, for people and tests.
-
-    Also updates the agents' lines in ``scenery``. Training uses :func:`observe`, which is faster.
+    """Renders every camera at full resolution, for people and tests. Also updates the agents' lines
+    in ``scenery``. Training uses :func:`observe`, which is faster.
     """
     update_agent_geometry(scenery, agents)
     update_objects(scenery, agents)
-    device, shape = scenery.device, (*_per_camera(lanes_of(scenery, agents), agents), agents.res)
+    device, shape = scenery.device, (*_per_camera(scenery, agents), agents.res)
     out = Render(
         indices=torch.empty(shape, dtype=torch.int32, device=device),
         locations=torch.empty(shape, device=device),
@@ -122,8 +120,7 @@ def observe(
     Raises:
         TypeError, ValueError: naming the argument that does not fit.
     """
-    n, a = lanes = lanes_of(scenery, agents)
-    device = scenery.device
+    lanes, device = lanes_of(scenery, agents), scenery.device
     if agents.res % checks.integer("subsample", subsample, 1, MAX_SUBSAMPLE):
         raise ValueError(
             f"subsample must divide the {agents.res} rays of a camera, but {subsample} was given"
@@ -133,18 +130,22 @@ def observe(
     for name, value in wanted.items():
         checks.flag(name, value)
     seen_fields = {}
-    if seen is not None or clear_mask is not None:
-        seen_fields = _seen_fields(scenery, seen, clear_mask)
-    if a > 1:
+    if seen is not None:
+        address, n_words = texel_bits(scenery, "seen", seen, lanes)
+        mask = checks.optional("clear_mask", clear_mask, lanes, torch.bool, device)
+        seen_fields = dict(seen=address, n_words=n_words, clear_mask=mask)
+    elif clear_mask is not None:
+        raise ValueError("clear_mask clears seen, but seen was not given")
+    if scenery.n_agents > 1:
         update_agent_geometry(scenery, agents, lit=rgb)
-    shape, pixels = _per_camera(lanes, agents), agents.res // subsample
+    shape, pixels = _per_camera(scenery, agents), agents.res // subsample
     half, int32 = torch.float16, torch.int32
     out = Observation(
         rgb=torch.empty((*shape, 3, pixels), dtype=half, device=device) if rgb else None,
         depth=torch.empty((*shape, pixels), dtype=half, device=device) if depth else None,
         centre_line=torch.empty(shape, dtype=int32, device=device) if centre_line else None,
         agent_ray=torch.empty(shape, dtype=int32, device=device) if agent_ray else None,
-        imu=torch.empty((n, a, 3), dtype=half, device=device) if imu else None,
+        imu=torch.empty((*lanes, 3), dtype=half, device=device) if imu else None,
         newly_seen=torch.empty(lanes, dtype=int32, device=device) if seen_fields else None,
     )
     if scenery.objects is not None and scenery.objects.lit:
@@ -155,18 +156,9 @@ def observe(
     return out
 
 
-def _per_camera(lanes, agents) -> tuple[int, ...]:
+def _per_camera(scenery, agents) -> tuple[int, ...]:
+    lanes = lanes_of(scenery, agents)
     return lanes if agents.n_cameras == 1 else (*lanes, agents.n_cameras)
-
-
-def _seen_fields(scenery, seen, clear_mask) -> dict[str, int]:
-    """Returns the fields of RenderParams about the texels seen."""
-    lanes = scenery.n_envs, scenery.n_agents
-    if seen is None:
-        raise ValueError("clear_mask clears seen, but seen was not given")
-    mask = checks.optional("clear_mask", clear_mask, lanes, torch.bool, scenery.device)
-    address, n_words = texel_bits(scenery, "seen", seen, lanes)
-    return dict(seen=address, n_words=n_words, clear_mask=mask)
 
 
 def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs) -> None:

@@ -24,12 +24,10 @@ MASK32 = 2**32 - 1
 
 
 class Resets:
-    """The ``reset(seed, mask)`` of an environment, for any that begins episodes by a mask.
-
-    Remembers the world that was returned last, so that lanes that do not begin keep their rows. A
-    step costs nothing more. The state of the environment is every tensor that
-    :func:`~megastep.engine.state_tree.state_tree` finds with N or B rows; draws are counted by
-    tensors called ``counts`` or ``n_draws``.
+    """The ``reset(seed, mask)`` of an environment that begins episodes by a mask. Keeps the last
+    world, so that lanes that do not begin keep their rows. The state of the environment is every
+    tensor that :func:`~megastep.engine.state_tree.state_tree` finds with N or B rows; draws are
+    counted by tensors called ``counts`` or ``n_draws``.
 
     Args:
         lanes_last: attributes of the environment whose lanes are on the last axis.
@@ -40,22 +38,14 @@ class Resets:
         is_used: whether a mask was ever given.
     """
 
-    __slots__ = (
-        "lanes_last",
-        "draws",
-        "last",
-        "is_used",
-    )  # no __dict__, so no state: see `state_tree`
+    __slots__ = ("lanes_last", "draws", "last", "is_used")  # no __dict__, so no state
 
     def __init__(self, lanes_last: tuple[str, ...] = (), draws: Mapping[str, int] | None = None):
         self.lanes_last, self.draws, self.is_used = lanes_last, draws or {}, False
         self.last: arrdict | None = None
 
     def __reduce__(self) -> tuple:
-        return Resets, (
-            self.lanes_last,
-            self.draws,
-        )  # a copy of an environment has no last world yet
+        return Resets, (self.lanes_last, self.draws)  # a copy has no last world yet
 
     def keep(self, world: "arrdict") -> "arrdict":
         """Remembers and returns a world. Call it on what ``step`` returns."""
@@ -124,13 +114,11 @@ class Resets:
                 yield leaf, 0
 
     def _seed(self, env, seed, chosen) -> None:
+        seeds = torch.empty_like(chosen, dtype=torch.int64)
         if isinstance(seed, torch.Tensor):
-            checks.alike("seed", seed, torch.empty_like(chosen, dtype=torch.int64))
-            start = _first_draw(seed)
+            start = _first_draw(checks.alike("seed", seed, seeds))
         else:
-            start = torch.full_like(
-                chosen, _first_draw(checks.integer("seed", seed, 0, 2**63 - 1)), dtype=torch.int64
-            )
+            start = seeds.fill_(_first_draw(checks.integer("seed", seed, 0, 2**63 - 1)))
         leaves = walk(env, torch.Tensor).values()
         found = [leaf for _, step, leaf in leaves if step[1:] in COUNTERS]
         found += [getattr(env, name)[row] for name, row in self.draws.items()]

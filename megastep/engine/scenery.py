@@ -1,8 +1,8 @@
 """Scenery: what the engine renders and what agents collide with.
 
 A *layout* is a floor plan as the engine holds it: walls, their textures and baked light, and
-lights. Each environment shows one layout, so a million environments can share a few thousand homes.
-An environment itself holds only its agents' lines and the light on them.
+lights. Each environment shows one, so a million environments can share a few thousand homes, and
+holds only its agents' lines and the light on them.
 
 N environments, D layouts, A agents per environment, M lines of the agent model, K texels of one
 environment's agents, W walls and T texels of all layouts.
@@ -26,10 +26,9 @@ BOX_WALLS = ENGINE.constants["BOX_WALLS"]  # walls per bounding box
 
 
 class Layouts(SetOnce):
-    """The static part of scenery: the floor plans that environments share.
-
-    ``lines.vals``, ``textures.vals``, ``baked.vals``, ``lights.vals`` and ``agent_textures`` may be
-    written in place. Call :func:`~megastep.engine.bake` after moving walls or lights.
+    """The static part of scenery: the floor plans that environments share. ``lines.vals``,
+    ``textures.vals``, ``baked.vals``, ``lights.vals`` and ``agent_textures`` may be written in
+    place. Call :func:`~megastep.engine.bake` after moving walls or lights.
 
     Args:
         lines: Ragged (W, 2, 2) metres, the walls of each layout.
@@ -89,13 +88,9 @@ class Layouts(SetOnce):
 
     @property
     def boxes(self) -> torch.Tensor:
-        """(b, 4) bounding boxes of every 32 walls of a layout: min x, min y, max x, max y.
-        Read-only.
-        """
-        return ReadOnlyTensor(
-            self._boxes,
-            "boxes are read-only: they follow the walls, so call bake after moving them",
-        )
+        """(b, 4) bounding boxes of every 32 walls of a layout: min x, min y, max x, max y."""
+        refusal = "boxes are read-only: they follow the walls, so call bake after moving them"
+        return ReadOnlyTensor(self._boxes, refusal)
 
     def update_bounding_boxes(self) -> None:
         """Refits ``boxes`` to the walls, in place. ``bake`` calls it."""
@@ -125,23 +120,18 @@ class Layouts(SetOnce):
 
 
 class Scenery(SetOnce):
-    """The scenery of N environments with A agents each.
-
-    This constructor gives every environment a separate layout; :meth:`of_layouts` shares layouts
-    between environments. :func:`megastep.scene.scenery` makes scenery from geometries.
+    """The scenery of N environments with A agents each, which share layouts.
+    :func:`megastep.scene.scenery` makes it from geometries.
 
     Args:
         n_agents: agents per environment A.
-        lights: Ragged (l, 3), the lights of each environment: x, y, intensity.
-        lines: Ragged (L, 2, 2) metres, the lines of each environment, its agents' first.
-        textures: Ragged (T, 3), the texels of each line. An agent line must have the same number of
-            texels in every environment.
+        layouts: the floor plans. May be written in place.
         model: (M, 2, 2) metres, the lines of an agent about its origin.
-        device: where to put it. Default: the device of ``lines``.
+        model_widths: (A M,) integers, the number of texels of each agent line.
+        layout: (N,) integers, the layout that each environment shows; kept as int32, which may be
+            written in place.
 
     Attributes:
-        layouts: :class:`Layouts`, the static part. May be written in place.
-        layout: (N,) int32, the layout that each environment shows. May be written in place.
         agent_lines: (N, A M, 2, 2), written by every render.
         agent_light: (N, K), written by every render.
         objects: :class:`~megastep.engine.Objects`, or None; may be set once.
@@ -155,69 +145,13 @@ class Scenery(SetOnce):
     def __init__(
         self,
         n_agents: int,
-        lights: Ragged,
-        lines: Ragged,
-        textures: Ragged,
-        model: "ArrayLike",
-        device: torch.device | str | None = None,
-    ):
-        n_agents = checks.integer("n_agents", n_agents, 0)
-        device = None if device is None else checks.device("device", device)
-        lines = checks.ragged("lines", lines, ("L", 2, 2), device)
-        device = lines.device
-        textures = checks.ragged("textures", textures, ("T", 3), device)
-        model = checks.floats("model", model, ("M", 2, 2), device)
-        n, n_agent_lines = len(lines), n_agents * len(model)
-        _same("textures", "one subarray per line of lines", len(lines.vals), len(textures))
-        if not n or int(lines.widths.min()) < n_agent_lines:
-            fewest = int(lines.widths.min()) if n else 0
-            raise ValueError(
-                f"lines must start, in every environment, with the {n_agent_lines} lines of its "
-                f"{n_agents} agents, but one environment has only {fewest} lines"
-            )
-        within = torch.arange(len(lines.vals), device=device) - lines.starts[lines.inverse]
-        is_agent = within < n_agent_lines
-        agent_widths = textures.widths[is_agent].view(n, n_agent_lines)
-        if not bool((agent_widths == agent_widths[0]).all()):
-            raise ValueError(
-                "textures of the agents' lines must have the same widths in every environment, but "
-                "they differ"
-            )
-        is_agent_texel = is_agent[textures.inverse]
-        layouts = Layouts(
-            Ragged(lines.vals[~is_agent], lines.widths - n_agent_lines),
-            Ragged(textures.vals[~is_agent_texel], textures.widths[~is_agent]),
-            lights,
-            textures.vals[is_agent_texel].view(n, int(agent_widths[0].sum()), 3),
-            device,
-        )
-        self._set(n_agents, layouts, model, agent_widths[0], torch.arange(n))
-
-    @classmethod
-    def of_layouts(
-        cls,
-        n_agents: int,
         layouts: Layouts,
         model: "ArrayLike",
         model_widths: "ArrayLike",
         layout: "ArrayLike",
-    ) -> "Scenery":
-        """Returns scenery whose environments share layouts.
-
-        Args:
-            n_agents: agents per environment A.
-            layouts: the floor plans.
-            model: (M, 2, 2) metres, the lines of an agent about its origin.
-            model_widths: (A M,) integers, the number of texels of each agent line.
-            layout: (N,) integers, the layout that each environment shows.
-        """
+    ):
         checks.instance("layouts", layouts, Layouts)
         n_agents = checks.integer("n_agents", n_agents, 0)
-        self = cls.__new__(cls)
-        self._set(n_agents, layouts, model, model_widths, layout)
-        return self
-
-    def _set(self, n_agents, layouts, model, model_widths, layout) -> None:
         device = layouts.texels.device
         model = checks.floats("model", model, ("M", 2, 2), device)
         n_lines, n_texels = n_agents * len(model), layouts.agent_textures.shape[1]
@@ -247,9 +181,8 @@ class Scenery(SetOnce):
 
     @property
     def textures(self) -> RaggedTorch:
-        """The texels (w, 3) of each line of all environments. Read-only.
-
-        Line l of environment e has the index ``lines.starts[e] + l``.
+        """The texels (w, 3) of each line of all environments, of line l of environment e at index
+        ``lines.starts[e] + l``. Read-only.
         """
         return views.textures(self)
 
@@ -259,13 +192,9 @@ class Scenery(SetOnce):
         return views.baked(self)
 
     def env(self, e: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...], torch.Tensor]:
-        """Returns copies of one environment's lines, lit textures and lights.
-
-        Takes the same time however many environments there are.
-
-        Returns:
-            (lines (l, 2, 2), one lit texture (w, 3) per line, lights (l, 3)): agents' lines, then
-            objects', then walls.
+        """Returns copies of one environment's lines (l, 2, 2), agents' first, then objects', then
+        walls; a lit texture (w, 3) of each; and lights (l, 3). Takes the same time however many
+        environments there are.
         """
         e = checks.integer("e", e, -self.n_envs, self.n_envs - 1)
         layouts, d = self.layouts, int(self.layout[e])

@@ -1,8 +1,5 @@
-"""The state of an environment: every tensor and generator reachable from its attributes.
-
-:func:`state_tree` finds them by path, :func:`snapshot` copies them, and :func:`restore` writes such
-a copy back in place. :mod:`~megastep.capture` uses this while it records a CUDA graph, and
-checkpoints of a run hold the state (:mod:`~megastep.env_state`).
+"""The state of an environment: every tensor and generator reachable from its attributes, for CUDA
+graphs (:mod:`~megastep.capture`) and checkpoints (:mod:`~megastep.env_state`).
 """
 
 import ast
@@ -41,10 +38,8 @@ OPAQUE = (  # types whose attributes hold no state of an environment
 
 
 def children(node: object, only_state: bool = True) -> list[tuple[str, Any]]:
-    """Returns [(step of the path, child)] of a node.
-
-    With ``only_state``, an object with ``__slots__`` in place of a ``__dict__``, or of a class with
-    an attribute ``IS_STATELESS``, has none.
+    """Returns [(step of the path, child)] of a node. With ``only_state``, an object with
+    ``__slots__`` in place of a ``__dict__``, or of a class with ``IS_STATELESS``, has none.
     """
     if only_state and getattr(type(node), "IS_STATELESS", False):
         return []
@@ -68,15 +63,8 @@ def walk(
     root: object, types: type | tuple[type, ...], only_state: bool = True
 ) -> dict[str, tuple[Any, str, Any]]:
     """Returns {path: (parent, step, leaf)} of the leaves reachable from ``root`` that are of one of
-    these types.
-
-    Paths read like attributes, ``.core.agents.positions``; ``step`` is a path's last part. An
-    object with children is visited once, by its first path.
-
-    Args:
-        root: where paths begin.
-        types: the types of leaves.
-        only_state: see :func:`children`.
+    these types. Paths read like attributes, ``.core.agents.positions``; ``step`` is a path's last
+    part. An object with children is visited once, by its first path.
     """
     leaves, visited, stack = {}, set(), [("", None, "", root)]
     while stack:
@@ -101,10 +89,8 @@ def node_at(root: object, path: str) -> Any:
 
 
 def rebind(parent: Any, step: str, leaf: Any) -> None:
-    """Replaces a node's child at a ``step`` of :func:`walk` by ``leaf``.
-
-    Raises:
-        TypeError, AttributeError: if the node does not allow it.
+    """Replaces a node's child at a ``step`` of :func:`walk` by ``leaf``. TypeError or
+    AttributeError if the node does not allow it.
     """
     if isinstance(parent, tuple):
         raise TypeError("a tensor inside a tuple was replaced")
@@ -117,10 +103,7 @@ def rebind(parent: Any, step: str, leaf: Any) -> None:
 
 
 def state_tree(env: object) -> dict[str, torch.Tensor | torch.Generator]:
-    """Returns {path: tensor or generator} of everything in ``env`` that can change.
-
-    Read-only tensors are left out.
-    """
+    """Returns {path: tensor or generator} of everything in ``env`` that is not read-only."""
     return {
         path: leaf
         for path, (_, _, leaf) in walk(env, _LEAVES).items()
@@ -148,10 +131,8 @@ def is_expanded(leaf: object) -> bool:
 
 @torch.no_grad()
 def restore(env: object, saved: State) -> None:
-    """Writes a :func:`snapshot` back, in place.
-
-    Raises:
-        ValueError: naming the first leaf that is missing or differs in shape or dtype.
+    """Writes a :func:`snapshot` back, in place. ValueError naming the first leaf that is missing or
+    differs in shape or dtype.
     """
     tree = state_tree(env)
     missing = sorted(saved.keys() - tree.keys())

@@ -41,7 +41,7 @@ def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
 
 def _visible_from(scenery, points) -> torch.Tensor:
     layouts, device = scenery.layouts, scenery.device
-    env_per_layout = Scenery.of_layouts(
+    env_per_layout = Scenery(
         scenery.n_agents,
         layouts,
         scenery.model,

@@ -17,7 +17,7 @@ from tests.helpers.texels import seen_of
 
 def core_of(envs, device, **settings):
     """A Core with these environments."""
-    core = cuda.Core(cuda.Scenery(**envs.scenery_arguments(), device=device), **settings)
+    core = cuda.Core(envs.scenery(device), **settings)
     for name in ("positions", "angles", "velocity", "angvelocity"):
         getattr(core.agents, name).copy_(getattr(envs, name))
     return core

@@ -46,7 +46,6 @@ def expected(scenery):
 def without_walls(n_agents):
     """Environments of two layouts: one has no walls, the other two walls."""
     other = random_scenery.random_environments(3, n_envs=2, n_agents=n_agents)
-    arguments = other.scenery_arguments()
     walls = Layouts(
         Ragged(torch.tensor([[[1.0, 1], [2, 1]], [[2, 1], [2, 2]]]), [0, 2]),
         Ragged(torch.rand(5, 3), [2, 3]),
@@ -55,7 +54,7 @@ def without_walls(n_agents):
         "cpu",
     )
     widths = [1] * 8 * n_agents
-    return Scenery.of_layouts(n_agents, walls, arguments["model"], widths, [0, 1, 1])
+    return Scenery(n_agents, walls, other.model, widths, [0, 1, 1])
 
 
 @pytest.mark.parametrize("name", VIEWS)
@@ -153,7 +152,7 @@ def test_bounding_boxes_are_updated_in_place(shared):
 
 def test_boxes_hold_32_walls_of_one_layout():
     other = random_scenery.random_environments(1, n_envs=3, n_walls=70)
-    layouts = Scenery(**other.scenery_arguments()).layouts
+    layouts = other.scenery().layouts
     starts = layouts.box_starts.tolist()
     for d in range(3):
         groups = layouts.lines[d].split(32)
@@ -193,41 +192,6 @@ def test_env_returns_copies(shared):
     after = [shared.layouts.lines.vals, shared.layouts.lights.vals]
     assert all(map(torch.equal, before, after))
     assert torch.equal(shared.env(-1)[0], shared.env(5)[0])
-
-
-# ---- Bad parts ----
-
-
-def parts(**changes):
-    """The arguments of a Scenery of two environments with one agent each."""
-    return random_scenery.random_environments(0, n_envs=2).scenery_arguments() | changes
-
-
-def test_agents_texture_widths_must_be_equal():
-    good = parts()
-    widths = good["textures"].widths.clone()
-    second = int(good["lines"].widths[0])
-    widths[second] += 1  # of the second environment's first agent line
-    widths[second + 1] -= 1
-    with pytest.raises(ValueError, match="textures of the agents' lines must have the same widths"):
-        Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
-
-
-def test_lines_must_start_with_the_agents():
-    good = parts()
-    with pytest.raises(ValueError, match="lines .* 1600 lines of its 200"):
-        Scenery(**parts(n_agents=200))
-    assert Scenery(**good).n_agents == 1
-
-
-def test_scenery_from_the_parts_of_another():
-    good = Scenery(**parts())
-    views = {name: getattr(good, name) for name in ("lights", "lines", "textures")}
-    other = Scenery(1, **views, model=good.model)
-    for name in VIEWS:
-        assert torch.equal(getattr(other, name).vals, getattr(good, name).vals), name
-    other.layouts.lights.vals.zero_()
-    assert good.lights.vals.any(), "memory of its own"
 
 
 # ---- Which environment starts with which layout ----

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from megastep import contract, core, engine, envs, modules, scene, toys
+from megastep import contract, core, envs, modules, scene, toys
 from megastep.arrdict import arrdict
 from megastep.envs.explorer.texel_runs import texel_runs
 from megastep.geometries import sample
@@ -91,8 +91,7 @@ def test_step_matches_twin_on_every_bit(n_agents, degenerate, device, monkeypatc
         scenery = random_scenery.random_environments(
             seed, n_agents=n_agents, degenerate=degenerate, origin=190.0 if seed % 2 else 1.0
         )
-        arguments = scenery.scenery_arguments(device)
-        c = core.Core(engine.Scenery(**arguments), res=8)
+        c = core.Core(scenery.scenery(device), res=8)
         c.agents.positions.copy_(scenery.positions)
         c.agents.angles.copy_(scenery.angles)
         c.scenery.layout.copy_(torch.tensor([1, 3, 0, 1]))

@@ -211,7 +211,7 @@ def constructors(f):
     parts = dict(lines=raggeds, textures=raggeds, lights=raggeds, device=device)
     yield Layouts, layouts, dict(parts, agent_textures=arrays)
     yield (
-        Scenery.of_layouts,
+        Scenery,
         dict(
             n_agents=A, layouts=f.layouts, model=model, model_widths=widths,
             layout=f.scenery.layout.clone(),
@@ -220,14 +220,6 @@ def constructors(f):
             n_agents=integers(0), layouts=objects, model=arrays, model_widths=ids,
             layout=lambda good: [*ids(good), ("the next", good + D)],
         ),
-    )  # fmt: skip
-    yield (
-        Scenery,
-        dict(
-            n_agents=A, lights=f.scenery.lights, lines=f.scenery.lines,
-            textures=f.scenery.textures, model=model, device=f.device,
-        ),
-        dict(parts, n_agents=integers(0), model=arrays),
     )  # fmt: skip
     yield (
         engine.Agents,

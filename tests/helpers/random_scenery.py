@@ -6,7 +6,7 @@ each), K lights, T texels.
 """
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ OCTAGON = torch.stack([CORNERS, CORNERS.roll(-1, 0)], 1)  # the original's model
 
 @dataclass(frozen=True)
 class Environments:
-    """The parts of a `Scenery` of N environments, and their agents. All float32."""
+    """The parts of N environments, and their agents. All float32."""
 
     model: torch.Tensor  # (M, 2, 2)
     lines: torch.Tensor  # (L, 2, 2), agents' lines about the origin
@@ -47,21 +47,27 @@ class Environments:
     def n_agents(self):
         return self.positions.shape[1]
 
-    def to(self, device):
-        return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
-
-    def scenery_arguments(self, device="cpu"):
-        """The keyword arguments of Scenery's documented constructor."""
+    def scenery(self, device="cpu"):
+        """Returns the Scenery, with a layout for each environment."""
+        from megastep.engine import Layouts, Scenery
         from megastep.ragged import Ragged
 
-        moved = self.to(device)
-        return dict(
-            n_agents=self.n_agents,
-            model=moved.model,
-            lights=Ragged(moved.lights, moved.light_widths),
-            lines=Ragged(moved.lines, moved.line_widths),
-            textures=Ragged(moved.textures, moved.texture_widths),
+        n_lines = self.n_agents * len(self.model)
+        of_line = torch.arange(self.n_envs).repeat_interleave(self.line_widths)
+        within = (
+            torch.arange(len(self.lines)) - (self.line_widths.cumsum(0) - self.line_widths)[of_line]
         )
+        is_agent = within < n_lines
+        is_agent_texel = is_agent.repeat_interleave(self.texture_widths)
+        widths = self.texture_widths[is_agent].view(self.n_envs, n_lines)
+        layouts = Layouts(
+            Ragged(self.lines[~is_agent], self.line_widths - n_lines),
+            Ragged(self.textures[~is_agent_texel], self.texture_widths[~is_agent]),
+            Ragged(self.lights, self.light_widths),
+            self.textures[is_agent_texel].view(self.n_envs, -1, 3),
+            device,
+        )
+        return Scenery(self.n_agents, layouts, self.model, widths[0], torch.arange(self.n_envs))
 
     def texels(self):
         """(N,): the number of texels of each environment."""

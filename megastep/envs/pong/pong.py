@@ -14,7 +14,6 @@ from megastep import engine, plotting, spaces
 from megastep.arrdict import arrdict, numpyify
 from megastep.devices import threads
 from megastep.engine import checks
-from megastep.engine.agents import check_flag_on_cpu
 from megastep.engine.launch_params import seed_params
 from megastep.envs.common import DisplayedEnv, step_outputs, world_of
 from megastep.envs.pong.tracker import LIBRARY, Tracker
@@ -146,7 +145,8 @@ class Pong(DisplayedEnv):
             tracker_speed=round(CELL * self.tracker_speed),
             n_threads=threads(),
         )
-        check_flag_on_cpu(self.error_flag)
+        if self.device.type == "cpu":
+            engine.check_flag(self.error_flag)
         obs = outputs["features"] if self.pixels is None else self.pixels
         return world_of(outputs, obs, ["points_won"])
 
