@@ -59,8 +59,8 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
 
 
 def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the texels of an environment's agents, (K, 3), in 16 colours with a red front, and the
-    number of texels per line, (A M,).
+    """Returns the texels of an environment's agents, (K, 3), in 16 colours with a red front, and
+    the number of texels per line, (A M,).
     """
     widths = texel_widths(model)
     bodies, front = linear(AGENT_PALETTE), linear([FRONT])[0]
@@ -71,8 +71,8 @@ def _agent_textures(n_agents, model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Returns the texels, (T, 3), of walls with ``widths``, (W,), texels each, in two colours: stripes
-    of random period, phase and duty cycle.
+    """Returns the texels, (T, 3), of walls with ``widths``, (W,), texels each: stripes of two
+    colours with a random period, phase and duty cycle.
     """
     n, palette = len(widths), linear(PALETTE)
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
