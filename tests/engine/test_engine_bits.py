@@ -139,15 +139,6 @@ def test_choice_of_kernel_on_an_h200(monkeypatch, n_envs, n_agents, res, subsamp
     assert rendering._kernel(scenery, res, subsample) == kernel
 
 
-def test_threads_of_an_environment_on_an_h200(monkeypatch):
-    room = {18: 132 * 18 * 64, None: 132 * 2048}
-    monkeypatch.setattr(operations, "n_resident_threads", lambda device, n=None: room[n])
-    counts = 1, 4752, 4753, 9504, 9505, 1_048_576
-    assert [operations._threads_per_env(n, None) for n in counts] == [32, 32, 16, 16, 8, 8]
-    kernels = [operations._physics_kernel(n, None) for n in (1, 33_792, 33_793)]
-    assert kernels == ["physics_unspilled", "physics_unspilled", "physics"]
-
-
 @pytest.mark.cuda
 def test_cpu_and_gpu_agree_on_angles_that_no_int_holds():
     angles = torch.tensor([2.0**31, 2.0**38, -(2.0**38), 1e30, -1e30, math.inf, math.nan])

@@ -92,9 +92,6 @@ def arrays(good):
     yield "an axis more", good[None]
     yield "an axis less", good[0]
     yield "a column less", good[..., 1:]
-    yield "complex", good.to(torch.complex64)
-    yield "meta", good.to("meta")
-    yield "sparse", good.to_sparse()
     if good.numel():
         yield "NaN", good * math.nan
         yield "infinite", good + math.inf
@@ -107,7 +104,6 @@ def raggeds(good):
     yield "a column less", Ragged(good.vals[..., 1:], good.widths)
     yield "NaN", Ragged(good.vals * math.nan, good.widths)
     yield "a subarray less", good[1:]
-    yield "complex", Ragged(good.vals.to(torch.complex64), good.widths)
 
 
 def integers(min, max=None):
