@@ -13,10 +13,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from megastep.envs.deathmatch.deathmatch_step import LIBRARY as DEATHMATCH
 
 from megastep.agents.networks.fused import LIBRARY
 from megastep.agents.storage.copies import LIBRARY as COPIES
+from megastep.envs.deathmatch.bot import LIBRARY as DEATHMATCH
 from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
 from megastep.envs.keys.keys import LIBRARY as KEYS
 from megastep.envs.memory.memory import LIBRARY as MEMORY

@@ -5,7 +5,6 @@ import re
 import subprocess
 
 import pytest
-from megastep.envs.deathmatch.deathmatch_step import LIBRARY as DEATHMATCH
 
 from megastep.agents.algorithms.kernels import LIBRARY as ALGORITHMS
 from megastep.agents.networks.fused import LIBRARY
@@ -14,6 +13,7 @@ from megastep.agents.networks.mingru_step import LIBRARY as ACTING
 from megastep.agents.selfplay.opponents import LIBRARY as SELFPLAY
 from megastep.agents.storage.copies import LIBRARY as COPIES
 from megastep.agents.training.episode_stats import LIBRARY as TRAINING
+from megastep.envs.deathmatch.bot import LIBRARY as DEATHMATCH
 from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
 from megastep.envs.keys.keys import LIBRARY as KEYS
 from megastep.envs.memory.memory import LIBRARY as MEMORY
