@@ -11,17 +11,11 @@ import threading
 from pathlib import Path
 from types import SimpleNamespace
 
+import check_kernels
 import pytest
 import torch
 
-from megastep.agents.networks.fused import LIBRARY
 from megastep.agents.storage.copies import LIBRARY as COPIES
-from megastep.envs.deathmatch.bot import LIBRARY as DEATHMATCH
-from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
-from megastep.envs.keys.keys import LIBRARY as KEYS
-from megastep.envs.memory.memory import LIBRARY as MEMORY
-from megastep.envs.pointgoal.pointgoal import LIBRARY as POINTGOAL
-from megastep.envs.pong.tracker import LIBRARY as PONG
 from megastep.kernels.build import compile, kernel_library, launch
 from megastep.kernels.build.launch import ENGINE
 
@@ -48,14 +42,9 @@ def run(code, cache, **env):
     return process.returncode, process.stdout.strip(), process.stderr
 
 
-GAMES = dict(
-    deathmatch=DEATHMATCH,
-    explorer=EXPLORER,
-    keys=KEYS,
-    memory=MEMORY,
-    pointgoal=POINTGOAL,
-    pong=PONG,
-)
+GAMES = {
+    one.folder.parent.name: one for one in check_kernels.libraries() if ENVS in one.folder.parents
+}
 libraries = pytest.mark.parametrize("kernels", [ENGINE, *GAMES.values()], ids=["engine", *GAMES])
 
 
@@ -67,31 +56,6 @@ def test_cpu_and_gpu_have_the_same_operations(kernels):
         operations.pop(variant, None)
         operations.pop(variant.replace("_", "_objects_"), None)
     assert kernels.cpu_operations == operations != {}
-
-
-@libraries
-def test_kernels_keep_file_and_line(kernels, tmp_path):
-    """The preprocessor's line markers, which error messages and ncu show, are right."""
-    files = kernels.sources(".h", ".cu")
-    source = tmp_path / "kernels.cu"
-    source.write_text(compile.joined(files))
-    command = [compile.compiler()[0], "-E", "-x", "c++", "-D__CUDACC__"]
-    command += [f"-I{kernels.folder}", f"-I{compile.KERNELS}", str(source)]
-    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    places, name, line = {}, None, 0
-    for text in output.splitlines():
-        marker = re.match(r'# (\d+) "(.*?)"', text)
-        if marker:
-            line, name = int(marker[1]), Path(marker[2]).name
-            continue
-        kernel = re.match(r'extern "C" __global__ void .*?(\w+)\(\w+Params p\)', text)
-        if kernel:
-            places[kernel[1]] = name, line
-        line += 1
-    assert places.keys() == kernels.cuda_operations.keys()
-    for operation, (name, line) in places.items():
-        text = files[name].splitlines()[line - 1]
-        assert text.startswith(("KERNEL", "EACH")) and operation in text
 
 
 @pytest.mark.cuda
@@ -120,12 +84,6 @@ def nvrtc(files, flags=kernel_library.CUDA_FLAGS):
         if "NVRTC could not build" in str(error):
             raise
         pytest.skip(f"needs NVRTC: {error}")
-
-
-@pytest.mark.parametrize("kernels", [LIBRARY, *GAMES.values()], ids=["cores", *GAMES])
-def test_nvrtc_builds_every_program(kernels):
-    cubin = nvrtc(kernels.sources(".h", ".cu"), kernels.cuda_flags)
-    assert all(operation.encode() in cubin for operation in kernels.cuda_operations)
 
 
 def test_nvrtc_reports_file_and_line():
@@ -225,34 +183,6 @@ def test_gpu_reciprocal_rounds_as_division_does(exponent):
     )
     compile.check_status(status, "Launching")
     assert torch.equal(reciprocals.cpu(), 1 / values)
-
-
-def test_a_thread_without_a_context_gets_the_gpus_and_launches_again(monkeypatch):
-    calls, current = [], []
-
-    def launched(*call):
-        calls.append(call)
-        return (0 if current else launch.INVALID_CONTEXT,)
-
-    driver = SimpleNamespace(
-        CUlaunchConfig=SimpleNamespace,
-        cuLaunchKernelEx=launched,
-        cuDeviceGet=lambda index: (0, f"device {index}"),
-        cuDevicePrimaryCtxRetain=lambda device: (0, f"context of {device}"),
-        cuCtxSetCurrent=lambda context: current.append(context) or (0,),
-    )
-    monkeypatch.setattr(launch, "bindings", lambda: (driver, None))
-    monkeypatch.setattr(launch, "cuda", lambda library, index: {"uniform": "function"})
-    monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=7))
-    monkeypatch.setattr(launch, "_can_start_early", lambda index: False)
-    monkeypatch.setattr(launch, "_config", launch._config.__wrapped__)
-    for _ in range(2):
-        launch.launch(ENGINE, "uniform", torch.device("cuda", 1), 100, **UNIFORM)
-    assert current == ["context of device 1"] and len(calls) == 3
-    assert calls[0] == calls[1] and calls[0][1] == "function"
-    config = calls[0][0]
-    assert (config.gridDimX, config.gridDimY, config.gridDimZ, config.hStream) == (2, 1, 1, 7)
 
 
 def test_without_early_starts_no_kernel_starts_early(monkeypatch):

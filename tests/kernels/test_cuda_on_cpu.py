@@ -113,51 +113,6 @@ def test_threads_exchange_numbers(exchange, body, expected, order):
     np.testing.assert_array_equal(exchange(body, NUMBERS, order), np.ravel(expected))
 
 
-COPY = """
-extern __shared__ int shared[];
-if (lane % 4 == 0)
-    begin_copy(shared + threadIdx.x, p.before + i);
-end_group();
-wait_for_copies<0>();
-__syncwarp();
-x = shared[threadIdx.x];
-"""
-
-
-def test_threads_copy_for_each_other(exchange):
-    np.testing.assert_array_equal(exchange(COPY, NUMBERS, in_every_order=True), NUMBERS)
-
-
-PRODUCT = """
-extern __shared__ int shared[];
-unsigned short* matrix = (unsigned short*)shared;
-for (int k = lane; k < 256; k += WARP)
-    matrix[k] = bfloat16_bits((float)(k / 16 * 3 % 7 - k % 16 % 5));
-__syncwarp();
-unsigned int left[2], right[2], columns[2];  // of the rows, upper and lower eight
-load_matrices(left, right, matrix + (lane % 16) * 16 + lane / 16 * 8);
-load_transposed(columns, matrix + (lane % 16) * 16);
-unsigned int rows[4] = {left[0], left[1], right[0], right[1]};
-float sums[4] = {(float)x, 0.f, 0.f, 0.f};
-multiply_add(sums, rows, columns[0], columns[1]);
-x = (int)(sums[0] + 1000.f * sums[1] + 1e5f * sums[2] + 3e6f * sums[3]);
-"""
-
-
-def test_products_of_matrices(exchange):
-    """Thread 4 g + q holds rows g and g + 8, columns 2 q and 2 q + 1 of the product of a 16 x 16
-    matrix and its left half.
-    """
-    k = np.arange(256)
-    matrix = (k // 16 * 3 % 7 - k % 16 % 5).reshape(16, 16)
-    product, g, q = matrix @ matrix[:, :8], LANES // 4, LANES % 4
-    expected = [product[g + row, 2 * q + column] for row in (0, 8) for column in (0, 1)]
-    expected = (np.array(expected).T * [1, 1000, 100_000, 3_000_000]).sum(1)
-    zeros = np.zeros(64, np.int32)
-    result = exchange(PRODUCT, zeros, in_every_order=True)
-    np.testing.assert_allclose(result.reshape(2, 32), expected[None].repeat(2, 0), rtol=1e-6)
-
-
 CLUSTER = """
 #include "common/dependent_launch.h"
 #include "common/tensor_cores.h"

@@ -1,8 +1,6 @@
 """Kernels that may start before the previous one has ended: they wait first."""
 
-import contextlib
 import re
-from types import SimpleNamespace
 
 import check_kernels
 import pytest
@@ -85,38 +83,6 @@ def test_only_a_wait_as_the_first_statement_counts(relays, body):
     (relays.folder / "waits.cu").write_text(f"KERNEL waits(RelayParams p) {{\n    {body}\n}}\n")
     assert relays.cuda_operations.keys() == {"waits", "careless"}
     assert relays.early_operations == set()
-
-
-@pytest.mark.parametrize("can_start_early", [False, True])
-def test_only_kernels_that_wait_are_launched_early(relays, monkeypatch, can_start_early):
-    """And those only on GPUs that can."""
-    configs = {}
-    driver = SimpleNamespace(
-        CUlaunchConfig=lambda: SimpleNamespace(attrs=[], numAttrs=0),
-        CUlaunchAttribute=lambda: SimpleNamespace(value=SimpleNamespace()),
-        CUlaunchAttributeID=SimpleNamespace(
-            CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION=6
-        ),
-        cuLaunchKernelEx=lambda config, kernel, *_: configs.update({kernel: config}) or (0,),
-    )
-    monkeypatch.setattr(launch, "bindings", lambda: (driver, None))
-    monkeypatch.setattr(launch, "cuda", lambda library, index: dict(waits="w", careless="c"))
-    monkeypatch.setattr(launch, "_config", launch._config.__wrapped__)
-    monkeypatch.setattr(launch, "_can_start_early", lambda index: can_start_early)
-    monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
-    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=7))
-    for operation in ("waits", "careless"):
-        blocks = launch.Blocks(3, 2, threads=32, shared=100)
-        fields = dict(first=None, second=None, after=None, n=0, pause=0)
-        launch.launch(relays, operation, torch.device("cuda", 0), blocks, **fields)
-    for config in configs.values():
-        assert (config.gridDimX, config.gridDimY, config.gridDimZ) == (3, 2, 1)
-        assert (config.blockDimX, config.blockDimY, config.blockDimZ) == (32, 1, 1)
-        assert (config.sharedMemBytes, config.hStream) == (100, 7)
-    assert configs["c"].numAttrs == len(configs["c"].attrs) == 0
-    assert configs["w"].numAttrs == len(configs["w"].attrs) == int(can_start_early)
-    for attribute in configs["w"].attrs:
-        assert attribute.id == 6 and attribute.value.programmaticStreamSerializationAllowed == 1
 
 
 def ptx(library):

@@ -4,35 +4,13 @@ import ctypes
 import re
 import subprocess
 
+import check_kernels
 import pytest
 
-from megastep.agents.algorithms.kernels import LIBRARY as ALGORITHMS
-from megastep.agents.networks.fused import LIBRARY
-from megastep.agents.networks.lstm import CLUSTERS as SEQUENCES
-from megastep.agents.networks.mingru_step import LIBRARY as ACTING
-from megastep.agents.selfplay.opponents import LIBRARY as SELFPLAY
-from megastep.agents.storage.copies import LIBRARY as COPIES
-from megastep.agents.training.episode_stats import LIBRARY as TRAINING
-from megastep.envs.deathmatch.bot import LIBRARY as DEATHMATCH
-from megastep.envs.explorer.explorer import LIBRARY as EXPLORER
-from megastep.envs.keys.keys import LIBRARY as KEYS
-from megastep.envs.memory.memory import LIBRARY as MEMORY
-from megastep.envs.pointgoal.pointgoal import LIBRARY as POINTGOAL
-from megastep.envs.pong.tracker import LIBRARY as PONG
 from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
-GAMES = dict(
-    deathmatch=DEATHMATCH,
-    explorer=EXPLORER,
-    keys=KEYS,
-    memory=MEMORY,
-    pointgoal=POINTGOAL,
-    pong=PONG,
-)
-NETWORKS = dict(cores=LIBRARY, sequences=SEQUENCES, acting=ACTING)
-LEARNER = dict(algorithms=ALGORITHMS, copies=COPIES, selfplay=SELFPLAY, training=TRAINING)
-LIBRARIES = dict(engine=ENGINE, **NETWORKS, **LEARNER, **GAMES)
+LIBRARIES = {"/".join(one.folder.parts[-3:]): one for one in check_kernels.libraries()}
 libraries = pytest.mark.parametrize("library", LIBRARIES.values(), ids=LIBRARIES)
 
 
@@ -148,53 +126,6 @@ def test_words_are_the_scalars_of_nested_structs_in_order():
     assert arrays["numbers.2.mask"].offset == 36 and arrays["second"].offset == 40
     assert arrays["pointers.1.values"] == ("pointers.1.values", "P", 48 + 24 + 8)
     assert arrays["third"].offset == 48 + 2 * 24 and len(arrays) == 3 + 3 * 3 + 2 * 3
-
-
-CORRIDOR = """
-#include "corridor.h"
-#include "light.h"
-extern "C" int is_wall_ruled_out(float ax, float ay, float bx, float by) {
-    Pose agent = pose_at(7.f, 2.f, 0.f);
-    FacingWall wall = facing_wall({ax, ay, bx, by}, agent, 0.1f);
-    return !may_occlude(corridor_of(3.f, 2.f, agent, 0.1f), wall);
-}
-extern "C" int is_box_ruled_out(float min_x, float min_y, float max_x, float max_y) {
-    Float4 bounds = bounds_of(3.f, 2.f, pose_at(7.f, 2.f, 0.f), 0.1f);
-    return !overlap({min_x, min_y, max_x, max_y}, bounds);
-}
-extern "C" int occluded(float ax, float ay, float bx, float by, float x, float y) {
-    return occludes(occluder_of(3.f, 2.f, ax, ay, bx, by), x - 3.f, y - 2.f);
-}
-"""
-
-
-def test_no_wall_that_occludes_a_light_is_ruled_out(tmp_path):
-    """The light is 4 m from an agent whose outermost texels are 0.1 m from its centre. Walls are
-    moved just far enough not to occlude the light from any texel, then a bit further.
-    """
-    binary = compiled(tmp_path, ENGINE, CORRIDOR)
-    binary.occluded.argtypes = [ctypes.c_float] * 6
-    binary.is_wall_ruled_out.argtypes = binary.is_box_ruled_out.argtypes = [ctypes.c_float] * 4
-
-    def aside(y):  # begins just in front of a texel
-        return 6.995, 2 + y, 8, 3
-
-    def across(x):
-        return x, 1, x, 3
-
-    def is_ruled_out(ax, ay, bx, by):
-        either = {binary.is_wall_ruled_out(ax, ay, bx, by)}
-        either.add(binary.is_wall_ruled_out(bx, by, ax, ay))
-        assert len(either) == 1  # whichever end comes first
-        return either.pop()
-
-    assert binary.occluded(*aside(0.0998), 7, 2.1) and not binary.occluded(*aside(0.0999), 7, 2.1)
-    assert not is_ruled_out(*aside(0.0998)) and is_ruled_out(*aside(0.11))
-    assert not binary.is_box_ruled_out(*aside(0.0998)) and binary.is_box_ruled_out(*aside(0.11))
-    assert binary.occluded(*across(7.09), 7.1, 2) and not binary.occluded(*across(7.1), 7.1, 2)
-    assert not is_ruled_out(*across(7.09)) and is_ruled_out(*across(7.11))  # behind the agent
-    assert binary.occluded(*across(3.01), 7.1, 2) and not binary.occluded(*across(2.99), 7.1, 2)
-    assert not is_ruled_out(*across(3.01)) and is_ruled_out(*across(2.99))  # behind the light
 
 
 @libraries

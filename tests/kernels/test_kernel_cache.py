@@ -3,10 +3,7 @@ are real.
 """
 
 import contextlib
-import ctypes
-import hashlib
 import os
-import signal
 import subprocess
 import sys
 
@@ -16,16 +13,9 @@ from test_compile import ROOT, STEP, run
 from megastep import cache
 from megastep.kernels.build import compile
 from megastep.kernels.build.launch import ENGINE
-from tests.helpers.processes import HUNG, wait_until
 
 UNUSED = "the cache is not used"
 BODY = b"what was built " * 10_000
-PLANTED = """
-#include <fcntl.h>
-#include <stdlib.h>
-#include <unistd.h>
-__attribute__((constructor)) static void planted() { close(creat(getenv("MARKER"), 0600)); }
-"""
 root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
 
 
@@ -148,67 +138,7 @@ def test_folder_writable_by_others(fetch, mode, tmp_path):
         assert fetch(tmp_path) == (BODY, None, 1)
 
 
-# ---- Planted files ----
-
-
-@pytest.mark.slow
-def test_planted_library_is_never_loaded(built, tmp_path, monkeypatch):
-    """Another user left it in a shared folder, with the right name and digest. It leaves a mark if
-    loaded.
-    """
-    folder, mark, source = tmp_path / "folder", tmp_path / "mark", tmp_path / "planted.c"
-    folder.mkdir()
-    source.write_text(PLANTED)
-    library = tmp_path / "planted.so"
-    compiler, _ = compile.compiler()
-    command = [compiler, "-x", "c", "-shared", "-fPIC", str(source), "-o", str(library)]
-    subprocess.run(command, check=True)
-    body = library.read_bytes()
-    path = folder / built[0].name
-    path.write_bytes(body + hashlib.sha256(body).digest())
-    folder.chmod(0o777)
-    status, out, err = run(STEP, folder, MARKER=str(mark))
-    assert (status, out) == (0, built[1]), err
-    assert err.count(UNUSED) == 1 and not mark.exists()
-    monkeypatch.setenv("MARKER", str(mark))
-    ctypes.CDLL(str(path))
-    assert mark.exists(), "it leaves its mark if loaded"
-
-
 # ---- Signals ----
-
-
-def interrupted(folder, compiler, code):
-    """Sends Ctrl-C to a program and its children while it builds. Returns (exit status, stdout,
-    stderr).
-    """
-    mark = folder / "mark"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env={
-            **os.environ,
-            "MEGASTEP_CACHE": str(folder / "cache"),
-            "CXX": compiler,
-            "MARKER": str(mark),
-        },
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
-    wait_until(mark.exists, process)
-    os.killpg(process.pid, signal.SIGINT)
-    (folder / "mark.go").touch()
-    out, err = process.communicate(timeout=HUNG)
-    return process.returncode, out.strip(), err
-
-
-@pytest.mark.slow
-def test_ctrl_c_while_building_reaches_the_programs_handler(built, quick, tmp_path):
-    handled = "import signal; signal.signal(signal.SIGINT, lambda *args: print('noted'))"
-    status, out, err = interrupted(tmp_path, quick, handled + STEP)
-    assert (status, out.split()) == (0, ["noted", built[1]]), err
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import json
 import re
 
 import benchmark
-import figures
 import numpy as np
 import paths
 import pytest
@@ -38,40 +37,6 @@ def test_report_draws_the_same_figure_again(tmp_path):
         plots.append((tmp_path / "frames.svg").read_text())
     assert plots[0] == plots[1]
     assert "explorer, as trained, NVIDIA H200" in plots[0]
-
-
-def test_plot_has_one_point_per_size_of_the_plain_environment(tmp_path):
-    """That of a step per graph, though there are records of both."""
-    rows = [record(f"explorer, `env.step`, {n} environments", 12.5) for n in ("1,024", "4,096")]
-    other = record("explorer, `env.step`, 4,096 environments, in a rollout", 99.0)
-    plots = []
-    for rows_of in (rows, [*rows, other]):
-        figures.plot_frames_per_second(rows_of, tmp_path / "frames.svg")
-        plots.append((tmp_path / "frames.svg").read_text())
-    assert plots[0] == plots[1]
-
-
-def test_newest_record_per_machine_in_order_of_size():
-    rows = [
-        record("a, 8,192 environments", 2.0, date="2026-01-03"),
-        record("a, 8,192 environments", 1.0),
-        record("a, 1,024 environments", 3.0),
-        record("a, 1,024 environments", 4.0),
-        record("a, 1,024 environments", 5.0, on="CPU, 2 threads"),
-        record("a, 1,024 environments", 6.0, on="CPU, 16 threads"),
-    ]
-    assert [row["value"] for row in records.newest(rows)] == [4.0, 2.0, 6.0]
-
-
-def test_names_that_differ_in_counts_are_one_measurement():
-    rows = [
-        record("duels (3 won, 0 drawn, 1 lost)", 1.0),
-        record("rating of 120,198,592 samples", 2.0),
-        record("rating of 240,198,592 samples", 3.0),
-        record("duels (2 won, 1 drawn, 1 lost)", 4.0),
-        record("rating of 120,223,040 samples", 5.0),
-    ]
-    assert [row["value"] for row in records.newest(rows)] == [4.0, 5.0, 3.0]
 
 
 # ---- The two tables of headline figures ----
@@ -120,35 +85,3 @@ def test_benchmarks_states_what_the_records_say():
                 assert f"{value:.1f}" == number, (n, end)
                 checked += 1
     assert checked
-
-
-def test_learning_curves_are_mean_and_range_of_seeds(tmp_path):
-    what = "training, 10 s, seed"
-    rows = [record("training, 60 s, seed 1, median rate", 3.0, curve=[[1, 2, 3]], commit="older")]
-    rows += [record(f"{what} {seed}, return in unseen homes", 40.0 + seed) for seed in (1, 2, 3)]
-    rows += [
-        record(f"{what} {seed}, median rate", 7.0, curve=[[1, 50, seed], end])
-        for seed, end in ((seed, [10, 99, 7 * seed]) for seed in (1, 2, 3))
-    ]
-    rows = [row | dict(benchmark="train") for row in rows]
-    (run,) = figures.learning_curves(rows).values()
-    assert run["evaluated"] == [41, 42, 43] and run["seconds"][[0, -1]].tolist() == [1, 10]
-    ends = [run[key][[0, -1]].tolist() for key in ("mean", "lower", "upper")]
-    assert ends == [[2, 14], [1, 7], [3, 21]]
-    assert benchmark.main(["report", "--json", str(write_records(tmp_path, *rows))]) == 0
-    assert "3 seeds" in (tmp_path / "results.svg").read_text()
-
-
-def test_scaling_is_plotted_for_the_machine_and_commit_measured_last(tmp_path):
-    older = [
-        record(f"pong, training on {n}", 1.0, on="A", commit="xyz", benchmark="scaling")
-        for n in ("1 GPU", "2 GPUs")
-    ]
-    rows = [
-        record(f"explorer, training on {n} GPU{'s' * (n > 1)}", rate, on=on, benchmark="scaling")
-        for on, rates in (("Z", [100.0, 150.0]), ("A", [10.0, 20.0]))
-        for n, rate in enumerate(rates, 1)
-    ]
-    figures.plot_scaling(older + rows, tmp_path / "both.svg")
-    figures.plot_scaling(rows[2:], tmp_path / "last.svg")
-    assert (tmp_path / "both.svg").read_text() == (tmp_path / "last.svg").read_text()

@@ -11,11 +11,6 @@ import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
-LINES = [
-    line.split(maxsplit=1)
-    for line in (ROOT / "Dockerfile").read_text().splitlines()
-    if line and not line.startswith("#")
-]
 BLOCKS = [
     block
     for name in lock.FILES
@@ -55,46 +50,7 @@ def test_lock_fits_pyproject_and_constraints():
         assert versions and all(map(wanted.specifier.contains, versions)), wanted
 
 
-def test_lock_is_split_by_package():
-    compiled = (
-        "numpy==2.0 ; python_version < '3.11' \\\n    --hash=sha256:a\nnvidia-x==1 \\\n"
-        "    --hash=sha256:b \\\n    --hash=sha256:c\nsetuptools==3 \\\n    --hash=sha256:d\n"
-        "torch==2 \\\n    --hash=sha256:e\ntorchmetrics==1 \\\n    --hash=sha256:f\n"
-    )
-    contents = lock.split(compiled, {"numpy"})
-    names = {file: re.findall(r"^([\w-]+)==", text, re.M) for file, text in contents.items()}
-    assert names == {
-        "build.txt": ["setuptools"],
-        "torch.txt": ["nvidia-x", "torch"],
-        "test.txt": ["torchmetrics"],
-        "packages.txt": ["numpy"],
-    }
-    together = "".join(text.partition("\n")[2] for text in contents.values())
-    assert sorted(together.splitlines()) == sorted(compiled.splitlines())
-
-
 # ---- The Dockerfile ----
-
-
-def test_image_installs_packages_by_hash_and_runs_without_root():
-    names = [name for name, _ in LINES]
-    args = dict(rest.split("=", 1) for name, rest in LINES if name == "ARG")
-    for name, rest in LINES:
-        for command in re.findall(r"pip install ([^&]+)", rest) if name == "RUN" else ():
-            command = command.replace("${TORCH}", args["TORCH"])
-            assert "--require-hashes" in command or command.split()[-1] == "/tmp/megastep"
-    (user,) = (rest for name, rest in LINES if name == "USER")
-    assert user != "root"
-    assert names.index("USER") > max(i for i, n in enumerate(names) if n == "RUN")
-
-
-def test_no_layer_of_the_image_holds_source_or_packages_of_tests():
-    names = [name for name, _ in LINES]
-    assert not {"COPY", "ADD", "VOLUME"} & {*names}
-    text = (ROOT / "requirements" / "test.txt").read_text()
-    only_tests = {*re.findall(r"^([\w-]+)==", text, re.M)}
-    assert only_tests >= {*check_image.UNWANTED} and lock.OF_IMAGE not in only_tests
-    assert not any("test.txt" in rest for _, rest in LINES)
 
 
 @pytest.mark.nightly
