@@ -42,9 +42,8 @@ def run(code, cache, **env):
     return process.returncode, process.stdout.strip(), process.stderr
 
 
-GAMES = {
-    one.folder.parent.name: one for one in check_kernels.libraries() if ENVS in one.folder.parents
-}
+FOUND = check_kernels.libraries()
+GAMES = {one.folder.parent.name: one for one in FOUND if one.folder.parents[1].name == "envs"}
 libraries = pytest.mark.parametrize("kernels", [ENGINE, *GAMES.values()], ids=["engine", *GAMES])
 
 
