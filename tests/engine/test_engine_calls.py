@@ -31,42 +31,12 @@ def test_depth_two_metres_from_a_wall(device):
     assert abs(float(o.depth[0, 0, 31]) - (1 - (2 - engine.AGENT_RADIUS) / 10)) < 5e-4
 
 
-def test_max_depth(device):
-    core = box(device, res=63)
-    core.agents.positions[:, :, 0] = 4.0
-    for max_depth, expected in ((4.0, 1 - (2 - engine.AGENT_RADIUS) / 4), (1.5, 0.0)):
-        o = engine.observe(core.scenery, core.agents, max_depth=max_depth)
-        assert abs(float(o.depth[0, 0, 31]) - expected) < 5e-4
-
-
 def test_wall_of_the_tutorial(device):
     core = box(device)
     core.agents.velocity[:] = torch.tensor([1000.0, 0.0])
     p = cuda.physics(core.scenery, core.agents)
     assert torch.allclose(core.agents.positions.cpu(), torch.tensor([5.8649, 3.0]), atol=1e-3)
     assert not core.agents.velocity.any() and bool((p.progress < 1).all())
-
-
-def test_two_cores_are_independent(device):
-    narrow, wide = box(device, res=16, fov=30.0), box(device, res=64, fov=150.0, cameras=[0, 180])
-    before = cuda.render(narrow.scenery, narrow.agents)
-    assert cuda.render(wide.scenery, wide.agents).screen.shape == (2, 1, 2, 64, 3)
-    after = cuda.render(narrow.scenery, narrow.agents)
-    assert before.screen.shape == (2, 1, 16, 3) and torch.equal(before.screen, after.screen)
-
-
-def test_environments_share_layouts(device):
-    scenery = scene.scenery([toys.box(), toys.column()], n_agents=1, n_envs=6, device=device)
-    assert scenery.layout.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.layouts) == 2
-    lines, textures, baked = scenery.lines, scenery.textures, scenery.baked
-    assert len(lines) == 6 and torch.equal(lines[1], lines[3])
-    assert torch.equal(lines.vals[lines.starts[2] : lines.ends[2]], lines[2])
-    assert len(textures) == len(lines.vals) == len(baked) and torch.equal(lines[-1], lines[5])
-    wall = int(lines.starts[3]) + 8  # after the agent's eight
-    assert torch.equal(textures[wall], textures[int(lines.starts[1]) + 8])
-    assert len(baked[wall]) == len(textures[wall])
-    assert torch.equal(textures.vals[textures.inverse == wall], textures[wall])
-    assert len(lines[1:3]) == 2
 
 
 def test_uniform_matches_published_philox_vectors(device):
@@ -223,21 +193,6 @@ def test_too_many_environments_say_how_many_fit(monkeypatch):
     monkeypatch.setattr(devices, "free_memory", lambda device: 10**6)
     with pytest.raises(engine.EngineError, match="at most [0-9,]+ fit"):
         scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device="cpu")
-
-
-def test_memory_of_a_gpu_includes_what_pytorch_caches(monkeypatch):
-    """1 GB is free, and PyTorch keeps 0.2 GB that nothing uses."""
-    for name, value in (
-        ("mem_get_info", (10**9, 10**10)),
-        ("memory_reserved", 3 * 10**8),
-        ("memory_allocated", 10**8),
-    ):
-        monkeypatch.setattr(torch.cuda, name, lambda device, value=value: value)
-    sentence = (
-        "16.8 GB, but 1.1 GB of the 1.2 GB that are free on cuda may .* at most 1,140,000 fit"
-    )
-    with pytest.raises(engine.EngineError, match=sentence):
-        devices.fit(2**24, 1000, "cuda")
 
 
 # ---- On a GPU ----

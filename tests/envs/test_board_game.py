@@ -7,7 +7,6 @@ import json
 import sys
 
 import pytest
-import torch
 
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.runs import checkpoint
@@ -103,42 +102,3 @@ def test_a_board_game_is_trained_evaluated_and_recorded(folder, capsys):
 
     assert record.main(["run=run", "steps=4", "file=board.mp4", "device=cpu"]) == 0
     assert (folder / "board.mp4").stat().st_size > 500
-
-
-def test_uint8_observations_are_stored_as_uint8_and_normalised(folder):
-    import board
-
-    from megastep.agents.algorithms.ppo import PPO
-    from megastep.agents.networks.policy import Policy
-    from megastep.agents.storage.collector import Collector
-    from megastep.agents.storage.rollout import Rollout
-
-    env = board.Board(6)
-    policy = Policy(env.obs_space, env.action_space, width=8)
-    learner = PPO(policy, n_minibatches=2)
-    rollout = Rollout(6, 6, env.obs_space, env.action_space, policy.initial(6))
-    Collector(env, policy, rollout)()
-    assert rollout.obs.dtype == torch.uint8 and rollout.obs.amax(-1).eq(255).all()
-    learner.update(rollout)
-    norm, std = policy.intake.norms[0], rollout.obs[-1].float().std(correction=0)
-    assert norm.mean.item() == pytest.approx(85)
-    assert norm.scale.item() == pytest.approx(std.item())
-
-
-def test_bytes_per_env_follow_the_dtype_of_the_space(folder):
-    import board
-
-    from megastep import spaces
-    from megastep.agents.algorithms.ppo import PPO
-    from megastep.agents.networks.policy import Policy
-
-    env = board.Board(6)
-    policy = Policy(env.obs_space, env.action_space, width=8)
-    learner = PPO(policy, n_steps=15, n_minibatches=2)
-    sizes = []
-    for dtype in (torch.uint8, None, torch.float32):
-        env.obs_space = spaces.MultiImage(1, 1, 1, 3, dtype=dtype)
-        sizes.append(learner.bytes_per_env(env))
-    # 16 rows of 3 numbers, in the rollout and in a minibatch of half of it
-    n_numbers = 16 * 3 * 1.5
-    assert (sizes[1] - sizes[0], sizes[2] - sizes[0]) == (n_numbers, 3 * n_numbers)

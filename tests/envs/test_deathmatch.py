@@ -11,7 +11,7 @@ from megastep import arrdict, contract, core, engine, envs, modules, scene, toys
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine.rendering import Observation
 from megastep.geometries import sample
-from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned, sound
+from tests.helpers.deathmatch_twins import hits_of, privileged, respawned, sound
 
 RADIUS = engine.AGENT_RADIUS
 METRICS = "kills", "deaths", "damage", "accuracy"
@@ -202,37 +202,6 @@ def views_of(c, who):
     return torch.stack([((shown // 8) == a).logical_and(shown >= 0).any(-1) for a in who], -1)
 
 
-@pytest.mark.parametrize("source", ["bench", "homes"])
-def test_hidden_spawns_are_seen_by_nobody(source, device):
-    """Whichever way the others look, except where all of an agent's points are visible. Without
-    `hidden`, many are seen.
-    """
-    homes = sample(source, 16)
-    c = core.Core(scene.scenery(homes, 3, 64, device=device))
-    seen = {}
-    for hidden in (False, True):
-        spawner, seen[hidden] = modules.RandomSpawns(homes, c, hidden=hidden), []
-        spawner(c.agent_full(True))
-        for a in range(3):
-            mask = c.agent_full(False)
-            mask[:, a] = True
-            spawner(mask)
-            seen[hidden] += [(e, a) for e in views_of(c, [a])[..., 0].any(1).nonzero().flatten()]
-            for e, b in seen[hidden] if hidden else ():
-                if a == b:
-                    assert not has_hidden_point(c, spawner, int(e), a)
-    assert len(seen[False]) > 20 > len(seen[True])
-
-
-def has_hidden_point(c, spawner, e, a):
-    """True if one of agent a's points is out of sight of all other agents in environment e."""
-    d = int(c.scenery.layout[e])
-    walls = c.scenery.layouts.lines[d].cpu().numpy().astype(float)
-    points = spawner.points[d].view(c.n_agents, -1, 2)[a].cpu().numpy().astype(float)
-    eyes = np.delete(c.agents.positions[e].cpu().numpy().astype(float), a, 0)
-    return any(not any(is_visible(walls, eye, at, RADIUS) for eye in eyes) for at in points)
-
-
 # ---- The rules, by hand ----
 
 
@@ -263,14 +232,6 @@ class Ring:
         return self.env.health.tolist()
 
 
-def turned(device, first, second, **settings):
-    """A Ring whose agents looked at nobody in the last step."""
-    ring = Ring(device, (2, 2, 180), (2, 5, 180), **settings)
-    ring.step()
-    ring.place(first, second)
-    return ring
-
-
 # The first agent looks at the second, which is two metres ahead and looks away.
 AMBUSH = (2.0, 3.5, 0.0), (4.0, 3.5, 0.0)
 
@@ -286,12 +247,6 @@ def test_agent_at_the_centre_of_a_view_is_hit_each_step(device):
         assert health_obs[1] == pytest.approx([1 - 0.1 * step, 0, 1], abs=1e-3)
 
 
-def test_walls_block_hits(device):
-    west, east = (2.0, 3.5, 0.0), (5.0, 3.5, 0.0)
-    for geometry, reward in ((toys.box(), [1, -1]), (toys.column(), [0, 0])):
-        assert Ring(device, west, east, geometry=geometry).step().reward.tolist() == reward
-
-
 def test_ten_hits_kill_and_the_next_step_respawns(device):
     ring = Ring(device, *AMBUSH)
     world = ring.step(9)
@@ -305,31 +260,6 @@ def test_ten_hits_kill_and_the_next_step_respawns(device):
     assert world.reset.tolist() == [False, True] and not world.reward.any()
     assert ring.health == [1, 1] and ring.env.ages.tolist() == [11, 0]
     assert ring.env.core.agents.positions[0, 0].tolist() == [2, 3.5], "the other stays"
-
-
-def test_kill_reward_is_shared(device):
-    """Two agents look at the one between them, which has health for four hits: two steps."""
-    settings = dict(damage=0.25, hit_reward=0, wound_cost=0, kill_reward=8, death_cost=3)
-    ring = Ring(device, (3.5, 5.5, -90), (3.5, 3.5, 0), (3.5, 1.5, 90), **settings)
-    assert not ring.step().reward.any()
-    world = ring.step()
-    assert world.reward.tolist() == [4, -3, 4] and world.terminal.tolist() == [False, True, False]
-    assert ring.env.tally[:3, [0, 2]].T.tolist() == 2 * [[0.5, 0.5, 2]]
-
-
-def test_first_observation_neither_hits_nor_is_hit(device):
-    """A killed agent respawns, by hand, into the view of its killer."""
-    ring = Ring(device, *AMBUSH, damage=1)
-    assert not ring.first.reward.any() and ring.first.reset.all()
-    assert ring.step().terminal.tolist() == [False, True]
-    counts = ring.env.spawner.counts.clone()
-    spawner, ring.env.spawner = ring.env.spawner, lambda mask: ring.place(*AMBUSH)
-    world = ring.step()
-    assert world.reset.tolist() == [False, True] and not world.reward.any()
-    assert world.obs.health[:, 0].tolist() == [[1, 0, 0], [1, 0, 0]], "nobody hit, nobody hurt"
-    ring.env.spawner = spawner
-    assert ring.step().terminal.tolist() == [False, True], "but at the next step"
-    assert torch.equal(counts, ring.env.spawner.counts)
 
 
 def test_drain_and_recovery_are_per_second(device):
@@ -348,16 +278,6 @@ def test_drain_and_recovery_are_per_second(device):
     assert ring.health == pytest.approx([1, 0.72])
     ring.step(20)
     assert ring.health == [1, 1], "and never more than all"
-
-
-def test_watching_a_target_is_paid_once_and_taken_back(device):
-    settings = dict(aim_reward=1, hit_reward=0, wound_cost=0)
-    pose, other = (2, 3.5, 0), (4, 3.8, 0)
-    ring = turned(device, pose, other, **settings)
-    rewards = [ring.step().reward[0].item() for _ in range(4)]
-    assert 0.5 < rewards[0] < 0.9 and rewards[1:] == [0, 0, 0]
-    ring.place((2, 3.5, 180), other)
-    assert ring.step().reward[0].item() == -rewards[0]
 
 
 def test_search_reward_counts_newly_seen_texels(device):
@@ -381,29 +301,6 @@ def test_search_reward_counts_newly_seen_texels(device):
             n_reset + reset.sum(),
         )
     assert n_rewarded > 60 and n_reset > 12
-
-
-def test_lanes_are_truncated_independently(device):
-    ring = Ring(device, (2, 2, 180), (5, 5, 0), limit=6)
-    ring.env.ages[1] = 2
-    for step in range(1, 8):
-        world = ring.step()
-        assert world.truncated.tolist() == [step == 6, step == 4], step
-        assert world.reset.tolist() == [step == 7, step == 5]
-        ring.place((2, 2, 180), (5, 5, 0))
-
-
-def test_an_ended_agent_takes_no_action(device):
-    """In the step in which an agent respawns, its action is ignored: it still stands 4 cm ahead of
-    the other agent, which is stopped by it.
-    """
-    ring = Ring(device, (2, 3.5, 0), (2.25, 3.5, 0), damage=1)
-    ring.step()
-    assert ring.env.ended.tolist() == [False, True]
-    world = ring.step(1, 3, 3)
-    agents = ring.env.core.agents
-    assert world.reset.tolist() == [False, True] and not agents.velocity.any()
-    assert 2.03 < float(agents.positions[0, 0, 0]) < 2.04
 
 
 def test_deaths_respawn_out_of_sight(device):

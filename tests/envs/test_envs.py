@@ -357,22 +357,6 @@ def test_step_launches_few_small_operations(name, max_launches):
     assert launches.count <= max_launches
 
 
-@pytest.mark.parametrize("name", FIRST)
-def test_display_draws_the_current_state(name, monkeypatch):
-    env = make(name)
-    env.reset()
-    written, text = [], plotting.Area.text
-    monkeypatch.setattr(
-        plotting.Area,
-        "text",
-        lambda self, at, w, *a, **k: (written.append(w), text(self, at, w, *a, **k)),
-    )
-    figure = env.display(3)
-    expected = type(env).plot_state(arrdict.numpyify(env.state(3)))
-    assert (plotting.rasterise(figure) == plotting.rasterise(expected)).all()
-    assert written[0].startswith("step 0")
-
-
 def test_explorer_resamples_homes_at_resets_only(device):
     env, generator = make("explorer", device, resample=True), torch.Generator().manual_seed(1)
     env.reset()

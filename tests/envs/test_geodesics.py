@@ -207,32 +207,6 @@ def test_path_in_an_empty_room_is_straight():
     assert (distances(result.goals.astype(float), toys.box(5).walls) > RADIUS + 0.05).all()
 
 
-def test_path_around_a_wall_is_two_tangents_and_an_arc():
-    """A wall from the middle of the southern side reaches two metres into a room of 6 x 4 m."""
-    g = room(((3, 0), (3, 2)))
-    result, end, n = geodesics_of(g, 60, 40), np.array([4.0, 3.0]), 0
-    for s, t in itertools.product(range(60), range(40)):
-        a, b = result.spawns[s] - end, result.goals[t] - end
-        if a[0] * b[0] > 0 or max(a[1], b[1]) > -0.3:
-            continue  # on one side, or high enough to see each other
-        reach = [np.sqrt(p @ p - RADIUS**2) for p in (a, b)]
-        turn = math.acos(a @ b / np.hypot(*a) / np.hypot(*b))
-        upward = 2 * math.pi - turn  # round the end, not through the wall
-        arc = upward - sum(math.acos(RADIUS / np.hypot(*p)) for p in (a, b))
-        assert result.lengths[s, t] == pytest.approx(sum(reach) + RADIUS * arc, abs=1e-2)
-        n += 1
-    assert n > 100
-
-
-def test_paths_take_gaps_wider_than_the_agent():
-    """A wall across the room with a gap at its northern end."""
-    for gap_, is_open in ((0.15, False), (WIDTH - 1e-3, False), (WIDTH + 5e-3, True), (0.45, True)):
-        result = geodesics_of(room(((3, 0), (3, 4 - gap_))), 100, 16)
-        sides = {bool(x > 4) for x in np.concatenate([result.spawns, result.goals])[:, 0]}
-        assert len(sides) == (2 if is_open else 1), gap_
-        assert np.isfinite(result.lengths).all()
-
-
 def test_fields_do_not_leak_through_walls():
     """A thin wall across the room, open at one end: distances on its two sides differ by metres,
     and a body that touches it reads those of its own side.

@@ -1,7 +1,6 @@
 """PointGoal's goals: how they are drawn and observed, and the cache of shortest paths."""
 
 import math
-import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -241,29 +240,6 @@ def test_equal_geometries_share_geodesics(folder):
     box = toys.box(3)
     out = all_of([box, toys.column(), box])
     assert out[0] is out[2] and out[0] is not out[1]
-
-
-@pytest.mark.parametrize("fault", ["corrupt", "foreign"])
-def test_a_damaged_cache_is_rebuilt(fault, folder):
-    """Foreign: the intact file of another geometry, under this one's name."""
-    right = all_of([toys.box(3)])
-    (path,) = folder.glob("geodesics-*")
-    if fault == "corrupt":
-        content = bytearray(path.read_bytes())
-        content[len(content) // 2] ^= 1
-        path.write_bytes(content)
-    else:
-        all_of([toys.column()])
-        (other,) = set(folder.glob("geodesics-*")) - {path}
-        path.write_bytes(other.read_bytes())
-    with pytest.warns(UserWarning, match=f"{re.escape(str(path))} is damaged"):
-        again = all_of([toys.box(3)])
-    assert all((a == b).all() for a, b in zip(right[0], again[0]))
-
-
-def test_many_layouts_show_progress(folder, capfd):
-    all_of([toys.box(2 + 0.01 * i) for i in range(module.MIN_PROGRESS)])
-    assert "48 layouts" in capfd.readouterr().err
 
 
 def test_errors_name_the_geometry():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import contract, envs, toys
+from megastep import envs, toys
 from megastep.arrdict import arrdict
 from megastep.envs.keys.episodes import OPEN, Areas, _doors, cached_episodes, episodes
 from megastep.geometries import sample
@@ -85,12 +85,6 @@ def test_no_way_leads_around_a_door_through_areas_too_small_for_points():
     assert states[1:].tolist() == [OPEN, OPEN, N_COLOURS, OPEN, OPEN, OPEN]
 
 
-@pytest.mark.nightly
-def test_ten_thousand_episodes_can_be_solved():
-    counts = check_episodes(300, 30) + check_episodes(40, 25, density=3.0)
-    assert counts.sum() == 10_000 and counts[N_COLOURS] > 7_500
-
-
 def test_homes_without_doors_are_refused():
     words = "no doorway between two of its parts.*Keys needs homes with doors"
     with pytest.raises(ValueError, match=words):
@@ -138,10 +132,6 @@ def test_keys_open_doors_of_their_colours_and_the_goal_ends_the_episode(device):
     assert torch.equal(world.metrics.doors, n_keys.float())
     world = env.step(still(env))
     assert world.reset.all() and not world.reward.any() and not doors.open.any()
-
-
-def test_contract(device):
-    contract.rollout(make_env(device, limit=12, resample=True, privileged=True), 40)
 
 
 def test_cached_episodes_are_those_that_were_drawn(tmp_path, monkeypatch):

@@ -3,12 +3,11 @@
 import re
 from pathlib import Path
 
-import av
 import loky
 import pytest
 import torch
 
-from megastep import arrdict, capture, contract, plotting, types
+from megastep import arrdict, capture, contract, types
 from tests.helpers import pages
 from tests.helpers.in_this_process import InThisProcess
 
@@ -73,18 +72,6 @@ def test_rover_is_rewarded_for_metres_and_ends_at_walls(names):
     assert any(bool(world.terminal.any()) for world in worlds)
     assert any(bool(world.truncated.any()) for world in worlds)
     assert max(float(world.reward.max()) for world in worlds) < 0.5, "at most 4 m/s for 0.1 s"
-
-
-def test_rover_is_displayed(names):
-    env = names["Rover"](n_envs=2, device="cpu")
-    env.reset()
-    assert plotting.rasterise(env.display(1)).std() > 5
-
-
-def test_video_has_the_fps_of_rover(names):
-    with av.open(str(names["folder"] / "rover.mp4")) as container:
-        video = container.streams.video[0]
-        assert (video.frames, video.average_rate) == (20, 10)
 
 
 @pytest.mark.cuda

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import arrdict, contract, envs
+from megastep import arrdict, envs
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine import EngineError
 from tests.helpers.pong_twins import PythonPong
@@ -96,31 +96,6 @@ class Court:
         return int(self.env.games[self.FIELDS[name]]) / 256
 
 
-@pytest.mark.parametrize(
-    "below, steepness", [(0.25, -0.875), (1, -0.5), (2, 0), (3, 0.5), (3.75, 0.875)]
-)
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_return_is_steeper_further_from_the_centre(side, below, steepness, device):
-    x, vx = (1.5, -1) if side == "left" else (38.5, 1)
-    court = Court(device, self_play=True).place(x=x, y=10 + below, vx=vx, vy=0, **{side: 10})
-    world = court.step()
-    assert court.vx == -vx and court.vy == pytest.approx(steepness, abs=1 / 256)
-    assert court.x == pytest.approx(x, abs=1 / 256), "half a cell there, and half a cell back"
-    assert not world.reward.any() and not world.terminal.any()
-
-
-@pytest.mark.parametrize("below", [-1 / 256, 4])
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_a_miss_gives_the_other_side_a_point(side, below, device):
-    x, vx = (1.5, -1) if side == "left" else (38.5, 1)
-    court = Court(device, self_play=True).place(x=x, y=10 + below, vx=vx, vy=0, **{side: 10})
-    world = court.step()
-    lost, won = (0, 1) if side == "left" else (1, 0)
-    assert world.reward[won] == 1 and world.reward[lost] == -1
-    assert world.metrics.points_won[won] == 1 and world.metrics.points_won[lost] == 0
-    assert world.terminal.all() and not world.truncated.any()
-
-
 def test_game_ends_at_its_points(device):
     court, shares = Court(device, points=2, self_play=True), []
     for x, vx, rewards, ends in [
@@ -138,17 +113,6 @@ def test_game_ends_at_its_points(device):
     world = court.step(1, 2)
     assert world.reset.all() and not world.reward.any()
     assert court.left == court.right == 13 and not court.env.games[Court.SCORES].any()
-
-
-def test_truncated_at_the_limit(device):
-    env = envs.Pong(8, device=device, limit=7, points=2)
-    world = env.reset()
-    for age in range(1, 15):
-        assert not world.truncated.any()
-        world = env.step(arrdict.arrdict(actions=torch.zeros((8, 1), dtype=int, device=device)))
-        assert torch.equal(env.games[10].cpu(), torch.full((8,), age))
-    assert world.truncated.all() and not world.terminal.any(), "7 steps for each of 2 points"
-    assert (world.metrics.points_won == 0.5).all(), "no ball has crossed half the court in 14 steps"
 
 
 def test_serves_are_random(device):
@@ -178,13 +142,6 @@ def test_both_sides_observe_the_court_mirrored(pixels, device):
 
 
 # ---- Display ----
-
-
-def test_image_is_what_the_left_side_sees():
-    env = envs.Pong(5, pixels=True, self_play=True, device="cpu")
-    worlds = contract.rollout(env, 30)
-    state = arrdict.numpyify(env.state(2))
-    assert (env.image(state) == worlds[-1].obs[4, 0, 0].numpy()).all()
 
 
 def test_text_shows_the_score_and_the_court():

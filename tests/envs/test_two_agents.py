@@ -10,12 +10,9 @@ import pytest
 import torch
 
 from megastep import arrdict, capture, contract, plotting
-from megastep.agents.cli import train
-from megastep.agents.runs import checkpoint
 from tests.helpers import pages
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "new-environment.md"
-SMALL = ["learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8"]
 
 
 @pytest.fixture(scope="module")
@@ -79,56 +76,3 @@ def test_convoy_runs_as_a_cuda_graph(convoy):
         env = wrap(convoy(16, device="cuda", limit=10, scripted=True))
         runs.append(arrdict.stack(contract.rollout(env, 30)))
     assert isinstance(env._step, capture.Graph) and contract.same(*runs)
-
-
-def test_rewards_and_observations_of_a_scripted_leader_do_not_change_the_weights(
-    convoy, monkeypatch
-):
-    original = convoy._world
-
-    def altered(self, reset, driven):
-        world, leads = original(self, reset, driven), self.role == 0
-        world["reward"] = torch.where(leads & ~reset, -7.0, world.reward)
-        world.obs.rgb[leads], world.obs.imu[leads] = 0.3, 2.0
-        return world
-
-    weights = []
-    for name, method in {"original": original, "altered": altered}.items():
-        monkeypatch.setattr(convoy, "_world", method)
-        words = ["env=convoy:Convoy", "env.scripted=true", "env.limit=20", "geometry=box"]
-        words += ["env.n_envs=8", "samples=1000", "device=cpu", f"folder={name}", *SMALL]
-        assert train.main(words) == 0
-        weights.append(checkpoint.load_latest(Path(name) / "checkpoints").state["policy"])
-        rows = [json.loads(line) for line in Path(name, "metrics.jsonl").read_text().splitlines()]
-        rows = [row for row in rows if row["episode/count"]]
-        assert rows
-        assert all(row["episode/return"] == row["episode/return/follower"] >= 0 for row in rows)
-        assert not any("episode/return/leader" in row for row in rows)
-    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
-
-
-# ---- Worlds that break the contract ----
-
-ALTERED = """
-    def _world(self, reset, driven):
-        world = super()._world(reset, driven)
-        world.metrics["together"] = world.metrics.together{}
-        return world
-"""
-METRIC = "metrics.together must be torch.float32 (8,) on cpu, not torch."
-FAULTS = {
-    "column": (ALTERED.format("[:, None]"), METRIC + "float32 (8, 1)"),
-    "integers": (ALTERED.format(".int()"), METRIC + "int32 (8,)"),
-    "roles": ("    roles = ('leader',)", "one name per agent, 2 in all, not ('leader',)"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_wrong_metric_or_role_is_one_line(convoy, fault, tmp_path, capsys):
-    body, clause = FAULTS[fault]
-    code = f"import convoy\n\n\nclass Wrong(convoy.Convoy):\n{body}\n"
-    (tmp_path / f"wrong_{fault}.py").write_text(code)
-    assert train.main([f"env=wrong_{fault}:Wrong", "geometry=box", *SMALL, "device=cpu"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "Wrong breaks the contract: " in line and clause in line
-    assert not list(tmp_path.glob("runs/*/"))

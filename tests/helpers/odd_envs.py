@@ -98,9 +98,5 @@ class Float255(Odd):
         return np.full((8, 8, 3), 128.0)
 
 
-class ManyActions(Odd):
-    action_space = spaces.Discrete(3_000_000)
-
-
 for _kind in [kind for kind in vars().values() if isinstance(kind, type) and issubclass(kind, Odd)]:
     gymnasium.register(f"Odd{_kind.__name__}-v0", _kind)
