@@ -1,6 +1,4 @@
-"""The twin against outputs of the original engine and against hand calculation; comparing with it
-finds errors.
-"""
+"""The twin against outputs of the original engine."""
 
 import pytest
 import torch
@@ -11,15 +9,8 @@ torch.set_num_threads(1)
 MOVING = "walls", "positions", "angles", "velocity", "angvelocity"
 
 
-def t(*values):
-    return torch.tensor(values, dtype=torch.float64)
-
-
 def stacked(dicts, *names):
     return {k: torch.stack([d[k] for d in dicts]) for k in names or dicts[0]}
-
-
-# Golden
 
 
 def placed(w):
@@ -81,23 +72,3 @@ def golden_step(case):
 @pytest.mark.parametrize("case", random_scenery.CASES)
 def test_twin_physics_matches_the_original(case):
     compare.check_golden(case, golden_step(case)[0])
-
-
-# Rays by hand
-
-NO_LINES = torch.zeros((0, 2, 2), dtype=torch.float64)
-
-
-def raycast(lines, position=(1.0, 0.0), angle=0.0, res=3, fov=90.0):
-    """The hits of one camera at `position`: fields of shape (R,)."""
-    hits = twin.raycast(lines, t(position), twin.rays(t(angle), [0.0], res, fov))
-    return {k: v[0, 0] for k, v in hits.items()}
-
-
-# Light by hand
-
-
-# Physics by hand
-
-
-# Random environments, and comparing
