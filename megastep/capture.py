@@ -36,14 +36,20 @@ class CaptureError(RuntimeError):
 
 
 class _StateBefore:
-    """The tensors and Python scalars reachable from some objects, and the containers that hold
-    them, before a function is called.
+    """The tensors and Python scalars reachable from some objects before a function is called, and
+    what lists, deques and dicts held.
     """
 
     def __init__(self, roots) -> None:
         self.roots = dict(enumerate(roots))
-        self.tensors, self.scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
-        self.containers = [(node, _members(node)) for node in _containers(self.roots)]
+        self.leaves = self._walk()
+        self.containers = [
+            (node, dict(node) if isinstance(node, dict) else [*node])
+            for node in _containers(self.roots)
+        ]
+
+    def _walk(self) -> dict[str, tuple]:
+        return walk(self.roots, (torch.Tensor, *SCALARS))
 
     def keep_in_place(self, output=None) -> object:
         """Copies each tensor that replaced another into the old one, and puts the old one back.
@@ -52,20 +58,21 @@ class _StateBefore:
         A tensor that replaced None, or a new attribute, stays: the function writes there from now
         on. Raises CaptureError for any other change that a graph cannot repeat.
         """
-        tensors, scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
-        self._refuse_changed_scalars(tensors, scalars)
-        reachable, replaced = {id(leaf) for _, _, leaf in tensors.values()}, []
-        for path, (_, _, old) in self.tensors.items():
-            if path not in tensors:
-                if id(old) in reachable:
-                    continue
+        now, replaced = self._walk(), []
+        reachable = {id(leaf) for _, _, leaf in now.values()}
+        for path, (_, _, old) in self.leaves.items():
+            parent, step, new = now.get(path, (None, "", None))
+            if not isinstance(old, torch.Tensor):
+                if path in now:
+                    _refuse_changed(path, old, new)
+            elif isinstance(new, torch.Tensor):
+                if new is not old:
+                    replaced.append((path, parent, step, old, new))
+            elif id(old) not in reachable:
                 raise CaptureError(
                     f"{_readable(path)}, a tensor of shape {tuple(old.shape)}, was removed during "
                     f"the call: keep it, and change it in place."
                 )
-            parent, step, new = tensors[path]
-            if new is not old:
-                replaced.append((path, parent, step, old, new))
         overwritten = {_storage(old) for *_, old, _ in replaced}
 
         def kept(leaf) -> object:
@@ -79,61 +86,42 @@ class _StateBefore:
             _copy_back(path, parent, step, old, new)
         return output
 
-    def _refuse_changed_scalars(self, tensors, scalars) -> None:
-        for path, (_, _, old) in self.scalars.items():
-            new = scalars[path][2] if path in scalars else old
-            is_tensor = path in tensors and old is not None
-            both_nan = old != old and new != new
-            if is_tensor or (old != new and not both_nan):
-                raise CaptureError(
-                    f"{_readable(path)} changed from {old!r} to "
-                    f"{'a tensor' if is_tensor else repr(new)} during the call, but a CUDA graph "
-                    f"replays tensors only: make it a tensor on the device."
-                )
-
     def undo(self) -> None:
-        """Puts back every tensor and scalar that was replaced, wherever assignment works, and what
-        containers held.
-        """
+        """Puts back what was replaced, wherever assignment works."""
         for node, members in self.containers:
-            if [*map(id, _members(node))] != [*map(id, members)]:
-                with contextlib.suppress(TypeError, AttributeError):
-                    _refill(node, members)
-        for before in (self.tensors, self.scalars):
-            now = walk(self.roots, (torch.Tensor, *SCALARS))
-            for path, (parent, step, leaf) in before.items():
-                if path not in now or now[path][2] is not leaf:
-                    with contextlib.suppress(TypeError, AttributeError, KeyError, IndexError):
-                        rebind(parent, step, leaf)
+            with contextlib.suppress(TypeError, AttributeError):
+                node.clear()
+                (node.update if isinstance(node, dict) else node.extend)(members)
+        now = self._walk()
+        for path, (parent, step, leaf) in self.leaves.items():
+            if path not in now or now[path][2] is not leaf:
+                with contextlib.suppress(TypeError, AttributeError, KeyError, IndexError):
+                    rebind(parent, step, leaf)
 
 
-def _containers(root) -> Iterator[list | collections.deque | dict]:
+def _refuse_changed(path, old, new) -> None:
+    """Raises CaptureError if a scalar is another one, or no longer one."""
+    is_tensor = isinstance(new, torch.Tensor)
+    is_same = old is None if is_tensor else old == new or (old != old and new != new)
+    if not is_same:
+        raise CaptureError(
+            f"{_readable(path)} changed from {old!r} to {'a tensor' if is_tensor else repr(new)} "
+            f"during the call, but a CUDA graph replays tensors only: make it a tensor on the "
+            f"device."
+        )
+
+
+def _containers(root) -> Iterator[Any]:
     """Yields every list, deque and dict that is reachable."""
     visited, stack = set(), [root]
     while stack:
         node = stack.pop()
-        if isinstance(node, (*OPAQUE, *SCALARS, torch.Tensor, torch.Generator)):
-            continue
-        if id(node) not in visited:
+        is_leaf = isinstance(node, (*OPAQUE, *SCALARS, torch.Tensor, torch.Generator))
+        if not is_leaf and id(node) not in visited:
             visited.add(id(node))
             if isinstance(node, (list, collections.deque, dict)):
                 yield node
             stack += [child for _, child in children(node)]
-
-
-def _members(container) -> list:
-    """Returns what a container holds: its items, or keys and values in turn."""
-    if isinstance(container, dict):
-        return [part for pair in dict.items(container) for part in pair]
-    return [*container]
-
-
-def _refill(container, members) -> None:
-    container.clear()
-    if isinstance(container, dict):
-        container.update(zip(members[::2], members[1::2]))
-    else:
-        container.extend(members)
 
 
 def _storage(tensor) -> tuple[torch.device, int]:
@@ -174,11 +162,9 @@ def _renew_generators(roots) -> None:
 
 
 def end_failed_recording() -> None:
-    """Makes PyTorch's default generator of the current GPU usable again after a recording failed.
-
-    Every recording registers it, and one that fails leaves it marked as being captured, so that
-    drawing from it raises. The next recording that succeeds removes the mark; this makes one, if
-    the GPU still works.
+    """Makes PyTorch's default generator of the current GPU usable again after a recording failed,
+    which leaves it marked as being captured, so that drawing from it raises. The next recording
+    that succeeds removes the mark; this makes one, if the GPU still works.
     """
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
     with contextlib.suppress(RuntimeError):  # the error of the failed recording is the one to raise

@@ -91,8 +91,6 @@ class Env(Protocol):
         coefficients: a tuple of `megastep.coefficients.Coefficients`, such as weights of rewards,
             which training has follow their schedules. Default: none.
         close(): ends what it started, such as processes. Called after training. Default: none.
-        pop_restarts(): returns how many environments were made anew after an error since the last
-            call, which reports have as ``episode/restarts``. Default: None, none ever is.
         wrapper_state(), load_wrapper_state(state, is_frozen): what wrappers around the environments
             have learnt, such as running statistics, as tensors and numbers by name. It belongs to
             the policy: evaluations give it to their environments and freeze it, and `init` gives
@@ -133,7 +131,6 @@ DEFAULTS: dict[str, Any] = {
     "coefficients": (),
     "resumable": True,
     "close": lambda: None,
-    "pop_restarts": lambda: None,
     "wrapper_state": dict,
     "load_wrapper_state": None,
     "max_episode_steps": 100_000,

@@ -11,6 +11,7 @@ import torch
 
 from megastep import envs, toys
 from megastep.env_state import EnvState
+from megastep.host_state import HostState
 
 
 class Colour(enum.Enum):
@@ -64,7 +65,7 @@ class Env:
         self.pair = torch.full((2,), float(self.n))  # no longer `also`
         self.later, self.later_array = torch.ones(self.n), np.arange(self.n)[::-1]
         self.later_list = [torch.full((1,), float(self.n)), np.ones(self.n)]
-        self.place_of_two, self.nested = (self.n, 1j), [*self.nested, [self.n, {self.n: "x"}]]
+        self.place_of_two, self.nested = (self.n, 1.5), [*self.nested, [self.n, {self.n: "x"}]]
         self.total += np.float64(self.n)
         self.colour, self.key = Colour.BLUE, bytes([self.n])
         self.by_name.pop("a", None)
@@ -151,14 +152,6 @@ def test_another_environment_is_refused_and_unchanged():
     assert str(facts(target)[:4]) == str(facts(Env())[:4])
 
 
-def test_object_that_became_one_of_another_class_is_refused():
-    env, target = Env(), Env()
-    env.held, target.held = Inner(), Env.__new__(Env)
-    saved = EnvState(env).state_dict()
-    with pytest.raises(ValueError, match="held was a Inner and is a Env$"):
-        EnvState(target).load_state_dict(saved)
-
-
 def test_state_that_fails_in_the_middle_is_put_back():
     """A tuple cannot take another tensor."""
     env, target = Env(), Env()
@@ -183,36 +176,6 @@ def test_state_of_another_version_is_refused_and_changes_nothing():
     with pytest.raises(ValueError, match=r"the shape of tally was \(3, 8\) and is \(4, 8\)"):
         env_state.load_state_dict(state)
     assert torch.equal(env.tally, before)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [".env.step", ".env.draw", ".env.__class__", ".env.by_name[2].__init__", ".env", ".generators"]
-    + [".env.helper", ".bot", ".env.__dict__", ".env.frames.append", ".env.__doc__", ".env.length"],
-)
-@pytest.mark.parametrize("value", [5, torch.zeros(1)])
-def test_what_is_no_state_is_never_set(path, value, monkeypatch):
-    monkeypatch.setattr(Env, "length", property(lambda env: 3), raising=False)
-    env = Env()
-    env.helper = env.draw
-    env_state, before = EnvState(env), str(facts(env))
-    saved, attributes = env_state.state_dict(), vars(env).copy()
-    saved["records"][path] = ("value", 5) if value == 5 else ("tensor", value, "cpu")
-    with pytest.raises(ValueError, match=r"is not state of the environment|it has no"):
-        env_state.load_state_dict(saved)
-    assert str(facts(env)) == before and vars(env).keys() == attributes.keys()
-    assert type(env) is Env and env.helper == env.draw and env.step() is not None
-
-
-def test_no_plain_value_of_megasteps_own_objects_is_set():
-    env = envs.Deathmatch(2, [toys.box()], device="cpu")
-    env.reset()
-    env_state = EnvState(env)
-    for name in ("step", "limit", "n_envs", "n_agents", "unheard_of"):
-        with pytest.raises(ValueError, match=f"{name} is not state"):
-            saved = env_state.state_dict()
-            saved["records"][f".env.{name}"] = "value", 5
-            env_state.load_state_dict(saved)
 
 
 def test_state_of_a_gpu_is_restored_without_one():
@@ -259,14 +222,13 @@ def test_what_is_on_a_cpu_beside_a_gpu_is_frozen_in_a_graph(what, monkeypatch):
     env = Env()
     env.device, env.long = torch.device("cuda:0"), np.zeros(1, np.longdouble)
     env.sparse = torch.eye(3).to_sparse()
-    state = EnvState(env, host_only=True)
-    before = state.host_state()
+    state = HostState(env)
     if what == "tensor":
         env.place += 1
     elif what == "generator":
         torch.rand(1, generator=env.generator)
     elif what == "default":
         torch.rand(1)
-    name = state.changed_on_host(before)
+    name = state.changed()
     of = {"tensor": "place", "generator": "generator", "default": "the global generator of torch"}
     assert name == of.get(what)

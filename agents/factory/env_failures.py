@@ -10,7 +10,7 @@ from pathlib import Path
 from megastep import engine
 from megastep.agents.errors import EnvFailed, UserError, memory_problem
 from megastep.agents.factory.settings import Env
-from megastep.hosting.env_error import BadValue, EnvError, one_line
+from megastep.hosting.env_error import EnvError, one_line
 from megastep.imports import import_object
 
 #: Has the traceback, in the run's folder.
@@ -43,9 +43,6 @@ def caught(
         if failure.trace:
             name = f"rank_{rank}_{FILE}" if rank else FILE
             text.append(f"Its traceback is in {_write(folder, name, failure.trace)}")
-        may_pass = not isinstance(failure, BadValue)
-        if getattr(env, "restart_failed", None) == 0 and may_pass and not is_sentence:
-            text.append("env.restart_failed=3 would make it anew up to 3 times")
         raise EnvFailed(". ".join(filter(None, [*text, saved()]))) from error
 
 

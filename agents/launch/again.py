@@ -36,7 +36,6 @@ RESUMABLE = (
     "dry_run",
     "logger",
     "finish",
-    "env.restart_failed",
 )
 
 

@@ -14,7 +14,7 @@ from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
 from megastep.capture import capture
 from megastep.dotdict import leaves
-from megastep.env_state import EnvState
+from megastep.host_state import HostState
 from megastep.types import Env, Tree, optional
 
 if TYPE_CHECKING:
@@ -103,11 +103,9 @@ def capture_with(
         because it changes attributes of a user's environment or policy that are not tensors. Such
         attributes are restored, so results do not depend on when a graph is recorded.
     """
-    state = EnvState(env, policies, host_only=True)
-    before = state.host_state()
-    roots = env, policies, *roots
-    captured = capture(function, args, roots, warmup, lambda: state.changed_on_host(before))
-    state.restore_host(before)
+    state = HostState(env, policies)
+    captured = capture(function, args, (env, policies, *roots), warmup, state.changed)
+    state.restore()
     return captured
 
 

@@ -114,9 +114,6 @@ class Episodes:
             stats |= self.opponents.pop_win_rates(trainer.ranks.sum)
         if trainer.curriculum is not None:
             stats |= trainer.ranks.mean(trainer.curriculum.stats())
-        if (n_restarts := optional(trainer.env, "pop_restarts")()) is not None:
-            n_restarts = torch.tensor([n_restarts], device=trainer.env.device)
-            stats["episode/restarts"] = int(trainer.ranks.sum(n_restarts))
         trainer.latest_stats |= stats
         metrics |= stats
         if stats.get("episode/window", 0) >= MIN_EPISODES:

@@ -3,17 +3,17 @@ out.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 
 from megastep import spaces
-from megastep.types import Space, Tree
+from megastep.dotdict import mapping
+from megastep.types import Env, Space, Tree
 
-__all__ = ["action_mask", "gymnasium_space", "int8", "row", "stacked", "to_numpy", "without_agents"]
-
-NUMPY = {torch.uint8: np.uint8, torch.float16: np.float16, torch.float32: np.float32}
+NUMPY: Any = {torch.float16: np.float16, torch.float32: np.float32}
 
 
 def gymnasium_space(space: Space, dtype: torch.dtype) -> gymnasium.Space:
@@ -21,7 +21,7 @@ def gymnasium_space(space: Space, dtype: torch.dtype) -> gymnasium.Space:
 
     Args:
         space: of observations or actions.
-        dtype: of observations whose space names no other than float16 and float32.
+        dtype: of observations in floats.
     """
     if isinstance(space, Mapping):
         parts = {key: gymnasium_space(part, dtype) for key, part in space.items()}
@@ -31,28 +31,20 @@ def gymnasium_space(space: Space, dtype: torch.dtype) -> gymnasium.Space:
         if not shape:
             return gymnasium.spaces.Discrete(space.n_actions)
         return gymnasium.spaces.MultiDiscrete([space.n_actions] * space.n_agents)
-    if isinstance(space, spaces.MultiContinuous):
-        low, high = (bound.expand(space.shape).reshape(shape).numpy() for bound in space.tensors())
-        return gymnasium.spaces.Box(low, high, dtype=np.float32)
-    is_bytes = space.dtype == torch.uint8
-    low, high = (bound.expand(space.shape).reshape(shape).numpy() for bound in space.bounds())
-    if is_bytes:
-        low, high = np.clip(low, 0, 255), np.clip(high, 0, 255)
-    kind = NUMPY[torch.uint8 if is_bytes else dtype]
+    is_action = isinstance(space, spaces.MultiContinuous)
+    pair = space.tensors() if is_action else space.bounds()
+    low, high = (bound.expand(space.shape).reshape(shape).numpy() for bound in pair)
+    kind = np.float32 if is_action else NUMPY[dtype]
+    if space.dtype == torch.uint8:
+        low, high, kind = np.clip(low, 0, 255), np.clip(high, 0, 255), np.uint8
     return gymnasium.spaces.Box(low.astype(kind), high.astype(kind), dtype=kind)
 
 
-def without_agents(space: Space, values: Tree, dtype: torch.dtype | None = None) -> Tree:
-    """Returns observations (B, ...) as a dict of tensors, without an axis of one agent per lane.
-
-    Args:
-        space: of the observations.
-        dtype: of those in floats; None leaves them.
-    """
+def without_agents(space: Space, values: Tree) -> Tree:
+    """Returns observations (B, ...) as a dict of tensors, without an axis of one agent per lane."""
     if isinstance(space, Mapping):
-        return {key: without_agents(part, values[key], dtype) for key, part in space.items()}
-    values = values[:, 0] if space.shape[0] == 1 else values
-    return values.to(dtype) if dtype and values.is_floating_point() else values
+        return {key: without_agents(part, values[key]) for key, part in space.items()}
+    return values[:, 0] if space.shape[0] == 1 else values
 
 
 def action_mask(space: Space, mask: Tree) -> Tree:
@@ -64,25 +56,28 @@ def action_mask(space: Space, mask: Tree) -> Tree:
     return mask[:, 0] if space.shape[0] == 1 else mask
 
 
-def to_numpy(tree: Tree) -> Tree:
+@mapping
+def as_dtype(leaf: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """Returns a tree of tensors whose floats are of a dtype."""
+    return leaf.to(dtype) if leaf.is_floating_point() else leaf
+
+
+@mapping
+def to_numpy(leaf: torch.Tensor) -> np.ndarray:
     """Returns a tree of tensors as arrays that share no memory with them."""
-    if isinstance(tree, Mapping):
-        return {key: to_numpy(part) for key, part in tree.items()}
-    return tree.detach().to("cpu", copy=True).numpy()
+    return leaf.detach().to("cpu", copy=True).numpy()
 
 
-def int8(tree: Tree) -> Tree:
+@mapping
+def int8(leaf: np.ndarray) -> np.ndarray:
     """Returns a tree of arrays as int8, as Gymnasium's spaces take masks."""
-    if isinstance(tree, Mapping):
-        return {key: int8(part) for key, part in tree.items()}
-    return tree.astype(np.int8)
+    return leaf.astype(np.int8)
 
 
-def row(tree: Tree, lane: int | np.integer) -> Tree:
+@mapping
+def row(leaf: Tree, lane: int | np.integer) -> Tree:
     """Returns one lane's values of a batch."""
-    if isinstance(tree, Mapping):
-        return {key: row(part, lane) for key, part in tree.items()}
-    return tree[lane]
+    return leaf[lane]
 
 
 def stacked(rows: Sequence[Tree]) -> Tree:
@@ -90,3 +85,13 @@ def stacked(rows: Sequence[Tree]) -> Tree:
     if isinstance(rows[0], Mapping):
         return {key: stacked([one[key] for one in rows]) for key in rows[0]}
     return np.stack(rows)
+
+
+def render_modes(env: Env, given: str | None) -> list[str]:
+    """Returns the render modes of an environment. Raises ValueError if one is given that it has
+    not.
+    """
+    modes = ["rgb_array"] if hasattr(env, "plot_state") else []
+    if given is not None and given not in modes:
+        raise ValueError(f"render_mode must be None or one of {modes}, not {given!r}")
+    return modes

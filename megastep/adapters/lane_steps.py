@@ -43,18 +43,18 @@ def _in_plain_tensors(method: Method) -> Method:
 
 
 class Copies:
-    """Copies a tree of tensors whose numbers change between the calls. On a GPU one kernel copies
-    all that fit, into memory whose views are made for several calls at once, since making a view
-    takes PyTorch as long as copying. It is kept as long as any of these copies is.
+    """Copies a tree of tensors as it is at each call. On a GPU one kernel copies all that fit, into
+    memory whose views are made for several calls at once, since making a view takes PyTorch as long
+    as copying. It is kept as long as any of these copies is.
     """
 
     def __init__(self, tree: Tree):
         leaves = _pytree.tree_leaves(tree)
         self._built = _builder(tree)
-        self._at = [i for i, leaf in enumerate(leaves) if leaf.is_cuda and _is_words(leaf)]
+        self._at = [i for i, leaf in enumerate(leaves) if _is_words(leaf)]
         self._others = [(i, leaf) for i, leaf in enumerate(leaves) if i not in self._at]
         self._leaves = [leaves[i] for i in self._at]
-        self._words = [_words(leaf) for leaf in self._leaves]
+        self._words = [leaf.view(-1).view(torch.int32) for leaf in self._leaves]
         self._blank: list[tuple[torch.Tensor, ...]] = []
 
     def __call__(self) -> Tree:
@@ -102,11 +102,7 @@ def fresh(tree: Tree) -> Tree:
 
 def _is_words(leaf) -> bool:
     is_aligned = leaf.nbytes % WORD == 0 and leaf.data_ptr() % WORD == 0
-    return leaf.is_contiguous() and leaf.itemsize <= WORD and is_aligned
-
-
-def _words(leaf) -> torch.Tensor:
-    return leaf.view(-1).view(torch.int32)
+    return leaf.is_cuda and leaf.is_contiguous() and leaf.itemsize <= WORD and is_aligned
 
 
 class Lanes:
@@ -137,14 +133,12 @@ class Lanes:
         self._resets: dict[int, Callable] = {}  # by their number of arguments
 
     @_in_plain_tensors
-    def reset(
-        self, seed: int | Sequence[int | None] | None = None, mask: torch.Tensor | None = None
-    ) -> World:
+    def reset(self, seed: int | Sequence[int | None] | None = None, mask: Tree = None) -> World:
         """Returns the first world, or with a mask the last one with new rows.
 
         Args:
             seed: of lane 0; the next has the next seed. Or one seed per lane.
-            mask: (B,) bool, lanes that begin.
+            mask: (B,) bool, a tensor or an array, lanes that begin.
 
         Raises:
             ValueError: naming what does not fit.
@@ -156,20 +150,20 @@ class Lanes:
                 f"{type(self.env).__name__} takes neither seeds nor masks: it has no "
                 "reset(seed=None, mask=None), see megastep.types.Env"
             )
-        seeds = self._seeds(seed)
+        seeds, mask = self._seeds(seed), self._mask(mask)
         if not isinstance(self._step, Graph):
             return self._reset(seed=seeds, mask=mask)
         # into the world that the graph of a step returns, by a graph too
-        mask = (
-            torch.ones(self.n_lanes, dtype=torch.bool, device=self.device) if mask is None else mask
-        )
+        if mask is None:
+            mask = torch.ones(self.n_lanes, dtype=torch.bool, device=self.device)
         arguments = (mask,) if seeds is None else (mask, seeds)
         if len(arguments) not in self._resets:
-            self._resets[len(arguments)] = capture(self._masked_reset, arguments, (self.env,))
-        return self._resets[len(arguments)](*arguments)
 
-    def _masked_reset(self, mask, seeds=None) -> World:
-        return self._reset(seed=seeds, mask=mask)
+            def masked(mask, seeds=None) -> World:
+                return self._reset(seed=seeds, mask=mask)
+
+            self._resets[len(arguments)] = capture(masked, arguments, (self.env,))
+        return self._resets[len(arguments)](*arguments)
 
     def _seeds(self, seed) -> torch.Tensor | None:
         if seed is None:
@@ -183,12 +177,9 @@ class Lanes:
             )
         return torch.as_tensor(seeds, dtype=torch.int64).to(self.device)
 
-    def mask(self, values: Tree) -> torch.Tensor:
-        """Returns a mask (B,) bool on the device, of a tensor or an array.
-
-        Raises:
-            ValueError: if it has another shape or dtype.
-        """
+    def _mask(self, values) -> torch.Tensor | None:
+        if values is None:
+            return None
         mask = torch.as_tensor(values)
         if mask.shape != (self.n_lanes,) or mask.dtype != torch.bool:
             raise ValueError(
@@ -197,9 +188,9 @@ class Lanes:
             )
         return mask.to(self.device)
 
-    def decision(self, actions: Tree) -> arrdict:
-        """Returns the decision of actions as other libraries batch them: per leaf (B, ...) of any
-        number type, without an axis of one agent per lane.
+    def _decision(self, actions) -> arrdict:
+        """Returns the decision of actions (B, ...) of any number type, without an axis of one agent
+        per lane.
         """
 
         def converted(space, values) -> torch.Tensor:
@@ -216,13 +207,13 @@ class Lanes:
         """
         if isinstance(self._step, Graph):  # which reads the decision, so inference mode may stay
             with torch.no_grad():
-                leaves = spaces.leaves(self.decision(actions))
+                leaves = spaces.leaves(self._decision(actions))
                 return self._step.with_leaves([*leaves.values()])
         return self._eager_step(actions)
 
     @_in_plain_tensors
     def _eager_step(self, actions) -> tuple[World, World, torch.Tensor]:
-        decision = self.decision(actions)
+        decision = self._decision(actions)
         if self._step is None:
             step = self._same_step if self._is_same_step else self._next_step
             self._step = capture(step, (decision,), (self.env,)) if self._on_gpu else step

@@ -10,8 +10,10 @@ import torch
 
 from megastep.adapters.gymnasium_spaces import (
     action_mask,
+    as_dtype,
     gymnasium_space,
     int8,
+    render_modes,
     row,
     stacked,
     to_numpy,
@@ -52,19 +54,13 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         roles = optional(env, "roles")
         self.possible_agents = [*(roles or (f"agent_{i}" for i in range(self.lanes.n_lanes)))]
         self.agents: list[str] = []
-        modes = ["rgb_array"] if hasattr(env, "plot_state") else []
-        if render_mode is not None and render_mode not in modes:
-            raise ValueError(f"render_mode must be None or one of {modes}, not {render_mode!r}")
-        self.render_mode = render_mode
+        self.render_mode, modes = render_mode, render_modes(env, render_mode)
         fps, name = optional(env, "fps"), type(env).__name__.lower()
         self.metadata = dict(name=f"{name}_v0", render_modes=modes, render_fps=fps)
-        self.observation_spaces = {
-            agent: gymnasium_space(env.obs_space, torch.float32) for agent in self.possible_agents
-        }
-        self.action_spaces = {
-            agent: gymnasium_space(env.action_space, torch.float32)
-            for agent in self.possible_agents
-        }
+        self.observation_spaces, self.action_spaces = (
+            {agent: gymnasium_space(space, torch.float32) for agent in self.possible_agents}
+            for space in (env.obs_space, env.action_space)
+        )
 
     def observation_space(self, agent: str) -> gymnasium.Space:
         """Returns the space of an agent's observations, the same object each time."""
@@ -109,7 +105,8 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         return observations, rewards, terminations, truncations, infos
 
     def _observations(self, world) -> dict[str, Tree]:
-        batch = to_numpy(without_agents(self.env.obs_space, world["obs"], torch.float32))
+        obs = as_dtype(without_agents(self.env.obs_space, world["obs"]), torch.float32)
+        batch = to_numpy(obs)
         return {agent: row(batch, i) for i, agent in enumerate(self.possible_agents)}
 
     def _masks(self, world) -> dict[str, dict]:

@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from megastep.adapters.gymnasium_spaces import (
     action_mask,
+    as_dtype,
     gymnasium_space,
     row,
     to_numpy,
@@ -61,7 +62,8 @@ class SB3VecEnv(VecEnv):
         )
 
     def _observations(self, world) -> Tree:
-        return to_numpy(without_agents(self.env.obs_space, world["obs"], torch.float32))
+        obs = without_agents(self.env.obs_space, world["obs"])
+        return to_numpy(as_dtype(obs, torch.float32))
 
     def _keep_masks(self, world) -> None:
         if "mask" in world:

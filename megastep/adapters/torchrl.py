@@ -10,9 +10,9 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs import EnvBase
 
 from megastep import spaces
-from megastep.adapters.gymnasium_spaces import action_mask, without_agents
+from megastep.adapters.gymnasium_spaces import action_mask, as_dtype, without_agents
 from megastep.adapters.lane_steps import Lanes, ended, fresh
-from megastep.types import Env, Tree, optional
+from megastep.types import Env, optional
 
 __all__ = ["TorchRLEnv"]
 
@@ -39,8 +39,8 @@ class TorchRLEnv(EnvBase):
         super().__init__(device=self.device_of_env, batch_size=[n])
         self.megastep, self.dtype_of_obs, self._seeds = env, dtype, None
         self._space = dict(_named(env.obs_space, "observation"))
-        if optional(env, "privileged_space") is not None:
-            self._space |= dict(privileged=optional(env, "privileged_space"))
+        if (privileged := optional(env, "privileged_space")) is not None:
+            self._space["privileged"] = privileged
         on = dict(device=self.device_of_env)
         self.observation_spec = Composite(
             {key: _spec(part, n, dtype, on) for key, part in self._space.items()}, shape=[n], **on
@@ -69,15 +69,10 @@ class TorchRLEnv(EnvBase):
         flags = dict(done=ended(world), terminated=world["terminal"], truncated=world["truncated"])
         parts = fresh(parts | flags | dict(reward=world["reward"]))
         parts = {
-            key: part[:, None] if key in (*flags, "reward") else self._as_dtype(part)
+            key: part[:, None] if key in (*flags, "reward") else as_dtype(part, self.dtype_of_obs)
             for key, part in parts.items()
         }
         return TensorDict(parts, batch_size=self.batch_size, device=self.device)
-
-    def _as_dtype(self, part) -> Tree:
-        if isinstance(part, Mapping):
-            return {key: self._as_dtype(leaf) for key, leaf in part.items()}
-        return part.to(self.dtype_of_obs) if part.is_floating_point() else part
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

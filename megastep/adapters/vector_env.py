@@ -13,8 +13,10 @@ from torch.utils import _pytree
 from megastep import envs
 from megastep.adapters.gymnasium_spaces import (
     action_mask,
+    as_dtype,
     gymnasium_space,
     int8,
+    render_modes,
     row,
     stacked,
     to_numpy,
@@ -75,9 +77,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = gymnasium_space(env.action_space, torch.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        modes = ["rgb_array"] if hasattr(env, "plot_state") else []
-        self.render_mode = _render_mode(render_mode, modes)
-        fps = optional(env, "fps")
+        modes, fps = render_modes(env, render_mode), optional(env, "fps")
+        self.render_mode = render_mode
         self.metadata = dict(autoreset_mode=mode, render_modes=modes, render_fps=fps)
         self._ended = np.zeros(self.num_envs, bool)
         self._stepped: tuple | None = None
@@ -99,13 +100,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         mask = options.pop("reset_mask", None)
         if options:
             raise ValueError(f"reset takes options['reset_mask'] alone, not {sorted(options)}")
-        if mask is not None:
-            mask = self.lanes.mask(mask)
         world = self.lanes.reset(seed, mask)
+        obs, mask_now = without_agents(self.env.obs_space, world["obs"]), self._mask(world)
         if self.to_numpy:
             self._ended = np.zeros_like(self._ended) if mask is None else to_numpy(ended(world))
-        infos = self._masks(world) if self.to_numpy else self._mask_infos(fresh(self._mask(world)))
-        return self._converted(world["obs"]), infos
+            return to_numpy(as_dtype(obs, self.dtype)), self._mask_infos(to_numpy(mask_now))
+        obs = as_dtype(fresh(obs) if self.copy else obs, self.dtype)
+        return obs, self._mask_infos(fresh(mask_now))
 
     def step(self, actions: Tree) -> tuple[Tree, Tree, Tree, Tree, dict[str, Tree]]:
         """Steps all lanes. Returns (observations, rewards, terminations, truncations, infos)."""
@@ -115,22 +116,14 @@ class VectorEnv(gymnasium.vector.VectorEnv):
                 'next by reset(options={"reset_mask": mask}) before the next step'
             )
         stepped = self.lanes.step(actions)
-        if self.to_numpy:
-            return self._as_arrays(*stepped)
-        if stepped is not self._stepped:  # on a GPU the same each time
-            self._stepped, self._parts = stepped, self._tensors(*stepped)
-            self._copies = Copies(self._parts)
-            floats = filter(torch.is_floating_point, _pytree.tree_leaves(self._parts["obs"]))
-            self._casts = any(leaf.dtype != self.dtype for leaf in floats)
-        parts = self._copies() if self.copy else self._parts
-        obs, final_obs = parts["obs"], parts.get("final_obs", {})
-        if self._casts:
-            obs, final_obs = self._as_dtype(obs), self._as_dtype(final_obs)
-        flags = parts["terminal"], parts["truncated"]
-        infos = self._infos(parts, final_obs) | self._mask_infos(parts["mask"])
-        return obs, parts["reward"], *flags, infos
+        parts = self._arrays(stepped) if self.to_numpy else self._tensors(stepped)
+        infos = {}
+        if not self.to_numpy or parts["over"].any():
+            infos = self._infos(parts["over"], parts["metrics"], parts.get("final_obs"))
+        infos |= self._mask_infos(parts["mask"])
+        return parts["obs"], *(parts[name] for name in OUTCOMES), infos
 
-    def _tensors(self, world, final, over) -> dict[str, Tree]:
+    def _parts(self, world, final, over) -> dict[str, Tree]:
         """Returns what a step returns, without copies."""
         parts: dict[str, Tree] = {name: final[name] for name in OUTCOMES}
         parts |= dict(over=over, metrics=dict(final.get("metrics", {})), mask=self._mask(world))
@@ -139,26 +132,29 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
         return parts
 
-    def _as_arrays(self, world, final, over) -> tuple[Tree, Tree, Tree, Tree, dict[str, Tree]]:
-        parts = {name: final[name] for name in OUTCOMES}
-        parts = to_numpy(parts | dict(over=over, metrics=dict(final.get("metrics", {}))))
-        is_same_step = self.mode is AutoresetMode.SAME_STEP
-        self._ended = np.zeros_like(self._ended) if is_same_step else parts["over"]
-        infos = self._numpy_infos(parts, final) if parts["over"].any() else {}
-        infos |= self._masks(world)
-        flags = parts["terminal"], parts["truncated"]
-        return self._converted(world["obs"]), parts["reward"], *flags, infos
+    def _tensors(self, stepped) -> dict[str, Tree]:
+        if stepped is not self._stepped:  # on a GPU the same each time
+            self._stepped, self._views = stepped, self._parts(*stepped)
+            self._copies = Copies(self._views)
+            floats = filter(torch.is_floating_point, _pytree.tree_leaves(self._views["obs"]))
+            self._casts = any(leaf.dtype != self.dtype for leaf in floats)
+        parts = self._copies() if self.copy else self._views
+        if not self._casts:
+            return parts
+        names = [name for name in ("obs", "final_obs") if name in parts]
+        return parts | {name: as_dtype(parts[name], self.dtype) for name in names}
 
-    def _converted(self, obs) -> Tree:
-        obs = without_agents(self.env.obs_space, obs, self.dtype if self.to_numpy else None)
-        if self.to_numpy:
-            return to_numpy(obs)
-        return self._as_dtype(fresh(obs) if self.copy else obs)
-
-    def _as_dtype(self, obs) -> Tree:
-        if isinstance(obs, Mapping):
-            return {key: self._as_dtype(part) for key, part in obs.items()}
-        return obs.to(self.dtype) if obs.is_floating_point() else obs
+    def _arrays(self, stepped) -> dict[str, Tree]:
+        parts = self._parts(*stepped)
+        last = parts.pop("final_obs", None)
+        parts = to_numpy(parts | dict(obs=as_dtype(parts["obs"], self.dtype)))
+        self._ended = parts["over"] if last is None else np.zeros_like(self._ended)
+        if last is not None and parts["over"].any():
+            last = to_numpy(as_dtype(last, self.dtype))
+            parts["final_obs"] = np.full(self.num_envs, None, dtype=object)
+            for lane in np.flatnonzero(parts["over"]):
+                parts["final_obs"][lane] = row(last, lane)
+        return parts
 
     def _mask(self, world) -> dict[str, Tree]:
         """Returns the mask of the actions that are allowed now, if the environment gives one."""
@@ -167,32 +163,21 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return {"action_mask": action_mask(self.env.action_space, world["mask"])}
 
     def _mask_infos(self, mask) -> dict[str, Tree]:
-        return mask and mask | {
-            "_action_mask": torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        }
+        """Returns a mask for infos; an array is int8, as Gymnasium's spaces sample by."""
+        if not mask:
+            return {}
+        if self.to_numpy:
+            return int8(mask) | {"_action_mask": np.ones(self.num_envs, bool)}
+        everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        return mask | {"_action_mask": everyone}
 
-    def _masks(self, world) -> dict[str, Tree]:
-        """Returns the mask as arrays, int8 as Gymnasium's spaces sample by."""
-        mask = int8(to_numpy(self._mask(world)))
-        return mask and mask | {"_action_mask": np.ones(self.num_envs, bool)}
-
-    def _infos(self, parts, final_obs) -> dict[str, Tree]:
+    def _infos(self, over, metrics, final_obs) -> dict[str, Tree]:
         """Returns Gymnasium's infos: each key with a mask of the lanes that have it."""
-        over, metrics = parts["over"], parts["metrics"]
-        own = {
-            key: part for name, value in metrics.items() for key, part in _pair(name, value, over)
-        }
+        pairs = ({name: values, f"_{name}": over} for name, values in metrics.items())
+        own = {key: part for pair in pairs for key, part in pair.items()}
         if self.mode is AutoresetMode.SAME_STEP:
             return dict(final_obs=final_obs, _final_obs=over, final_info=own, _final_info=over)
         return own
-
-    def _numpy_infos(self, parts, final) -> dict[str, Tree]:
-        final_obs = np.full(self.num_envs, None, dtype=object)
-        if self.mode is AutoresetMode.SAME_STEP:
-            last = self._converted(final["obs"])
-            for lane in np.flatnonzero(parts["over"]):
-                final_obs[lane] = row(last, lane)
-        return self._infos(parts, final_obs)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns a drawing (H, W, 3) uint8 of each environment if ``render_mode`` is
@@ -208,10 +193,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.lanes.close()
 
 
-def _pair(name, value, mask) -> tuple[tuple[str, Tree], tuple[str, Tree]]:
-    return (name, value), (f"_{name}", mask)
-
-
 def _mode(given) -> AutoresetMode:
     if isinstance(given, AutoresetMode):
         return given
@@ -220,12 +201,6 @@ def _mode(given) -> AutoresetMode:
         names = ", ".join(mode.name for mode in AutoresetMode)
         raise ValueError(f"autoreset_mode must be one of {names}, not {given!r}")
     return modes[str(given).lower()]
-
-
-def _render_mode(given, modes) -> str | None:
-    if given is not None and given not in modes:
-        raise ValueError(f"render_mode must be None or one of {modes}, not {given!r}")
-    return given
 
 
 class SingleEnv(gymnasium.Env):

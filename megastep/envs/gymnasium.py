@@ -34,7 +34,7 @@ class Gymnasium(VectorizedEnv):
 
     They step on the CPU: one after the other in this process (sync), in worker processes, one per
     core (async), or together, by the environment's own vector class (own).
-    With a learner on a GPU, observations and actions cross through pinned memory.
+    With a learner on a GPU, observations cross through pinned memory.
 
     Observation:
         Box: (B, 1, n) float32, flattened, or an image (B, 1, C, H, W), uint8 or float32, if it has
@@ -67,8 +67,6 @@ class Gymnasium(VectorizedEnv):
         vectorization: how environments are stepped: sync, one after the other in this process;
             async, divided among processes, one per core; own, the environment's own vector
             environment.
-        restart_failed: how often each environment is made anew after an error of its own. The
-            episode is then truncated. Not with own.
         seed: each environment is reset with a seed of its own, which derives from this one.
         films: renders images from the start, if it can. Some environments make their renderer in
             the constructor, and some step more slowly with it.
@@ -87,7 +85,6 @@ class Gymnasium(VectorizedEnv):
         kwargs: dict[str, Any] | None = None,
         wrappers: tuple[str, ...] = (),
         vectorization: Literal["sync", "async", "own"] = "sync",
-        restart_failed: Annotated[int, Field(ge=0, le=1_000_000)] = 0,
         seed: int = 1,
         films: bool = False,
         check: bool = True,
@@ -98,15 +95,14 @@ class Gymnasium(VectorizedEnv):
             functions = [import_object(name) for name in wrappers]
         except ValueError as error:
             raise ValueError(f"env.wrappers: {error}") from None
-        settings = dict(seed=seed, restart_failed=restart_failed, check=check)
-        with _one_sentence(id, kwargs):
-            if vectorization == "own":
-                vector = _own(spec, n_envs, kwargs, bool(wrappers), restart_failed)
-            else:
-                vector = _hosted(spec, n_envs, kwargs, functions, vectorization, films, settings)
         # one seed for each, or one for all
         seeds = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
-        seeds = seeds[0] if vectorization == "own" else seeds
+        with _one_sentence(id, kwargs):
+            if vectorization == "own":
+                seeds, vector = seeds[0], _own(spec, n_envs, kwargs, bool(wrappers))
+            else:
+                settings = dict(seed=seed, check=check)
+                vector = _hosted(spec, n_envs, kwargs, functions, vectorization, films, settings)
         super().__init__(id, vector, n_envs, 1, seeds, device, check)
 
 
@@ -138,15 +134,10 @@ def _spec(id) -> "EnvSpec":
     return gymnasium.registry[name]
 
 
-def _own(spec, n_envs, kwargs, has_wrappers, restart_failed) -> Any:
+def _own(spec, n_envs, kwargs, has_wrappers) -> Any:
     """Returns the environment's own vector environment."""
     import gymnasium
 
-    if restart_failed:
-        raise ValueError(
-            "env.restart_failed makes single environments anew, which its own vector environment "
-            "has not; use env.vectorization=sync or async"
-        )
     if has_wrappers:
         raise ValueError(
             "env.wrappers go around single environments, which its own vector environment has "
@@ -169,7 +160,7 @@ def _own(spec, n_envs, kwargs, has_wrappers, restart_failed) -> Any:
 
 def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, settings) -> Any:
     """Returns single environments as a vector environment, in this process or in others."""
-    from megastep.hosting.guard import HostedEnvs, make_env
+    from megastep.hosting.hosted import HostedEnvs, make_env
     from megastep.hosting.probe import probe
     from megastep.hosting.processes import VectorProcesses
 
@@ -177,7 +168,6 @@ def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, settings) -> A
     kwargs = {"disable_env_checker": True, **kwargs}
     with global_generators.kept():
         example = make_env(spec, wrappers, kwargs)
-    max_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
     if films and "rgb_array" in (example.metadata.get("render_modes") or ()):
         kwargs = {"render_mode": "rgb_array", **kwargs}
     with contextlib.suppress(Exception):
@@ -187,7 +177,7 @@ def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, settings) -> A
         vector = HostedEnvs(make, n_envs, found=probe(make), **settings)
     else:
         vector = VectorProcesses(make, n_envs, **settings)
-    vector.max_episode_steps = max_steps
+    vector.max_episode_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
     return vector
 
 

@@ -32,20 +32,15 @@ Conversion = tuple[Space, Callable[[Any], Any]]
 
 def observation(space: Any, path: str = "observation") -> Conversion:
     """Returns the observation space for one of Gymnasium's, and a function from a batch of its
-    values, arrays (N, ...), to arrays of ours, (N, *space.shape) per leaf.
-
-    Args:
-        path: what the space is called in messages.
-
-    Raises:
-        ValueError: naming the first leaf that no encoder takes.
+    values, arrays (N, ...), to arrays of ours, (N, *space.shape) per leaf. Raises ValueError for
+    the first leaf that no encoder takes.
     """
     from gymnasium import spaces as gym
 
     if isinstance(space, (gym.Dict, gym.Tuple)):
-        parts = _parts(space, observation, path)
-        return _tree(parts), lambda values: arrdict(
-            {name: convert(values[key]) for name, key, _, convert in parts}
+        tree, parts = _parts(space, observation, path)
+        return tree, lambda values: arrdict(
+            {name: convert(values[key]) for name, key, convert in parts}
         )
     if isinstance(space, gym.Discrete):
         return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x - space.start)[:, None]
@@ -69,24 +64,19 @@ def observation(space: Any, path: str = "observation") -> Conversion:
 
 def actions(space: Any, path: str = "action") -> Conversion:
     """Returns the action space for one of Gymnasium's, and a function from arrays of our actions,
-    (N, *space.shape) per leaf, to a batch of its values, arrays (N, ...).
-
-    Args:
-        path: what the space is called in messages.
-
-    Raises:
-        ValueError: naming the first leaf that no output chooses.
+    (N, *space.shape) per leaf, to a batch of its values, arrays (N, ...). Raises ValueError for the
+    first leaf that no output chooses.
     """
     from gymnasium import spaces as gym
 
     if isinstance(space, (gym.Dict, gym.Tuple)):
-        parts = _parts(space, actions, path)
-        as_batch = (
-            dict if isinstance(space, gym.Dict) else lambda pairs: tuple(dict(pairs).values())
-        )
-        return _tree(parts), lambda tree: as_batch(
-            (key, convert(tree[name])) for name, key, _, convert in parts
-        )
+        tree, parts = _parts(space, actions, path)
+
+        def batch(values) -> dict | tuple:
+            converted = {key: convert(values[name]) for name, key, convert in parts}
+            return converted if isinstance(space, gym.Dict) else (*converted.values(),)
+
+        return tree, batch
     dtype, shape = space.dtype, (-1, *(space.shape or ()))
     if isinstance(space, gym.Discrete):
         whole = spaces.MultiDiscrete(1, int(space.n))
@@ -131,26 +121,26 @@ def _image(space) -> Conversion | None:
     What has other axes than rows, columns and a few channels must be uint8 or have the same bounds
     everywhere, unlike a stack of vectors.
     """
-    if type(space).__name__ != "Box" or len(space.shape) not in (2, 3, 4) or 0 in space.shape:
+    if type(space).__name__ != "Box" or len(space.shape) not in (2, 3, 4):
         return None
     is_uint8, shape = space.dtype == np.uint8, space.shape
     is_uniform = is_uint8 or all((x == x.flat[0]).all() for x in (space.low, space.high))
+    dtype = torch.uint8 if is_uint8 else torch.float32
     if len(shape) == 2:
         is_bounded = is_uint8 or (is_uniform and np.isfinite([space.low, space.high]).all())
         if not is_bounded or min(shape) < (MIN_SIDE if is_uint8 else MIN_FLOAT_SIDE):
             return None
-        channels, rows = 1, shape
-        convert = _grey
-    else:
-        n_stacked, shape = math.prod(shape[:-3]), shape[-3:]
-        is_last = _has_channels_last(shape, is_uniform)
-        if is_last is None or (n_stacked > 1 and not is_uniform):
-            return None
-        channels = n_stacked * (shape[2] if is_last else shape[0])
-        rows = shape[:2] if is_last else shape[1:]
-        convert = _channels_last if is_last else _channels_first
-    dtype = torch.uint8 if is_uint8 else torch.float32
-    return spaces.MultiImage(1, channels, *rows, dtype=dtype), convert
+        return spaces.MultiImage(1, 1, *shape, dtype=dtype), lambda x: x[:, None, None]
+    is_last = _has_channels_last(shape[-3:], is_uniform)
+    if is_last is None or (math.prod(shape[:-3]) > 1 and not is_uniform):
+        return None
+
+    def convert(x) -> np.ndarray:
+        x = np.moveaxis(x, -1, -3) if is_last else x
+        return x.reshape(len(x), 1, -1, *x.shape[-2:])
+
+    _, _, *sizes = convert(np.empty((1, *shape), bool)).shape
+    return spaces.MultiImage(1, *sizes, dtype=dtype), convert
 
 
 def _has_channels_last(shape, is_uniform) -> bool | None:
@@ -166,35 +156,19 @@ def _has_channels_last(shape, is_uniform) -> bool | None:
         return False
     if not is_uniform or not (can_be_last or can_be_first):
         return None
-    if can_be_last and can_be_first:
-        is_square = first == middle, middle == last
-        return is_square[0] if is_square[0] != is_square[1] else last <= first
-    return can_be_last
+    if can_be_last and can_be_first and (first == middle) == (middle == last):
+        return last <= first
+    return first == middle if can_be_last and can_be_first else can_be_last
 
 
-def _grey(x) -> np.ndarray:
-    return x[:, None, None]
-
-
-def _channels_first(x) -> np.ndarray:
-    return x.reshape(len(x), 1, -1, *x.shape[-2:])
-
-
-def _channels_last(x) -> np.ndarray:
-    return _channels_first(np.moveaxis(x, -1, -3))
-
-
-def _parts(space, conversion, path) -> list[tuple[str, object, Space, Callable]]:
-    """Returns [(name of ours, Gymnasium's key, space, function)] of a Dict or Tuple."""
+def _parts(space, conversion, path) -> tuple[dotdict, list[tuple[str, object, Callable]]]:
+    """Returns the space of a Dict or Tuple, and [(our name, Gymnasium's key, function)]."""
     children = space.spaces if isinstance(space.spaces, Mapping) else dict(enumerate(space.spaces))
-    return [
-        (name, key, *conversion(child, f"{path}[{key!r}]"))
-        for name, (key, child) in zip(identifiers(children), children.items())
-    ]
-
-
-def _tree(parts) -> dotdict:
-    return dotdict({name: space for name, _, space, _ in parts})
+    tree, parts = dotdict(), []
+    for name, (key, child) in zip(identifiers(children), children.items()):
+        tree[name], convert = conversion(child, f"{path}[{key!r}]")
+        parts.append((name, key, convert))
+    return tree, parts
 
 
 def _choices(nvec) -> tuple[Space, list[str]]:

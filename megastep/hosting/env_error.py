@@ -9,12 +9,7 @@ _HERE = str(Path(__file__).parent)
 
 
 class EnvError(RuntimeError):
-    """An environment of somebody else raised an error.
-
-    Args:
-        sentence: which environment, and its error.
-        trace: the traceback of that error, as text.
-    """
+    """An environment of somebody else raised an error: a sentence, and its traceback as text."""
 
     def __init__(self, sentence: str, trace: str = ""):
         super().__init__(sentence, trace)
@@ -25,11 +20,7 @@ class EnvError(RuntimeError):
 
     @classmethod
     def of(cls, error: Exception, place: str) -> "EnvError":
-        """Returns an error that an environment raised as an EnvError.
-
-        Args:
-            place: what failed, such as `environment 3`.
-        """
+        """Returns an error that was raised in a place, such as `environment 3`, as an EnvError."""
         frames = error.__traceback__
         while frames and frames.tb_frame.f_code.co_filename.startswith(_HERE):
             frames = frames.tb_next

@@ -10,17 +10,16 @@ import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
-from megastep.hosting.env_error import BadValue
-from megastep.hosting.guard import close_all
+from megastep.hosting.hosted import Hosted
 from megastep.hosting.probe import Probe, play_parallel, probe
-from megastep.hosting.values import CHECKED_STEPS, allowed_actions, masked_actions, problem
-from megastep.hosting.wrapper_state import give_state, load_wrapper_state, wrapper_state
+from megastep.hosting.values import allowed_actions, masked_actions
+from megastep.hosting.wrapper_state import wrapper_state
 from megastep.types import Tree
 
 __all__ = ["ParallelEnvs"]
 
 
-class ParallelEnvs:
+class ParallelEnvs(Hosted):
     """N parallel environments as one of Gymnasium's vector environments, with a row per agent.
 
     Args:
@@ -31,15 +30,12 @@ class ParallelEnvs:
         wrappers: put around each, in this order.
 
     Attributes:
-        found: what is found about them, as of :class:`~megastep.hosting.guard.HostedEnvs`.
         present: (N, A) bool, agents that act in the next step. An agent is not if the reset left it
             out or its episode has ended, until it is among the environment's agents again.
 
     Raises:
         ValueError: it is turn-based, or the spaces of two agents differ.
     """
-
-    HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
 
     def __init__(
         self,
@@ -49,6 +45,7 @@ class ParallelEnvs:
         check: bool = True,
         wrappers: Sequence[Callable] = (),
     ):
+        super().__init__(None, check)
         parameters = inspect.signature(make).parameters
         if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             kwargs = {"render_mode": "rgb_array", **kwargs}
@@ -72,16 +69,12 @@ class ParallelEnvs:
         self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]  # observations
         masks = _masks(*first) if isinstance(first, tuple) and len(first) == 2 else {}
         sizes = [masked_actions(self.single_action_space, one) for one in masks.values()]
-        learnt = ()
-        if wrapper_state(env):
-            learnt = probe(make_one, play=play_parallel).learnt
+        learnt = probe(make_one, play=play_parallel).learnt if wrapper_state(env) else ()
         self.found = Probe(learnt=learnt, n_masked=min(sizes, default=0))
         self.masks = np.ones((n_lanes, max(0, self.found.n_masked)), bool)
         shape = n_envs, len(self.agents)
         self.reward, self.present = np.zeros(shape), np.zeros(shape, bool)
         self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
-        self.n_to_check = [CHECKED_STEPS if check else 0] * n_envs
-        self.frozen: Tree = None
 
     def _common(self, space_of) -> gymnasium.Space:
         first, *others = self.agents
@@ -95,7 +88,8 @@ class ParallelEnvs:
     def reset(self, *, seed: list[int] | None = None) -> tuple[Tree, dict]:
         for e in range(len(self.envs)):
             self._begin(e, seed and seed[e])
-        return self._observations(), self._infos()
+        obs, *_, infos = self._results()
+        return obs, infos
 
     def step(self, actions: Tree) -> tuple:
         rows = iterate(self.actions, actions)
@@ -105,39 +99,18 @@ class ParallelEnvs:
                 self._step(e, {agent: chosen[agent] for agent in env.agents})
             else:
                 self._begin(e)
-        flags = self.terminated.ravel(), self.truncated.ravel()
-        return self._observations(), self.reward.ravel(), *flags, self._infos()
-
-    def render(self) -> list[np.ndarray]:
-        return [env.render() for env in self.envs]
-
-    def close(self) -> None:
-        close_all(self.envs)
-
-    def wrapper_state(self) -> Tree:
-        """Returns what the wrappers of the first environment have learnt, by path."""
-        return wrapper_state(self.envs[0], self.found.learnt) if self.found.learnt else {}
-
-    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what others have learnt.
-
-        Args:
-            is_frozen: it stays as it is from now on.
-        """
-        for env in self.envs:
-            self.frozen = give_state(env, state, is_frozen)
+        return self._results()
 
     def _begin(self, e, seed=None) -> None:
-        observed, infos = self._checked(e, "reset", self.envs[e].reset(seed=seed))
+        env = self.envs[e]
+        observed, infos = self._checked(e, "reset", env.reset(seed=seed), self.agents)
         self._observe(e, observed, infos)
-        for flags in (self.reward, self.terminated, self.truncated):
-            flags[e] = 0
-        agents = self.envs[e].agents
-        self.present[e] = [agent in agents and agent in observed for agent in self.agents]
+        self.reward[e] = self.terminated[e] = self.truncated[e] = 0
+        self.present[e] = [agent in env.agents and agent in observed for agent in self.agents]
 
     def _step(self, e, actions) -> None:
         env = self.envs[e]
-        result = self._checked(e, "step", env.step(actions))
+        result = self._checked(e, "step", env.step(actions), self.agents)
         observed, rewards, terminated, truncated, infos = result
         self._observe(e, observed, infos)
         for a, agent in enumerate(self.agents):
@@ -152,17 +125,6 @@ class ParallelEnvs:
             self.truncated[e, a] = was_present and not ends and not is_here
             self.present[e, a] = is_here
 
-    def _checked(self, e, method, result) -> tuple:
-        """Returns the result of `reset` or `step`. Raises BadValue if its form is wrong."""
-        if self.frozen:
-            load_wrapper_state(self.envs[e], self.frozen)
-        if self.n_to_check[e] > 0:
-            self.n_to_check[e] -= 1
-            space = self.single_observation_space
-            if clause := problem(method, result, space, self.agents):
-                raise BadValue.of(clause, f"environment {e}")
-        return result
-
     def _observe(self, e, observed, infos) -> None:
         n_masked = self.masks.shape[1]
         masks = _masks(observed, infos) if n_masked else {}
@@ -173,11 +135,12 @@ class ParallelEnvs:
                 place = f"environment {e}, {agent}"
                 self.masks[a] = allowed_actions(masks.get(agent, {}), n_masked, place)
 
-    def _infos(self) -> dict[str, np.ndarray]:
-        return {"present": self.present.ravel(), "action_mask": self.masks.copy()}
-
-    def _observations(self) -> np.ndarray | dict | tuple:
-        return concatenate(self.single_observation_space, self.latest, self.batch)
+    def _results(self) -> tuple:
+        self.n_to_check = max(0, self.n_to_check - 1)
+        obs = concatenate(self.single_observation_space, self.latest, self.batch)
+        flags = self.terminated.ravel(), self.truncated.ravel()
+        infos = {"present": self.present.ravel(), "action_mask": self.masks}
+        return obs, self.reward.ravel(), *flags, infos
 
 
 def _masks(observed, infos) -> dict[str, Mapping]:

@@ -62,7 +62,7 @@ class RewardRecorder(gymnasium.Wrapper):
 
 
 def numbers_of(info: object) -> dict[str, float]:
-    """Returns the numbers of an `info` by key, without those in dicts and arrays of several."""
+    """Returns the single numbers of an `info` by key."""
     values = {}
     for key, value in info.items() if isinstance(info, Mapping) else ():
         if isinstance(value, np.ndarray) and value.size == 1:
@@ -74,9 +74,7 @@ def numbers_of(info: object) -> dict[str, float]:
 
 
 def play(env: Any, seed: int) -> Iterator[tuple]:
-    """Takes random actions in an environment of Gymnasium. Yields reward, whether the episode is
-    over, and info, for each step.
-    """
+    """Yields reward, whether the episode is over, and info, for each step by a random action."""
     actions = copy.deepcopy(env.action_space)  # which may be that of a class
     actions.seed(seed)
     while True:
@@ -97,12 +95,8 @@ def play_parallel(env: Any, seed: int) -> Iterator[tuple]:
 
 def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
     """Makes an environment, plays an episode of at most `MAX_STEPS` and `MAX_SECONDS`, and closes
-    it. Leaves the global generators as they were.
-
-    An error ends the episode: the same one comes in training, which names it.
-
-    Args:
-        play: takes random actions, as `play` does.
+    it. Leaves the global generators as they were. An error ends the episode: the same one comes in
+    training, which names it.
     """
     names, first, last, is_changed, n_masked = (), {}, {}, False, 0
     with kept():

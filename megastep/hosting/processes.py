@@ -18,7 +18,7 @@ from gymnasium.vector.utils import create_empty_array
 
 from megastep import workers
 from megastep.hosting.env_error import EnvError
-from megastep.hosting.guard import HostedEnvs, start_rendering
+from megastep.hosting.hosted import HostedEnvs, start_rendering
 from megastep.hosting.probe import Probe, probe
 from megastep.types import Tree
 
@@ -29,7 +29,7 @@ PATIENCE = 5
 
 
 class VectorProcesses:
-    """N environments in worker processes, with the interface of Gymnasium's vector environments.
+    """N environments in worker processes, with the interface of :class:`HostedEnvs`.
 
     Each environment gets the same seed as in one process, so the numbers are the same. The workers
     end with :meth:`close`, with this object, or with the process that made it, even if that is
@@ -39,16 +39,15 @@ class VectorProcesses:
         make: makes one environment. It is sent to the workers.
         n_envs: number of environments, N.
         seed: of what the environments draw from global generators.
-        settings: others of :class:`~megastep.hosting.guard.HostedEnvs`.
+        check: see :class:`HostedEnvs`.
     """
 
     max_episode_steps: int | None = None
 
-    def __init__(self, make: Callable, n_envs: int, seed: int = 0, **settings: Any):
+    def __init__(self, make: Callable, n_envs: int, seed: int = 0, check: bool = True):
         import loky
         from loky.backend import get_context
 
-        self.restart_failed = settings.get("restart_failed", 0)
         # one per core, shared among the ranks of a host
         n_processes = loky.cpu_count() // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         edges = np.linspace(0, n_envs, min(max(n_processes, 1), n_envs) + 1).astype(int).tolist()
@@ -59,9 +58,11 @@ class VectorProcesses:
         with workers.terminal_signals_blocked():
             for rows in self.rows:
                 pipe, far_end = multiprocessing.Pipe()
-                worker = _Worker(make, rows, dict(seed=seed, **settings))
                 process = context.Process(  # pyright: ignore[reportAttributeAccessIssue]
-                    target=worker.serve, args=(far_end,), daemon=True, env=workers.WORKER_ENV
+                    target=_serve,
+                    args=(far_end, make, rows, seed, check),
+                    daemon=True,
+                    env=workers.WORKER_ENV,
                 )
                 process.start()
                 far_end.close()
@@ -69,37 +70,29 @@ class VectorProcesses:
                 self.processes.append(process)
         # in a worker, since a fault may end the process that it happens in
         self.pipes[0].send(("probe", {}))
-        self.found = self._receive(0)
-        self.found = Probe() if isinstance(self.found, Exception) else self.found
-        (example, *_) = self._ask("begin", [{"found": self.found}] * len(self.rows))
+        found = self._receive(0)
+        self.found = Probe() if isinstance(found, Exception) else found
+        (example, *_) = self._ask("begin", found=self.found)
         self.metadata, self.render_mode, spaces = example
         self.single_observation_space, self.single_action_space = spaces
         self.observations = create_empty_array(self.single_observation_space, n_envs)
-        self.results = np.zeros(n_envs), np.zeros(n_envs, bool), np.zeros(n_envs, bool)
         self.latest_state: Tree = {}
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
-        """Resets every environment. Returns (observations, infos), see `step`."""
-        seeds = [{"seed": seed and list(seed[rows])} for rows in self.rows]
-        answers = self._ask("reset", seeds)
-        for rows, (obs, _) in zip(self.rows, answers):
-            _write(self.observations, rows, obs)
-        return self.observations, self._merged([infos for _, infos in answers])
+        """Resets every environment. Returns (observations, infos)."""
+        obs, infos = zip(*self._ask("reset", seed=seed))
+        return self._batch(obs), _joined(infos)
 
     def step(self, actions: Tree) -> tuple:
         """Takes one step. Returns (observations, rewards, terminated, truncated, infos), which are
         valid until the next call.
         """
-        answers = self._ask("step", [{"actions": _read(actions, rows)} for rows in self.rows])
-        for rows, (obs, *results, _) in zip(self.rows, answers):
-            _write(self.observations, rows, obs)
-            _write(self.results, rows, results)
-        return self.observations, *self.results, self._merged([infos for *_, infos in answers])
+        obs, *results, infos = zip(*self._ask("step", actions=actions))
+        return self._batch(obs), *map(np.concatenate, results), _joined(infos)
 
     def render(self) -> list:
         """Returns a frame of every environment."""
-        answers = self._ask("render", [{}] * len(self.rows))
-        return [frame for frames in answers for frame in frames]
+        return [frame for frames in self._ask("render") for frame in frames]
 
     def wrapper_state(self) -> Tree:
         """Returns what the wrappers of the first environment have learnt, by path; of a process
@@ -114,9 +107,8 @@ class VectorProcesses:
         return self.latest_state
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """As :meth:`~megastep.hosting.guard.HostedEnvs.load_wrapper_state`."""
-        arguments = dict(state=state, is_frozen=is_frozen)
-        self._ask("load_wrapper_state", [arguments] * len(self.rows))
+        """As :meth:`~megastep.hosting.hosted.Hosted.load_wrapper_state`."""
+        self._ask("load_wrapper_state", state=state, is_frozen=is_frozen)
 
     def close(self) -> None:
         """Closes the environments and ends their processes, by force after `PATIENCE` seconds.
@@ -124,11 +116,10 @@ class VectorProcesses:
         Raises:
             EnvError: the first error of an environment that could not be closed.
         """
-        answers, pipes = [], [*self.pipes]
+        answers, pipes, end = [], [*self.pipes], time.monotonic() + PATIENCE
         for pipe in pipes:
             with contextlib.suppress(EOFError, OSError):  # it has ended
                 pipe.send(("close", {}))
-        end = time.monotonic() + PATIENCE
         for pipe in pipes:
             with contextlib.suppress(EOFError, OSError):
                 if pipe.poll(max(0.0, end - time.monotonic())):
@@ -138,9 +129,12 @@ class VectorProcesses:
         self._finalizer()
         _raise_first(answers)
 
-    def _ask(self, command, arguments) -> list:
-        """Returns the answer of each process to a command."""
-        for pipe, own in zip(self.pipes, arguments, strict=True):
+    def _ask(self, command, **arguments) -> list:
+        """Returns the answer of each process to a command; rows of arguments are divided."""
+        for pipe, rows in zip(self.pipes, self.rows, strict=True):
+            own = arguments
+            if command in ("reset", "step"):
+                own = {name: _rows_of(batch, rows) for name, batch in arguments.items()}
             with contextlib.suppress(OSError):  # of a process that has ended, as its answer says
                 pipe.send((command, own))
         return _raise_first([self._receive(number) for number in range(len(self.pipes))])
@@ -167,51 +161,39 @@ class VectorProcesses:
             f"the process that steps environments {rows.start} to {rows.stop - 1} was ended {how}"
         )
 
-    def _merged(self, infos) -> dict[str, np.ndarray]:
-        """Returns the infos of all environments."""
-        merged = {}
-        for rows, own in zip(self.rows, infos):
-            for key, values in own.items():
-                if key not in merged:
-                    shape = self.rows[-1].stop, *values.shape[1:]
-                    merged[key] = np.zeros(shape, values.dtype)
-                merged[key][rows] = values
-        return merged
+    def _batch(self, parts) -> Tree:
+        for rows, part in zip(self.rows, parts):
+            _write(self.observations, rows, part)
+        return self.observations
 
 
-class _Worker:
-    """What a process does: it answers commands until the pipe is closed, which it is when the other
-    process ends.
-    """
+def _serve(pipe, make, rows, seed, check) -> None:
+    """Answers commands until the pipe is closed, which it is when the other process ends."""
+    global_seed = int(np.random.SeedSequence([seed, rows.start]).generate_state(1)[0])
+    np.random.seed(global_seed)  # for what draws too rarely to be found by a probe
+    random.seed(global_seed)
+    envs: Any = None
 
-    def __init__(self, make, rows, settings) -> None:
-        self.make, self.rows, self.settings = make, rows, settings
-        self.envs: Any = None
-
-    def serve(self, pipe) -> None:
-        seeds = np.random.SeedSequence([self.settings["seed"], self.rows.start])
-        seed = int(seeds.generate_state(1)[0])
-        np.random.seed(seed)  # for what draws too rarely to be found by a probe
-        random.seed(seed)
-        command = None
-        with contextlib.suppress(EOFError, OSError):
-            while command != "close":
-                command, arguments = pipe.recv()
-                pipe.send(_attempt(self.answer, command, arguments))
-        if command != "close" and self.envs is not None:
-            _attempt(self.envs.close)
-
-    def answer(self, command, arguments) -> Any:
+    def answer(command, arguments) -> Any:
+        nonlocal envs
         if command == "probe":
-            return probe(self.make)
+            return probe(make)
         if command == "begin":
-            n_envs, first = self.rows.stop - self.rows.start, self.rows.start
-            self.envs = envs = HostedEnvs(self.make, n_envs, first, **arguments, **self.settings)
+            n_envs = rows.stop - rows.start
+            envs = HostedEnvs(make, n_envs, rows.start, seed=seed, check=check, **arguments)
             spaces = envs.single_observation_space, envs.single_action_space
             return envs.metadata, envs.render_mode, spaces
         if command == "render":
-            start_rendering(self.envs)
-        return getattr(self.envs, command)(**arguments)
+            start_rendering(envs)
+        return getattr(envs, command)(**arguments)
+
+    command = None
+    with contextlib.suppress(EOFError, OSError):
+        while command != "close":
+            command, arguments = pipe.recv()
+            pipe.send(_attempt(answer, command, arguments))
+    if command != "close" and envs is not None:
+        _attempt(envs.close)
 
 
 def _raise_first(answers) -> list:
@@ -241,6 +223,10 @@ def _end(pipes, processes) -> None:
             process.join()
 
 
+def _joined(infos) -> dict[str, np.ndarray]:
+    return {key: np.concatenate([own[key] for own in infos]) for key in infos[0]}
+
+
 def _write(to, rows, values) -> None:
     """Copies the values of some environments into the batch of all."""
     if isinstance(to, dict):
@@ -252,10 +238,10 @@ def _write(to, rows, values) -> None:
             _write(part, rows, value)
 
 
-def _read(batch, rows) -> object:
-    """Returns the rows of a batch of actions."""
+def _rows_of(batch, rows) -> Any:
+    """Returns the rows of a batch of actions or of seeds."""
     if isinstance(batch, dict):
-        return {key: _read(part, rows) for key, part in batch.items()}
+        return {key: _rows_of(part, rows) for key, part in batch.items()}
     if isinstance(batch, tuple):
-        return tuple(_read(part, rows) for part in batch)
-    return batch[rows]
+        return tuple(_rows_of(part, rows) for part in batch)
+    return batch if batch is None else batch[rows]

@@ -27,14 +27,9 @@ ABSENT = {"reset": (None, {}), "step": (None, 0.0, False, False, {})}
 def problem(
     method: str, result: Tree, space: Space, agents: Collection[str] | None = None
 ) -> str | None:
-    """Returns what is wrong with the result of `reset` or `step`, as a clause, None if nothing is.
-    Numbers beyond the bounds of the space are left to `beyond_bounds`.
-
-    Args:
-        method: its name.
-        result: what it returned.
-        space: the observation space.
-        agents: of an environment of PettingZoo, each part of whose results is a dict by agent.
+    """Returns what is wrong with the result of `reset` or `step`, as a clause, None if nothing is,
+    but for numbers beyond the bounds of the observation space. With `agents`, of PettingZoo, each
+    part of the result is a dict by agent.
     """
     names = FORMS[method].strip("()").split(", ")
     if not isinstance(result, (tuple, list)) or len(result) != len(names):
@@ -72,28 +67,19 @@ def _problem_of_one(method, values, space) -> str | None:
 
 
 def beyond_bounds(space: Space, batch: Tree, path: str = "it") -> Iterator[tuple[str, bool]]:
-    """Yields which observations of a batch are beyond the bounds of their space, as clauses, and
-    whether the space is a Box, by whose bounds nothing is scaled.
-
-    Args:
-        space: of one observation.
-        batch: observations of B lanes.
-        path: the observation's name in clauses.
+    """Yields which observations of a batch (B, ...) are beyond the bounds of their space, as
+    clauses, and whether the space is a Box, by whose bounds nothing is scaled.
     """
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         for key, part in space.items() if isinstance(space, spaces.Dict) else enumerate(space):
             yield from beyond_bounds(part, batch[key], f"its part {key!r}")
         return
-    is_box = isinstance(space, spaces.Box)
+    is_box, low, high = isinstance(space, spaces.Box), 0, 1  # as of MultiBinary
     if is_box:
         low, high = space.low, space.high
     elif isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
         n = space.n if isinstance(space, spaces.Discrete) else space.nvec
         low, high = space.start, space.start + n - 1
-    elif isinstance(space, spaces.MultiBinary):
-        low, high = 0, 1
-    else:
-        return
     beyond = (batch < low) | (batch > high)
     if beyond.any():
         beyond &= ~(np.isclose(batch, low) | np.isclose(batch, high))  # rounding errors
@@ -116,11 +102,8 @@ def masked_actions(space: Space, info: object) -> int:
 
 
 def allowed_actions(info: Mapping, n: int, place: str) -> np.ndarray:
-    """Returns the mask of an ``info``, (n,) bool. One that allows nothing, as at an episode's end,
-    counts as one that allows all; so does none.
-
-    Raises:
-        BadValue: it is of another shape.
+    """Returns the mask of an ``info``, (n,) bool. None, or one that allows nothing, as at an
+    episode's end, allows all. Raises BadValue if it has another shape.
     """
     mask = np.asarray(info.get("action_mask", np.ones(n)), bool)
     if mask.shape != (n,):

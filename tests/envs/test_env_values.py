@@ -14,7 +14,7 @@ from gymnasium import spaces  # noqa: E402
 
 from megastep.envs import Gymnasium  # noqa: E402
 from megastep.hosting.env_error import BadValue  # noqa: E402
-from megastep.hosting.guard import HostedEnvs  # noqa: E402
+from megastep.hosting.hosted import HostedEnvs  # noqa: E402
 from megastep.hosting.values import beyond_bounds, problem  # noqa: E402
 from tests.helpers.odd_envs import Odd  # noqa: E402
 

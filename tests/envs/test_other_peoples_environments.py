@@ -1,7 +1,6 @@
 """Environments of other packages that fail, end their process, or render oddly."""
 
 import re
-import warnings
 
 import numpy as np
 import pytest
@@ -9,14 +8,12 @@ import torch
 
 from megastep import contract
 from megastep.arrdict import arrdict
-from megastep.env_state import EnvState
 
 gymnasium = pytest.importorskip("gymnasium")
 from megastep.envs import Gymnasium  # noqa: E402
 from megastep.hosting.env_error import EnvError  # noqa: E402
-from megastep.hosting.guard import HostedEnvs  # noqa: E402
 from megastep.hosting.probe import probe  # noqa: E402
-from megastep.hosting.vectorized import _as_frame as as_frame  # noqa: E402
+from megastep.hosting.vectorized import as_frame  # noqa: E402
 from tests.helpers import odd_envs  # noqa: E402
 
 
@@ -27,60 +24,6 @@ def make(name, n_envs=4, **settings):
 
 def act(env):
     return env.step(arrdict(actions=torch.zeros(env.n_envs, 1, dtype=torch.int64)))
-
-
-class FailsAt(odd_envs.Odd):
-    """Fails in its third step."""
-
-    def step(self, action):
-        if self.count == 2:
-            raise ValueError("no")
-        return super().step(action)
-
-
-def test_failed_environment_is_made_anew_and_its_episode_truncated():
-    vector = HostedEnvs(FailsAt, 1, restart_failed=2)
-    vector.reset(seed=[5])
-    first, n_failures = vector.envs[0].env, 0
-    for expected in [(1, 1), (2, 1), (2, 0), (0, 0), (1, 1), (2, 1), (2, 0), (0, 0), (1, 1)]:
-        obs, reward, terminated, truncated, infos = vector.step(np.zeros(1, int))
-        assert (obs.item(), reward.item()) == expected and not terminated
-        assert truncated == (expected == (2, 0)) == ("failure" in infos)
-        n_failures += int(infos.get("restarts", np.zeros(1)).sum())
-    assert n_failures == 2 and vector.envs[0].env is not first
-    vector.step(np.zeros(1, int))
-    with pytest.raises(EnvError, match="^environment 0 failed: ValueError: no$") as error:
-        vector.step(np.zeros(1, int))
-    assert "odd" not in error.value.trace and "in step" in error.value.trace
-
-
-def test_failed_environments_are_counted_the_same_in_processes():
-    worlds, counts = [], []
-    for vectorization in ("sync", "async"):
-        env = make("Crash", 5, vectorization=vectorization, restart_failed=9)
-        with pytest.warns(
-            UserWarning, match="OSError: simulator does not answer; it was made anew"
-        ):
-            worlds.append(contract.rollout(env, 40))
-        counts.append((env.pop_restarts(), env.pop_restarts()))
-        env.close()
-    assert all(map(contract.same, *worlds)) and counts[0] == counts[1]
-    lengths = sum(int(world.truncated.sum()) for world in worlds[0])
-    assert lengths > counts[0][0] > 0 == counts[0][1]
-
-
-def test_count_of_failures_is_in_the_state():
-    env, resumed = (make("Crash", restart_failed=9) for _ in range(2))
-    env.reset(), resumed.reset()
-    state, of_resumed = EnvState(env), EnvState(resumed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for _ in range(60):
-            act(env)
-        of_resumed.load_state_dict(state.state_dict())
-        worlds = [(act(env), act(resumed)) for _ in range(60)]
-    assert all(contract.same(*pair) for pair in worlds)
-    assert env.pop_restarts() == resumed.pop_restarts() > 0
 
 
 def test_process_that_ends_is_named_with_its_environments():
