@@ -138,7 +138,7 @@ WRONG = {
 }
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("message", WRONG)
 def test_validate_geometry_refuses_wrong_entries(message):
     g = toys.box()

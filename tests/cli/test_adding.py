@@ -15,7 +15,7 @@ import pytest
 
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.factory.components import kind_of
-from megastep.agents.runs import checkpoint, folders
+from megastep.agents.runs import checkpoint, folders, json_lines
 from tests.helpers import tiny
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -217,7 +217,7 @@ def test_custom_learner(outside, capsys):
     assert train.main([*words, *learner_words, "samples=48", "logging.every=1"]) == 0
     config = saved().config["train"]["learner"]
     assert config == {"name": "reinforce:Reinforce", "anneal": "never", "lr": 0.1, "length": 4}
-    rows = [json.loads(line) for line in (leftovers()[0] / "metrics.jsonl").open()]
+    rows = json_lines.read(leftovers()[0] / "metrics.jsonl")
     assert [row["samples"] for row in rows] == [16, 32, 48] and "loss/policy" in rows[-1]
     assert train.main(["resume=latest", "samples=64"]) == 0
     assert evaluate.main(["run=latest", "episodes=4"]) == 0

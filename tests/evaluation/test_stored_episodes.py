@@ -31,7 +31,7 @@ def evaluated(tmp_path_factory):
 
 def rows_of(folder):
     (path,) = (folder / "evaluations").glob("*.csv")
-    rows = list(csv.DictReader(path.open()))
+    rows = list(csv.DictReader(path.read_text().splitlines()))
     return [row for row in rows if row["agent"] == "trained"]
 
 

@@ -8,7 +8,8 @@ def test_flushed_factors_outlive_the_process_and_later_ones_do_not(tmp_path):
     for factor in (1.0, 0.75):
         record.append(factor)
     record.flush()
-    record.append(0.5)  # and then the process is killed
+    record.append(0.5)
+    record.file.file.close()  # as when the process is killed
     assert annealing.read(tmp_path).tolist() == [1.0, 0.75]
 
 

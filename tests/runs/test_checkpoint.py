@@ -97,7 +97,7 @@ def test_every_flipped_bit_is_detected(folder, file, every):
     assert checkpoint.load_latest(folder).step == 30
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::UserWarning")
 def test_run_that_is_trained_meanwhile_replaces_its_checkpoints(folder, monkeypatch):
     real, tried = checkpoint.read, []
 
@@ -141,7 +141,7 @@ class Payload:
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize(
-    "write", [torch.save, lambda value, file: pickle.dump(value, open(file, "wb"))]
+    "write", [torch.save, lambda value, file: file.write_bytes(pickle.dumps(value))]
 )
 def test_code_in_a_checkpoint_is_refused_and_does_not_run(folder, tmp_path, write):
     mark, path = tmp_path / "ran", folder / "step_30" / "state.pt"
@@ -297,7 +297,7 @@ print(newest, *sorted(os.listdir(folder)))
 """
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("steps", ["new", pytest.param("again", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kills", [5, pytest.param(40, marks=pytest.mark.nightly)])
 def test_kill_9_at_random_leaves_the_newest_checkpoint_intact(tmp_path, kills, steps):

@@ -98,7 +98,7 @@ def test_damaged_line_is_named_and_skipped(tmp_path, damage):
     assert [row["samples"] for row in json_lines.read(path)] == [0, 1, 3, 9]
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::UserWarning")
 def test_last_line_cut_short_causes_no_warning(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(lines(3)[:-5])
@@ -168,6 +168,7 @@ def test_csv_that_fails_is_dropped_and_keeps_what_it_has(tmp_path):
     run_loggers.write(1, {"x": 1})
     with faults.full_disk(0), pytest.warns(UserWarning, match="File too large") as warnings:
         run_loggers.write(2, {"y": 2})
+    run_loggers.close()
     assert str(warnings[-1].message).startswith("logger=csv failed and is dropped (")
     assert table(tmp_path) == [["samples", "x"], ["1", "1"]]
 

@@ -25,7 +25,7 @@ def table_of(folder):
 
 
 def events_of(folder):
-    return json.loads(gzip.open(Path(folder, "profile.json.gz")).read())["traceEvents"]
+    return json.loads(gzip.decompress(Path(folder, "profile.json.gz").read_bytes()))["traceEvents"]
 
 
 @pytest.mark.parametrize("learner", ["ppo", pytest.param("vtrace", marks=pytest.mark.nightly)])

@@ -382,6 +382,7 @@ def test_checkpoint_reaches_no_further_than_the_files_on_disk(tmp_path, monkeypa
         run.save(**options)
         run.saver.wait()
         assert len(checkpoint.list_checkpoints(tmp_path / "checkpoints")) == len(options)
+    writer.close()
 
 
 def test_budget_ends_at_the_nearer_limit():
@@ -429,7 +430,7 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
     assert all(0 < r <= 7 for r in returns)
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_nonfinite_metric_is_named_once_and_left_out(tmp_path, bad):
     """The metric of lane 2, a leader, is never finite; that of lane 3, a follower, is 80."""
