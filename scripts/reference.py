@@ -31,6 +31,7 @@ from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+import megastep
 from megastep.agents import package
 from megastep.agents.cli import blocks
 from megastep.agents.errors import EXIT_CODES
@@ -250,9 +251,9 @@ def markdown(text: str | None, hints: dict[str, str] | None = None) -> str:
 @functools.cache
 def comment_on(module: str, name: str) -> str:
     """Returns the comment at a constant, above it or behind it, in its module or another."""
-    own = Path(importlib.import_module(module).__file__)
+    own, root = Path(importlib.import_module(module).__file__), Path(megastep.__file__).parent
     definition = re.compile(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", re.M)
-    for path in (own, *sorted(own.parents[1].rglob("*.py"))):
+    for path in (own, *sorted(root.rglob("*.py")), *sorted((root / "agents").rglob("*.py"))):
         found = definition.search(path.read_text(errors="replace"))
         if found and (text := found[2] or re.sub(r"^#:? ?", "", found[1], flags=re.M)):
             return text

@@ -132,11 +132,11 @@ def drawn_in_this_process(monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def cuda_on_cpu(tmp_path_factory):
+def cuda_on_cpu():
     """Runs CUDA kernels on a CPU."""
     from tests.helpers.cuda_on_cpu import CudaOnCpu
 
-    return CudaOnCpu(tmp_path_factory.mktemp("cuda"))
+    return CudaOnCpu()
 
 
 @pytest.fixture(

@@ -9,8 +9,10 @@ import sys
 import tempfile
 from pathlib import Path
 
+import filelock
 import torch
 
+from megastep import cache
 from megastep.engine import operations, rendering
 from megastep.kernels.build import compile
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
@@ -80,9 +82,6 @@ class TensorOnCpu(torch.Tensor):
 class CudaOnCpu:
     """A stand-in for `launch` that runs `.cu` files where tensors are on the CPU.
 
-    Args:
-        folder: where it builds libraries.
-
     Attributes:
         order: in which threads run, one of `ORDERS`.
         is_late: copies to shared memory, and what blocks of a cluster send each other, arrive as
@@ -90,8 +89,8 @@ class CudaOnCpu:
         launched: the operations since `install`.
     """
 
-    def __init__(self, folder: Path):
-        self.folder, self.launched = folder, set()
+    def __init__(self):
+        self.launched = set()
         self.order, self.is_late = "forward", False
         self._libraries = {}
 
@@ -136,16 +135,11 @@ class CudaOnCpu:
         return results[0]
 
     def _build(self, library):
-        folder = self.folder / str(len(self._libraries))
-        folder.mkdir(exist_ok=True)
-        for name, text in library.sources(".h", ".cu").items():
-            for expression, replacement in SPELLINGS:
-                text = re.sub(expression, replacement, text)
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_text(text)
-        for name, replacement in REPLACED.items():
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_text(replacement.read_text())
+        """Loads a library from the cache of kernels, which processes and sessions share."""
+        sources = library.sources(".h", ".cu")
+        for expression, replacement in SPELLINGS:
+            sources = {k: re.sub(expression, replacement, text) for k, text in sources.items()}
+        sources |= {name: path.read_text() for name, path in REPLACED.items()}
         lines = [f'#include "{HEADER.name}"']
         lines += [BACKEND] * ("--fmad=false" in library.cuda_flags)
         lines += [compile.joined(library.sources(".h", ".cu"))]
@@ -157,12 +151,23 @@ class CudaOnCpu:
             f"thread_order, is_late); }}"
             for operation, struct in library.cuda_operations.items()
         ]
-        source, binary = folder / "all.cpp", folder / "all.so"
-        source.write_text("\n".join(lines))
-        folders = _precompiled().name, folder, compile.KERNELS
-        command = [compile.compiler()[0], *FLAGS, *(f"-I{path}" for path in folders)]
-        subprocess.run([*command, str(source), "-o", str(binary)], check=True)
-        return ctypes.CDLL(str(binary))
+        sources["all.cpp"] = "\n".join(lines)
+        parts = HEADER.read_text(), *compile.compiler(), *FLAGS, *sources, *sources.values()
+        name = f"cuda-on-cpu-{compile._key(*parts)}.so"
+        with filelock.FileLock(Path(tempfile.gettempdir()) / f"{name}.lock"):
+            return compile._load(name, *cache.fetch(name, lambda: self._compiled(sources)))
+
+    def _compiled(self, sources):
+        with tempfile.TemporaryDirectory() as folder:
+            for name, text in sources.items():
+                path = Path(folder) / name
+                path.parent.mkdir(exist_ok=True)
+                path.write_text(text)
+            folders = _precompiled().name, folder, compile.KERNELS
+            command = [compile.compiler()[0], *FLAGS, *(f"-I{path}" for path in folders)]
+            binary = Path(folder) / "all.so"
+            subprocess.run([*command, f"{folder}/all.cpp", "-o", binary], check=True)
+            return binary.read_bytes()
 
     def install(self, monkeypatch):
         """Replaces `launch` in all modules that import it."""

@@ -46,7 +46,7 @@ def built(tmp_path_factory):
         folder = tmp_path_factory.mktemp("exchange")  # a loaded library stays loaded
         (folder / "params.h").write_text(PARAMS)
         (folder / "exchange.cu").write_text(text)
-        return KernelLibrary(folder, *flags), CudaOnCpu(folder)
+        return KernelLibrary(folder, *flags), CudaOnCpu()
 
     return build
 
