@@ -8,6 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
+import docstrings  # noqa: E402
 import reference  # noqa: E402
 
 from megastep.agents import package  # noqa: E402
@@ -53,7 +54,7 @@ toc_object_entries = False  # hundreds, which every page's sidebar would be sear
 
 def linkcode_resolve(domain, info):
     """Returns where the source of a name is, on its line."""
-    path, line = reference.source_of(info["module"], info["fullname"])
+    path, line = docstrings.source_of(info["module"], info["fullname"])
     return f"{REPOSITORY}/blob/main/{path}#L{line}" if REPOSITORY and path else None
 
 

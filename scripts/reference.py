@@ -5,27 +5,23 @@ docs/conf.py does so when the site is built; tests/test_reference.py finds what 
 
 - a setting is an argument of a constructor, described under `Args:` of its docstring; one of a
   script is described by the comment at its key in configs/;
-- a metric is described under `Metrics:` of the docstring of what reports it;
-- a public name is a class or function without an underscore, described by its docstring.
+- a metric is described under `Metrics:` of the docstring of what reports it.
 """
 
 import dataclasses
 import functools
 import importlib
-import inspect
 import math
-import operator
-import pkgutil
 import re
 import sys
-import textwrap
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import ModuleType, NoneType
+from types import NoneType
 from typing import Any, Literal, NamedTuple
 
+from docstrings import api, described, first_sentence, markdown
 from omegaconf import OmegaConf
 from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
@@ -61,225 +57,6 @@ REPORTERS = {
     "Self-play": "megastep.agents.selfplay.opponents:Opponents.pop_win_rates",
     "Curricula": "megastep.agents.training.curriculum:Curriculum.stats",
 }
-#: Megastep's own machinery, which nobody needs to import; and `cuda`, another name of `engine`.
-INTERNAL = re.compile(
-    r"megastep\.(__main__|adapters\.(?!vector_env)\w+|atomic_files|cache|compat|cuda|colour|demo|global_generators|hosting|imports|kernels|host_state|moments"
-    r"|web|agents\.(cli|console|export|distributed\.(?!pooling)"
-    r"\w+|factory|hardware|launch|package|pretrained|runs|networks\.(kernels|web|\w+_cpu)|storage\.\w*kernels"
-    r"|algorithms\.kernels)|geometries\.homes\.\w+|envs\.\w+\.(?!(env|bot|tracker)\b)\w+|geodesics)\b"
-)
-
-
-# ---- Docstrings ----
-
-
-def section(text: str | None, title: str) -> dict[str, str]:
-    """Returns {name: description} of a section of a docstring, such as `Args`. Names that share a
-    description each have it.
-    """
-    body = re.search(rf"^{title}:\n((?:    .*\n|\n)+)", f"{inspect.cleandoc(text or '')}\n", re.M)
-    entries = {}
-    for entry in re.findall(r"^ {4}(\S.*(?:\n {8}.*)*)", body[1] if body else "", re.M):
-        names, colon, description = entry.partition(": ")
-        if colon:
-            words = re.sub(r":\w+:`~?([\w.]+)`", r"`\1`", " ".join(description.split()))
-            words = words.replace("``", "`")
-            entries |= dict.fromkeys(names.replace("`", "").split(", "), words)
-    return entries
-
-
-def described(one: Any, title: str) -> dict[str, str]:
-    """Returns {name: description} of a section of a class, with its bases, or of a function."""
-    kinds = reversed(one.__mro__) if inspect.isclass(one) else [one]
-    sections = [section(kind.__doc__, title) for kind in kinds]
-    return functools.reduce(operator.or_, sections)
-
-
-def first_sentence(one: Any) -> str:
-    paragraph = (inspect.getdoc(one) or "").partition("\n\n")[0]
-    return re.split(r"(?<=\.) (?=[A-Z])", " ".join(paragraph.split()))[0]
-
-
-# ---- Public names ----
-
-
-def modules(root: str = "megastep") -> Iterator[ModuleType]:
-    """Yields a package and the modules below it, but for `INTERNAL` ones."""
-    yield (module := importlib.import_module(root))
-    for found in pkgutil.iter_modules(getattr(module, "__path__", ())):
-        name = f"{root}.{found.name}"
-        if not (found.name.startswith("_") or INTERNAL.match(name)):
-            yield from modules(name)
-
-
-def public(module: ModuleType) -> dict[str, Any]:
-    """Returns the public names of a module that no package above it exports."""
-    names = getattr(module, "__all__", None)
-    if names is None:
-        own = {k: v for k, v in vars(module).items() if _is_code(v)}
-        names = [k for k, v in own.items() if v.__module__ == module.__name__ and k[0] != "_"]
-    above, parts = set(), module.__name__.split(".")
-    for n in range(2, len(parts)):
-        above |= {*getattr(importlib.import_module(".".join(parts[:n])), "__all__", ())}
-    found = {name: getattr(module, name) for name in names}
-    return {k: v for k, v in found.items() if k not in above and not inspect.ismodule(v)}
-
-
-def methods(kind: type) -> dict[str, Any]:
-    """Returns the public methods and properties that a class defines, but for those that it
-    describes under `Attributes:`.
-    """
-    plain = types.FunctionType, property, classmethod, staticmethod
-    attributes = described(kind, "Attributes")
-    found = {k: v for k, v in vars(kind).items() if k[0] != "_" and isinstance(v, plain)}
-    return {name: value for name, value in found.items() if name not in attributes}
-
-
-def undescribed() -> list[str]:
-    """Returns the public names and methods without a docstring."""
-    found = []
-    for module in modules():
-        for name, one in public(module).items():
-            path = f"{module.__name__}.{name}"
-            own = methods(one) if inspect.isclass(one) else {}
-            text = inspect.getdoc(one) if callable(one) else comment_on(module.__name__, name)
-            found += [] if text else [path]
-            found += [f"{path}.{k}" for k in own if not inspect.getdoc(getattr(one, k))]
-    return found
-
-
-def _is_code(value):
-    return inspect.isclass(value) or inspect.isfunction(value)
-
-
-def api(root: str) -> str:
-    """Returns the documentation of a module or package: a heading per module, and a directive of
-    Sphinx's Python domain per public name.
-    """
-    lines = []
-    for module in modules(root):
-        if names := public(module):
-            lines += [f"## {module.__name__}", "", markdown(module.__doc__), ""]
-            for name, one in names.items():
-                lines += _object(module.__name__, name, one, "::::")
-    return "\n".join(lines)
-
-
-def _object(module, name, one, fence):
-    """Returns the lines about a class, with its methods, a function or a constant."""
-    kind, arguments = "data", ""
-    if inspect.isclass(one):
-        kind = "exception" if issubclass(one, BaseException) else "class"
-    elif callable(one):
-        kind = "method" if "." in name else "function"
-    elif isinstance(one, property):
-        kind = "property"
-    called = kind in ("class", "function", "method")
-    arguments = _signature(one, kind == "method") if called else ""
-    text = comment_on(module, name) if kind == "data" else inspect.getdoc(one)
-    text = markdown(text, _hints(one) if called else {})
-    lines = [f"{fence}{{py:{kind}}} {name}{arguments}", f":module: {module}"]
-    lines += [f":value: {one!r}"] if kind == "data" and isinstance(one, (int, float)) else []
-    lines += ["", text, ""]
-    for key, below in methods(one).items() if inspect.isclass(one) else ():
-        below = below if isinstance(below, property) else getattr(one, key)
-        lines += _object(module, f"{name}.{key}", below, fence[1:])
-    return [*lines, fence, ""]
-
-
-def _signature(one, is_method):
-    """Returns the arguments of a class or function with their defaults, without types."""
-    try:
-        parameters = [*inspect.signature(one).parameters.values()]
-    except (TypeError, ValueError):  # of a built-in class
-        return ""
-    parameters = [p.replace(annotation=p.empty) for p in parameters if p.name != "self"]
-    defaults = (p.empty if p.default is p.empty else _Plain(p.default) for p in parameters)
-    return str(inspect.Signature([p.replace(default=d) for p, d in zip(parameters, defaults)]))
-
-
-class _Plain:
-    """A default as signatures show it."""
-
-    def __init__(self, value):
-        text = getattr(value, "__name__", None) or repr(value)
-        self.text = text if len(text) <= 40 and "<" not in text and "\n" not in text else "..."
-
-    def __repr__(self):
-        return self.text
-
-
-def _hints(one):
-    """Returns the types of the arguments as text, without the bounds of settings."""
-    function = one.__init__ if inspect.isclass(one) else one
-    try:
-        hints = typing.get_type_hints(function)
-    except (AttributeError, NameError, TypeError):
-        return {}
-    texts = {name: inspect.formatannotation(hint) for name, hint in hints.items()}
-    texts = {name: re.sub(r"\b(?:\w+\.)+(?=\w)", "", text) for name, text in texts.items()}
-    return {name: text for name, text in texts.items() if len(text) <= 60}
-
-
-def markdown(text: str | None, hints: dict[str, str] | None = None) -> str:
-    """Returns a docstring as Markdown.
-
-    Args:
-        text: what is indented below a line `Title:` becomes a list, if each of its entries begins
-            with a name and a colon.
-        hints: the types of arguments.
-    """
-    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", inspect.cleandoc(text or ""))
-    text = re.sub(r"``([^`]+)``", r"`\1`", re.sub(r"::$", ":", text, flags=re.M))
-
-    def listed(match):
-        title, body = match[1], textwrap.dedent(match[2]).strip()
-        entries = re.findall(r"^\S.*(?:\n(?: +.*|(?=\n)))*", body, re.M)
-        pairs = [re.fullmatch(r"([\w.*`(), ]+): (.*)", e, re.S) for e in entries]
-        if all(pairs) and title not in ("Returns", "Yields"):
-            rows = []
-            for pair in pairs:
-                name = pair[1].replace("`", "")
-                kind = f" (`{hints[name]}`)" if hints and name in hints else ""
-                rows.append(f"- **{name}**{kind}: {' '.join(pair[2].split())}")
-            body = "\n".join(rows)
-        return f"\n**{title}**\n\n{body}\n"
-
-    return re.sub(r"^(\S[^\n]*):\n((?:    .*\n|\n)+)", listed, f"{text}\n", flags=re.M).rstrip()
-
-
-@functools.cache
-def comment_on(module: str, name: str) -> str:
-    """Returns the comment at a constant, above it or behind it, in its module or another."""
-    own, root = Path(importlib.import_module(module).__file__), Path(megastep.__file__).parent
-    definition = re.compile(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", re.M)
-    for path in (own, *sorted(root.rglob("*.py")), *sorted((root / "agents").rglob("*.py"))):
-        found = definition.search(path.read_text(errors="replace"))
-        if found and (text := found[2] or re.sub(r"^#:? ?", "", found[1], flags=re.M)):
-            return text
-    return ""
-
-
-def documentation(module: str) -> str:
-    """Returns the docstring of a module."""
-    return markdown(importlib.import_module(module).__doc__)
-
-
-def source_of(module: str, name: str) -> tuple[str, int]:
-    """Returns the file of a class or function in the repository, and its first line; "" and 0 of
-    what has none.
-    """
-    try:
-        one = operator.attrgetter(name)(importlib.import_module(module))
-        one = inspect.unwrap(getattr(one, "fget", one))
-        path = Path(inspect.getsourcefile(one)).resolve()
-        line = inspect.getsourcelines(one)[1]
-    except (AttributeError, OSError, TypeError):
-        return "", 0
-    root = Path(__file__).resolve().parents[1]
-    return (str(path.relative_to(root)), line) if path.is_relative_to(root) else ("", 0)
-
-
 # ---- Settings ----
 
 
@@ -294,12 +71,7 @@ class Setting(NamedTuple):
 
 
 def settings_of(group: str, member: str = "") -> list[Setting]:
-    """Returns the settings of a component.
-
-    Args:
-        group: env, geometry, learner, curriculum, logger, agent or opponents.
-        member: what chooses the component, such as ppo.
-    """
+    """Returns the settings of a member of a group, such as learner and ppo."""
     name = SINGLE.get(group) or components.members(group)[member]
     kind = components.kind_of(group, name)
     meanings = described(import_object(name), "Args")
@@ -355,9 +127,7 @@ def configured(group: str, member: str, device: str) -> dict[str, Any]:
 
 
 def also_set(group: str, member: str) -> dict[str, tuple[Any, Any]]:
-    """Returns {dotted key: (value on a GPU, on a CPU)} of what the file of a group's member sets of
-    other groups.
-    """
+    """Returns {dotted key: (value on a GPU, on a CPU)} that a member sets of other groups."""
     file, both = f"{group}/{member}.yaml", []
     for device in ("cuda", "cpu"):
         content = _merged(file, device) if (package.CONFIGS / file).exists() else {}
@@ -408,7 +178,7 @@ def kind_of(field: FieldInfo) -> str:
     options = [field.annotation]
     if typing.get_origin(field.annotation) in (typing.Union, types.UnionType):
         options = typing.get_args(field.annotation)
-    names = {name for one in _validators(field) for name in one}
+    names = _known_names(field)
     if any(isinstance(one, Scheduled) for one in field.metadata):
         words = ["number", "schedule"]
     else:
@@ -426,11 +196,11 @@ def _power(match):
     return f"{base}^{round(math.log(n, base))}"
 
 
-def _validators(field):
-    """Yields the names that the validators of a field know."""
-    for one in field.metadata:
-        if isinstance(one, AfterValidator) and isinstance(one.func, functools.partial):
-            yield one.func.keywords.get("names", ())
+def _known_names(field):
+    """Returns the names that the validators of a field know."""
+    functions = [one.func for one in field.metadata if isinstance(one, AfterValidator)]
+    partials = [one for one in functions if isinstance(one, functools.partial)]
+    return {name for one in partials for name in one.keywords.get("names", ())}
 
 
 def _word(hint, names):
@@ -465,7 +235,7 @@ def unexplained() -> list[str]:
 
 @functools.cache
 def metrics() -> dict[str, dict[str, str]]:
-    """Returns {title: {metric: meaning}} of all that reports metrics."""
+    """Returns {title: {metric: meaning}}."""
     tables = {k: described(import_object(path), "Metrics") for k, path in REPORTERS.items()}
     for group, prefix in (("env", "episode/"), ("learner", "")):
         for path in components.members(group).values():
@@ -488,7 +258,7 @@ def has_metric(name: str) -> bool:
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     lines = [head, ["---"] * len([*head]), *rows]
-    lines = [[" ".join(cell.split()).replace("|", "\\|") for cell in line] for line in lines]
+    lines = [[" ".join(str(cell).split()).replace("|", "\\|") for cell in line] for line in lines]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -535,10 +305,6 @@ def _metrics_page():
     return "\n".join(lines)
 
 
-def _exit_codes():
-    return table(["exit code", "meaning"], [[str(k), text] for k, text in EXIT_CODES.items()])
-
-
 def _benchmarks():
     sys.path.append(str(Path(__file__).parent / "benchmarks"))
     import paths
@@ -551,12 +317,14 @@ def _benchmarks():
 #: What the words of a generated block make.
 PAGES: dict[str, Callable[..., str]] = {
     "api": api,
-    "module": documentation,
+    "module": lambda module: markdown(importlib.import_module(module).__doc__),
     "settings": _settings_page,
     "benchmarks": _benchmarks,
     "recipes": _recipes,
     "metrics": _metrics_page,
-    "exit-codes": _exit_codes,
+    "exit-codes": lambda: table(
+        ["exit code", "meaning"], [[str(k), v] for k, v in EXIT_CODES.items()]
+    ),
 }
 
 

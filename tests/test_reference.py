@@ -3,6 +3,7 @@
 import json
 import re
 
+import docstrings
 import pytest
 import reference
 
@@ -17,10 +18,10 @@ DOCS = ROOT / "docs"
 
 
 def test_public_names_are_described_and_on_a_page():
-    assert reference.undescribed() == []
+    assert docstrings.undescribed() == []
     pages = "".join(path.read_text() for path in DOCS.glob("reference/api-*.md"))
     roots = tuple(re.findall(r"\{generated\} api (\S+)", pages))
-    names = [module.__name__ for module in reference.modules() if reference.public(module)]
+    names = [module.__name__ for module in docstrings.modules() if docstrings.public(module)]
     assert [n for n in names if not f"{n}.".startswith(tuple(f"{root}." for root in roots))] == []
 
 
@@ -52,7 +53,7 @@ def test_settings_say_what_applies():
 def test_metrics_of_environments_are_described(name):
     plans = {} if name in ("keys", "pong") else {"geometries": [toys.box()]}
     world = envs.ENVS[name](2, device="cpu", **plans).reset()
-    assert {*world.metrics} == {*reference.described(envs.ENVS[name], "Metrics")}
+    assert {*world.metrics} == {*docstrings.described(envs.ENVS[name], "Metrics")}
 
 
 def test_metrics_and_files_of_a_run_are_described(here):

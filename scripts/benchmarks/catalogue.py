@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from adapter_steps import adapters
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
-from nsight_counters import counters
 from populations import copies, members, small_members
 from scaling import scaling
 from shortest_paths import paths
@@ -20,7 +19,6 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "objects": objects,
     "mazes": mazes,
     "kernels": kernels,
-    "counters": counters,
     "observe": observe,
     "agents": agents,
     "deathmatch": deathmatch,

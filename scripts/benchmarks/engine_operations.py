@@ -14,10 +14,7 @@ N_ARENAS = {"cuda": 65_536, "cpu": 1024}  # homes of four agents each
 
 
 def operations(n: int, device: torch.device) -> Iterator[tuple[str, Callable[[int], object]]]:
-    """Yields each operation that steps are made of, for ``n`` agents: (name, function of i).
-
-    The order is that of ``nsight_counters.KERNELS``.
-    """
+    """Yields each operation that steps are made of, for ``n`` agents: (name, function of i)."""
     env, _ = walk_in_homes("explorer", n, device)
     scenery, agents = env.core.scenery, env.core.agents
     decisions = random_actions(env.action_space, n, device)
