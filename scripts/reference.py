@@ -27,7 +27,6 @@ from pydantic import AfterValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-import megastep
 from megastep.agents import package
 from megastep.agents.cli import blocks
 from megastep.agents.errors import EXIT_CODES
