@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from megastep.agents.errors import ConfigErrors, UserError
-from megastep.agents.factory import components
+from megastep.agents.factory import check, components
 from megastep.agents.launch import signals
 from megastep.agents.reports import runs as reported
 from megastep.agents.runs import folders
@@ -107,9 +107,9 @@ class Run:
             format: "onnx", "torch", "safetensors" or "hub".
             file: default: one in the run's folder.
         """
-        from megastep.agents.cli.export import export
+        from megastep.agents.cli import export
 
-        return export(str(self.path), format, None if file is None else os.fspath(file))
+        return export.run(_checked(export.Export, run=self, format=format, file=file))
 
     def web(
         self,
@@ -126,10 +126,10 @@ class Run:
             homes: numbers of homes of the test split. Default: the first four.
             seed: of the first episodes.
         """
-        from megastep.agents.cli.web import write
+        from megastep.agents.cli import web
 
-        file = None if file is None else os.fspath(file)
-        return write(str(self.path), against, homes, seed, file)
+        chosen = dict(against=against, homes=homes, seed=seed, file=file)
+        return web.run(_checked(web.Web, run=self, **chosen))
 
 
 def make(env: object, privileged: bool = False, **settings_of_env: object) -> "Env":
@@ -200,8 +200,7 @@ def evaluate(
     if _is_policy(run):
         played = playing.first_episodes(_played(env), run, **cast(dict, settings))
         return statistics.summaries(played, optional(env, "roles"))
-    given = {} if env is None else {"env": env}
-    cfg = _settings("evaluate", {"run": run, **given, **settings})
+    cfg = _settings("evaluate", {"run": run, "env": env} | settings)
     with _interrupts():
         return json.loads(evaluate_run.run(cfg).with_suffix(".json").read_text())["rows"]
 
@@ -229,9 +228,7 @@ def record(
     if _is_policy(run):
         options = cast(dict, settings)
         return recording.film(_played(env), run, options.pop("file"), **options)
-    given = {"run": run, "env": env}
-    given = {key: value for key, value in given.items() if value is not None}
-    cfg = _settings("record", given | settings)
+    cfg = _settings("record", {"run": run, "env": env} | settings)
     with _interrupts():
         return recording.Film(filming.run(cfg))
 
@@ -254,11 +251,7 @@ def runs() -> list[Run]:
 
 
 def _plain(value, key) -> Any:
-    """Returns an argument as files have it.
-
-    Args:
-        key: that errors name.
-    """
+    """Returns an argument as files have it. Errors name the key."""
     value = value.path if isinstance(value, Run) else value
     value = os.fspath(value) if isinstance(value, os.PathLike) else value
     if inspect.isclass(value) or inspect.isfunction(value):
@@ -272,22 +265,27 @@ def _plain(value, key) -> Any:
         return {name: _plain(part, f"{key}.{name}") for name, part in value.items()}
     if isinstance(value, Sequence):
         return [_plain(part, key) for part in value]
-    if isinstance(value, numbers.Integral):
-        return int(value)
     if isinstance(value, numbers.Real):
-        return float(value)
-    problem = (
-        f"{type(value).__name__} is not a setting; use numbers, texts, lists, dicts, or a class"
-    )
-    raise ConfigErrors([(key, problem)])
+        return int(value) if isinstance(value, numbers.Integral) else float(value)
+    problem = "is not a setting; use numbers, texts, lists, dicts, or a class"
+    raise ConfigErrors([(key, f"{type(value).__name__} {problem}")])
+
+
+def _checked(kind, **arguments) -> Any:
+    """Returns the settings of a command that no file configures."""
+    return check.check(kind, _plain(arguments, "settings"))
 
 
 def _settings(name: str, arguments: Mapping[str, object]) -> Any:
     """Returns the settings of a command that its words would give, ready to run."""
-    from megastep.agents.cli import command  # with Hydra
+    from megastep.agents.cli import command, compose  # with Hydra
 
     plain = {key: _plain(value, key) for key, value in arguments.items()}
-    return command.settings_from(name, plain)
+    plain = {key: value for key, value in plain.items() if (key, value) != ("env", None)}
+    chosen = command.load(name)
+    cfg = compose.settings_from(chosen, plain)
+    chosen.ready(cfg)
+    return cfg
 
 
 # ---- Policies, and signals ----

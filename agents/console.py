@@ -53,8 +53,9 @@ class TolerantStream:
 
 def open_streams() -> None:
     """Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
-    that no file takes their number.
+    that no file takes their number. A thread that ends for a full disk costs a line.
     """
+    threading.excepthook = warn_of_thread
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
@@ -120,34 +121,27 @@ def table(
         width: in characters. The last columns are left out until it fits, and a line below names
             them. The first two stay.
     """
-    if width:
-        n = len(head)
-        while n > 2 and _width(table(head[:n], [row[:n] for row in rows])) > width:
-            n -= 1
-        if n < len(head):
-            shown = table(head[:n], [row[:n] for row in rows], is_markdown)
-            if _width(shown) > width:  # of two columns: their cells are broken
-                shown = _rendered(head[:n], [row[:n] for row in rows], is_markdown, width)
-            return f"{shown}\nToo wide for this terminal, but in the file: {', '.join(head[n:])}"
-    return _rendered(head, rows, is_markdown)
-
-
-def _rendered(head, rows, is_markdown, width=10_000) -> str:
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    style = box.HEAVY_HEAD if is_unicode() else box.ASCII
-    grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
-    for row in rows:
-        grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
-    plain: dict = dict(markup=False, emoji=False, color_system=None)
-    Console(file=text, width=width, force_terminal=False, **plain).print(grid)
-    return text.getvalue().strip()
+    def shown(n, width=10_000) -> str:
+        style = box.HEAVY_HEAD if is_unicode() else box.ASCII
+        grid, text = Table(*head[:n], box=box.MARKDOWN if is_markdown else style), StringIO()
+        for row in rows:
+            grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row[:n]))
+        plain: dict = dict(markup=False, emoji=False, color_system=None)
+        Console(file=text, width=width, force_terminal=False, **plain).print(grid)
+        return text.getvalue().strip()
 
-
-def _width(text) -> int:
-    return max(map(len, text.splitlines()))
+    n = len(head)
+    text = shown(n)
+    while width and n > 2 and max(map(len, text.splitlines())) > width:
+        n -= 1
+        text = shown(n, width if n == 2 else 10_000)  # whose cells are broken if they must be
+    if n == len(head):
+        return text
+    return f"{text}\nToo wide for this terminal, but in the file: {', '.join(head[n:])}"
 
 
 def terminal_width() -> int | None:

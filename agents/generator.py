@@ -6,14 +6,8 @@ import torch
 
 
 def stream_seed(seed: int, name: str) -> int:
-    """Returns the seed of one of a run's random streams, from 0 to 2**63 - 1.
-
-    Streams of different names, or of different seeds, are independent: the seed is the beginning of
-    a SHA-256.
-
-    Args:
-        seed: the run's seed.
-        name: what draws from the stream, such as "policy".
+    """Returns the seed of one of a run's random streams, from 0 to 2**63 - 1, by the name of what
+    draws from it, such as "policy". Streams of different names or seeds are independent.
     """
     digest = hashlib.sha256(f"{seed} {name}".encode()).digest()
     return int.from_bytes(digest[:8], "little") >> 1
@@ -31,9 +25,6 @@ class SeededGenerator:
 
     A state saved on one type of device means nothing on another: there, the sequence starts again
     from the seed.
-
-    Args:
-        seed: seed of the generator.
     """
 
     def __init__(self, seed: int):
@@ -41,11 +32,7 @@ class SeededGenerator:
         self._generator: torch.Generator | None = None
 
     def on(self, device: torch.device) -> torch.Generator:
-        """Returns the generator for a device.
-
-        Args:
-            device: device as tensors name theirs, so a GPU with its number (`cuda:0`).
-        """
+        """Returns the generator for a device, a GPU with its number (`cuda:0`)."""
         if self._generator is None or self._generator.device != device:
             self._generator = torch.Generator(device).manual_seed(self.seed)
         return self._generator

@@ -26,11 +26,9 @@ __all__ = [
     "LearnerOptions",
     "Logger",
     "Moments",
-    "OpponentPool",
     "RolloutLike",
     "Row",
     "RunResult",
-    "SaverLike",
     "StateDict",
     "with_defaults",
 ]
@@ -235,59 +233,3 @@ class RunResult(NamedTuple):
     numbers: dict[str, float]
     film: Path | None = None
     table: Sequence[Mapping[str, str]] = ()
-
-
-class SaverLike(Protocol):
-    """Saves a trainer's state, possibly while training goes on."""
-
-    error: str | None  # why the last checkpoint that was begun could not be saved
-    lacks_replay: bool  # it was not due to hold the replay buffer
-    folder: Path  # where the checkpoints go
-    config: Config  # that of the run, and its spaces
-
-    @property
-    def is_writing(self) -> bool:
-        """Whether a checkpoint is being written."""
-        ...
-
-    def __call__(self, step: int, state: StateDict, score: float | None, is_last: bool) -> None: ...
-
-    def give_up(self) -> None:
-        """Waits no longer for the parts of other ranks, as one has ended."""
-
-    def wait(self) -> None:
-        """Returns when everything is saved, or has failed."""
-
-
-class OpponentPool(Protocol):
-    """The part of `selfplay.opponents.Opponents` that a trainer uses."""
-
-    env: Env  # without the opponents
-    scripted: object  # the bot, or None
-
-    def refresh_snapshots(self, policy: Actor, n_updates: int) -> None:
-        """Replaces the oldest snapshot by the policy if it is time to."""
-
-    def is_due(self, n_updates: int) -> bool:
-        """Returns whether `refresh_rival` replaces one after so many updates."""
-        ...
-
-    def next_rival(self, member: int, size: int, n_updates: int) -> int:
-        """Returns the member of a population whose policy is next."""
-        ...
-
-    def refresh_rival(self, policy: Actor, n_updates: int) -> None:
-        """Replaces the oldest snapshot of another member by this policy."""
-
-    def pop_win_rates(
-        self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]
-    ) -> dict[str, float]:
-        """Returns the fraction won against each kind of opponent since the last call."""
-        ...
-
-    def state_dict(self) -> StateDict:
-        """Returns everything that changes."""
-        ...
-
-    def load_state_dict(self, state: StateDict) -> None:
-        """Continues from a `state_dict`."""

@@ -12,13 +12,8 @@ from megastep.settings import closest
 
 
 def import_object(name: str) -> Callable:
-    """Returns the class or function at `module:attribute`.
-
-    Modules of the current folder come before installed ones, and after those of Python. For what
-    is in megastep, that folder is not searched: a downloaded one may hold anything.
-
-    Raises:
-        ValueError: if it cannot be imported, in one sentence.
+    """Returns the class or function at `module:attribute`. Raises ValueError if it cannot be
+    imported. For what is in megastep, the current folder is not searched: it may hold anything.
     """
     module, _, attribute = name.partition(":")
     if not all(part.isidentifier() for part in [*module.split("."), *attribute.split(".")]):
@@ -44,8 +39,6 @@ def import_object(name: str) -> Callable:
 def search_current_folder() -> None:
     """Adds the current folder to `sys.path`: before installed packages, so that none shadows a
     module of the user, and after the standard library, so that a `random.py` there breaks nothing.
-
-    Worker processes get `sys.path`, and so find the same modules.
     """
     here = os.getcwd()
     if here not in sys.path:
@@ -54,11 +47,8 @@ def search_current_folder() -> None:
 
 
 def resolve(name: str, table: dict[str, type], base: type) -> type:
-    """Returns the entry of `table` called `name`, or the class at this import path.
-
-    Raises:
-        ValueError: if it is neither, or no class derived from `base` that takes one argument, in
-            one sentence.
+    """Returns the entry of `table` called `name`, or the class at this import path. Raises
+    ValueError if it is neither, or no class derived from `base` that takes one argument.
     """
     known_name(name, [*table])
     if name in table:
@@ -75,10 +65,8 @@ def resolve(name: str, table: dict[str, type], base: type) -> type:
 
 
 def known_name(name: str, names: Sequence[str]) -> str:
-    """Returns `name`, which is one of `names` or an import path that can be imported.
-
-    Raises:
-        ValueError: if it is neither, in one sentence.
+    """Returns `name`, which is one of `names` or an import path that can be imported. Raises
+    ValueError if it is neither.
     """
     if name not in names:
         if ":" not in name:

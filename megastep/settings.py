@@ -83,11 +83,7 @@ def _strict(hint) -> Any:
 
 
 def _frozen(kind: type, is_finite=True, is_strict=False) -> Any:
-    """Makes a frozen dataclass of a class.
-
-    Args:
-        is_strict: no value is converted, as where a function gets the same ones.
-    """
+    """Makes a frozen dataclass of a class; a strict one converts no value."""
     if not is_strict:
         hints = typing.get_type_hints(kind, include_extras=True)
         own = inspect.get_annotations(kind)
@@ -140,7 +136,6 @@ def settings_of(
     **more,
 ) -> type:
     """Returns a frozen dataclass of the arguments of a class or function: types, bounds, defaults.
-
     An argument without an annotation has the type of its default.
 
     Args:
@@ -152,8 +147,7 @@ def settings_of(
         more: fields to add: a type, or (type, default).
 
     Raises:
-        ValueError: if an annotation cannot be read, or an argument has the name of a field of
-            `more`.
+        ValueError: an annotation cannot be read, or an argument is called as a field of `more`.
     """
     fields = {name: f if isinstance(f, tuple) else (f,) for name, f in more.items()}
     try:
@@ -179,7 +173,7 @@ def parameters_of(constructor: Callable) -> dict[str, inspect.Parameter]:
     """
     found = {}
     for _, arguments in _signatures(constructor):
-        found = {**found, **{k: one for k, one in arguments.items() if k not in found}}
+        found |= {name: one for name, one in arguments.items() if name not in found}
     return found
 
 
@@ -214,8 +208,8 @@ def _field(hint, default) -> tuple:
 
 
 def _has_members(protocol, value) -> object:
-    """Returns a value that has all members of a protocol; ValueError otherwise. From Python 3.12
-    `isinstance` does not see those that a wrapper has by `__getattr__`.
+    """Returns a value that has all members of a protocol, also those that a wrapper has by
+    `__getattr__`, which `isinstance` does not see from Python 3.12; ValueError otherwise.
     """
     members = {**protocol.__annotations__, **vars(protocol)}
     absent = [name for name in members if not name.startswith("_") and not hasattr(value, name)]
@@ -231,20 +225,15 @@ def _class(name, fields) -> type:
     body: dict = {"__annotations__": {key: field[0] for key, field in fields.items()}}
     for key, (_, *default) in fields.items():
         if default and type(default[0]).__hash__ is None:  # one that could change, such as a list
-            body[key] = dataclasses.field(default_factory=functools.partial(_identity, default[0]))
+            body[key] = dataclasses.field(default_factory=lambda value=default[0]: value)
         elif default:
             body[key] = default[0]
     return type(name, (), body)
 
 
-def _identity(value: T) -> T:
-    return value
-
-
 def checked(function: F) -> F:
-    """Decorator: checks a function's arguments against its annotations.
-
-    The function gets its arguments as they are, not copies, unlike with `pydantic.validate_call`.
+    """Decorator: checks a function's arguments against its annotations. The function gets its
+    arguments as they are, not copies, unlike with `pydantic.validate_call`.
 
     Raises:
         ValueError: naming every argument that is wrong, and what is allowed.
@@ -281,9 +270,7 @@ def _plain(value) -> object:
 
 
 def sentence(error: Mapping, field: FieldInfo | None, value: object) -> str:
-    """Returns what is wrong with the `value` of a `field`, from one of pydantic's errors: what is
-    allowed, and what was given.
-    """
+    """Returns what is allowed of a `field`, and the `value` given, from one of pydantic's errors."""
     kind, got = error["type"], "nothing" if value is None else repr(value)
     is_schedule = isinstance(value, Mapping) and value.keys() == {"from", "to"}
     if is_schedule and kind != "value_error":

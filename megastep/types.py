@@ -146,7 +146,7 @@ DEFAULTS: dict[str, Any] = {
     # of environments with opponents
     "learners": None,  # (B,) bool, lanes whose transitions are stored; None: all
     "matchups": {},  # (B,) bool by name, groups of lanes that are reported apart
-    "opponent_pool": None,  # an `agents.types.OpponentPool`
+    "opponent_pool": None,  # an `Opponents` of agents.selfplay
     "begin_step": lambda: None,  # starts what a step can do before its actions are known
 }
 

@@ -15,7 +15,7 @@ import torch
 import megastep
 from megastep import devices
 from megastep.agents import api
-from megastep.agents.cli import command, compose
+from megastep.agents.cli import compose
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.launch import signals
 from megastep.agents.networks.policy import Policy
@@ -121,7 +121,7 @@ def test_errors_are_those_of_the_command_line_and_nothing_is_written(here):
 
 @pytest.mark.parametrize("value", ["true", 'a "b" \\', None, "1"])
 def test_a_value_means_itself_and_is_no_grammar(value):
-    chosen = command.settings_from("train", {"folder": value, "device": "cpu"})
+    chosen = api._settings("train", {"folder": value, "device": "cpu"})
     assert chosen.folder == value
 
 

@@ -77,9 +77,7 @@ def blocks_of(device: object, learner: object) -> dict[str, bool]:
 
 
 def built_in(learner: str) -> str | None:
-    """Returns the name of the built-in learner whose blocks a learner has, from its name or import
-    path; None if it has none.
-    """
+    """Returns the name of the built-in learner whose blocks a learner has; None if it has none."""
     names = {path: name for name, path in components.members("learner").items()}
     paths = [learner]
     if ":" in learner and learner not in names:
@@ -114,9 +112,6 @@ def plain(config: Container, resolve: bool = False) -> check.Tree:
 def leave_out_others(config: DictConfig, learner: str | None) -> None:
     """Takes what only built-in learners have from the settings of a user's learner, which has the
     file of one.
-
-    Args:
-        learner: import path, None for `config.learner.name`.
     """
     name = learner or OmegaConf.select(config, "learner.name")
     known = components.members("learner").values()

@@ -37,10 +37,6 @@ OPTIONS = {
         "const": "all",
         "help": "print what the configuration is composed of: defaults-tree, searchpath, ...",
     },
-    "-sc --shell-completion": {
-        "action": "store_true",
-        "help": 'tab completion: eval "$({command} -sc install=bash)"',
-    },
     "--hydra-help": {"action": "store_true", "help": "print Hydra's own help and stop"},
 }
 #: Options of every command.
@@ -94,9 +90,8 @@ def without_dashes(word: str) -> str:
     are left as they are.
     """
     name, is_given, _ = word.partition("=")
-    options = {option for names in OPTIONS for option in names.split()}
-    is_key = is_given and name.startswith("--") and name not in options
-    return word.removeprefix("--") if is_key else word
+    is_option = name in " ".join(OPTIONS).split()
+    return word.removeprefix("--") if is_given and not is_option else word
 
 
 def _run(command: Command, argv: list[str]) -> int:
@@ -110,22 +105,21 @@ def _run(command: Command, argv: list[str]) -> int:
         allow_abbrev=False,
     )
     for names, arguments in {**(OPTIONS if command.has_files else {}), **COMMON}.items():
-        arguments = arguments | {"help": arguments["help"].replace("{command}", script)}
         parser.add_argument(*names.split(), **arguments)
     options = parser.parse_intermixed_args(argv)
-    is_needed = any(field.is_required() for field in command.kind.__pydantic_fields__.values())
     if options.version:
         console.say(package.version())
-    elif command.has_files:
+        return 0
+    if command.has_files:
         return _run_composed(command, options, argv, parser)
-    elif options.help or (is_needed and not argv):
+    is_needed = any(field.is_required() for field in command.kind.__pydantic_fields__.values())
+    if options.help or (is_needed and not argv):
         console.say(parser.format_help().rstrip())
         return 0 if options.help else 2
-    else:
-        from megastep.agents.cli import words
+    from megastep.agents.cli import words
 
-        return command.run(words.plain_settings(command, options.overrides)) or 0
-    return 0
+    result = command.run(words.plain_settings(command, options.overrides))
+    return result if isinstance(result, int) else 0
 
 
 def _run_composed(command, options, argv, parser) -> int:
@@ -136,22 +130,18 @@ def _run_composed(command, options, argv, parser) -> int:
         command, options.config_name, options.config_dir, options.config_path
     )
     words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
-    flags = [one for one in argv if one not in (*options.overrides, "-m", "--multirun")]
     if options.help:
         parser.epilog = "groups, chosen with group=member:" + "".join(
             f"\n  {name:<11} {', '.join(members)}" for name, members in composer.groups().items()
         )
         console.say(parser.format_help().rstrip())
-    elif options.shell_completion:
-        with user_errors(kinds=compose.HYDRA_ERRORS):
-            composer.complete(flags, words)
     elif options.cfg == "job":
-        for i, job in enumerate(
-            sweeps.jobs_of(composer, words)[0] if options.multirun else [words]
-        ):
+        jobs = sweeps.jobs_of(composer, words)[0] if options.multirun else [words]
+        for i, job in enumerate(jobs):
             print("---\n" * (i > 0), end="", flush=True)
             print(composer.shown(job, options.package), end="", flush=True)
     elif options.cfg or options.info or options.hydra_help:
+        flags = [one for one in argv if one not in (*options.overrides, "-m", "--multirun")]
         with user_errors(kinds=compose.HYDRA_ERRORS):
             composer.call_hydra(flags + words)
     elif options.multirun:
@@ -181,20 +171,6 @@ def _ready(composer, words) -> Any:
 def load(name: str) -> Command:
     """Returns the command of this name."""
     return importlib.import_module(f"megastep.agents.cli.{name}").COMMAND
-
-
-def settings_from(name: str, arguments: dict[str, Any]) -> Any:
-    """Returns the settings of a command from keyword arguments, ready to run.
-
-    Raises:
-        UserError: with everything that is wrong.
-    """
-    from megastep.agents.cli import compose
-
-    command = load(name)
-    cfg = compose.settings_from(command, arguments)
-    command.ready(cfg)
-    return cfg
 
 
 def with_member(tree: check.Tree, key: str) -> check.Tree:

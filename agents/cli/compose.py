@@ -52,7 +52,7 @@ STORE.store(name="open", node=OmegaConf.create(OPEN))
 
 
 def own(config: DictConfig, resolve: bool = False) -> check.Tree:
-    """Nested dicts of all but Hydra's part, without groups that nothing is in."""
+    """Nested dicts of all but Hydra's part, without empty groups."""
     keys = [str(key) for key in config if key != "hydra"]
     tree = blocks.plain(OmegaConf.masked_copy(config, keys), resolve)
     return {key: value for key, value in tree.items() if value != {}}
@@ -74,14 +74,10 @@ def is_import_path(value: object) -> bool:
     return isinstance(value, str) and ":" in value and "$" not in value  # Hydra interpolates a $
 
 
-# ---- Composing ----
-
-
 class Composer:
     """Composes and checks the configuration of one command.
 
     Args:
-        command: whose settings they are.
         name: another file than the command's own.
         folder: a folder whose files and groups are found beside ours.
         main: a folder in place of ours.
@@ -124,16 +120,13 @@ class Composer:
         """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable
         ones.
         """
-        lists = lists_of(self.command.kind)
-        overrides = parse(words, lists, self.cure_for_value, self.loader)
-        return [
-            one
-            for one in overrides
-            if one.value() is not None
-            or not self.members(one.key_or_group)
-            # Hydra has no word for leaving out a group that is left out anyway
-            or self.composed().hydra.runtime.choices.get(key_of(one)) is not None
-        ]
+
+        def is_left_out_anyway(one) -> bool:  # a group, for which Hydra has no word
+            is_none = one.value() is None and self.members(one.key_or_group)
+            return is_none and self.composed().hydra.runtime.choices.get(key_of(one)) is None
+
+        overrides = parse(words, lists_of(self.command.kind), self.cure_for_value, self.loader)
+        return [one for one in overrides if not is_left_out_anyway(one)]
 
     def settings(self, words: Iterable[str]) -> Any:
         return self.compose(words)[0]
@@ -152,10 +145,8 @@ class Composer:
         return self.checked(typed, errors)
 
     def checked(self, typed: list[Typed], errors: list) -> tuple[Any, DictConfig]:
-        """Returns checked settings, and the configuration they are from.
-
-        Args:
-            errors: what is wrong already, (key, sentence) each.
+        """Returns checked settings, and the configuration they are from. `errors` has what is wrong
+        already.
         """
         config, more = self.config(typed)
         secret = [*refused_resolvers(own(config))]
@@ -268,23 +259,6 @@ class Composer:
         part = OmegaConf.select(config, key) if key else config
         return OmegaConf.to_yaml(part) if OmegaConf.is_config(part) else f"{part}\n"
 
-    def complete(self, flags: list[str], words: list[str]) -> None:
-        """Has Hydra complete the last word of COMP_LINE, from every key that there is."""
-        line = f"{os.environ.get('COMP_LINE', '')}|"
-        *before, last = line.split()
-        overrides = self.parse(word for word in before if "=" in word)
-        config, errors = self.config([*map(typed_word, overrides)])
-        if errors:  # nothing completes what follows words that are wrong
-            return
-        tree = own(config)
-        names = self.command.kind.__pydantic_fields__
-        if "." in last:  # those of components, which are imported for it
-            names = [key for key, _ in check.fields_of(self.command.kind, tree)]
-        keys = OmegaConf.from_dotlist([f"{key}=null" for key in names])
-        node = {"defaults": [self.name, "_self_"], **blocks.plain(OmegaConf.merge(keys, tree))}
-        STORE.store(name="every-key", node=node)
-        self.call_hydra([*flags, *words, "--config-name=every-key"])
-
     def call_hydra(self, arguments: list[str], task: Callable | None = None) -> None:
         """Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv."""
         os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", arguments
@@ -307,9 +281,7 @@ def store_member(group: str, member: str, path: str) -> None:
 
 def settings_from(command: "Command", arguments: Mapping[str, Any]) -> Any:
     """Returns the checked settings of a command from keyword arguments, as `typed_of` takes them.
-
-    Raises:
-        ConfigErrors: with everything that is wrong.
+    Raises ConfigErrors with everything that is wrong.
     """
     state = global_hydra.GlobalHydra.instance()
     before = state.hydra  # of a program of the user's

@@ -3,9 +3,7 @@ closed streams are handled before anything else is imported.
 """
 
 import importlib
-import os
 import sys
-import threading
 
 from megastep.agents import package
 from megastep.agents.errors import UserError
@@ -30,36 +28,24 @@ COMMANDS = {
 
 def main() -> int:
     """Runs the installed command, `megastep`. Returns the exit code."""
-    words, line = sys.argv[1:] or ["--help"], os.environ.get("COMP_LINE", "")
-    if words[0] in ("-sc", "--shell-completion"):
-        script = "".join(line.split()[1:2])  # which is completed here, its options elsewhere
-        if "query=" not in " ".join(words):
-            words = ["train", *words]
-        elif script in ("train", "evaluate", "record") and (
-            len(line.split()) > 2 or line.endswith(" ")
-        ):
-            os.environ["COMP_LINE"] = line.replace(script, "", 1)
-            words = [script, *words]
-        else:
-            print(" ".join(name for name in COMMANDS if name.startswith(script)))
-            words = [""]
-    if words[0] in COMMANDS:
-        return run_command(words[0], words[1:])
+    name, *words = sys.argv[1:] or ["--help"]
+    if name in COMMANDS:
+        return run_command(name, words)
     from megastep.agents import console
     from megastep.settings import closest
 
     console.open_streams()
-    if words[0] in ("-h", "--help"):
+    if name == "--version":
+        console.say(package.version())
+    elif name not in ("-h", "--help"):
+        text = f"{name!r} is unknown; {closest(name, COMMANDS)}"
+        console.say(f"megastep: {text}", sys.stderr)
+        return 2
+    else:
         names = {package.command(name, "python -m "): text for name, text in COMMANDS.items()}
         for name, text in names.items():
             console.say(f"  {name:<{max(map(len, names))}}  {text}")
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
-    elif words[0] == "--version":
-        console.say(package.version())
-    elif words[0]:
-        text = f"{words[0]!r} is unknown; {closest(words[0], COMMANDS)}"
-        console.say(f"megastep: {text}", sys.stderr)
-        return 2
     return 0
 
 
@@ -70,7 +56,6 @@ def run_command(name: str, words: list[str] | None = None) -> int:
     from megastep.agents import console
 
     console.open_streams()
-    threading.excepthook = console.warn_of_thread
     try:
         return importlib.import_module(f"megastep.agents.cli.{name}").main(words)
     except UserError as error:

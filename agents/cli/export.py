@@ -8,7 +8,7 @@ from megastep.agents.cli.command import Command, with_member
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import settings
 from megastep.agents.runs import folders
-from megastep.settings import closest, frozen
+from megastep.settings import frozen
 
 HELP = """Writes a trained agent for use elsewhere.
 
@@ -37,27 +37,13 @@ class Export:
     member: settings.PopulationMember = None
 
 
-def run(cfg: Export) -> None:
-    """Writes an agent for another runtime."""
-    chosen = with_member({"run": cfg.run, "member": cfg.member}, "run")["run"]
-    export(chosen, cfg.format, cfg.file)
-
-
-def export(run: str, kind: str, file: str | None = None) -> Path:
-    """Writes an agent's file or folder, and says what was written. Returns its path.
-
-    Args:
-        run: a run, one of its checkpoints, or a packaged agent.
-        kind: a key of `FORMATS`.
-        file: default: one in the run's folder.
-
-    Raises:
-        UserError: there is no such run or format; or it cannot be written so.
+def run(cfg: Export) -> Path:
+    """Writes an agent's file or folder, and says what was written. Returns its path. Raises
+    UserError if there is no such run, or it cannot be written so.
     """
-    if kind not in FORMATS:
-        raise UserError(f"format: {kind!r} is unknown; {closest(kind, FORMATS)}")
+    kind, run = cfg.format, with_member({"run": cfg.run, "member": cfg.member}, "run")["run"]
     source, suffix = folders.find(run), Path(FORMATS[kind]).suffix
-    path = folders.folder_of(source) / FORMATS[kind] if file is None else Path(file)
+    path = folders.folder_of(source) / FORMATS[kind] if cfg.file is None else Path(cfg.file)
     if suffix and path.suffix != suffix:
         raise UserError(f"file={path} must end with {suffix} for format={kind}")
     from megastep.agents import pretrained  # with PyTorch
@@ -65,22 +51,20 @@ def export(run: str, kind: str, file: str | None = None) -> Path:
     from megastep.agents.export.step import Step
 
     if kind == "safetensors":
-        for written in agent.write(run, path):
-            console.say(f"Wrote {written}")
+        console.say("\n".join(f"Wrote {written}" for written in agent.write(run, path)))
         return path
     policy, env = pretrained.load_with_env(run, "cpu", films=kind == "hub")
     name = folders.name_of(source)
     if kind == "hub":
-        for written in hub.write(run, path, name, policy, env):
-            console.say(f"Wrote {written}")
+        written = hub.write(run, path, name, policy, env)
+        console.say("\n".join(f"Wrote {file}" for file in written))
         return path
     with user_errors(f"{path} cannot be written: "):
         path.parent.mkdir(parents=True, exist_ok=True)
     step = Step(policy, env.obs_space, env.reset().get("mask"))
-    write, runner = {
-        "onnx": (runtimes.write_onnx, runtimes.run_onnx),
-        "torch": (runtimes.write_torch, runtimes.run_torch),
-    }[kind]
+    write, runner = runtimes.write_torch, runtimes.run_torch
+    if kind == "onnx":
+        write, runner = runtimes.write_onnx, runtimes.run_onnx
     with user_errors(f"{path} cannot be written: ", (OSError,)):
         write(step, path, name)
     found = runtimes.compare(step, runner(path), policy, env)

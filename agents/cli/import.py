@@ -1,11 +1,12 @@
 """megastep import source=SOURCE path=FILE: floor plans of others, as geometries."""
 
+import contextlib
 import importlib.util
 import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -36,21 +37,14 @@ it. In a drawing walls have the id, class or label `wall`, doors `door`; walls=N
   entrances=open       leaves the doors to the outside open, as there; by default they are closed"""
 
 
-class Database(NamedTuple):
-    """Where a database is to be had."""
-
-    title: str
-    place: str
-    licence: str
-
-
+#: Title, place and licence of the databases.
 DATABASES = {
-    "cubicasa": Database(
+    "cubicasa": (
         "CubiCasa5k (Kalervo et al. 2019)",
         "https://zenodo.org/record/2613548",
         "CC BY-NC 4.0: no commercial use, name the authors",
     ),
-    "houseexpo": Database(
+    "houseexpo": (
         "HouseExpo (Li et al. 2019)",
         "https://github.com/TeaganLi/HouseExpo",
         "MIT; its plans are from SUNCG, which was withdrawn after a dispute about rights",
@@ -108,13 +102,13 @@ def _import_own(cfg) -> None:
     from megastep.geometries.plans import imports, sheets
 
     with user_errors(f"{path} is not a floor plan: "):
-        if cfg.source == "svg":
-            if cfg.scale is None:
-                raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
+        if cfg.source == "map":
+            own = imports.own_map(path, cfg.metres_per_pixel)
+        elif cfg.scale is None:
+            raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
+        else:
             marks = {key: getattr(cfg, key) for key in ("walls", "doors") if getattr(cfg, key)}
             own = imports.own_svg(path, cfg.scale, **marks)
-        else:
-            own = imports.own_map(path, cfg.metres_per_pixel)
     with user_errors(f"{file} cannot be written: "):
         files.save(file, [own.geometry])
         sheet = file.with_name(f"{file.stem}-sheet.png")
@@ -129,18 +123,17 @@ def _import_own(cfg) -> None:
     )
 
 
-def _confirm(source, licence) -> None:
+def _confirm(cfg) -> None:
     """Shows where a database is to be had, and has its licence confirmed."""
-    database = DATABASES[source]
-    console.say(f"{database.title}\n  from {database.place}\n  licence: {database.licence}")
-    if licence == "accept":
+    title, place, licence = DATABASES[cfg.source]
+    console.say(f"{title}\n  from {place}\n  licence: {licence}")
+    if cfg.licence == "accept":
         return
     if not sys.stdin or not sys.stdin.isatty():
         raise UserError("the licence is not confirmed; licence=accept does so")
-    try:
+    answer = ""
+    with contextlib.suppress(EOFError):
         answer = input("Was it downloaded from there, and do you accept the licence? [y/N] ")
-    except EOFError:
-        answer = ""
     if answer.strip().lower() not in ("y", "yes"):
         raise UserError("the licence is not confirmed, so nothing is imported")
 
@@ -149,7 +142,7 @@ def _import_database(cfg) -> None:
     source, path, start = cfg.source, Path(cfg.path), time.monotonic()
     if not path.exists():
         raise UserError(f"path={path} does not exist")
-    _confirm(source, cfg.licence)
+    _confirm(cfg)
     from megastep.geometries import imported
     from megastep.geometries.plans import imports, sheets
 
@@ -165,13 +158,9 @@ def _import_database(cfg) -> None:
     numbers = [i for i, plan in enumerate(plans) for _ in plan.geometries]
     with user_errors(f"{imported.folder()} cannot be written: "):
         file, digest = imported.write(source, geometries, numbers)
-        pairs = []
-        for member in shown:
-            pairs.append((member.name[-40:], *imports.first_home(options, member)))
-        sheet = imported.folder() / f"{source}.png"
-        sheets.write(sheet, pairs)
-        report = imported.folder() / f"{source}.md"
-        report.write_text(_report(source, path, plans, geometries, file, digest))
+        sheet, report = (imported.folder() / f"{source}.{kind}" for kind in ("png", "md"))
+        sheets.write(sheet, [(one.name[-40:], *imports.first_home(options, one)) for one in shown])
+        report.write_text(_report(source, path, plans, geometries, f"{file.name}, sha256 {digest}"))
     n_refused = sum(not plan.geometries for plan in plans)
     console.say(
         f"{len(geometries):,} floor plans of {len(plans):,} files in {file}\n"
@@ -181,31 +170,28 @@ def _import_database(cfg) -> None:
     )
 
 
-def _report(source, path, plans, geometries, file, digest) -> str:
+def _report(source, path, plans, geometries, file) -> str:
     """Returns the report of an import in Markdown."""
     from megastep.geometries.plans import imports
 
-    notes = [note for plan in plans for note in plan.notes]
+    title, _, licence = DATABASES[source]
+    notes = [(plan.name, note) for plan in plans for note in plan.notes]
     some = geometries[:: max(1, len(geometries) // 500)]
     columns = [imports.quantiles(some), imports.quantiles(imports.generated_homes())]
     rows = [[key, *(column[key] for column in columns)] for key in columns[0]]
-    table = console.table(
-        ("quantiles 5 / 25 / 50 / 75 / 95 %", source, "generated homes"), rows, is_markdown=True
-    )
+    head = "quantiles 5 / 25 / 50 / 75 / 95 %", source, "generated homes"
     refused = [(plan.name, plan.refusal) for plan in plans if plan.refusal]
     kinds = Counter(refusal for _, refusal in refused)
-    n_rooms, n_reachable = (sum(note[i] for note in notes) for i in (0, 1))
-    warnings = [
-        f"- {plan.name}: {text}" for plan in plans for note in plan.notes for text in note.warnings
-    ]
+    n_rooms, n_reachable = (sum(note[i] for _, note in notes) for i in (0, 1))
+    warnings = [f"- {name}: {text}" for name, note in notes for text in note.warnings]
     lines = [
-        f"# Import of {DATABASES[source].title}",
-        f"- from {path}, licence {DATABASES[source].licence}",
-        f"- {file.name}, sha256 {digest}",
+        f"# Import of {title}",
+        f"- from {path}, licence {licence}",
+        f"- {file}",
         f"- {len(geometries):,} floor plans of {len(plans):,} files; {len(refused):,} are refused",
         f"- {n_reachable:,} of {n_rooms:,} rooms can be reached; agents spawn in these alone",
-        f"- {sum(note.n_sealed for note in notes):,} doors to the outside are closed",
-        f"\n{table}\n",
+        f"- {sum(note.n_sealed for _, note in notes):,} doors to the outside are closed",
+        f"\n{console.table(head, rows, is_markdown=True)}\n",
         "## Refused",
         *(f"- {n:,} times: {text}" for text, n in kinds.most_common()),
         *[f"- {name}: {text}" for name, text in refused][:MAX_LINES],

@@ -2,7 +2,7 @@
 
 import datetime
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,32 +30,19 @@ class Inspect:
 def run(cfg: Inspect) -> int:
     """Inspects a run. Returns the exit code: 1 if one of its checkpoints is damaged."""
     path = folders.find(cfg.run)
-    if agent_file.is_agent_file(path):
-        return _inspect([path], _lines_of_agent)
-    if folders.checkpoints_of(path) == path:
-        return _inspect([path], _lines)
-    path = folders.checkpoints_of(path)
-    if not checkpoint.list_checkpoints(path):
-        raise UserError(f"There is no checkpoint in {path}; has the run saved one yet?")
-    return _inspect(checkpoint.list_checkpoints(path), _lines, path)
-
-
-def _inspect(
-    paths: list[Path], lines_of: Callable[[Path], Iterable[str]], folder: Path | None = None
-) -> int:
-    """Prints the lines about each path. Returns 1 if one is damaged, else 0.
-
-    Args:
-        folder: where a run may delete some of these checkpoints meanwhile, and save others.
-    """
+    is_agent, folder = agent_file.is_agent_file(path), folders.checkpoints_of(path)
+    is_one = is_agent or folder == path
+    paths = [path] if is_one else checkpoint.list_checkpoints(folder)
+    if not paths:
+        raise UserError(f"There is no checkpoint in {folder}; has the run saved one yet?")
     is_damaged, n_printed = False, 0
     while paths:
         path, *paths = paths
         try:
-            console.say("\n".join(lines_of(path)))
+            console.say("\n".join((_lines_of_agent if is_agent else _lines)(path)))
             n_printed += 1
-        except checkpoint.GoneCheckpoint as error:
-            if folder is None:
+        except checkpoint.GoneCheckpoint as error:  # the run has saved others meanwhile
+            if is_one:
                 raise UserError(str(error)) from None
             paths = paths if paths or n_printed else checkpoint.list_checkpoints(folder)
         except checkpoint.CheckpointError as error:
@@ -72,19 +59,13 @@ def _lines(path: Path) -> Iterator[str]:
         written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
     except FileNotFoundError:
         raise checkpoint.GoneCheckpoint(path) from None
-    numbers = [f"{name} {value:,.6g}" for name, value in loaded.numbers.items()]
-    made_with = [f"{name} {value}" for name, value in loaded.made_with.items()]
     yield f"{path}: intact, format {manifest['format']}, written {written:%Y-%m-%d %H:%M:%S}"
-    yield f"  {'; '.join(numbers)}"
-    if made_with:
-        yield f"  {'; '.join(made_with)}"
+    yield f"  {'; '.join(f'{name} {value:,.6g}' for name, value in loaded.numbers.items())}"
+    if loaded.made_with:
+        yield f"  {'; '.join(f'{name} {value}' for name, value in loaded.made_with.items())}"
     for name, entry in manifest["files"].items():
         yield f"  {name:<14}{console.number(entry['bytes'])} bytes, sha256 {entry['sha256'][:16]}"
-    head = ["part", "tensors", "numbers", "bytes", "largest"]
-    rows = [
-        _row(name, part) for name, part in (loaded.state or {}).items() if isinstance(part, dict)
-    ]
-    yield from (f"  {line}" for line in console.table(head, rows).splitlines())
+    yield _table(loaded.state)
 
 
 def _lines_of_agent(path: Path) -> Iterator[str]:
@@ -92,22 +73,25 @@ def _lines_of_agent(path: Path) -> Iterator[str]:
     loaded, about = agent_file.read(path, "cpu"), agent_file.read_metadata(path)
     yield f"{path}: intact, {console.number(path.stat().st_size)} bytes"
     yield from (f"  {name}: {value}" for name, value in about["facts"].items())
-    head = ["part", "tensors", "numbers", "bytes", "largest"]
-    rows = [_row(name, part) for name, part in (loaded.state or {}).items()]
-    yield from (f"  {line}" for line in console.table(head, rows).splitlines())
+    yield _table(loaded.state)
     for table in about["tables"]:
         yield f"  {table['title']}: {len(table['rows'])} rows"
 
 
-def _row(name: str, part: "StateDict") -> list[str]:
-    """Returns the cells about a part of a checkpoint's state."""
-    tensors = dict(_tensors(part))
-    n_numbers = sum(math.prod(leaf.shape) for leaf in tensors.values())
-    n_bytes = sum(leaf.nbytes for leaf in tensors.values())
-    path, leaf = max(tensors.items(), key=lambda item: item[1].nbytes, default=("", None))
-    largest = "" if leaf is None else f"{path.lstrip('.')} {tuple(leaf.shape)}"
-    numbers = [console.number(number) for number in (len(tensors), n_numbers, n_bytes)]
-    return [name, *numbers, largest]
+def _table(state: "StateDict | None") -> str:
+    """Returns a table of what is in the parts of a state."""
+    rows = []
+    for name, part in (state or {}).items():
+        if isinstance(part, dict):
+            tensors = dict(_tensors(part))
+            n_numbers = sum(math.prod(leaf.shape) for leaf in tensors.values())
+            n_bytes = sum(leaf.nbytes for leaf in tensors.values())
+            numbers = [*map(console.number, (len(tensors), n_numbers, n_bytes))]
+            largest = max(tensors, key=lambda path: tensors[path].nbytes, default=None)
+            shape = f"{largest.lstrip('.')} {tuple(tensors[largest].shape)}" if largest else ""
+            rows.append([name, *numbers, shape])
+    lines = console.table(["part", "tensors", "numbers", "bytes", "largest"], rows).splitlines()
+    return "\n".join(f"  {line}" for line in lines)
 
 
 def _tensors(tree, path="") -> "Iterator[tuple[str, torch.Tensor]]":
@@ -115,9 +99,8 @@ def _tensors(tree, path="") -> "Iterator[tuple[str, torch.Tensor]]":
     if hasattr(tree, "nbytes"):
         yield path, tree
     elif isinstance(tree, (dict, list, tuple)):
-        pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
-        for key, part in pairs:
-            yield from _tensors(part, f"{path}.{key}".replace("..", "."))
+        for key, part in tree.items() if isinstance(tree, dict) else enumerate(tree):
+            yield from _tensors(part, f"{path}.{key}")
 
 
 COMMAND = Command("inspect", Inspect, HELP)

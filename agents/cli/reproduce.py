@@ -2,13 +2,12 @@
 and evaluates as `megastep train` and `megastep evaluate` do, and compares.
 """
 
-import hashlib
 import itertools
 import json
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +32,17 @@ CPU_THREADS = 2
 STATED = re.compile(r"(-?[\d.]+)( %)? (?:\(|\| )(-?[\d.]+) to (-?[\d.]+)\)?")
 
 
+class Interval(NamedTuple):
+    """A value and its 95 % interval."""
+
+    value: float
+    lower: float
+    upper: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.4g} ({self.lower:.4g} to {self.upper:.4g})"
+
+
 class Result(NamedTuple):
     """A number that a page states.
 
@@ -53,7 +63,7 @@ class Result(NamedTuple):
         value, percent, lower, upper = self._parts()
         return f"{self.metric} {value}{percent} ({lower} to {upper})"
 
-    def agrees(self, found: "Interval") -> bool:
+    def agrees(self, found: Interval) -> bool:
         """Returns true if a 95 % interval, rounded as the stated one is, has a number in common
         with it: a run on another kind of machine is another sample of the same training.
         """
@@ -69,17 +79,6 @@ class Result(NamedTuple):
         return match.groups(default="")
 
 
-class Interval(NamedTuple):
-    """A value and its 95 % interval."""
-
-    value: float
-    lower: float
-    upper: float
-
-    def __str__(self) -> str:
-        return f"{self.value:.4g} ({self.lower:.4g} to {self.upper:.4g})"
-
-
 class Row(NamedTuple):
     """A training run with its results.
 
@@ -87,7 +86,6 @@ class Row(NamedTuple):
         device: cpu or cuda.
         train: words of `megastep train`.
         minutes: of the run and its evaluations, about; given for a CPU.
-        exact: machines and the SHA-256 of the run's metrics.jsonl on each.
     """
 
     name: str
@@ -95,7 +93,6 @@ class Row(NamedTuple):
     train: str
     results: list[Result]
     minutes: int | None = None
-    exact: Sequence[dict] = ()
 
 
 def read() -> dict[str, Row]:
@@ -122,34 +119,24 @@ def run(cfg: Reproduce) -> int:
     """
     rows = read()
     if cfg.row is None:
-        console.say(listing(rows.values()))
+        for device, title in ("cpu", "On two CPU cores"), ("cuda", "On one H200"):
+            lines = [
+                [row.name, str(row.minutes or ""), row.train, "; ".join(map(str, row.results))]
+                for row in rows.values()
+                if row.device == device
+            ]
+            table = console.table(["row", "minutes", "megastep train", "result"], lines)
+            console.say(f"{title}\n{table}")
+        console.say(f"To run one: {package.command('reproduce', 'python ')} ROW")
         return 0
     if cfg.row not in rows:
         raise UserError(f"{cfg.row!r} is unknown; {closest(cfg.row, rows)}")
     return reproduce(rows[cfg.row])
 
 
-def listing(rows: Iterable[Row]) -> str:
-    """Returns a table of the rows for each device."""
-    rows, parts = [*rows], []
-    for device, title in ("cpu", "On two CPU cores"), ("cuda", "On one H200"):
-        lines = [
-            [row.name, str(row.minutes or ""), row.train, "; ".join(map(str, row.results))]
-            for row in rows
-            if row.device == device
-        ]
-        parts += [title, console.table(["row", "minutes", "megastep train", "result"], lines)]
-    return "\n".join([*parts, f"To run one: {package.command('reproduce', 'python ')} ROW"])
-
-
-# ---- Running a row ----
-
-
 def reproduce(row: Row) -> int:
-    """Trains and evaluates a row, and says whether its results are as stated.
-
-    Returns:
-        The exit code of the training or an evaluation if it fails, else 1 if a result differs.
+    """Trains and evaluates a row, and says whether its results are as stated. Returns the exit code
+    of the training or an evaluation if it fails, else 1 if a result differs.
 
     Raises:
         UserError: the row needs a GPU and there is none.
@@ -167,13 +154,11 @@ def reproduce(row: Row) -> int:
     folder = folders.RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-reproduce-{row.name}"
     device = f"device={row.device}"
     finish = "finish.evaluate=false", "finish.record=false"
-    words = [*row.train.split(), *finish, device, f"folder={folder}"]
-    if code := train.main(words):
+    if code := train.main([*row.train.split(), *finish, device, f"folder={folder}"]):
         return code
     found = []
     for more, group in itertools.groupby(row.results, lambda result: result.evaluate):
-        words = [f"run={folder}", device, "baseline=false", *more.split()]
-        if code := evaluate.main(words):
+        if code := evaluate.main([f"run={folder}", device, "baseline=false", *more.split()]):
             return code
         tables = (folder / "evaluations").glob("*.json")
         newest = max(tables, key=lambda path: path.stat().st_mtime_ns)
@@ -195,71 +180,23 @@ def found_in(rows: list[dict], metric: str) -> Interval:
 
 
 def compare(row: Row, folder: Path, found: Sequence[Interval]) -> int:
-    """Prints how a run's results compare with those stated, and writes reproduction.json into its
-    folder. Returns the exit code.
-
-    Args:
-        found: a number for each of the row's results.
+    """Prints how the numbers found compare with those stated, and writes reproduction.json into the
+    run's folder. Returns the exit code.
     """
-    metrics = (folder / "metrics.jsonl").read_bytes()
     samples = json_lines.read(folder / "metrics.jsonl")[-1]["samples"]
-    here, digest = machine(row.device), hashlib.sha256(metrics).hexdigest()
-    is_exact, sentence = compare_bits(row.exact, here, digest)
     agree = [*map(Result.agrees, row.results, found)]
-    is_reproduced = all(agree) and is_exact is not False
     for result, number, agrees in zip(row.results, found, agree, strict=True):
         verdict = "agrees" if agrees else "DIFFERS"
         console.say(f"{verdict}: {number}, stated {result}, docs/lab/{result.page}")
-    console.say(sentence)
     if not all(agree) and "samples=" not in row.train:
-        console.say(
-            f"The run had {samples:,} samples; in the same seconds a slower or busier machine has "
-            "fewer"
-        )
-    console.say(f"{row.name} is {'' if is_reproduced else 'NOT '}reproduced: {folder}")
-    report = {
-        "row": row.name,
-        "is_reproduced": is_reproduced,
-        "samples": samples,
-        "values": {str(result): number.value for result, number in zip(row.results, found)},
-        "exact": {**here, "sha256": digest},
-    }
+        busy = "in the same seconds a slower or busier machine has fewer"
+        console.say(f"The run had {samples:,} samples; {busy}")
+    console.say(f"{row.name} is {'' if all(agree) else 'NOT '}reproduced: {folder}")
+    values = {str(result): number.value for result, number in zip(row.results, found)}
+    report = dict(row=row.name, is_reproduced=all(agree), samples=samples, values=values)
     with user_errors(f"{folder} cannot be written: "):
         write_atomically(folder / "reproduction.json", json.dumps(report, indent=2).encode())
-    return 0 if is_reproduced else 1
-
-
-def machine(device: str) -> dict:
-    """Returns what the bits of a run depend on, besides configuration and code."""
-    import torch  # after OMP_NUM_THREADS is set
-
-    from megastep.agents.runs import provenance
-
-    facts = {"device": provenance.device_name(torch.device(device)), "torch": torch.__version__}
-    if device == "cpu":
-        facts["instructions"] = torch.backends.cpu.get_cpu_capability()
-        facts["threads"] = torch.get_num_threads()
-    return facts
-
-
-def compare_bits(known: Sequence[dict], here: dict, digest: str) -> tuple[bool | None, str]:
-    """Compares the digest of a run's metrics.jsonl with those known for its row.
-
-    Returns:
-        True if it equals one of them, False if it differs from that of this kind of machine, None
-        if there is none of this kind; and a sentence.
-    """
-    if any(one["sha256"] == digest for one in known):
-        return True, "metrics.jsonl is equal to the recorded one, byte for byte"
-    if any(here.items() <= one.items() for one in known):
-        return False, "metrics.jsonl DIFFERS from the one recorded on this kind of machine"
-    if not known:
-        return None, "metrics.jsonl is not compared: none is recorded for this row"
-    others = " or ".join(
-        ", ".join(f"{key} {one[key]}, here {here[key]}" for key in here if one[key] != here[key])
-        for one in known
-    )
-    return None, f"metrics.jsonl differs from the recorded one, of another machine: {others}"
+    return 0 if all(agree) else 1
 
 
 COMMAND = Command("reproduce", Reproduce, HELP)

@@ -8,7 +8,6 @@ its workers: one that is killed for memory leaves the others.
 import contextlib
 import csv
 import dataclasses
-import importlib
 import io
 import itertools
 import json
@@ -19,7 +18,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 import traceback
 import uuid
@@ -33,6 +31,7 @@ from omegaconf import OmegaConf
 
 from megastep import workers
 from megastep.agents import console, package
+from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.words import key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
@@ -65,13 +64,10 @@ OmegaConf.register_new_resolver(
 
 def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list, Any]:
     """Returns (the words of each job that is known beforehand; their settings, all of them checked;
-    Hydra's configuration of the first).
+    Hydra's configuration of the first). Raises ConfigErrors for the first wrong job.
 
     Of a grid these are all jobs; of a search, the first of all values, and each other value and
     bound alone.
-
-    Raises:
-        ConfigErrors: with all that is wrong in the first wrong job.
     """
     values = {key_of(override): _values(override) for override in composer.parse(words)}
     config = composer.compose([options[0] for options in values.values() if options[0]])[1].hydra
@@ -105,9 +101,7 @@ def _values(override: Override) -> list[str | None]:
 
 
 def sweep(composer: Composer, words: list[str]) -> int:
-    """Checks all jobs, then hands the sweep over to Hydra, past jobs that fail. Returns the exit
-    code.
-    """
+    """Checks all jobs, then has Hydra run them, past those that fail. Returns the exit code."""
     rank.refuse("The jobs of a sweep start their own ranks; leave torchrun out, and add ranks=")
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
@@ -130,12 +124,9 @@ def sweep(composer: Composer, words: list[str]) -> int:
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
     words += [str(override.input_line) for override in overrides.values()]
-    # processes of launchers find megastep, in a checkout too; a job's settings find modules of the
-    # current folder
-    if (package.ROOT / "train.py").exists():
-        os.environ["PYTHONPATH"] = os.pathsep.join(
-            filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
-        )
+    if (package.ROOT / "train.py").exists():  # processes of launchers find a checkout, too
+        paths = str(package.ROOT), os.environ.get("PYTHONPATH")
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     job, problem = new_job(composer, folder), ""
     try:
         with signals.interrupting(job.interrupt):
@@ -172,9 +163,8 @@ def new_job(composer: Composer, folder: Path) -> "Job":
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """Runs one job, in whichever process a launcher starts, and records what became of it.
-
-    It is what Hydra's main calls. Composes again, as the machine may have another device.
+    """What Hydra calls for a job, in whichever process a launcher starts; it records what became of
+    the job. It composes again, as the machine may have another device.
 
     Attributes:
         source: the script's name, and the other arguments of the Composer.
@@ -191,9 +181,7 @@ class Job:
     start: str
 
     def __call__(self, config: object) -> float | None:
-        """Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
-        alone.
-        """
+        """Returns the job's score, None if it failed: a sweeper is to go on."""
         hydra = HydraConfig.get()
         words, number = [*hydra.overrides.task], hydra.job.num
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
@@ -232,22 +220,9 @@ class Job:
         return ended
 
     def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
-        """Runs a job in this process. Returns what became of it.
-
-        In a job of submitit's, SIGUSR1 and SIGUSR2 get to its own handler once the job is saved,
-        and it has the job started again.
-
-        Args:
-            is_again: it was started before, and continues from what it saved.
+        """Runs a job in this process, and continues one that was started before. Returns what
+        became of it.
         """
-        try:
-            return self._run(row, words, is_again)
-        except signals.Interrupted as stop:
-            if stop.args[0] in signals.ANNOUNCING and "SUBMITIT_EXECUTOR" in os.environ:
-                signal.raise_signal(stop.args[0])
-            raise
-
-    def _run(self, row, words, is_again) -> "Row":
         began, number, result = time.monotonic(), row["number"], None
         if os.getpid() != self.process:  # its lines are among those of others
             warnings.showwarning, console.prefix = console.warn, f"job {number}: "
@@ -255,22 +230,18 @@ class Job:
         self.record(row)
         try:
             with signals.interrupting():
-                composer = self.composer()
+                composer = Composer(load(self.source[0]), *self.source[1:])
                 cfg = composer.settings(words)
-                cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
-                if is_again:  # not for evaluations, which begin again
-                    cfg = settings.changed(cfg, resume=AUTO)
-                grouped = {
-                    label: settings.changed(one, group=Path(self.folder).name)
-                    for label, one in getattr(cfg, "logger", {}).items()
-                    if getattr(one, "group", "") is None
-                }
-                cfg = settings.changed(cfg, logger=getattr(cfg, "logger", {}) | grouped)
+                if isinstance(cfg, settings.Train):
+                    cfg = self.own_settings(cfg, row["folder"], is_again)
                 with gpu_slots.taken(cfg) as cfg:
                     result = composer.command.run(cfg)
                 row |= {"state": DONE, **(scores.outcome(result) if result else {})}
         except signals.Interrupted as stop:
             row["state"] = f"interrupted: {stop.args[1]}"
+            if stop.args[0] in signals.ANNOUNCING and "SUBMITIT_EXECUTOR" in os.environ:
+                self.record(row)
+                signal.raise_signal(stop.args[0])  # submitit has the saved job started again
             raise
         except Exception as error:  # whatever it is, the other jobs are worth running
             kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
@@ -285,9 +256,14 @@ class Job:
             console.warn(f"job {number}: no episode finished, so it has no score; train longer")
         return row
 
-    def composer(self) -> Composer:
-        module = importlib.import_module(f"megastep.agents.cli.{self.source[0]}")
-        return Composer(module.COMMAND, *self.source[1:])
+    def own_settings(self, cfg: settings.Train, folder: str, is_again: bool) -> settings.Train:
+        """Returns the settings of a training with what differs for a job of a sweep."""
+        for label, one in cfg.logger.items():
+            if getattr(one, "group", "") is None:
+                one = settings.changed(one, group=Path(self.folder).name)
+                cfg = settings.changed(cfg, logger=cfg.logger | {label: one})
+        resume = AUTO if is_again else cfg.resume
+        return settings.changed(cfg, folder=os.path.relpath(folder), resume=resume)
 
     def path(self, name: str) -> Path:
         return Path(self.records, name)
@@ -305,9 +281,7 @@ class Job:
         return {"number": number, "varied": {}, "state": RUNNING}
 
     def ended_rows(self) -> "list[Row]":
-        """Returns what the jobs recorded, once none runs: one that did not say how it ended is
-        lost.
-        """
+        """Returns what the jobs recorded, once none runs."""
         rows = self.rows()
         return [row | {"state": LOST} if row["state"] == RUNNING else row for row in rows]
 
@@ -338,7 +312,6 @@ def run_job(text: str) -> None:
     job = Job(**fields)
     signals.exit_on_signals(job.source[0])
     console.open_streams()
-    threading.excepthook = console.warn_of_thread
     workers.end_with_parent(os.getppid())
     with contextlib.suppress(signals.Interrupted):
         job.run(row, words)

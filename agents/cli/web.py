@@ -32,37 +32,19 @@ class Web:
     file: str | None = None
 
 
-def run(cfg: Web) -> None:
-    """Writes the page of an agent."""
-    homes = None if cfg.homes is None else [*cfg.homes]
-    write(cfg.run, cfg.against, homes, cfg.seed, cfg.file)
-
-
-def write(
-    run: str,
-    against: str | None = None,
-    homes: list[int] | None = None,
-    seed: int = 1,
-    file: str | None = None,
-) -> Path:
-    """Writes a page, and says where and how large it is. Returns its path.
-
-    Args:
-        file: default: one in the run's folder, or here of a packaged agent.
-        run, against, homes, seed: as for `megastep.agents.export.web.make`.
-
-    Raises:
-        UserError: the page cannot be made, or the file not written.
+def run(cfg: Web) -> Path:
+    """Writes a page, and says where and how large it is. Returns its path. Raises UserError if it
+    cannot be made or written.
     """
-    source = folders.find(run)
-    own = folders.folder_of(source) / "page.html"
-    path = own if file is None else Path(file)
+    own = folders.folder_of(folders.find(cfg.run)) / "page.html"
+    path = own if cfg.file is None else Path(cfg.file)
     if path.suffix != ".html":
         raise UserError(f"file={path} is not a page; its name ends with .html")
     from megastep.agents.export import web  # with PyTorch
     from megastep.atomic_files import write_atomically
 
-    text = web.make(run, against, homes, seed)
+    homes = None if cfg.homes is None else [*cfg.homes]
+    text = web.make(cfg.run, cfg.against, homes, cfg.seed)
     with user_errors(f"{path} cannot be written: "):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, text.encode())

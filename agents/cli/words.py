@@ -21,15 +21,11 @@ WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
 
 
 class Typed(NamedTuple):
-    """A setting that was given.
-
-    Attributes:
-        word: how Hydra's grammar has it, where it chooses a member of a group.
-    """
+    """A setting that was given."""
 
     key: str
     value: Any
-    word: str
+    word: str  # how Hydra's grammar has it, where it chooses a member of a group
     is_delete: bool = False
     is_added: bool = False
 
@@ -40,15 +36,12 @@ def parse(
     cure: Callable[[str], str],
     loader: "ConfigLoader | None" = None,
 ) -> list[types.Override]:
-    """Returns words as Hydra's grammar reads them.
+    """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable ones.
 
     Args:
         lists: keys whose values are lists, also without brackets: run=a,b.
         cure: what is said of a word without `=`.
         loader: Hydra's, for glob().
-
-    Raises:
-        ConfigErrors: with all unreadable words.
     """
     parser = overrides_parser.OverridesParser.create(loader)
     overrides: list[types.Override] = []

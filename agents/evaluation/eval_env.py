@@ -55,7 +55,7 @@ class EvalEnv:
         is_duel: bool = False,
         **options: Any,
     ):
-        env = settings.changed(env, **(FOR_TWO if is_duel else {"resample": False}))
+        env = settings.changed_known(env, **(FOR_TWO if is_duel else {"resample": False}))
         self.seed = rank_seed(seed, process_group.rank() if rank is None else rank[0])
         self.sample = factory.make_sample(env, [*homes], seed=self.seed, device=device)
         n_agents = optional(self.sample, "n_agents")

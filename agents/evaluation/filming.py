@@ -34,7 +34,7 @@ def run(cfg: settings.Record) -> Path:
         geometry = factory.typed_or(trained.geometry, geometry, env_settings)
         folder = folders.folder_of(runs[0].path)
     if cfg.against is not None:
-        env_settings = settings.changed(env_settings, **eval_env.FOR_TWO)
+        env_settings = settings.changed_known(env_settings, **eval_env.FOR_TWO)
     geometry = geometry or components.settings_for("geometry", components.HOMES)
     homes = factory.homes(env_settings, geometry, cfg.split)
     env_settings = settings.changed(env_settings, n_envs=1)

@@ -20,7 +20,6 @@ _FUNCTIONS = (
     "in_env",
     "layout_sources",
     "make_bot",
-    "make_curriculum",
     "make_device",
     "make_learner",
     "make_opponents",

@@ -20,11 +20,10 @@ T = TypeVar("T")
 
 
 def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
-    """Returns the settings of dataclass `kind` from nested dicts.
+    """Returns the settings of a dataclass, such as `settings.Train`, from nested dicts as YAML has
+    them: 1e6 counts as an integer, a list as a tuple.
 
     Args:
-        kind: a dataclass, such as `settings.Train`.
-        tree: nested dicts as YAML gives them; 1e6 counts as an integer, a list as a tuple.
         names: more names to suggest for a mistyped key, such as groups.
 
     Raises:
@@ -51,15 +50,9 @@ def check(kind: type[T], tree: Tree, names: Iterable[str] = ()) -> T:
 
 
 def as_tree(chosen: Any, prefix: str = "") -> Tree:
-    """The inverse of `check`: strings, numbers, true, false, None, lists and nested dicts.
-
-    Leaves out defaults that only the constructor can give, such as functions.
-
-    Args:
-        prefix: of the keys in errors.
-
-    Raises:
-        ConfigErrors: other values that no file can hold.
+    """The inverse of `check`: strings, numbers, true, false, None, lists and nested dicts, without
+    defaults that only the constructor can give, such as functions. Raises ConfigErrors for other
+    values that no file can hold.
     """
     tree = {}
     for name, field in type(chosen).__pydantic_fields__.items():

@@ -27,10 +27,8 @@ adapter = functools.cache(TypeAdapter)
 
 
 def _wrappers(value: object) -> tuple[object, ...]:
-    """Returns the wrappers of an environment, names and dicts of `name` and settings.
-
-    Raises:
-        ValueError: naming what is wrong.
+    """Returns the wrappers of an environment, names and dicts of `name` and settings. Raises
+    ValueError for others.
     """
     items = [value] if isinstance(value, (str, dict)) else value
     if not isinstance(items, (list, tuple)):
@@ -47,10 +45,8 @@ def _wrappers(value: object) -> tuple[object, ...]:
 
 
 def wrapper_settings(item: "str | dict") -> Any:
-    """Returns the settings of a wrapper, with the import path of its class as `name`.
-
-    Raises:
-        ValueError: they are not those of the class.
+    """Returns the settings of a wrapper, with the import path of its class as `name`. Raises
+    ValueError if they are not those of the class.
     """
     tree = {"name": item} if isinstance(item, str) else dict(item)
     label = tree["name"]
@@ -176,8 +172,8 @@ def kind_of(group: str, name: str) -> type:
 
 
 def settings_for(group: str, name: str | None = None, **values: Any) -> Any:
-    """Returns the settings of a group's member: `name`, its import path, but for the agent and the
-    opponents; and those that differ from its defaults.
+    """Returns the settings of a group's member: its import path, unless the group has only one, and
+    those that differ from the defaults.
     """
     kind = kind_of(group, name or SINGLE[group])
     return kind(**values) if name is None else kind(name=name, **values)
@@ -191,7 +187,13 @@ def members(group: str) -> dict[str, str]:
     if group == "wrapper":
         wrappers = importlib.import_module("megastep.wrappers").WRAPPERS  # with PyTorch
         return {label: f"megastep.wrappers:{kind.__name__}" for label, kind in wrappers.items()}
-    return {**_modules(GROUPS[group]), **_files(group)}
+    found = _modules(GROUPS[group])
+    for path in sorted((package.CONFIGS / group).glob("*.yaml")):
+        tree = yaml.safe_load(path.read_text()) or {}
+        tree = tree.get(group, tree)
+        if "name" in tree:
+            found[path.stem] = tree["name"]
+    return found
 
 
 def _modules(group) -> dict[str, str]:
@@ -209,23 +211,10 @@ def _modules(group) -> dict[str, str]:
         # a class that is called like its module, but for capitals
         name = rf"^(?:class|from [\w.]+ import) ({stem.replace('_', '')})\b"
         match = re.search(name, text, re.I | re.M)
-        if (
-            match
-            and stem not in group.shared
-            and (not group.first or re.search(rf"self,\s*{group.first}\b", text))
-        ):
+        is_taken = not group.first or re.search(rf"self,\s*{group.first}\b", text)
+        if match and is_taken and stem not in group.shared:
             found[stem] = f"{module}.{stem}:{match[1]}"
     return found
-
-
-def _files(group) -> dict[str, str]:
-    """Returns {member: its `name`} of the files of a group that name a component."""
-    trees = {
-        path.stem: yaml.safe_load(path.read_text()) or {}
-        for path in sorted((package.CONFIGS / group).glob("*.yaml"))
-    }
-    trees = {member: tree.get(group, tree) for member, tree in trees.items()}
-    return {member: tree["name"] for member, tree in trees.items() if "name" in tree}
 
 
 @functools.cache

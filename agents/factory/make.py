@@ -14,7 +14,6 @@ from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, components
 from megastep.agents.factory.settings import (
     Agent,
-    Curriculum,
     Env,
     Geometry,
     Learner,
@@ -43,7 +42,6 @@ from megastep.wrappers import Wrapper
 if TYPE_CHECKING:
     from megastep.agents import types as agent_types
     from megastep.agents.factory.settings import Component
-    from megastep.agents.storage.collector import Collector
 
 #: Number of environments in which the memory of one is measured.
 PROBE = 65
@@ -67,13 +65,11 @@ errors = functools.partial(user_errors, kinds=KINDS)
 
 
 def construct(settings: "Component", constructor: Callable | None = None, **arguments: Any) -> Any:
-    """Calls a class or function with those of the settings and arguments that it takes.
+    """Calls a class or function, by default the one at `settings.name`, with those of the settings
+    and arguments that it takes.
 
     A setting that a class passes on to its base class as one of its `**kwargs` is left out if it
     has the default there: a class may fix one.
-
-    Args:
-        constructor: default: the one at the import path in `settings.name`.
     """
     with errors():
         is_env = constructor is None and hasattr(settings, "wrappers")
@@ -105,14 +101,8 @@ def construct(settings: "Component", constructor: Callable | None = None, **argu
 
 
 def _wrappers_of(settings, taken) -> tuple[list[str], list]:
-    """Returns the wrappers of an environment's own package, and the settings of megastep's. They
-    are told apart by their base class.
-
-    Args:
-        taken: arguments that the environment takes.
-
-    Raises:
-        ValueError: a wrapper has no environment that it fits around.
+    """Returns the wrappers of an environment's own package, and the settings of megastep's, by
+    their base class. Raises ValueError if the environment, which takes some arguments, takes none.
     """
     inside, outside = [], []
     for item in settings.wrappers:
@@ -161,10 +151,8 @@ def spread(homes: list[dict], n_envs: int) -> list[dict]:
 
 
 def make_sample(env: Env, geometries: list[dict], **arguments) -> types.Env:
-    """Returns a small environment of the same kind, which tells spaces and sizes.
-
-    Raises:
-        UserError: naming the clause of the contract that a class of the user's breaks.
+    """Returns a small environment of the same kind, which tells spaces and sizes. Raises UserError
+    with the clause of the contract that a class of the user's breaks.
     """
     names = [item["name"] if isinstance(item, dict) else item for item in env.wrappers]
     is_ours = all(":" not in name for name in names) and env.name.startswith("megastep.")
@@ -189,9 +177,6 @@ def check_memory(
 
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
-
-    Args:
-        n_members: trainings that are to fit side by side.
     """
 
     def fit(bytes_each) -> None:
@@ -246,20 +231,6 @@ def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> "agent_typ
     return learner
 
 
-def make_curriculum(settings: Curriculum, geometries: list[dict]) -> Callable | None:
-    """Returns a function of (env, learner, rollout) that makes the curriculum, None if there is to
-    be none.
-    """
-    if settings.name == "none":
-        return None
-    sources = sources_of(geometries)
-
-    def make(env, learner, rollout) -> "Collector":
-        return construct(settings, env=env, learner=learner, rollout=rollout, sources=sources)
-
-    return make
-
-
 def sources_of(geometries: Sequence[Mapping]) -> list[str] | None:
     """Returns the `source` of each geometry, which `geometry=mixed` sets; None if one has none."""
     sources = [g.get("source") if isinstance(g, Mapping) else None for g in geometries]
@@ -281,11 +252,8 @@ def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
 def make_opponents(
     cfg: Train, env: types.Env, sample: types.Env, policy: Policy, seed: int = 1
 ) -> Opponents | None:
-    """Returns the environment with opponents in it, None if there are to be none.
-
-    Args:
-        sample: a small environment, in which a scripted opponent is tried.
-        seed: of the opponents' actions.
+    """Returns the environment with opponents in it, None if there are to be none. A scripted one is
+    tried in a small `sample`.
 
     Raises:
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
@@ -305,10 +273,8 @@ def make_opponents(
 
 
 def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
-    """Returns a policy that needs no weights.
-
-    It is given the environment's settings that it takes, such as `fov`, and the environment if it
-    takes `env`. It takes one step in `env`.
+    """Returns a policy that needs no weights. It is given the environment's settings that it takes,
+    such as `fov`, and the environment if it takes `env`, and takes one step there.
 
     Args:
         name: one of `BOTS`, the import path of a class, or None, the class that is `env.bot`.

@@ -61,10 +61,8 @@ UNITS = {
 
 
 def quantity(text: object, kind: str) -> object:
-    """Returns the number that people write as `100k` or `1h30min`; anything else as it is.
-
-    Args:
-        kind: a key of `UNITS`.
+    """Returns the number that people write as `100k` or `1h30min`, by a key of `UNITS`; anything
+    else as it is.
     """
     units = UNITS[kind]
     part = rf"(\d+(?:\.\d+)?(?:e\+?\d+)?) *({'|'.join(sorted(units, key=len, reverse=True))})"
@@ -128,15 +126,23 @@ def _group(group: str) -> object:
 
 
 def changed(settings: T, **changes: object) -> T:
-    """Returns a copy of settings with those of the changes that it has.
+    """Returns a copy of settings with other values. Nothing is checked again, since a stranger's
+    default need not be what its annotation says.
 
-    Nothing is checked again, since a stranger's default need not be what its annotation says.
+    Raises:
+        TypeError: a change that no setting has.
     """
     result = copy.copy(settings)
     for name, value in changes.items():
-        if hasattr(settings, name):
-            object.__setattr__(result, name, value)  # of a frozen class
+        if not hasattr(settings, name):
+            raise TypeError(f"{type(settings).__name__} has no setting {name}")
+        object.__setattr__(result, name, value)  # of a frozen class
     return result
+
+
+def changed_known(settings: T, **changes: object) -> T:
+    """Returns a copy of settings with those of the changes that it has."""
+    return changed(settings, **{k: v for k, v in changes.items() if hasattr(settings, k)})
 
 
 def run_name(cfg: "Train") -> str:
@@ -151,16 +157,11 @@ def _chosen_loggers(tree) -> dict:
         raise ValueError(f"is a group of keys, got {tree!r}")
     errors, known = [], components.members("logger")
     for key, value in tree.items():
-        if dataclasses.is_dataclass(value) or (isinstance(value, dict) and "name" in value):
-            continue
-        kinds = {one: components.kind_of("logger", path) for one, path in known.items()}
-        owners = [one for one, kind in kinds.items() if key in kind.__pydantic_fields__]
-        text = f"no such key or logger; {closest(key, known)}"
-        if key in known:
-            text = f"is not chosen; add logger={key}, or logger=[tensorboard,{key}] for both"
-        elif owners and key != "name":
-            text = f"no such key; did you mean logger.{owners[0]}.{key}?"
-        errors.append((key, text))
+        if not (dataclasses.is_dataclass(value) or isinstance(value, dict) and "name" in value):
+            text = f"no such logger, whose keys are logger.wandb.mode=; {closest(key, known)}"
+            if key in known:
+                text = f"is not chosen; add logger={key}, or logger=[tensorboard,{key}] for both"
+            errors.append((key, text))
     if errors:
         raise located(errors)
     return tree
@@ -207,8 +208,6 @@ class Common:
 
 @frozen
 class Finish:
-    """What follows training."""
-
     evaluate: bool
     episodes: Count
     record: bool
@@ -218,16 +217,12 @@ class Finish:
 
 @frozen
 class Logging:
-    """How often metrics are written, and how many updates are profiled."""
-
     every: Count = 100
     profile: Annotated[int, Field(ge=0, le=1000)] = 0
 
 
 @frozen
 class Evaluation:
-    """Evaluations while training."""
-
     every: Annotated[int | float | str, AfterValidator(_every)] | None = None
     episodes: Count = 128
     stop: dict[str, Annotated[float, Field(allow_inf_nan=False)]] = dataclasses.field(
@@ -237,8 +232,6 @@ class Evaluation:
 
 @frozen
 class Checkpoints:
-    """When checkpoints are saved, and how many are kept."""
-
     seconds: Seconds = 30.0
     keep: Annotated[int, Field(ge=2, le=1000)] = 2
     replay_every: Count = 20
@@ -247,8 +240,6 @@ class Checkpoints:
 
 @frozen
 class Population:
-    """Agents that train at once, and take over from each other."""
-
     size: Annotated[int, Field(ge=1, le=1024)] = 1
     every: Samples = 20_000_000
     vary: dict[str, Variation] = dataclasses.field(default_factory=dict)

@@ -27,8 +27,8 @@ from megastep.agents.runs import (
     populations,
     provenance,
     restore,
-    saver,
 )
+from megastep.agents.runs.saver import Saver
 from megastep.agents.training import budget, loggers, repeat
 from megastep.agents.training.callbacks import Evaluations, Snapshots
 from megastep.agents.training.profiler import Profiler
@@ -37,9 +37,7 @@ from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.imports import import_object
 
 if TYPE_CHECKING:
-    from megastep.agents.networks.policy import Policy
-    from megastep.agents.types import Learner, Row
-    from megastep.types import Env
+    from megastep.agents.types import Row
 
 
 def make_trainer(
@@ -71,51 +69,48 @@ def make_trainer(
     number, n_ranks = ranks = world() if ranks is None else ranks
     seed = rank_seed(cfg.seed, number)
     seed_everything(seed)
-    if homes is None:
-        homes = factory.homes(cfg.env, cfg.geometry, "training")
-    where = {
-        "geometries": homes,
-        "seed": seed,
-        "device": device,
-        "privileged": cfg.agent.critic == "asymmetric",
-    }
+    homes = factory.homes(cfg.env, cfg.geometry, "training") if homes is None else homes
+    critic = cfg.agent.critic
+    where = dict(geometries=homes, seed=seed, device=device, privileged=critic == "asymmetric")
     sample = factory.make_sample(cfg.env, **where)
-    policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
+    policy = factory.make_policy(cfg.agent, sample, cfg.seed, critic)
     policy.generator = SeededGenerator(stream_seed(seed, "policy"))
     learner = factory.make_learner(cfg.learner, policy, seed)
-    cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)
-    check_population(cfg, learner)
+    options = with_defaults(learner, LearnerOptions)
+    cfg = annealed(cfg, options.set_lr is not None)
+    if cfg.population.size > 1 and options.copy_from is None:
+        raise UserError(
+            f"{type(learner).__name__} has no copy_from(other), so the members of a population "
+            "cannot take over from each other: add the method, or use population.size=1"
+        )
     factory.check_memory(cfg.env, sample, learner, n_members=n_members, **where)
     env = factory.construct(cfg.env, **where)
     loaded = load(cfg, policy, env, learner, device, number)
     resumed = loaded if cfg.resume else None
-    measured = []
+    had: dict = (resumed and resumed.state) or Counter()
+    observers = []
     if cfg.evaluation.every is not None and make_evaluator is not None:
         evaluator = make_evaluator(cfg, env, device, ranks)
-        measured = [
-            Evaluations(evaluator, settings.every(cfg.evaluation.every), cfg.evaluation.stop)
-        ]
+        every = settings.every(cfg.evaluation.every)
+        observers.append(Evaluations(evaluator, every, cfg.evaluation.stop))
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     if resumed and number == 0:
         for name in "checkpoints", "snapshots":
             checkpoint.set_aside_after(folder / name, resumed.step)
     config = {"train": check.as_tree(cfg), "spaces": restore.spaces_of(env)}
     made_with = provenance.made_with(device, package.version(), n_ranks)
-    checkpoints = folder / "checkpoints"
-    had: dict = (resumed and resumed.state) or Counter()
     with factory.errors():
-        files = saver.RankFiles(checkpoints, token, number, n_ranks)
-        keep = cfg.checkpoints.keep, made_with, cfg.checkpoints.replay_every, files
-        saves, limits = saver.Saver(checkpoints, config, *keep), budget_of(cfg, folder, resumed)
-        writers, record = [], None
+        of_ranks = cfg.checkpoints.replay_every, token, number, n_ranks
+        saves = Saver(folder / "checkpoints", config, cfg.checkpoints.keep, made_with, *of_ranks)
+        limits, record = budget_of(cfg, folder, resumed), None
         if number == 0:  # which alone writes these
             record = annealing.AnnealingRecord(folder, had["updates"])
-            writers = [record, make_loggers(cfg, folder, had["samples_at_report"]), *callbacks]
-        if number == 0 and cfg.checkpoints.snapshots:
-            shots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
-            writers.append(Snapshots(shots, cfg.checkpoints.snapshots))
-        if number == 0 and cfg.logging.profile:
-            writers.append(Profiler(folder, cfg.logging.profile, device))
+            observers += [record, make_loggers(cfg, folder, had["samples_at_report"]), *callbacks]
+            if cfg.checkpoints.snapshots:
+                shots = Saver(folder / "snapshots", config, keep_checkpoints=10**9)
+                observers.append(Snapshots(shots, cfg.checkpoints.snapshots))
+            if cfg.logging.profile:
+                observers.append(Profiler(folder, cfg.logging.profile, device))
         trainer = Trainer(
             opponents or env,
             policy,
@@ -124,19 +119,19 @@ def make_trainer(
             saver=saves,
             log_every=cfg.logging.every,
             checkpoint_seconds=cfg.checkpoints.seconds,
-            callbacks=[*measured, *writers, *(import_object(name)() for name in cfg.callbacks)],
+            callbacks=[*observers, *(import_object(name)() for name in cfg.callbacks)],
             ranks=ranks,
         )
         if cfg.population.schedule:
             trainer.tuning.follow(populations.schedule(Path(cfg.population.schedule)))
-        if make_curriculum := factory.make_curriculum(cfg.curriculum, homes):
-            trainer.curriculum = make_curriculum(trainer.env, learner, trainer.rollout)
+        if cfg.curriculum.name != "none":
+            parts = dict(env=trainer.env, learner=learner, rollout=trainer.rollout)
+            sources = factory.sources_of(homes)
+            trainer.curriculum = factory.construct(cfg.curriculum, sources=sources, **parts)
         trainer.episodes.begin(trainer, factory.layout_sources(cfg.env, homes), cfg.desync)
         if record is not None:
-            is_resumed = resumed is not None
-            trainer.nonfinite_guard.make_hint = functools.partial(
-                repeat.hint, trainer, record, is_resumed
-            )
+            hint = functools.partial(repeat.hint, trainer, record, resumed is not None)
+            trainer.nonfinite_guard.make_hint = hint
         if resumed:
             with state_errors(resumed.path):
                 trainer.run_state.load_state_dict(had, is_new_rank=number >= resumed.n_ranks)
@@ -144,14 +139,7 @@ def make_trainer(
     return trainer
 
 
-def load(
-    cfg: settings.Train,
-    policy: "Policy",
-    env: "Env",
-    learner: "Learner",
-    device: torch.device,
-    rank: int,
-) -> checkpoint.Checkpoint | None:
+def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint | None:
     """Returns the checkpoint that a run continues from, or starts from the weights of, once the
     policy has them; None for a new run.
     """
@@ -162,24 +150,12 @@ def load(
     restore.load_weights(policy, loaded, env)
     if cfg.init:
         restore.load_wrappers(env, loaded, is_frozen=False)
-    if cfg.resume:
-        state = loaded.state or {}
+    elif check_state := getattr(learner, "check_state", None):
         with state_errors(loaded.path):
-            if check_state := getattr(learner, "check_state", None):
-                check_state(state["learner"])  # before anything is written
+            check_state((loaded.state or {})["learner"])  # before anything is written
     if rank == 0 and policy.critic is not None and agent_file.is_agent_file(path):
         console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
     return loaded
-
-
-def check_population(cfg: settings.Train, learner: "Learner") -> None:
-    """Raises UserError if a learner cannot be a member of a population."""
-    options = with_defaults(learner, LearnerOptions)
-    if cfg.population.size > 1 and options.copy_from is None:
-        raise UserError(
-            f"{type(learner).__name__} has no copy_from(other), so the members of a population "
-            "cannot take over from each other: add the method, or use population.size=1"
-        )
 
 
 def make_loggers(cfg: settings.Train, folder: Path, step: int) -> loggers.Loggers:
@@ -229,11 +205,9 @@ def budget_of(
     cfg: settings.Train, folder: Path, loaded: checkpoint.Checkpoint | None
 ) -> budget.Budget:
     """Returns the budget of a run, with the factors of the learning rate that are to be repeated.
-
-    Raises:
-        UserError: the run to repeat did not record them.
+    Raises UserError if the run to repeat did not record them.
     """
-    limits, recorded = (cfg.samples, cfg.seconds, cfg.learner.anneal), ()
+    recorded = ()
     if cfg.rerun:
         source = folders.folder_of(folders.find(cfg.rerun))
         recorded = annealing.read(source)
@@ -249,6 +223,7 @@ def budget_of(
         if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
             assert loaded.state is not None
             recorded = recorded[: loaded.state["updates"]]
+    limits = cfg.samples, cfg.seconds, cfg.learner.anneal
     is_scheduled = bool(conflicts.schedules_of(cfg))
     return budget.Budget(*limits, recorded, cfg.rerun is not None, is_scheduled)
 
@@ -257,11 +232,9 @@ def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
     """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
     limited, else by never; by never if the learner has no `set_lr`, or lr does not stay constant.
     """
-    changes_itself = conflicts.changes_lr(cfg.learner)
-    limits = [
-        name
-        for name in ("samples", "seconds")
-        if has_set_lr and not changes_itself and getattr(cfg, name) is not None
-    ]
-    anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
-    return settings.changed(cfg, learner=settings.changed(cfg.learner, anneal=anneal))
+    if cfg.learner.anneal != "auto":
+        return cfg
+    is_free = has_set_lr and not conflicts.changes_lr(cfg.learner)
+    limits = [name for name in ("samples", "seconds") if is_free and getattr(cfg, name) is not None]
+    learner = settings.changed(cfg.learner, anneal=[*limits, "never"][0])
+    return settings.changed(cfg, learner=learner)

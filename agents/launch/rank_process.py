@@ -2,7 +2,6 @@
 
 import os
 import sys
-import threading
 import traceback
 import warnings
 from pathlib import Path
@@ -26,7 +25,6 @@ def main() -> int:
     workers.end_with_parent(facts["parent"])
     console.open_streams()
     console.prefix = facts["prefix"]
-    threading.excepthook = console.warn_of_thread
     warnings.showwarning = console.warn
     folder = None
 

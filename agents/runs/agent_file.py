@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from megastep.agents.types import Config, Row
 
-SUFFIX, FORMAT = ".safetensors", "2"
+FORMAT = "2"
 #: The kinds of the texts in the header.
 KINDS = {
     "config": typed_json.Config,
@@ -47,7 +47,7 @@ _SEAL = re.compile(rb'"sha256":"([0-9a-f]{64})"')
 
 def is_agent_file(path: Path) -> bool:
     """Returns True if a path has the suffix of agent files."""
-    return path.suffix == SUFFIX
+    return path.suffix == ".safetensors"
 
 
 def write(
@@ -98,11 +98,8 @@ def sealed(content: bytes) -> bytes:
 
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
-    """Loads an agent file as a checkpoint that has only the policy's state.
-
-    Args:
-        path: the file.
-        device: device of the tensors; None loads no state and does not import PyTorch.
+    """Loads an agent file as a checkpoint that has only the policy's state, on a device; without
+    one no state.
 
     Raises:
         CheckpointError: the file is damaged or not an agent file, or another version of megastep
@@ -118,11 +115,7 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
 
 
 def read_metadata(path: Path) -> Row:
-    """Returns `config`, `facts`, `tables` and `wrappers` of an agent file.
-
-    Raises:
-        CheckpointError: as `read`.
-    """
+    """Returns `config`, `facts`, `tables` and `wrappers` of an agent file. Raises as `read`."""
     try:
         with safetensors.safe_open(path, framework="np") as file:
             texts = {"wrappers": "{}", **(file.metadata() or {})}

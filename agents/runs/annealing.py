@@ -29,7 +29,7 @@ def read(folder: Path | str) -> array:
 
 
 class AnnealingRecord:
-    """Appends to a run's record.
+    """A callback that appends to a run's record. What a full disk refuses is written later.
 
     Args:
         folder: the run folder.
@@ -39,40 +39,31 @@ class AnnealingRecord:
         OSError: the file cannot be written.
     """
 
+    is_slow = True
+
     def __init__(self, folder: Path | str, n_updates: int = 0):
         n_bytes = min(n_updates, len(read(folder))) * array("d").itemsize
         self.file = AppendedFile(Path(folder) / FILE, n_bytes)
 
-    is_slow = True
-
     def on_rollout(self, trainer: Any, rollout: object) -> None:
-        """Appends the factor of the update that a trainer begins."""
-        self.append(trainer.lr_fraction)
+        """Appends the factor of the update that a trainer begins, in memory."""
+        self.file.unwritten += array("d", [trainer.lr_fraction]).tobytes()
 
     def on_report(self, trainer: object, metrics: object) -> None:
-        """Writes the appended factors, if the disk has room; else the next report tries again."""
+        """Writes the appended factors."""
         with contextlib.suppress(OSError):
-            self.flush()
+            self.file.flush()
 
     def may_save(self, trainer: object) -> bool:
         """Flushes the factors to disk, which a checkpoint must not reach beyond. Returns whether
         they are there.
         """
-        try:
+        with contextlib.suppress(OSError):
             self.file.sync()
-        except OSError:
-            return False
-        return True
-
-    def append(self, factor: float) -> None:
-        """Appends the factor of an update, in memory until the next `flush`."""
-        self.file.unwritten += array("d", [factor]).tobytes()
-
-    def flush(self) -> None:
-        """Writes the appended factors."""
-        self.file.flush()
+            return True
+        return False
 
     def close(self) -> None:
-        """Writes the appended factors, if the disk has room, and closes the file."""
+        """Writes the appended factors and closes the file."""
         with contextlib.suppress(OSError):
             self.file.close()

@@ -131,7 +131,8 @@ def save(
     parts = {name: {k: state[k] for k in keys if k in state} for name, keys in PARTS.items()}
     others = {key for part in parts.values() for key in part}
     parts["state.pt"] = {key: part for key, part in state.items() if key not in others}
-    path = folder / _next_name(folder, step)
+    taken = [n for at, n in map(_step_and_number, list_checkpoints(folder)) if at == step]
+    path = folder / (f"step_{step}-{taken[-1] + 1}" if taken else f"step_{step}")
     with replacing(path) as temporary:
         temporary.mkdir()
         for name, part in parts.items():
@@ -140,7 +141,11 @@ def save(
         _write(temporary / "config.json", typed_json.dumps(config, indent=2).encode())
         add_files(temporary)
         manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
-        manifest |= dict(made_with=made_with or {}, files=_entries(temporary))
+        manifest |= dict(made_with=made_with or {}, files={})
+        for file in sorted(temporary.iterdir()):
+            with open(file, "rb") as data:
+                entry = {"sha256": _digest(data), "bytes": file.stat().st_size}
+            manifest["files"][file.name] = entry
         _write(temporary / "manifest.json", sealed(manifest))
     set_aside_after(folder, step)
     _prune(folder, keep_checkpoints, step)
@@ -148,10 +153,8 @@ def save(
 
 
 def save_tensors(path: Path, tree: StateDict) -> None:
-    """Writes plain dicts of tensors and numbers into a file and flushes it to disk.
-
-    Raises:
-        OSError: the disk is full or not writable.
+    """Writes plain dicts of tensors and numbers into a file and flushes it to disk. Raises OSError
+    if the disk is full or not writable.
     """
     import torch
 
@@ -164,11 +167,6 @@ def save_tensors(path: Path, tree: StateDict) -> None:
     sync(path)
 
 
-def rank_file(rank: int) -> str:
-    """Returns the file name of a rank's state, for ranks other than 0."""
-    return f"rank{rank}.pt"
-
-
 def sealed(manifest: Row) -> bytes:
     """Returns a manifest as JSON, with its own SHA-256 added."""
     digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
@@ -178,15 +176,6 @@ def sealed(manifest: Row) -> bytes:
 def _write(path, content) -> None:
     path.write_bytes(content)
     sync(path)
-
-
-def _entries(folder) -> Row:
-    """Returns the manifest's entries of the files in a folder."""
-    entries = {}
-    for path in sorted(folder.iterdir()):
-        with open(path, "rb") as file:
-            entries[path.name] = {"sha256": _digest(file), "bytes": path.stat().st_size}
-    return entries
 
 
 def _digest(file) -> str:
@@ -207,15 +196,7 @@ def load_latest(
     rank: int = 0,
 ) -> Checkpoint:
     """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
-
-    Warns of each damaged checkpoint that it skips.
-
-    Args:
-        folder: a `checkpoints` folder or one checkpoint.
-        device: device of weights and optimizer; the rest is loaded to the CPU. None loads no state
-            and does not import PyTorch.
-        is_whole: also loads environments and replay buffer.
-        rank: the rank whose state is loaded, see `read`.
+    Warns of each damaged checkpoint that it skips. The arguments are those of `read`.
 
     Raises:
         GoneCheckpoint: its run has deleted the one at `folder`.
@@ -251,7 +232,8 @@ def read(
 
     Args:
         path: the checkpoint's folder.
-        device: device of the tensors in `state.pt`; None verifies all files and loads no state.
+        device: of the tensors in `state.pt`; None verifies all files, loads no state and does not
+            import PyTorch.
         is_whole: also loads the rank's other files, to the CPU; rank 0 verifies all files.
         rank: the rank whose state is loaded. If it has no file, only rank 0's `state.pt` is read.
 
@@ -263,11 +245,11 @@ def read(
     manifest = read_manifest(path)
     parts = ["state.pt"]
     if is_whole:
-        parts += [rank_file(rank)] if rank else PARTS
+        parts += [f"rank{rank}.pt"] if rank else PARTS
         parts = [name for name in parts if name in manifest["files"]]
     is_verified = device is None or (is_whole and rank == 0)
     names = manifest["files"] if is_verified else [*parts, "config.json"]
-    with verified(path, manifest, names) as files:
+    with _verified(path, manifest, names) as files:
         try:
             config = typed_json.loads(files["config.json"].read())
         except ValueError as error:
@@ -281,20 +263,13 @@ def read(
 
 
 def read_manifest(path: Path) -> Row:
-    """Returns a checkpoint's manifest.
-
-    Raises:
-        DamagedCheckpoint: its bytes are not those that `sealed` writes.
-        GoneCheckpoint: the checkpoint no longer exists.
-        CheckpointError: it has another format.
-    """
+    """Returns a checkpoint's manifest. Raises as `read`."""
     try:
         with _readable(path, "manifest.json"):
             data = (path / "manifest.json").read_bytes()
         manifest = typed_json.loads(data)
         version = manifest["format"]
-        body = {key: value for key, value in manifest.items() if key != "sha256"}
-        if data != sealed(body):
+        if data != sealed({key: value for key, value in manifest.items() if key != "sha256"}):
             raise ValueError("it does not match its own SHA-256")
         if version == FORMAT:
             typed_json.check(typed_json.Manifest, manifest)
@@ -313,16 +288,8 @@ def read_manifest(path: Path) -> Row:
 
 
 @contextlib.contextmanager
-def verified(path: Path, manifest: Row, names: Iterable[str]) -> Iterator[dict[str, BinaryIO]]:
-    """Opens files of a checkpoint and compares each with the SHA-256 in its manifest.
-
-    Yields:
-        The open files by name, each at its beginning.
-
-    Raises:
-        DamagedCheckpoint: a file is missing or differs.
-        GoneCheckpoint: the checkpoint was deleted before all were open.
-    """
+def _verified(path: Path, manifest: Row, names: Iterable[str]) -> Iterator[dict[str, BinaryIO]]:
+    """Yields open files of a checkpoint by name, which have the SHA-256 of its manifest."""
     with contextlib.ExitStack() as stack:
         files = {}
         for name in names:
@@ -347,7 +314,6 @@ def _readable(path, name) -> Iterator[None]:
 
 
 def _load(path, name, file, device) -> Any:
-    """Returns the state in an open file. Raises DamagedCheckpoint."""
     import torch
 
     try:
@@ -362,13 +328,11 @@ def _load(path, name, file, device) -> Any:
 
 
 def is_intact(path: Path) -> bool:
-    """Returns whether a checkpoint is whole: every file is the one that was written."""
-    try:
-        manifest = read_manifest(path)
-        with verified(path, manifest, manifest["files"]):
-            return True
-    except CheckpointError:
-        return False
+    """Returns whether every file of a checkpoint is the one that was written."""
+    with contextlib.suppress(CheckpointError):
+        read(path, None)
+        return True
+    return False
 
 
 # ---- The checkpoints of a folder ----
@@ -387,7 +351,6 @@ def step_of(path: Path) -> int:
 
 def set_aside_after(folder: Path | str, step: int) -> None:
     """Renames checkpoints later than `step` to `step_<N>.aside`, as a run resumes from `step`.
-
     `save` deletes them once the run reaches their step again.
     """
     for path in list_checkpoints(folder):  # newest last, so it is the latest until then
@@ -404,35 +367,22 @@ def _step_and_number(path: Path) -> tuple[int, int]:
     return int(match[1]), int(match[2] or 1)
 
 
-def _next_name(folder: Path, step: int) -> str:
-    """Returns `step_<N>`, or `step_<N>-2` and so on if the step has checkpoints already."""
-    numbers = [n for other, n in map(_step_and_number, list_checkpoints(folder)) if other == step]
-    return f"step_{step}-{numbers[-1] + 1}" if numbers else f"step_{step}"
-
-
 def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
-    """Deletes old checkpoints, and set-aside ones up to `step`.
-
-    Keeps the last `keep_checkpoints` steps, the step with the best score and the last step with a
-    replay buffer; of each step, only the last checkpoint.
+    """Deletes all but the last checkpoint of each of the last steps, of the step with the best
+    score and of the last step with a replay buffer; and those set aside up to `step`.
     """
-    checkpoints = list_checkpoints(folder)
-    last_of_each_step = list({step_of(path): path for path in checkpoints}.values())
-    scored = [(path, _score(path)) for path in last_of_each_step]
-    scores = {path: score for path, score in scored if score is not None}
+    checkpoints, scores = list_checkpoints(folder), {}
+    last_of_each_step = [*{step_of(path): path for path in checkpoints}.values()]
+    for path in last_of_each_step:
+        with contextlib.suppress(CheckpointError):
+            if (score := read_manifest(path)["score"]) is not None:
+                scores[path] = score
     best = max(scores, key=scores.__getitem__, default=None)
     with_replay = [path for path in last_of_each_step if (path / "replay.pt").exists()]
     kept = {*last_of_each_step[-keep_checkpoints:], best, *with_replay[-1:]}
     aside = [path for path in folder.glob("step_*.aside") if step_of(path) <= step]
     for path in [*(path for path in checkpoints if path not in kept), *aside]:
         _delete(path)
-
-
-def _score(path: Path) -> float | None:
-    try:
-        return read_manifest(path)["score"]
-    except CheckpointError:
-        return None
 
 
 def _delete(path: Path) -> None:

@@ -52,15 +52,8 @@ def make(path: Path) -> Path:
 
 
 def new(name: str, folder: str | None = None, is_again: bool = False) -> Path:
-    """Returns the folder of a new run.
-
-    Args:
-        name: end of the default folder's name, which starts with the time.
-        folder: a folder that is empty or does not exist; None for the default in `RUNS`.
-        is_again: as for `check_free`.
-
-    Raises:
-        UserError: the folder is not empty or cannot be written.
+    """Returns the folder of a new run: `folder`, or one in `RUNS` that is called by the time and a
+    name. Raises as `check_free`.
     """
     if folder is None:
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
@@ -98,8 +91,7 @@ def write_config(folder: Path, config: "Config") -> None:
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Locks a run folder for the duration of the context, so that no other process trains in it.
-
-    The system releases the lock when this process ends, even by kill -9, so locks are never stale.
+    The system releases the lock when this process ends, even by kill -9.
 
     Raises:
         UserError: another process, which the message names, trains in it; or it cannot be written.
@@ -131,9 +123,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def record_start(folder: Path) -> None:
-    """Records that training starts in a folder. `latest` is the last one recorded, since
-    modification times are unreliable.
-    """
+    """Records that training starts in a folder, which is `latest` from then on."""
     with console.warned(f"{STARTED} cannot be written, so `latest` will not find {folder}: "):
         RUNS.mkdir(exist_ok=True)
         with open(STARTED, "ab") as file:
@@ -144,9 +134,7 @@ def record_start(folder: Path) -> None:
 
 
 def known() -> list[Path]:
-    """Returns the folders of all runs in the current folder or started from it, in the order of
-    their last start or resumption.
-    """
+    """Returns the folders of all runs here or started from here, by their last start."""
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
     folders = {*RUNS.glob("*"), *SWEEPS.glob("*/*"), *order}
@@ -156,45 +144,38 @@ def known() -> list[Path]:
 
 def pretrained() -> dict[str, Path]:
     """Returns the agent files that come with megastep, by name."""
-    files = sorted(package.PRETRAINED.glob(f"*{agent_file.SUFFIX}"))
-    return {path.stem: path for path in files}
+    return {path.stem: path for path in sorted(package.PRETRAINED.glob("*.safetensors"))}
 
 
 def find(name: str, member: int | str | None = "best") -> Path:
-    """Returns the path of a run folder, a checkpoint or an agent file.
+    """Returns the path of a run folder, a checkpoint or an agent file. Raises UserError with the
+    most similar names if there is none.
 
     Args:
         name: a path, `latest`, or the name of a pretrained agent; an existing path has priority.
-        member: of a population, whose folder is returned if the path is a population's: a number,
-            or `best`; None: the population's own folder.
-
-    Raises:
-        UserError: nothing is found; the message has the most similar names.
+        member: of a population, if the path is a population's: a number, or `best`; None: the
+            population's own folder.
     """
     path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
         path = folders[-1]
     if populations.is_root(path):
         return path if member is None else populations.member(path, member)
-    if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
+    is_run = any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints"))
+    if is_run or (agent_file.is_agent_file(path) and os.path.isfile(path)):
         return path
-    if agent_file.is_agent_file(path) and os.path.isfile(path):
-        return path
+    problem = "is neither a run folder nor a pretrained agent"
     if os.path.exists(path):
         problem = "is not a run: it has no folder checkpoints"
         if name in agents:
             raise UserError(f"{name} {problem}; rename it to use the pretrained agent {name}")
     elif name in agents:
         return agents[name]
-    else:
-        problem = "is neither a run folder nor a pretrained agent"
     near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4)
     near += difflib.get_close_matches(name, agents, n=1, cutoff=0.6)
-    makes = "train.py makes runs"
-    names = f"{makes}, and pretrained agents are {', '.join(agents)}" if agents else makes
-    raise UserError(
-        f"{shortened(name)} {problem}; " + (f"did you mean {' or '.join(near)}?" if near else names)
-    )
+    cure = f"train.py makes runs, and pretrained agents are {', '.join(agents)}"
+    cure = f"did you mean {' or '.join(near)}?" if near else cure
+    raise UserError(f"{shortened(name)} {problem}; {cure}")
 
 
 def load_checkpoint(
@@ -209,9 +190,7 @@ def load_checkpoint(
     Args:
         path: from `find`.
         is_trusted: also allows import paths outside megastep that this user has not trained with.
-        device: device of the state; None loads no state and does not import PyTorch.
-        is_whole: also loads environments and replay buffer, to resume.
-        rank: the rank whose environments and replay buffer are loaded.
+        device, is_whole, rank: as for `checkpoint.read`.
 
     Raises:
         UserError: there is no intact checkpoint, or `trust=true` is needed.
@@ -238,8 +217,9 @@ def resume_command(folder: Path, key: str = "resume") -> str:
 
 
 def command_of(script: str, key: str, folder: Path) -> str:
-    """Returns the command that does something with a run, such as `python evaluate.py run=RUN`."""
-    # quoted for the shell and for Hydra where needed
+    """Returns the command that does something with a run, such as `python evaluate.py run=RUN`,
+    quoted for the shell and for Hydra.
+    """
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
     return f"{package.command(script, 'python ')} {shlex.quote(f'{key}={name}')}"
@@ -254,15 +234,13 @@ def to_continue(folder: Path) -> str:
 
 
 def checkpoints_of(path: Path) -> Path:
-    """Returns the `checkpoints` folder of a run. A checkpoint's path is returned unchanged, even if
-    the checkpoint was deleted.
-    """
+    """Returns the `checkpoints` folder of a run; the path of a checkpoint as it is."""
     return path / "checkpoints" if (path / "checkpoints").exists() else path
 
 
 def folder_of(path: Path) -> Path:
-    """Returns the run folder of a path from `find`. For an agent file, which may be read-only,
-    returns a folder in `RUNS` for its results, which may not exist yet.
+    """Returns the run folder of a path from `find`; for an agent file a folder in `RUNS` for its
+    results, which may not exist yet.
     """
     if agent_file.is_agent_file(path):
         return RUNS / f"pretrained-{path.stem}"

@@ -24,6 +24,7 @@ class JsonLines:
     def __init__(self, path: Path | str):
         self.path = Path(path)
         self.file = AppendedFile(self.path)
+        self.close = self.file.close
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
         """Appends a line. NaN and infinity become null."""
@@ -33,14 +34,10 @@ class JsonLines:
         }
         self.file.write((json.dumps({"samples": step, **json_values}) + "\n").encode())
 
-    def close(self) -> None:
-        self.file.close()
-
 
 def read(path: Path | str) -> "list[Row]":
-    """Returns the objects in a file.
-
-    Skips damaged lines with a warning, and silently a last line that a crash cut short.
+    """Returns the objects in a file. Skips damaged lines with a warning, and silently a last line
+    that a crash cut short.
     """
     return [row for row, _ in _intact_lines(Path(path))]
 

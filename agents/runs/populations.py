@@ -63,11 +63,7 @@ def _highest(scores_of) -> int:
 
 
 def member(root: Path, which: "int | str" = "best") -> Path:
-    """Returns the run folder of a member, by its number or `best`.
-
-    Raises:
-        UserError: there is no such member.
-    """
+    """Returns the run folder of a member, by its number or `best`. Raises UserError for others."""
     n = len(members(root))
     number = best(root) if which == "best" else int(which)
     if not 0 <= number < n:
@@ -79,10 +75,7 @@ def member(root: Path, which: "int | str" = "best") -> Path:
 
 def common_checkpoints(root: Path) -> list[Path]:
     """Returns the newest checkpoint of each member after one number of samples, that all of them
-    have saved whole.
-
-    Raises:
-        UserError: there is none.
+    have saved whole. Raises UserError if there is none.
     """
     by_step = []
     for folder in members(root):
@@ -100,10 +93,7 @@ def common_checkpoints(root: Path) -> list[Path]:
 
 def read(path: Path) -> "list[list[Row]]":
     """Returns the rows of `population.jsonl`, a list for each generation, each in the order of
-    members.
-
-    Raises:
-        UserError: the file cannot be read, or holds something else.
+    members. Raises UserError if the file cannot be read, or holds something else.
     """
     with user_errors(f"{path} does not hold the generations of a population; {INIT}: "):
         rows = json_lines.read(path)

@@ -16,7 +16,6 @@ import torch
 from megastep.agents.runs.json_lines import JsonLines
 
 FILE = "provenance.jsonl"
-GIT_TIMEOUT = 5  # seconds; a repository may be on a slow disk
 
 
 def record(
@@ -56,11 +55,6 @@ def record(
 def made_with(device: torch.device, version: str, n_ranks: int = 1) -> dict[str, str | int]:
     """Returns versions, device, threads and ranks. Runs that agree in these, in code and in
     configuration, the seed included, are bit-identical.
-
-    Args:
-        device: device that trains.
-        version: megastep's version.
-        n_ranks: number of ranks.
     """
     facts = {"torch": torch.__version__, "megastep": version}
     if n_ranks > 1:
@@ -76,15 +70,20 @@ def commit(folder: Path) -> str | None:
     """Returns the commit of the git checkout at a folder, with `-dirty` if tracked files have
     changed; None without a checkout or git.
     """
-    # ignore a git hook's variables, if one starts this; take no lock in the user's checkout
-    env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
-    options: dict = dict(timeout=GIT_TIMEOUT, text=True, env={**env, "GIT_OPTIONAL_LOCKS": "0"})
-    options |= dict(stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    words = "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"
     if not (folder / ".git").exists():  # megastep may be installed inside another's checkout
         return None
+    # ignore a git hook's variables, if one starts this; take no lock in the user's checkout
+    env = {name: text for name, text in os.environ.items() if not name.startswith("GIT_")}
+    words = "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        return subprocess.check_output(["git", "-C", str(folder), *words], **options).strip()
+        return subprocess.check_output(
+            ["git", "-C", str(folder), *words],
+            env={**env, "GIT_OPTIONAL_LOCKS": "0"},
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=5,  # seconds; a repository may be on a slow disk
+            text=True,
+        ).strip()
 
 
 def device_name(device: torch.device) -> str:

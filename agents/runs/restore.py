@@ -2,7 +2,6 @@
 wrappers have learnt.
 """
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
 
 import torch
@@ -43,14 +42,8 @@ def policy_of(
 
 
 def load_weights(policy: Policy, loaded: "Checkpoint", env: Env | None = None) -> Policy:
-    """Returns a policy with a checkpoint's weights, the critic's too if both have one. With the
-    file of an agent, which only acts, the critic keeps the weights that it has.
-
-    Args:
-        env: what the policy was made for. Default: an environment with the spaces of its training.
-
-    Raises:
-        UserError: naming what differs, if they do not fit.
+    """Returns a policy with a checkpoint's weights, the critic's too if both have one. Raises
+    UserError if they, or the spaces of `env`, do not fit.
     """
     saved, present = loaded.config["spaces"], {} if env is None else spaces_of(env)
     if present and (names := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]):
@@ -75,13 +68,8 @@ def load_weights(policy: Policy, loaded: "Checkpoint", env: Env | None = None) -
 
 
 def load_wrappers(env: Env, loaded: "Checkpoint", is_frozen: bool = True) -> None:
-    """Gives the wrappers of an environment what those of a checkpoint's have learnt.
-
-    Args:
-        is_frozen: it stays as it is from now on.
-
-    Raises:
-        UserError: the environment is not in the same wrappers.
+    """Gives the wrappers of an environment what those of a checkpoint's have learnt, which stays as
+    it is if frozen. Raises UserError if the environment is not in the same wrappers.
     """
     if state := (loaded.state or {}).get("wrappers"):
         load = optional(env, "load_wrapper_state")
@@ -97,7 +85,7 @@ def spaces_of(env: Env) -> dict[str, str]:
     return {name: repr(space) for name, space in spaces.leaves(tree).items()}
 
 
-def _nested(texts: Mapping[str, str]) -> dict:
+def _nested(texts) -> dict:
     """Returns the tree of spaces that `spaces_of` wrote."""
     tree = {}
     for name, text in texts.items():

@@ -12,16 +12,11 @@ if TYPE_CHECKING:
 
 
 def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float | None:
-    """Returns the score of a training run: the mean of what the episodes that ended in its last
-    reports returned, or of another of their statistics. None if no episode finished.
+    """Returns the score of a training run: the mean return, or another statistic, of the episodes
+    in the last reports of its `metrics.jsonl`. None if no episode finished.
 
-    Each episode counts once. `episode/NAME` is a mean over a window of `episode/window` episodes,
-    which may include some from earlier reports (`training.episode_stats`).
-
-    Args:
-        rows: the objects of `metrics.jsonl`.
-        name: of the statistic.
-        n_reports: number of last reports.
+    Each episode counts once: `episode/NAME` is a mean over a window of `episode/window` episodes,
+    which may include some from earlier reports.
     """
     total, n_episodes, end = 0.0, 0, len(rows)
     while end > max(0, len(rows) - n_reports):
@@ -37,15 +32,11 @@ def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float 
 
 
 def outcome(result: Path) -> dict[str, float | None]:
-    """Returns the scores of a job of a sweep.
+    """Returns the scores of a run folder, or of the .json file of an evaluation.
 
-    Args:
-        result: the job's run folder, or the .json file of an evaluation.
-
-    Returns:
-        `evaluated`: the return in an evaluation (for a run, its last), or the fraction of duels
-        won against the first opponent; `lower` and `upper`: its 95 % interval. `score`: a run's
-        `mean`; for an evaluation, the same as `evaluated`. Each is None if unknown.
+    `evaluated` is the return in an evaluation (for a run, its last), or the fraction of duels won
+    against the first opponent, `lower` and `upper` its 95 % interval; `score` is a run's `mean`, or
+    the same as `evaluated`. Each is None if unknown.
     """
     files, rows = [result], []
     if is_run := result.is_dir():

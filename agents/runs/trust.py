@@ -5,6 +5,7 @@ if this user has trained with it before, or with `trust=true`. The paths that th
 with are kept in `megastep/trusted` in `$XDG_CONFIG_HOME`, by default `~/.config`, one per line.
 """
 
+import contextlib
 import os
 import re
 import warnings
@@ -38,26 +39,21 @@ def foreign_names(config: "Config") -> list[str]:
 
 def remember(names: Iterable[str]) -> None:
     """Keeps import paths that this user trains with. Warns if they cannot be kept."""
-    new = [name for name in untrusted(names) if name.isprintable()]
     try:
-        if new:
+        if new := [name for name in untrusted(names) if name.isprintable()]:
             _file().parent.mkdir(parents=True, exist_ok=True)
             with open(_file(), "a") as file:
                 file.write("".join(f"{name}\n" for name in new))
     except OSError as error:
-        warnings.warn(
-            f"{_file()} cannot be written ({error.strerror}), so whatever loads this run needs "
-            "trust=true",
-            stacklevel=2,
-        )
+        problem = f"{_file()} cannot be written ({error.strerror})"
+        warnings.warn(f"{problem}, so whatever loads this run needs trust=true", stacklevel=2)
 
 
 def untrusted(names: Iterable[str]) -> list[str]:
     """Returns the import paths that this user has not trained with yet."""
-    try:
+    known = []
+    with contextlib.suppress(OSError):
         known = _file().read_text().splitlines()
-    except OSError:
-        known = []
     return [name for name in names if name not in known]
 
 

@@ -33,8 +33,6 @@ class _Entry(TypedDict):
 
 
 class Manifest(TypedDict):
-    """manifest.json of a checkpoint."""
-
     step: _Count
     score: float | None
     numbers: dict[str, bool | int | _Number]
@@ -61,14 +59,10 @@ class Config(TypedDict):
 
 
 class Facts(TypedDict):
-    """How the agent in an agent file was trained."""
-
     samples: _Count
 
 
 class Table(TypedDict):
-    """An evaluation in an agent file."""
-
     title: str
     command: str
     rows: list[dict[str, Any]]
@@ -86,15 +80,8 @@ def dumps(value: Any, indent: int | None = None) -> str:
 
 
 def loads(text: str | bytes, kind: object = None) -> Any:
-    """The inverse of `dumps`.
-
-    Args:
-        kind: what the value must be, such as `Manifest`; None for anything. Keys of which a kind
-            says nothing may be there.
-
-    Raises:
-        ValueError: `dumps` cannot have written the text; or the value is of another kind, with the
-            first wrong key.
+    """The inverse of `dumps`. Raises ValueError for a text that `dumps` cannot have written, or a
+    value that is not of a kind, such as `Manifest`. More keys than those of the kind may be there.
     """
     try:
         value = json.loads(text, object_hook=_decoded)

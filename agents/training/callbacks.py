@@ -26,8 +26,8 @@ from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
+    from megastep.agents.runs.saver import Saver
     from megastep.agents.training.trainer import Trainer
-    from megastep.agents.types import SaverLike
 
 #: The methods, and what each gets beside the trainer.
 HOOKS = {
@@ -193,7 +193,7 @@ class Snapshots:
 
     is_slow = True
 
-    def __init__(self, saver: SaverLike, n: int):
+    def __init__(self, saver: Saver, n: int):
         self.saver, self.n, self.n_parts_done = saver, n, 0
 
     def on_start(self, trainer: Trainer) -> None:

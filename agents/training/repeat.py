@@ -83,7 +83,7 @@ def _keep(path, run, record) -> Path:
     kept = folders.make(run / FOLDER)
     try:
         shutil.copytree(path, kept / "checkpoints" / path.name, copy_function=_link)
-        record.flush()
+        record.file.flush()
         shutil.copy2(run / annealing.FILE, kept)
     except OSError:
         shutil.rmtree(kept, ignore_errors=True)

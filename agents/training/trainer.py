@@ -10,7 +10,7 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.agreement import Plan, agree
 from megastep.agents.distributed.process_group import unhurried
 from megastep.agents.distributed.ranks import Ranks, world
-from megastep.agents.runs.saver import NoSaver
+from megastep.agents.runs.saver import NoSaver, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.callbacks import Callbacks, DriftCheck, Losses
 from megastep.agents.training.episodes import Episodes
@@ -24,7 +24,7 @@ from megastep.types import Env, optional
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.training.curriculum import Curriculum
-    from megastep.agents.types import Learner, SaverLike, StateDict
+    from megastep.agents.types import Learner, StateDict
 
 
 class Trainer:
@@ -70,7 +70,7 @@ class Trainer:
         learner: Learner,
         budget: Budget | None = None,
         *,
-        saver: SaverLike | None = None,
+        saver: Saver | None = None,
         log_every: int = 1,
         checkpoint_seconds: float = 30.0,
         callbacks: Sequence[object] = (),

@@ -96,12 +96,11 @@ def test_each_logger_has_settings_of_its_own():
 @pytest.mark.parametrize(
     "words, key, text",
     [
-        (["logger.mode=offline"], "logger.mode", "no such key; did you mean logger.wandb.mode?"),
-        (["logger=wandb", "logger.group=g"], "logger.group", "did you mean logger.wandb.group?"),
+        (["logger.mode=offline"], "logger.mode", "whose keys are logger.wandb.mode="),
         (["logger.wandb.mode=offline"], "logger.wandb", "is not chosen; add logger=wandb, or"),
         (["logger=wandb", "logger.wandb.mod=x"], "logger.wandb.mod", "logger.wandb.mode?"),
         (["logger=wandb", "logger.wandb.mode=x"], "logger.wandb.mode", "'x' is unknown; there are"),
-        (["logger.mlfow.uri=x"], "logger.mlfow", "no such key or logger; there are csv"),
+        (["logger.mlfow.uri=x"], "logger.mlfow", "there are csv"),
         (["logger=wandbb"], "logger", "'wandbb' is unknown; did you mean wandb?"),
         (["logger=[csv,wandbb]"], "logger", "'wandbb' is unknown; did you mean wandb?"),
         (["logger=null"], "logger", "None is unknown"),

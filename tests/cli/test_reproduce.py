@@ -2,9 +2,7 @@
 
 import functools
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -19,7 +17,6 @@ from tests.helpers import tiny
 LAB = Path(__file__).parents[2] / "docs" / "lab"
 ROWS = reproduce.read()
 RESULTS = [result for row in ROWS.values() for result in row.results]
-HERE = {"device": "cpu EPYC", "torch": "2.13.0+cpu", "instructions": "AVX2", "threads": 2}
 #: Minimal pays nothing, so every return is 0.
 NOTHING = Result("page.md", "line", "episodes=4", "return", "0 (0 to 0)")
 
@@ -68,22 +65,6 @@ def test_intervals_with_a_number_in_common_agree(text, agreeing, differing):
     assert not any(result.agrees(Interval(sum(ends) / 2, *ends)) for ends in differing)
 
 
-@pytest.mark.parametrize(
-    "known, is_exact, words",
-    [
-        ([], None, "none is recorded"),
-        ([HERE | {"sha256": "a"}], True, "byte for byte"),
-        ([HERE | {"sha256": "b", "threads": 1}, HERE | {"sha256": "b"}], False, "DIFFERS"),
-        ([HERE | {"sha256": "b", "threads": 1}], None, "threads 1, here 2"),
-        ([HERE | {"sha256": "a", "threads": 1}], True, "byte for byte"),
-    ],
-)
-def test_metrics_are_compared_on_the_same_kind_of_machine(known, is_exact, words):
-    verdict, sentence = reproduce.compare_bits(known, HERE, "a")
-    assert verdict is is_exact
-    assert words in sentence
-
-
 def test_values_of_an_evaluation_and_of_duels():
     spl = {"mean": 0.5, "lower": 0.4, "upper": 0.6}
     rows = [{"return": 3.0, "lower": 2.0, "upper": 4.0, "metrics": {"spl": spl}}, {"return": 1.0}]
@@ -91,28 +72,6 @@ def test_values_of_an_evaluation_and_of_duels():
     assert reproduce.found_in(rows, "spl") == (0.5, 0.4, 0.6)
     random, bot = {"against": "random"}, {"against": "bot", "won": 0.3, "lower": 0.2, "upper": 0.4}
     assert reproduce.found_in([random, bot], "bot") == (0.3, 0.2, 0.4)
-
-
-@pytest.mark.slow
-def test_a_run_gives_the_same_bytes_again(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    row = Row("first", "cpu", " ".join([*tiny.TINY, f"samples={2 * tiny.UPDATE}"]), [NOTHING])
-    assert reproduce.reproduce(row) == 0
-    (path,) = tmp_path.glob("runs/*-reproduce-first/reproduction.json")
-    report = json.loads(path.read_text())
-    assert (report["is_reproduced"], report["samples"]) == (True, 2 * tiny.UPDATE)
-    assert reproduce.reproduce(row._replace(name="again", exact=[report["exact"]])) == 0
-    assert "byte for byte" in capsys.readouterr().out
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", [row.name for row in ROWS.values() if row.exact])
-def test_recorded_bytes_come_out_again(name, tmp_path):
-    """On the kinds of machine that are recorded; elsewhere, that the results do."""
-    words = [sys.executable, "-m", "megastep", "reproduce", name]
-    env = os.environ | {"PYTHONPATH": str(LAB.parents[1])}
-    assert subprocess.run(words, cwd=tmp_path, env=env).returncode == 0
 
 
 def test_each_place_is_evaluated_once(tmp_path, monkeypatch, capsys):

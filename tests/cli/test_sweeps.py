@@ -487,23 +487,3 @@ def test_config_dir_and_config_name(here, capsys):
     ):
         assert train.main(words) == 2
         assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "line, expected",
-    [
-        ("env=ex", "env=explorer"),
-        ("learner.la", "learner.lambda_="),
-        ("env=minimal env.long", "env.longest="),
-        ("hydra.sweep.d", "hydra.sweep.dir="),
-        ("-m hydra/launcher=ba", "hydra/launcher=basic"),
-        ("folder=./pay", "folder=./payer.py"),
-        ("env=explorr learner.la", ""),
-        ("logger=ten", "logger=tensorboard"),
-        ("logger=[csv,wandb] logger.wandb.pro", "logger.wandb.project="),
-    ],
-)
-def test_shell_completion(monkeypatch, capsys, line, expected):
-    monkeypatch.setenv("COMP_LINE", f"python train.py {line}")
-    assert train.main(["-sc", "query=bash"]) == 0
-    assert capsys.readouterr().out.strip() == expected

@@ -43,7 +43,7 @@ def trained(*words):
         actions=trainer.rollout.actions,
         generators=[state["learner"][name] for name in ("generator", "policy_generator")],
         n=(trainer.samples, trainer.updates, trainer.episodes.stats.windows),
-        parts=trainer.saver.rank_files.rank,
+        parts=trainer.saver.rank,
     )
 
 

@@ -7,7 +7,7 @@ from megastep.agents.cli import inspect
 from megastep.agents.factory.trainer import differing
 from megastep.agents.runs import checkpoint
 from megastep.agents.runs import saver as saver_module
-from megastep.agents.runs.saver import RankFiles, Saver
+from megastep.agents.runs.saver import Saver
 from tests.training.test_trainer import UPDATE, make_trainer
 
 
@@ -23,7 +23,7 @@ def state(rank):
 
 def savers(folder, n_ranks=2, launch="now"):
     return [
-        Saver(folder, {"train": {}}, rank_files=RankFiles(folder, launch, rank, n_ranks))
+        Saver(folder, {"train": {}}, launch=launch, rank=rank, n_ranks=n_ranks)
         for rank in range(n_ranks)
     ]
 
