@@ -270,7 +270,7 @@ def _plain(value) -> object:
 
 
 def sentence(error: Mapping, field: FieldInfo | None, value: object) -> str:
-    """Returns what is allowed of a `field`, and the `value` given, from one of pydantic's errors."""
+    """Returns what is allowed of a `field`, and the `value` given, from an error of pydantic."""
     kind, got = error["type"], "nothing" if value is None else repr(value)
     is_schedule = isinstance(value, Mapping) and value.keys() == {"from", "to"}
     if is_schedule and kind != "value_error":
