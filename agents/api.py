@@ -2,8 +2,7 @@
 
 Keyword arguments are the words of the command line, checked in the same way: `seconds=60`,
 `env="explorer"`, `learner={"lr": 3e-4}` or `**{"learner.lr": 3e-4}`. A class or a function stands
-for its import path, a `Run` for its folder. What would end a command with a sentence raises it
-as a `UserError`.
+for its import path, a `Run` for its folder. What ends a command with a sentence raises `UserError`.
 """
 
 import contextlib
@@ -79,13 +78,9 @@ class Run:
         return pretrained.load(str(self.path))
 
     def make(self, n_envs: int = 16, geometry: object = None, **changes: object) -> "Env":
-        """Returns an environment like the one of the training.
-
-        Args:
-            n_envs: number of environments.
-            geometry: other floor plans, as `train` takes them. Default: those of the training, in
-                the split `test`.
-            changes: `split`, `seed`, `device`, and settings of the environment.
+        """Returns an environment like the one of the training, in other floor plans if a geometry
+        is given; by default in the split `test`. `changes` are `split`, `seed`, `device`, and
+        settings of the environment.
         """
         own = {key: self.config[key] for key in ("env", "geometry")}
         if geometry is not None:
@@ -101,11 +96,8 @@ class Run:
         return record(self, **settings)
 
     def export(self, format: str, file: "str | os.PathLike | None" = None) -> Path:
-        """Writes the agent for another runtime: `run.export("onnx")`. Returns the path.
-
-        Args:
-            format: "onnx", "torch", "safetensors" or "hub".
-            file: default: one in the run's folder.
+        """Writes the agent for another runtime, "onnx", "torch", "safetensors" or "hub", by default
+        into the run's folder. Returns the path.
         """
         from megastep.agents.cli import export
 
@@ -118,7 +110,7 @@ class Run:
         homes: list[int] | None = None,
         seed: int = 1,
     ) -> Path:
-        """Writes a page that plays the agent in a browser: `run.web()`. Returns the path.
+        """Writes a page that plays the agent in a browser. Returns the path.
 
         Args:
             file: default: `page.html` in the run's folder.
@@ -235,9 +227,7 @@ def record(
 
 def load(run: "Run | str | os.PathLike") -> Run:
     """Returns a run by its folder, a checkpoint of it, `latest`, or the name of a packaged agent.
-
-    Raises:
-        UserError: there is none; the message names the most similar.
+    Raises UserError with the most similar name if there is none.
     """
     return run if isinstance(run, Run) else Run(folders.find(os.fspath(run)))
 

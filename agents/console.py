@@ -1,6 +1,4 @@
-"""Lines, warnings, tables and progress, on a terminal or not. Output that cannot be written, as on
-a full disk or a closed pipe, never ends the work.
-"""
+"""Lines, warnings, tables and progress. Output that cannot be written never ends the work."""
 
 import contextlib
 import html
@@ -164,9 +162,7 @@ def _notebook() -> ModuleType | None:
 
 
 class Progress:
-    """A context: a bar with a line of text on a terminal and in a notebook, elsewhere a line every
-    10 seconds.
-    """
+    """A context: a bar on a terminal and in a notebook, elsewhere a line every 10 seconds."""
 
     def __init__(self) -> None:
         from rich import progress  # only for those who wait

@@ -22,9 +22,8 @@ EXIT_CODES = {
 
 
 class UserError(Exception):
-    """Something the user can put right, in one sentence.
-
-    Ends the program with the exit code `code`, without a traceback.
+    """Something the user can put right, in one sentence. Ends the program with the exit code
+    `code`.
     """
 
     code = 2

@@ -14,9 +14,7 @@ def stream_seed(seed: int, name: str) -> int:
 
 
 def rank_seed(seed: int, rank: int) -> int:
-    """Returns the seed of a rank: the run's seed for rank 0, for each other one of its own, below
-    2**31 as NumPy and environments of others want it.
-    """
+    """Returns the run's seed for rank 0, for each other one of its own, below 2**31."""
     return seed if rank == 0 else stream_seed(seed, f"rank {rank}") % 2**31
 
 

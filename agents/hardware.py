@@ -7,14 +7,11 @@ from megastep.agents.errors import user_errors
 
 
 def make_device(name: str, index: int | None = None) -> torch.device:
-    """Returns the device of this name, and makes a GPU the current one.
+    """Returns the device `auto`, `cpu`, `cuda` or `cuda:1`, and makes a GPU the current one. Raises
+    UserError if there is none.
 
     Args:
-        name: `auto`, `cpu`, `cuda` or `cuda:1`.
         index: of the GPU that `auto` and `cuda` mean.
-
-    Raises:
-        UserError: there is no such device.
     """
     if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
         name = f"cuda:{index}"
@@ -26,8 +23,8 @@ def make_device(name: str, index: int | None = None) -> torch.device:
 
 
 def share_threads(width: int) -> None:
-    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
-    layers, threads lose more by waiting for each other than they gain.
+    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer, as threads
+    lose more by waiting for each other in smaller ones.
     """
     n_threads = devices.threads()
     devices.set_threads(n_threads)

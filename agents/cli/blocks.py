@@ -6,9 +6,8 @@
       learner:
         gamma: 0.98
 
-A block is merged as Hydra reads its file, through a source of files that is one of its plugins, so
-a later file wins over the blocks of an earlier one. A learner of a user has the blocks of the
-built-in learner that it derives from, if of any.
+A block is merged as Hydra reads its file, so a later file wins over the blocks of an earlier one. A
+learner of a user has the blocks of the built-in learner that it derives from, if of any.
 """
 
 from collections.abc import Mapping
@@ -47,9 +46,7 @@ class BlockSource(FileConfigSource):
 
 
 class Folders(SearchPathPlugin):
-    """Has Hydra read the files of our folder, and of the one given by --config-dir beside it, with
-    their blocks.
-    """
+    """Has Hydra read the files of our folder, and of --config-dir, with their blocks."""
 
     main, beside = "", ""
 
@@ -67,9 +64,7 @@ plugins.Plugins.instance().register(Folders)
 
 
 def blocks_of(device: object, learner: object) -> dict[str, bool]:
-    """Returns the names of blocks, and whether they apply on a device, and with a learner as
-    `built_in` takes it. Values of other types are errors when the settings are checked.
-    """
+    """Returns the names of blocks, and whether they apply on a device and with a learner."""
     is_cpu = device == "cpu" or (device == "auto" and not gpu.is_available())
     name = built_in(str(learner))
     learners = {one: one == name for one in components.members("learner")}
@@ -110,9 +105,7 @@ def plain(config: Container, resolve: bool = False) -> check.Tree:
 
 
 def leave_out_others(config: DictConfig, learner: str | None) -> None:
-    """Takes what only built-in learners have from the settings of a user's learner, which has the
-    file of one.
-    """
+    """Takes what only built-in learners have from the settings of a user's learner."""
     name = learner or OmegaConf.select(config, "learner.name")
     known = components.members("learner").values()
     if not isinstance(name, str) or name in known:

@@ -86,8 +86,8 @@ class Command:
 
 
 def without_dashes(word: str) -> str:
-    """Returns `--learner.lr=0.1`, as agents of W&B's sweeps write it, as `learner.lr=0.1`; options
-    are left as they are.
+    """Returns `--learner.lr=0.1`, as W&B's agents write it, as `learner.lr=0.1`; options as they
+    are.
     """
     name, is_given, _ = word.partition("=")
     is_option = name in " ".join(OPTIONS).split()
@@ -175,7 +175,7 @@ def load(name: str) -> Command:
 
 def with_member(tree: check.Tree, key: str) -> check.Tree:
     """Returns the tree with the folder of a population's member at a key, in place of the
-    population's folder there and `member`. Raises ConfigErrors if there is no such member.
+    population's and of `member`. Raises ConfigErrors if there is no such member.
     """
     run, member = tree.get(key), tree.get("member")
     if member is None or not isinstance(run, str):

@@ -1,5 +1,4 @@
-"""The words of a command line, or keyword arguments -> Hydra -> checked settings, before anything
-is written.
+"""The words of a command line, or keyword arguments -> Hydra -> checked settings.
 
 Hydra's grammar reads the words, and `hydra.compose` composes the groups from files, with their
 `blocks`. Keys are set in what comes out, so that every error has its own word.
@@ -117,9 +116,7 @@ class Composer:
         return {name: members for name, members in files.items() if members and name != "hydra"}
 
     def parse(self, words: Iterable[str]) -> list[types.Override]:
-        """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable
-        ones.
-        """
+        """Returns words as Hydra's grammar reads them."""
 
         def is_left_out_anyway(one) -> bool:  # a group, for which Hydra has no word
             is_none = one.value() is None and self.members(one.key_or_group)
@@ -132,9 +129,7 @@ class Composer:
         return self.compose(words)[0]
 
     def compose(self, words: Iterable[str]) -> tuple[Any, DictConfig]:
-        """Returns checked settings, and the configuration they are from, Hydra's part included.
-        Raises ConfigErrors with everything that is wrong.
-        """
+        """Returns checked settings, and the configuration they are from, Hydra's part included."""
         typed, errors = [], []
         for one in self.parse(words):
             if one.is_sweep_override():
@@ -145,9 +140,7 @@ class Composer:
         return self.checked(typed, errors)
 
     def checked(self, typed: list[Typed], errors: list) -> tuple[Any, DictConfig]:
-        """Returns checked settings, and the configuration they are from. `errors` has what is wrong
-        already.
-        """
+        """Returns what `compose` does. `errors` has what is wrong already."""
         config, more = self.config(typed)
         secret = [*refused_resolvers(own(config))]
         errors = [*errors, *more]
@@ -238,8 +231,8 @@ class Composer:
     def _composed(
         self, *groups: str, device: str | None = None, learner: str | None = None
     ) -> DictConfig:
-        """Returns the configuration of files, once more if they choose another device or learner
-        than the one whose blocks were merged.
+        """Returns the configuration of files, with the blocks of the device and learner that they
+        choose.
         """
         typed = dict(word.lstrip("+").split("=", 1) for word in groups if "=" in word)
         applied = blocks.blocks_of(device or "auto", learner or typed.get("learner", GUESS))
@@ -280,9 +273,7 @@ def store_member(group: str, member: str, path: str) -> None:
 
 
 def settings_from(command: "Command", arguments: Mapping[str, Any]) -> Any:
-    """Returns the checked settings of a command from keyword arguments, as `typed_of` takes them.
-    Raises ConfigErrors with everything that is wrong.
-    """
+    """Returns the checked settings of a command from keyword arguments."""
     state = global_hydra.GlobalHydra.instance()
     before = state.hydra  # of a program of the user's
     try:

@@ -27,8 +27,8 @@ The most common words:
 
 
 def prepare(tree: Tree, typed: list[str]) -> Tree:
-    """Returns the tree with the member of a population that is asked for, and without what files,
-    such as environments', set for training alone.
+    """Returns the tree with the member of a population, and without what files set for training
+    alone.
     """
     tree = with_member(tree, "run")
     kinds = settings.Train, settings.Played

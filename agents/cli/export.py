@@ -38,9 +38,7 @@ class Export:
 
 
 def run(cfg: Export) -> Path:
-    """Writes an agent's file or folder, and says what was written. Returns its path. Raises
-    UserError if there is no such run, or it cannot be written so.
-    """
+    """Writes an agent's file or folder, and says what was written. Returns its path."""
     kind, run = cfg.format, with_member({"run": cfg.run, "member": cfg.member}, "run")["run"]
     source, suffix = folders.find(run), Path(FORMATS[kind]).suffix
     path = folders.folder_of(source) / FORMATS[kind] if cfg.file is None else Path(cfg.file)

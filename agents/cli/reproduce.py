@@ -1,6 +1,4 @@
-"""Makes results of docs/lab again. `megastep reproduce` lists them, `megastep reproduce ROW` trains
-and evaluates as `megastep train` and `megastep evaluate` do, and compares.
-"""
+"""Makes results of docs/lab again, with `megastep train` and `megastep evaluate`."""
 
 import itertools
 import json
@@ -65,7 +63,7 @@ class Result(NamedTuple):
 
     def agrees(self, found: Interval) -> bool:
         """Returns true if a 95 % interval, rounded as the stated one is, has a number in common
-        with it: a run on another kind of machine is another sample of the same training.
+        with it.
         """
         _, percent, *bounds = self._parts()
         decimals = max(len(bound.partition(".")[2]) for bound in bounds)
@@ -114,9 +112,7 @@ class Reproduce:
 
 
 def run(cfg: Reproduce) -> int:
-    """Lists the rows, or reproduces one. Returns the exit code: 1 if a result differs from what is
-    stated.
-    """
+    """Lists the rows, or reproduces one. Returns the exit code: 1 if a result differs."""
     rows = read()
     if cfg.row is None:
         for device, title in ("cpu", "On two CPU cores"), ("cuda", "On one H200"):
@@ -135,12 +131,7 @@ def run(cfg: Reproduce) -> int:
 
 
 def reproduce(row: Row) -> int:
-    """Trains and evaluates a row, and says whether its results are as stated. Returns the exit code
-    of the training or an evaluation if it fails, else 1 if a result differs.
-
-    Raises:
-        UserError: the row needs a GPU and there is none.
-    """
+    """Trains and evaluates a row, and compares. Returns the exit code."""
     from megastep.agents.cli import evaluate, train
     from megastep.agents.launch import gpu
     from megastep.agents.runs import folders
@@ -168,9 +159,7 @@ def reproduce(row: Row) -> int:
 
 
 def found_in(rows: list[dict], metric: str) -> Interval:
-    """Returns a number of an evaluation's table: the fraction of duels won against the opponent of
-    this name, else the mean return or a metric's mean.
-    """
+    """Returns a number of an evaluation's table: a mean, or the fraction of duels won."""
     cells, key = rows[0], metric
     if "against" in rows[0]:
         cells, key = next(row for row in rows if row["against"] == metric), "won"
@@ -180,8 +169,8 @@ def found_in(rows: list[dict], metric: str) -> Interval:
 
 
 def compare(row: Row, folder: Path, found: Sequence[Interval]) -> int:
-    """Prints how the numbers found compare with those stated, and writes reproduction.json into the
-    run's folder. Returns the exit code.
+    """Prints how numbers compare with those stated, and writes reproduction.json. Returns the exit
+    code.
     """
     samples = json_lines.read(folder / "metrics.jsonl")[-1]["samples"]
     agree = [*map(Result.agrees, row.results, found)]

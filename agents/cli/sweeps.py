@@ -1,8 +1,7 @@
 """Sweeps are Hydra's own, with its launchers and sweepers. Added here: the check of all jobs before
 the first starts, the GPUs of each job, what a job returns, and the table of them all.
 
-The basic launcher's jobs run in this process, those of joblib in processes of their own, started by
-its workers: one that is killed for memory leaves the others.
+Jobs of joblib run in processes of their own, so that one that is killed leaves the others.
 """
 
 import contextlib
@@ -63,11 +62,9 @@ OmegaConf.register_new_resolver(
 
 
 def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list, Any]:
-    """Returns (the words of each job that is known beforehand; their settings, all of them checked;
-    Hydra's configuration of the first). Raises ConfigErrors for the first wrong job.
-
-    Of a grid these are all jobs; of a search, the first of all values, and each other value and
-    bound alone.
+    """Returns (the words of each job that is known beforehand; their checked settings; Hydra's
+    configuration). Of a grid these are all jobs; of a search, the first of all values, and each
+    other value and bound alone.
     """
     values = {key_of(override): _values(override) for override in composer.parse(words)}
     config = composer.compose([options[0] for options in values.values() if options[0]])[1].hydra
@@ -220,8 +217,8 @@ class Job:
         return ended
 
     def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
-        """Runs a job in this process, and continues one that was started before. Returns what
-        became of it.
+        """Runs a job in this process, from its checkpoint if it was started before. Returns its
+        row.
         """
         began, number, result = time.monotonic(), row["number"], None
         if os.getpid() != self.process:  # its lines are among those of others

@@ -75,12 +75,8 @@ CURES = {
 
 
 def prepare(tree: Tree, typed: list[str]) -> Tree:
-    """Returns the tree of a run that resumes or repeats another or starts from its weights; any
-    other is returned as it is.
-
-    A run that is resumed or repeated keeps its own settings, except for typed keys. A run that
-    starts from the weights of another has its environment, geometry and agent, except for typed
-    keys and groups.
+    """Returns the tree of a run that resumes or repeats another, which keeps its own settings, or
+    starts from its weights, in its environment, geometry and agent; typed keys and groups win.
     """
     set_ranks(tree, typed)
     if "population.member" in typed:
@@ -164,11 +160,7 @@ def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterat
 
 
 def set_ranks(tree: Tree, typed: list[str]) -> None:
-    """Sets the number of ranks that torchrun has started, if it has.
-
-    Raises:
-        ConfigErrors: another number was typed.
-    """
+    """Sets the number of ranks that torchrun has started, if it has, unless another was typed."""
     with user_errors():
         info = environment.rank_info()
     if info is None:
@@ -181,9 +173,7 @@ def set_ranks(tree: Tree, typed: list[str]) -> None:
 
 
 def ready(cfg: settings.Train) -> None:
-    """Raises UserError if there are fewer GPUs than ranks, or the run's folder is taken: by another
-    run or, if it is resumed, by the process that trains in it.
-    """
+    """Raises UserError if there are fewer GPUs than ranks, or the folder is taken or in use."""
     info = environment.rank_info()
     if environment.rank() > 0 or (info and info.attempt > 0):  # rank 0 checks
         return

@@ -33,9 +33,7 @@ class Web:
 
 
 def run(cfg: Web) -> Path:
-    """Writes a page, and says where and how large it is. Returns its path. Raises UserError if it
-    cannot be made or written.
-    """
+    """Writes a page, and says where and how large it is. Returns its path."""
     own = folders.folder_of(folders.find(cfg.run)) / "page.html"
     path = own if cfg.file is None else Path(cfg.file)
     if path.suffix != ".html":

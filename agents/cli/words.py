@@ -85,9 +85,7 @@ def typed_word(override: types.Override) -> Typed:
 
 
 def plain_settings(command: "Command", words: list[str]) -> Any:
-    """Returns the settings of a command that no file configures. A word without `=` is the value of
-    its first key.
-    """
+    """Returns the settings of a command without files, whose first key needs no `=`."""
     kind = command.kind
     first = next(iter(kind.__pydantic_fields__))
     words = [word if "=" in word else f"{first}={word}" for word in words]

@@ -150,10 +150,8 @@ class NoCurriculum:
 
 @functools.cache
 def kind_of(group: str, name: str) -> type:
-    """Returns the dataclass of the settings of a group's member, by the member's `name`.
-
-    Raises:
-        ValueError: if nothing can be imported under this name, or it takes other arguments.
+    """Returns the dataclass of the settings of a group's member, by the member's `name`. Raises
+    ValueError if nothing can be imported under this name, or it takes other arguments.
     """
     if (group, name) == ("curriculum", "none"):
         return NoCurriculum
@@ -172,18 +170,14 @@ def kind_of(group: str, name: str) -> type:
 
 
 def settings_for(group: str, name: str | None = None, **values: Any) -> Any:
-    """Returns the settings of a group's member: its import path, unless the group has only one, and
-    those that differ from the defaults.
-    """
+    """Returns the settings of a group's member, by its import path if there are several."""
     kind = kind_of(group, name or SINGLE[group])
     return kind(**values) if name is None else kind(name=name, **values)
 
 
 @functools.cache
 def members(group: str) -> dict[str, str]:
-    """Returns {member: its `name`} of a group: those that have a module of that name, and
-    those that a file in configs/ names.
-    """
+    """Returns {member: its `name`} of a group, from modules and files in configs/."""
     if group == "wrapper":
         wrappers = importlib.import_module("megastep.wrappers").WRAPPERS  # with PyTorch
         return {label: f"megastep.wrappers:{kind.__name__}" for label, kind in wrappers.items()}
@@ -229,7 +223,5 @@ def label(name: str) -> str:
 
 
 def env_name(env: Any) -> str:
-    """What an environment is called in titles, from its settings: `explorer`, or the id that one of
-    other packages has, `CartPole-v1`.
-    """
+    """What an environment is called in titles: `explorer`, or the id that it has, `CartPole-v1`."""
     return getattr(env, "id", None) or label(env.name)

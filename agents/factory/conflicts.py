@@ -117,9 +117,7 @@ def schedules_of(cfg: "Train") -> list[str]:
 
 
 def variable(cfg: "Train") -> dict[str, Scheduled]:
-    """Returns the bounds of the settings that may vary between the members of a population, by key:
-    those that may be schedules.
-    """
+    """Returns the bounds, by key, of the settings that members of a population may vary."""
     return {key: bounds for key, field, _ in _fields(cfg) if (bounds := _bounds(field))}
 
 
@@ -172,8 +170,8 @@ def changes_lr(learner: "Learner") -> bool:
 
 
 def ignored_geometry(env: "Env | None", typed: list[str]) -> list[tuple[str, str]]:
-    """Returns [(key, sentence)] of the first typed key that chooses a geometry, if the environment
-    takes none. `env` may be None, that of a run.
+    """Returns [(key, sentence)] of the first typed key of a geometry, if the environment takes
+    none.
     """
     keys = [key for key in typed if key.split(".")[0] == "geometry"]
     if not keys or env is None or components.takes_geometries(env.name):

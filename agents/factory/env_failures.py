@@ -22,16 +22,12 @@ METHODS = "__init__", "reset", "step", "check", "desync"
 def caught(
     env: Env, folder: Path, saved: Callable[[], str] = lambda: "", rank: int = 0
 ) -> Iterator[None]:
-    """Turns an error of an environment into one sentence, and writes its traceback into a file.
+    """Turns an error of an environment into an EnvFailed, and writes its traceback into a file in a
+    folder. Errors of megastep's own code are raised as they are.
 
     Args:
-        env: settings of the environment.
-        folder: where the file goes.
         saved: returns what else to say, such as the command that resumes.
         rank: number of this process, which another's file than rank 0's has in its name.
-
-    Raises:
-        EnvFailed: in place of the error. Errors of megastep's own code are raised as they are.
     """
     try:
         yield

@@ -101,9 +101,7 @@ def construct(settings: "Component", constructor: Callable | None = None, **argu
 
 
 def _wrappers_of(settings, taken) -> tuple[list[str], list]:
-    """Returns the wrappers of an environment's own package, and the settings of megastep's, by
-    their base class. Raises ValueError if the environment, which takes some arguments, takes none.
-    """
+    """Returns the wrappers of an environment's own package, and the settings of megastep's."""
     inside, outside = [], []
     for item in settings.wrappers:
         name = item["name"] if isinstance(item, dict) else item
@@ -238,9 +236,7 @@ def sources_of(geometries: Sequence[Mapping]) -> list[str] | None:
 
 
 def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
-    """Returns the name of the source of each layout of an environment in training; None if floor
-    plans have no sources, or it is unknown which of them the layouts are.
-    """
+    """Returns the name of the source of each layout in training, None if unknown."""
     sources = sources_of(geometries)
     if sources is None or getattr(env, "resample", False):
         return sources
@@ -253,10 +249,7 @@ def make_opponents(
     cfg: Train, env: types.Env, sample: types.Env, policy: Policy, seed: int = 1
 ) -> Opponents | None:
     """Returns the environment with opponents in it, None if there are to be none. A scripted one is
-    tried in a small `sample`.
-
-    Raises:
-        UserError: if the opponent cannot play there; with the number of snapshots that fits.
+    tried in a small `sample`. Raises UserError if one cannot play there or snapshots do not fit.
     """
     options = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot or cfg.opponents.league):
@@ -273,14 +266,11 @@ def make_opponents(
 
 
 def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
-    """Returns a policy that needs no weights. It is given the environment's settings that it takes,
-    such as `fov`, and the environment if it takes `env`, and takes one step there.
+    """Returns a policy that needs no weights, given the environment's settings and the environment,
+    if it takes them. It takes one step there. Raises UserError if it cannot play.
 
     Args:
         name: one of `BOTS`, the import path of a class, or None, the class that is `env.bot`.
-
-    Raises:
-        UserError: if there is no such class, or it cannot play there.
     """
     where = type(env).__name__
     with errors():

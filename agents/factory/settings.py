@@ -61,9 +61,7 @@ UNITS = {
 
 
 def quantity(text: object, kind: str) -> object:
-    """Returns the number that people write as `100k` or `1h30min`, by a key of `UNITS`; anything
-    else as it is.
-    """
+    """Returns the number that people write as `100k` or `1h30min`; anything else as it is."""
     units = UNITS[kind]
     part = rf"(\d+(?:\.\d+)?(?:e\+?\d+)?) *({'|'.join(sorted(units, key=len, reverse=True))})"
     if not isinstance(text, str) or not re.fullmatch(rf"(?:{part} *)+", text.lower()):
@@ -127,10 +125,7 @@ def _group(group: str) -> object:
 
 def changed(settings: T, **changes: object) -> T:
     """Returns a copy of settings with other values. Nothing is checked again, since a stranger's
-    default need not be what its annotation says.
-
-    Raises:
-        TypeError: a change that no setting has.
+    default need not be what its annotation says. Raises TypeError for a key that there is not.
     """
     result = copy.copy(settings)
     for name, value in changes.items():
@@ -291,9 +286,7 @@ class Train(Common):
 
 @frozen
 class Trained:
-    """What a trained agent needs to play: it has neither a learner nor loggers, whose classes may
-    not be here.
-    """
+    """What a trained agent needs to play: no learner or logger, whose class may not be here."""
 
     seed: int
     env: Env

@@ -1,6 +1,4 @@
-"""Makes the trainer of a run: a new one, one that continues, or one that starts from the weights of
-another.
-"""
+"""Makes the trainer of a run that is new, continues, or starts from the weights of another."""
 
 import contextlib
 import functools
@@ -140,8 +138,8 @@ def make_trainer(
 
 
 def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint | None:
-    """Returns the checkpoint that a run continues from, or starts from the weights of, once the
-    policy has them; None for a new run.
+    """Returns the checkpoint that a run continues or starts from, whose weights the policy then
+    has.
     """
     if not (start := cfg.resume or cfg.init):
         return None
@@ -192,9 +190,7 @@ def differing(before: "Row", now: "Row") -> list[str]:
 
 
 def seed_everything(seed: int) -> None:
-    """Seeds the global generators of PyTorch, NumPy and Python, which only code of the user's draws
-    from.
-    """
+    """Seeds the global generators, which only code of the user's draws from."""
     seed = stream_seed(seed, "global")
     torch.manual_seed(seed)
     np.random.seed(seed % 2**32)
@@ -204,9 +200,7 @@ def seed_everything(seed: int) -> None:
 def budget_of(
     cfg: settings.Train, folder: Path, loaded: checkpoint.Checkpoint | None
 ) -> budget.Budget:
-    """Returns the budget of a run, with the factors of the learning rate that are to be repeated.
-    Raises UserError if the run to repeat did not record them.
-    """
+    """Returns the budget of a run, with the factors of the learning rate to be repeated."""
     recorded = ()
     if cfg.rerun:
         source = folders.folder_of(folders.find(cfg.rerun))

@@ -58,7 +58,7 @@ def write(
     tables: Sequence[Row] = (),
     wrappers: Mapping[str, object] | None = None,
 ) -> None:
-    """Writes an agent file atomically.
+    """Writes an agent file atomically. Raises OSError.
 
     Args:
         path: the file.
@@ -67,9 +67,6 @@ def write(
         facts: plain values by name, among them `samples`.
         tables: evaluations.
         wrappers: of the environment, what they have learnt, by path: tensors and numbers.
-
-    Raises:
-        OSError: the file cannot be written.
     """
     from safetensors.torch import save
 
@@ -86,9 +83,7 @@ def write(
 
 
 def sealed(content: bytes) -> bytes:
-    """Returns a file's bytes with the SHA-256 in its header recomputed. Raises ValueError if it has
-    none.
-    """
+    """Returns a file's bytes with the SHA-256 in its header recomputed."""
     header_end = 8 + int.from_bytes(content[:8], "little")
     if not (match := _SEAL.search(content, 0, header_end)):
         raise ValueError("its header has no SHA-256")
@@ -99,11 +94,7 @@ def sealed(content: bytes) -> bytes:
 
 def read(path: Path, device: torch.device | str | None) -> Checkpoint:
     """Loads an agent file as a checkpoint that has only the policy's state, on a device; without
-    one no state.
-
-    Raises:
-        CheckpointError: the file is damaged or not an agent file, or another version of megastep
-            wrote it.
+    one no state. Raises CheckpointError if it is damaged or of another version.
     """
     metadata, state = read_metadata(path), None
     if device is not None:

@@ -14,10 +14,8 @@ FILE = "annealing.f64"
 
 
 def read(folder: Path | str) -> array:
-    """Returns the factor of each update of a run; empty without a record.
-
-    Raises:
-        ValueError: a factor is not from 0 to 1.
+    """Returns the factor of each update of a run; empty without a record. Raises ValueError if one
+    is not from 0 to 1.
     """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
@@ -29,14 +27,8 @@ def read(folder: Path | str) -> array:
 
 
 class AnnealingRecord:
-    """A callback that appends to a run's record. What a full disk refuses is written later.
-
-    Args:
-        folder: the run folder.
-        n_updates: updates of the run so far. Factors of later updates are removed.
-
-    Raises:
-        OSError: the file cannot be written.
+    """A callback that appends to a run's record, whose factors after `n_updates` are removed. What
+    a full disk refuses is written later.
     """
 
     is_slow = True
@@ -55,9 +47,7 @@ class AnnealingRecord:
             self.file.flush()
 
     def may_save(self, trainer: object) -> bool:
-        """Flushes the factors to disk, which a checkpoint must not reach beyond. Returns whether
-        they are there.
-        """
+        """Flushes the factors to disk, which a checkpoint must not reach beyond."""
         with contextlib.suppress(OSError):
             self.file.sync()
             return True

@@ -107,7 +107,7 @@ def save(
     add_files: Callable[[Path], object] = lambda path: None,
 ) -> Path:
     """Writes a checkpoint and deletes old ones. Returns its folder. Only one process may save into
-    a folder at a time.
+    a folder at a time. Raises OSError if the disk is full; other checkpoints are unchanged then.
 
     Args:
         folder: the run's `checkpoints` folder.
@@ -118,9 +118,6 @@ def save(
         score: such as the mean return, higher is better; None if unknown.
         made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
         add_files: puts the files of other ranks into the checkpoint's folder.
-
-    Raises:
-        OSError: the disk is full or not writable. Other checkpoints are unchanged.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -153,9 +150,7 @@ def save(
 
 
 def save_tensors(path: Path, tree: StateDict) -> None:
-    """Writes plain dicts of tensors and numbers into a file and flushes it to disk. Raises OSError
-    if the disk is full or not writable.
-    """
+    """Writes plain dicts of tensors and numbers into a file on disk. Raises OSError."""
     import torch
 
     try:
@@ -195,12 +190,8 @@ def load_latest(
     is_whole: bool = True,
     rank: int = 0,
 ) -> Checkpoint:
-    """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
-    Warns of each damaged checkpoint that it skips. The arguments are those of `read`.
-
-    Raises:
-        GoneCheckpoint: its run has deleted the one at `folder`.
-        CheckpointError: there is none, all are damaged, or another version of megastep wrote it.
+    """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`,
+    as `read`. Warns of each damaged checkpoint that it skips.
     """
     folder, messages = Path(folder), []
     if (folder / "manifest.json").exists() or _NAME.fullmatch(folder.name):

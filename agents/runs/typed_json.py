@@ -9,7 +9,7 @@ The JSON can also hold infinity, NaN, and dicts with keys other than strings:
 import functools
 import json
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import pydantic
 from pydantic import Field
@@ -27,51 +27,30 @@ _File = Annotated[str, Field(pattern=r"^((state|world|replay|rank[1-9]\d*)\.pt|c
 Row = dict[str, bool | int | float | str | None]
 
 
-class _Entry(TypedDict):
-    sha256: str
-    bytes: _Count
+def _object(**kinds: Any) -> Any:
+    """Returns the kind of an object with these keys, and perhaps others."""
+    return cast(Any, TypedDict)("Object", kinds)
 
 
-class Manifest(TypedDict):
-    step: _Count
-    score: float | None
-    numbers: dict[str, bool | int | _Number]
-    files: dict[_File, _Entry]
-    made_with: Row
-
-
-class _Member(TypedDict):
-    name: str
-
-
-class _Train(TypedDict):
-    env: _Member
-    geometry: _Member
-    learner: _Member
-    agent: dict[str, Any]
-
-
-class Config(TypedDict):
-    """config.json of a checkpoint. Each setting is checked when it is used."""
-
-    train: _Train
-    spaces: dict[str, str]
-
-
-class Facts(TypedDict):
-    samples: _Count
-
-
-class Table(TypedDict):
-    title: str
-    command: str
-    rows: list[dict[str, Any]]
-
-
-#: A line about a member of a population.
-Generation = TypedDict(
-    "Generation", {"samples": _Count, "generation": _Count, "member": _Count, "from": _Count}
+#: manifest.json of a checkpoint.
+Manifest = _object(
+    step=_Count,
+    score=float | None,
+    numbers=dict[str, bool | int | _Number],
+    files=dict[_File, _object(sha256=str, bytes=_Count)],
+    made_with=Row,
 )
+_member = _object(name=str)
+#: config.json of a checkpoint. Each setting is checked when it is used.
+Config = _object(
+    train=_object(env=_member, geometry=_member, learner=_member, agent=dict[str, Any]),
+    spaces=dict[str, str],
+)
+#: How the agent in an agent file was trained, and one of its evaluations.
+Facts = _object(samples=_Count)
+Table = _object(title=str, command=str, rows=list[dict[str, Any]])
+#: A line about a member of a population.
+Generation = _object(samples=_Count, generation=_Count, member=_Count, **{"from": _Count})
 
 
 def dumps(value: Any, indent: int | None = None) -> str:

@@ -314,8 +314,9 @@ def test_values_are_those_of_the_device_where_the_job_runs(here, monkeypatch):
     job = sweeps.new_job(Composer(load("train")), here)
     job = cloudpickle.loads(cloudpickle.dumps(job))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    composer = Composer(load(job.source[0]), *job.source[1:])
     for words, n_envs in ((["seed=1"], 4096), (["seed=1", "device=cpu"], 256)):
-        assert job.composer().settings(words).env.n_envs == n_envs
+        assert composer.settings(words).env.n_envs == n_envs
 
 
 @pytest.fixture
