@@ -50,8 +50,10 @@ def of_training(cfg: "Train") -> Iterator[tuple[str, str]]:
             yield key, "is a schedule over the budget; give samples= or seconds="
     for name in ("samples", "seconds"):
         if cfg.resume is None and getattr(cfg, f"more_{name}") is not None:
-            text = f"extends a resumed run; give resume=RUN, or {name}= for a new run"
-            yield f"more_{name}", text
+            yield (
+                f"more_{name}",
+                f"extends a resumed run; give resume=RUN, or {name}= for a new run",
+            )
     yield from _population_conflicts(cfg)
     if cfg.member is not None and cfg.init is None:
         yield "member", "is of a population whose weights start a run; give init=RUN"
@@ -60,8 +62,7 @@ def of_training(cfg: "Train") -> Iterator[tuple[str, str]]:
         yield "evaluation.stop", text
     budgets = cfg.samples, cfg.seconds, cfg.more_samples, cfg.more_seconds
     if cfg.checkpoints.snapshots and not any(budgets):
-        text = "are spread over the budget; give samples= or seconds="
-        yield "checkpoints.snapshots", text
+        yield "checkpoints.snapshots", "are spread over the budget; give samples= or seconds="
 
 
 def of_recording(cfg: "Record") -> Iterator[tuple[str, str]]:
@@ -83,9 +84,8 @@ def of_recording(cfg: "Record") -> Iterator[tuple[str, str]]:
         yield "against", "needs run=, the agent that plays against it"
     if len(stored) == 2:
         yield "episode", "cannot be combined with worst"
-    for name in stored:
-        if cfg.run is None:
-            yield name, "needs run=, whose newest evaluation it is about"
+    for name in stored if cfg.run is None else ():
+        yield name, "needs run=, whose newest evaluation it is about"
     for name in ("geometry", "homes", "against", "env") if stored else ():
         if getattr(cfg, name) is not None:
             yield name, f"cannot be combined with {stored[0]}, whose evaluation has its own"
@@ -105,14 +105,11 @@ def _bounds(field) -> Scheduled | None:
 
 def schedules_of(cfg: "Train") -> list[str]:
     """Returns the keys of settings that have a schedule."""
+    items = [components.wrapper_settings(one) for one in cfg.env.wrappers if isinstance(one, dict)]
     fields = [*_fields(cfg)]
-    for item in cfg.env.wrappers:
-        if isinstance(item, dict):
-            wrapper = components.wrapper_settings(item)
-            fields += [
-                ("env.wrappers", field, getattr(wrapper, name))
-                for name, field in wrapper.__pydantic_fields__.items()
-            ]
+    for item in items:
+        of_item = item.__pydantic_fields__.items()
+        fields += [("env.wrappers", field, getattr(item, name)) for name, field in of_item]
     return [k for k, field, value in fields if _bounds(field) and not isinstance(value, float)]
 
 
@@ -122,38 +119,23 @@ def variable(cfg: "Train") -> dict[str, Scheduled]:
 
 
 def _population_conflicts(cfg: "Train") -> Iterator[tuple[str, str]]:
-    chosen, bounds, is_many = cfg.population, variable(cfg), cfg.population.size > 1
+    chosen, is_many = cfg.population, cfg.population.size > 1
     for key, one in chosen.vary.items():
-        problem = one.problem()
-        if key not in bounds:
-            problem = f"cannot vary; {closest(key, bounds)}"
-        elif key in schedules_of(cfg):
-            problem = f"is a schedule, {getattr(cfg.learner, key[8:], '')}, and so cannot vary"
-        elif key == "learner.lr" and getattr(cfg.learner, "desired_kl", None) is not None:
-            problem = "follows learner.desired_kl, and so cannot vary"
-        elif not problem:
-            try:
-                for number in one.ends():
-                    bounds[key].check(number)
-            except ValueError as error:
-                problem = str(error)
-        if problem:
+        if problem := _problem_of_variation(cfg, key, one):
             yield "population.vary", f"{key} {problem}"
             break
-    if chosen.schedule is not None:
-        if is_many:
-            text = "is of a single agent, and cannot be combined with population.size"
-            yield "population.schedule", text
-        elif not os.path.isfile(chosen.schedule):
-            text = f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
-            yield "population.schedule", text
+    if chosen.schedule is not None and is_many:
+        text = "is of a single agent, and cannot be combined with population.size"
+        yield "population.schedule", text
+    elif chosen.schedule is not None and not os.path.isfile(chosen.schedule):
+        text = f"there is no file {chosen.schedule!r}; give RUN/population.jsonl"
+        yield "population.schedule", text
     if not is_many:
         if chosen.vary:
             text = "is 1, and population.vary needs several members: population.size=8"
             yield "population.size", text
         return
-    is_in_samples = cfg.evaluation.every is not None and not isinstance(cfg.evaluation.every, str)
-    if chosen.score == "evaluated" and not is_in_samples:
+    if chosen.score == "evaluated" and not isinstance(cfg.evaluation.every, int):
         text = "is evaluated, which needs evaluations every so many samples: evaluation.every=10M"
         yield "population.score", text
     if isinstance(cfg.ranks, int) and cfg.ranks > chosen.size:
@@ -161,6 +143,23 @@ def _population_conflicts(cfg: "Train") -> Iterator[tuple[str, str]]:
         yield "ranks", f"{cfg.ranks} {text}"
     if cfg.resume == "auto":
         yield "resume", "cannot be auto for a population yet; give resume=RUN, its folder"
+
+
+def _problem_of_variation(cfg, key, one) -> str | None:
+    bounds = variable(cfg)
+    if key not in bounds:
+        return f"cannot vary; {closest(key, bounds)}"
+    if key in schedules_of(cfg):
+        return f"is a schedule, {getattr(cfg.learner, key[8:], '')}, and so cannot vary"
+    if key == "learner.lr" and getattr(cfg.learner, "desired_kl", None) is not None:
+        return "follows learner.desired_kl, and so cannot vary"
+    if problem := one.problem():
+        return problem
+    try:
+        for number in one.ends():
+            bounds[key].check(number)
+    except ValueError as error:
+        return str(error)
 
 
 def changes_lr(learner: "Learner") -> bool:
