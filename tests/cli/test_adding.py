@@ -370,20 +370,6 @@ def test_core_contract_error_names_the_clause(outside, capsys, change, clause):
     assert "mean:Mean" in error and clause in error, error
 
 
-@pytest.mark.parametrize("key", ["agent.core", "agent.encoder"])
-@pytest.mark.parametrize(
-    "name, reason",
-    [
-        ("builtins:dict", "must be a class derived from torch's Module"),
-        ("builtins:bytes.decode", "must be a class derived from torch's Module"),
-        ("torch.nn:Linear", "must take one argument (missing a required argument"),
-    ],
-)
-def test_core_or_encoder_of_another_kind(outside, capsys, key, name, reason):
-    error = refused(capsys, *MINIMAL, *SMALL, f"{key}={name}")
-    assert f"{name} {reason}" in error and "Traceback" not in error
-
-
 def test_encoder_contract_error(outside, capsys):
     text = "from torch import nn\n\n\nclass Half(nn.Flatten):\n    n_features = 3\n\n"
     outside({"half.py": text + "    def __init__(self, space):\n        super().__init__(-4)\n"})

@@ -254,7 +254,6 @@ def test_record_against(here, capsys, monkeypatch):
     assert "the other is tests.helpers.games:High" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("script", [evaluate, record])
 @pytest.mark.parametrize(
     "name, sentence",
     [
@@ -266,8 +265,8 @@ def test_record_against(here, capsys, monkeypatch):
         ("nowhere", "nowhere is neither a run folder nor a pretrained agent"),
     ],
 )
-def test_opponent_errors(here, capsys, name, sentence, script):
-    assert script.main(["run=a", f"against={name}", "device=cpu"]) == 2
+def test_opponent_errors(here, capsys, name, sentence):
+    assert evaluate.main(["run=a", f"against={name}", "device=cpu"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(sentence, line)
 

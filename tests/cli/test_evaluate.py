@@ -14,7 +14,6 @@ import torch
 from megastep import envs, spaces
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
-from megastep.agents.evaluation import evaluate_run as evaluation
 from megastep.agents.evaluation import playing, statistics, tables
 from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.bots.random import RandomActions
@@ -370,16 +369,6 @@ def test_suite_evaluates_each_source_by_itself(explorer, capsys):
     assert alone.items() <= rows[2].items(), "as in an evaluation of that source alone"
 
 
-def test_suite_of_imported_plans(explorer, tmp_path):
-    files.save(tmp_path / "plans.npz", sample("homes", 20))
-    words = ["run=x", "geometry=suite", "geometry.parts={box: 1}"]
-    words.append(f"geometry.plans={tmp_path / 'plans.npz'}")
-    suite = settings(*words, script="evaluate").geometry
-    written = evaluate.run(configured(run=str(explorer), geometry=suite, baseline=False))
-    rows = json.loads(written.read_text())["rows"]
-    assert [(row["source"], row["homes"]) for row in rows[:-1]] == [("box", 1), ("plans", 2)]
-
-
 @pytest.mark.parametrize("geometry", ["suite", "maze"])
 def test_a_geometry_that_the_environment_does_not_take_is_refused(here, geometry):
     pong = ["env=pong", "env.n_envs=4", "learner.n_steps=8", "agent.width=8"]
@@ -420,23 +409,6 @@ def test_environment_without_a_layout_is_warned_of(here, capsys):
     assert "Homeless has no `layout`" in capsys.readouterr().err
     evaluate.run(configured(run="run", baseline=False))
     assert "layout" not in capsys.readouterr().err, "the box is one home"
-
-
-def test_checkpoint_deleted_while_it_is_evaluated(trained, monkeypatch, tmp_path):
-    """As a run that is training deletes it."""
-    copy = shutil.copytree(trained, tmp_path / "copy", ignore=lambda *_: ["evaluations"])
-    (deleted,) = checkpoint.list_checkpoints(copy / "checkpoints")
-    play = evaluation.play
-
-    def late(*args):
-        if deleted.exists():
-            shutil.rmtree(deleted)
-        return play(*args)
-
-    monkeypatch.setattr(evaluation, "play", late)
-    written = evaluate.run(configured(run=str(copy), baseline=False))
-    assert written.parent == copy / "evaluations" and written.exists()
-    assert json.loads(written.read_text())["checkpoint"] == str(deleted) and not deleted.exists()
 
 
 def test_evaluate_refuses_another_environment(trained, tmp_path):

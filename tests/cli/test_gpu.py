@@ -4,14 +4,10 @@ import os
 import subprocess
 import sys
 import threading
-import types
 
 import pytest
 
-from megastep.agents.cli import train
 from megastep.agents.launch import gpu
-from megastep.agents.runs import checkpoint
-from tests.helpers.tiny import TINY, settings
 
 #: Prints how many times as long as one stream 32 take that do the same, each on its own.
 STREAMS = """
@@ -96,13 +92,6 @@ def test_is_available_without_pytorch(
     assert gpu.is_available() == available and "torch" not in sys.modules
 
 
-def test_is_available_is_pytorchs_word(installed, monkeypatch):
-    installed(Driver(n_gpus=1))
-    monkeypatch.setitem(sys.modules, "torch", types.SimpleNamespace(cuda=types.SimpleNamespace()))
-    sys.modules["torch"].cuda.is_available = lambda: False
-    assert not gpu.is_available()
-
-
 def test_no_driver(monkeypatch, installed):
     installed(None)
 
@@ -128,25 +117,6 @@ def test_wakes_its_own_gpu(installed, device, woken):
     driver = installed(Driver())
     gpu.wake(device)
     assert contexts(driver) == woken
-
-
-def test_resumed_run_wakes_its_own_gpu_alone(installed, monkeypatch, tmp_path):
-    from megastep.agents.factory.check import as_tree
-
-    config = {"train": as_tree(settings(*TINY)) | {"device": "cuda:3"}, "spaces": {}}
-    checkpoint.save(
-        tmp_path / "run/checkpoints", 32, dict(samples=32, seconds=1.0, updates=1), config
-    )
-    driver, ran = installed(Driver()), []
-    monkeypatch.setattr(train, "run", lambda cfg: ran.append(cfg.device))
-    assert train.main([f"resume={tmp_path / 'run'}"]) == 0
-    assert ran == ["cuda:3"] and contexts(driver) == [3]
-
-
-def test_errors_wake_no_gpu(installed):
-    driver = installed(Driver())
-    assert train.main(["device=cuda", "learner.lrr=1"]) == 2
-    assert contexts(driver) == []
 
 
 @pytest.mark.cuda

@@ -81,20 +81,6 @@ def test_bad_input_leaves_nothing(here, words, text, capsys):
     assert text in capsys.readouterr().err and not [*here.glob("runs/*")]
 
 
-@pytest.mark.slow
-def test_learns_in_small_units():
-    """Observations times 1e-4, rewards times 1e-5. Random actions keep the pole up for 22 steps."""
-    module = "tests.helpers.learning_wrappers"
-    words = [
-        *("env=gymnasium", "env.id=CartPole-v1", "device=cpu", "samples=25000", "folder=run"),
-        f"env.wrappers=[{module}:TinyObservations,{module}:TinyRewards]",
-    ]
-    assert train.main(words) == 0
-    last = json_lines.read("run/metrics.jsonl")[-1]
-    assert last["episode/true_return"] > 35
-    assert last["episode/return"] == pytest.approx(1e-5 * last["episode/true_return"], rel=1e-3)
-
-
 def test_value_outside_its_space_is_named(here, capsys):
     """And everything is saved, as for any failure of an environment."""
     words = [*WORDS, "env.id=tests.helpers.learning_wrappers:Seven-v0", "folder=run"]

@@ -194,15 +194,6 @@ print(agents.Agent.__module__, agents.__file__, megastep.agents.__file__)
 
 
 @pytest.mark.nightly
-def test_installed_package_claims_no_other_import_name(python, tmp_path):
-    for name in ("train", "evaluate", "configs", "scripts", "tests", "hydra_plugins"):
-        output = run([python, "-c", f"import {name}"], tmp_path, returncode=1)
-        assert "ModuleNotFoundError" in output
-    packages = run([python, "-m", "pip", "list"], tmp_path)
-    assert not any(name in packages for name in ("wandb", "optuna", "pytest"))
-
-
-@pytest.mark.nightly
 def test_sweeps_without_the_extra_packages(python, tmp_path):
     megastep = commands(python, tmp_path / "empty", tmp_path / "cache")
     sweep = ["-m", "seed=1,2", "samples=64", "hydra.sweep.dir=mine"]

@@ -1,6 +1,5 @@
 """Videos of trained agents."""
 
-import errno
 import io
 import os
 import re
@@ -93,18 +92,6 @@ def test_pictures_are_the_last_frame(filmed):
     assert b"step 3" in svg and pdf.startswith(b"%PDF")
 
 
-def test_look(filmed):
-    small = plt.imread(io.BytesIO(filmed(".png", "dpi=50", "theme=dark", "title=A title")))
-    assert small.shape[:2] == (360, 320) and small[0, 0, :3].max() < 0.15
-    fast = filmed(".mp4", "speed=2.5")
-    import av
-
-    with av.open(io.BytesIO(fast)) as video:
-        assert video.streams.video[0].average_rate == 25
-    svg = filmed(".svg", "axes=true", "title=A title")
-    assert b"x, m" in svg and b"A title" in svg and b"x, m" not in filmed(".svg")
-
-
 def test_homes_in_a_grid(filmed):
     grid = frames_of(filmed(".gif", "homes=[0,2,1]", "geometry=homes"))[-1]
     alone = frames_of(filmed(".gif", "home=2", "geometry=homes", "title='home 2'"))[-1]
@@ -144,55 +131,25 @@ def test_environment_without_homes_has_one(here, capsys):
     assert record.main([*words, "file=pong.gif"]) == 0 and os.listdir() == ["pong.gif"]
 
 
-def full_disk(*_):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-@pytest.mark.parametrize("ending", ["mp4", "gif", "png"])
-def test_full_disk(trained, here, monkeypatch, capsys, ending):
-    monkeypatch.setattr(recording.os, "fsync", full_disk)
-    file = f"film.{ending}"
-    assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
-    assert "No space left on device" in capsys.readouterr().err and not os.listdir()
-
-
 def test_disk_that_fills_up_while_the_film_is_written(trained, here, capsys):
     with faults.full_disk(2000):
         assert record.main([f"run={trained}", "steps=3", "device=cpu", "file=film.mp4"]) == 2
     assert "File too large" in capsys.readouterr().err and not os.listdir()
 
 
-@pytest.mark.parametrize(
-    "name, value, text",
-    [("matplotlib", None, "needs matplotlib"), ("av", None, "needs av")],
-)
-def test_missing_package(trained, here, monkeypatch, capsys, name, value, text):
+@pytest.mark.parametrize("name, text", [("matplotlib", "needs matplotlib"), ("av", "needs av")])
+def test_missing_package(trained, here, monkeypatch, capsys, name, text):
     for module in [m for m in sys.modules if m.split(".")[0] == name or "plotting.pict" in m]:
         monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, name, value)
+    monkeypatch.setitem(sys.modules, name, None)
     assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=film.mp4"]) == 2
     assert text in capsys.readouterr().err and not os.listdir()
-
-
-@pytest.mark.parametrize("env", ["explorer", "pointgoal"])
-def test_several_cameras(env, tmp_path):
-    options = [f"env={env}", "geometry=box", "env.cameras=[0,120,240]", "device=cpu", "steps=1"]
-    heights = []
-    for cameras in options[2], "env.cameras=[0]":
-        file = tmp_path / "a.png"
-        assert record.main([*options[:2], cameras, *options[3:], f"file={file}"]) == 0
-        heights.append(len(plt.imread(file)))
-    assert heights == [720, 720], "the plan makes room for the rows"
 
 
 @pytest.mark.parametrize(
     "file, text",
     [
         ("/proc/video.mp4", "The video /proc/video.mp4 could not be made: "),
-        (
-            "a/video.avi",
-            "file: 'a/video.avi' is neither a film, .mp4 or .gif, nor its last frame, ",
-        ),
         ("folder.mp4", "The video folder.mp4 could not be made: folder.mp4 is a folder"),
         (f"{300 * 'x'}.mp4", "File name too long"),
     ],
@@ -223,8 +180,9 @@ def handlers():
         signal.signal(number, handler)
 
 
-@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("script", ["record", "train"])
+@pytest.mark.parametrize(
+    "script, number, code", [("record", signal.SIGTERM, 143), ("train", signal.SIGINT, 130)]
+)
 def test_signal_while_filming(
     script, number, code, trained, tmp_path, handlers, monkeypatch, capsys
 ):
@@ -248,8 +206,3 @@ def test_training_survives_a_failed_video(trained, tmp_path, monkeypatch, capsys
     assert train.main([*TINY, "finish.record=true"]) == 0
     assert "Frame 0 could not be drawn" in capsys.readouterr().err
     assert not list(tmp_path.glob("runs/*/*.mp4"))
-
-
-def test_geometry_keys_need_a_geometry(capsys):
-    assert record.main(["env=minimal", "geometry.n=4"]) == 2
-    assert re.search("geometry: .*give geometry=", capsys.readouterr().err)

@@ -7,8 +7,6 @@ import pathlib
 import shutil
 import subprocess
 import sys
-import threading
-import time
 
 import pytest
 
@@ -18,7 +16,7 @@ from megastep.agents.cli.words import typed_word
 from megastep.agents.errors import UserError
 from megastep.agents.runs import folders
 from megastep.agents.runs.folders import locked
-from tests.helpers.processes import HUNG, ROOT, in_threads
+from tests.helpers.processes import ROOT
 
 pytestmark = pytest.mark.usefixtures("here")
 
@@ -34,13 +32,6 @@ def run(name):
 def test_make_numbers_taken_names():
     paths = [folders.make(pathlib.Path("runs/a")) for _ in range(3)]
     assert [str(path) for path in paths] == ["runs/a", "runs/a-2", "runs/a-3"]
-
-
-def test_make_from_many_threads():
-    for round in range(20):
-        made = []
-        in_threads(lambda made=made, n=round: made.append(folders.make(pathlib.Path(f"runs/{n}"))))
-        assert len(set(made)) == 8 and all(path.is_dir() for path in made)
 
 
 @pytest.mark.parametrize(
@@ -148,27 +139,6 @@ def test_lock_of_a_killed_process(here):
         assert (here / "lock").read_text() == str(os.getpid())
 
 
-def test_stale_lock_with_a_live_pid(here):
-    (here / "lock").write_text(str(os.getppid()))
-    with locked(here):
-        assert (here / "lock").read_text() == str(os.getpid())
-
-
-def test_lock_file_deleted_while_locking(here, monkeypatch):
-    real, calls = fcntl.flock, []
-
-    def flock(file, how):
-        calls.append(1)
-        if len(calls) == 1:
-            (here / "lock").unlink()
-        return real(file, how)
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with locked(here):
-        assert (here / "lock").read_text() == str(os.getpid())
-    assert len(calls) >= 2
-
-
 def test_file_system_without_locks(here, monkeypatch, capsys):
     def flock(file, how):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
@@ -176,38 +146,3 @@ def test_file_system_without_locks(here, monkeypatch, capsys):
     monkeypatch.setattr(fcntl, "flock", flock)
     with locked(here):
         assert "file system without locks" in capsys.readouterr().err
-
-
-def test_lock_refuses_all_but_one(here):
-    inside, refused, decided = [], [], threading.Event()
-
-    def work():
-        try:
-            with locked(here):
-                inside.append(1)
-                decided.wait(HUNG)
-        except UserError:
-            refused.append(1)
-            if len(refused) == 7:
-                decided.set()
-
-    in_threads(work)
-    assert (len(inside), len(refused)) == (1, 7) and not (here / "lock").exists()
-
-
-def test_lock_excludes_threads(here):
-    inside, most = [], []
-
-    def work():
-        for _ in range(50):
-            try:
-                with locked(here):
-                    inside.append(1)
-                    most.append(len(inside))
-                    time.sleep(1e-4)
-                    inside.pop()
-            except UserError:
-                pass
-
-    in_threads(work)
-    assert set(most) == {1} and not (here / "lock").exists()

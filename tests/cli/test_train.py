@@ -24,7 +24,6 @@ from megastep.agents.factory.settings import Train
 from megastep.agents.factory.trainer import annealed
 from megastep.agents.launch import run as launch_run
 from megastep.agents.runs import checkpoint, json_lines
-from megastep.agents.runs.folders import locked
 from megastep.agents.training import loggers
 from megastep.agents.training.trainer import Trainer
 from megastep.settings import MAX_ENVS
@@ -168,13 +167,6 @@ def test_resume_from_an_earlier_checkpoint(saved_often):
     assert checkpoint.load_latest(folder / "checkpoints").step == 5 * UPDATE
 
 
-def test_killed_after_resuming_an_earlier_checkpoint(saved_often, monkeypatch):
-    monkeypatch.setattr(Trainer, "train", lambda *_: None)  # as if killed at once
-    train.run(configured(f"resume={saved_often / 'checkpoints' / f'step_{UPDATE}'}", tiny=[]))
-    assert [row["samples"] for row in json_lines.read(saved_often / "metrics.jsonl")] == [UPDATE]
-    assert checkpoint.load_latest(saved_often / "checkpoints").step == UPDATE
-
-
 def test_init(here):
     first = train.run(configured("samples=1"))
     second = train.run(configured("samples=1", "learner.lr=1e-12", f"init={first}", "seed=2"))
@@ -234,28 +226,6 @@ def test_resume_refuses_a_spent_budget(here, capsys):
     assert (written["samples"], written["more_samples"]) == (3 * UPDATE, None)
 
 
-def test_latest_is_trained_last(here):
-    first = train.run(configured("samples=1"))
-    second = train.run(configured("samples=1", "seed=2"))
-    assert evaluate.main([f"run={first}", "episodes=2", "device=cpu"]) == 0
-    assert train.run(configured("resume=latest", f"samples={2 * UPDATE}", tiny=[])) == second
-    assert train.run(configured(f"resume={first}", f"samples={2 * UPDATE}", tiny=[])) == first
-    assert train.run(configured("resume=latest", f"samples={3 * UPDATE}", tiny=[])) == first
-
-
-def test_second_training_in_one_folder(here, capsys):
-    folder = train.run(configured("samples=1"))
-    (here / "new").mkdir()
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    for name, words in ((folder, [f"resume={folder}", "samples=99"]), ("new", ["folder=new"])):
-        with locked(here / name):
-            capsys.readouterr()
-            assert train.main([*(TINY if name == "new" else []), *words]) == 2
-            (sentence,) = capsys.readouterr().err.splitlines()
-            assert "in use by process" in sentence or "is not empty" in sentence
-    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-
-
 @pytest.mark.parametrize(
     "damage, sentence",
     [
@@ -301,8 +271,7 @@ def inject(monkeypatch, name, step, value, lane=2):
     monkeypatch.setattr(envs.Minimal, "step", with_fault)
 
 
-@pytest.mark.parametrize("value", [float("nan"), 1e30])
-@pytest.mark.parametrize("name", ["reward", "obs"])
+@pytest.mark.parametrize("name, value", [("reward", float("nan")), ("obs", 1e30)])
 def test_non_finite_world_exits_with_1(here, monkeypatch, capsys, name, value):
     inject(monkeypatch, name, step=13, value=value)
     assert train.main([*TINY, f"samples={8 * UPDATE}", "folder=run"]) == 1
@@ -334,14 +303,6 @@ def test_divergence_stops_with_advice(here, capsys):
     assert "learning rate smaller than 1000" in sentence
     assert len(json_lines.read(here / "run" / "metrics.jsonl")) < 100
     assert nonfinite_leaf(checkpoint.load_latest(here / "run" / "checkpoints").state) is None
-
-
-@pytest.mark.parametrize("take", [lambda: torch.empty(2**55), lambda: bytearray(2**60)])
-def test_too_little_memory_is_one_sentence(monkeypatch, capsys, take):
-    monkeypatch.setattr(train, "run", lambda cfg: take())
-    assert train.main([*TINY]) == 2
-    (sentence,) = capsys.readouterr().err.splitlines()
-    assert re.search(r"(can't allocate|Out of) memory.*; choose fewer environments", sentence)
 
 
 def error_of_allocator():
@@ -397,21 +358,6 @@ def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 5 * UPDATE
 
 
-def test_disk_with_space_again(here, monkeypatch):
-    real, calls = checkpoint.save, []
-
-    def save(*arguments):
-        calls.append(arguments)
-        if len(calls) == 1:
-            raise OSError(28, "No space left on device")
-        return real(*arguments)
-
-    monkeypatch.setattr(checkpoint, "save", save)
-    with pytest.warns(UserWarning, match="tries again"):
-        folder = train.run(configured(f"samples={3 * UPDATE}", "checkpoints.seconds=1e-9"))
-    assert checkpoint.load_latest(folder / "checkpoints").step == 3 * UPDATE
-
-
 def test_settings_that_no_environment_can_have(here, capsys):
     explorer = [word for word in TINY if "est=" not in word] + ["env=explorer", "env.subsample=3"]
     elsewhere = [word for word in TINY if "est=" not in word] + ["env=pointgoal"]
@@ -438,9 +384,7 @@ def test_too_many_environments(here, capsys):
     assert not any((here / "runs").iterdir())
 
 
-@pytest.mark.parametrize(
-    "folder", ["file", "file/below", "/proc/run", "full", "link", "link/below", 300 * "x"]
-)
+@pytest.mark.parametrize("folder", ["file/below", "/proc/run", "full", "link", 300 * "x"])
 def test_unusable_run_folder(here, monkeypatch, capsys, folder):
     (here / "file").write_text("")
     (here / "link").symlink_to("nowhere")
