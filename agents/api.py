@@ -192,7 +192,7 @@ def evaluate(
     if _is_policy(run):
         played = playing.first_episodes(_played(env), run, **cast(dict, settings))
         return statistics.summaries(played, optional(env, "roles"))
-    cfg = _settings("evaluate", {"run": run, "env": env} | settings)
+    cfg = _settings("evaluate", _given(run=run, env=env) | settings)
     with _interrupts():
         return json.loads(evaluate_run.run(cfg).with_suffix(".json").read_text())["rows"]
 
@@ -220,7 +220,7 @@ def record(
     if _is_policy(run):
         options = cast(dict, settings)
         return recording.film(_played(env), run, options.pop("file"), **options)
-    cfg = _settings("record", {"run": run, "env": env} | settings)
+    cfg = _settings("record", _given(run=run, env=env) | settings)
     with _interrupts():
         return recording.Film(filming.run(cfg))
 
@@ -261,6 +261,10 @@ def _plain(value, key) -> Any:
     raise ConfigErrors([(key, f"{type(value).__name__} {problem}")])
 
 
+def _given(**arguments) -> dict:
+    return {key: value for key, value in arguments.items() if value is not None}
+
+
 def _checked(kind, **arguments) -> Any:
     """Returns the settings of a command that no file configures."""
     return check.check(kind, _plain(arguments, "settings"))
@@ -271,7 +275,6 @@ def _settings(name: str, arguments: Mapping[str, object]) -> Any:
     from megastep.agents.cli import command, compose  # with Hydra
 
     plain = {key: _plain(value, key) for key, value in arguments.items()}
-    plain = {key: value for key, value in plain.items() if (key, value) != ("env", None)}
     chosen = command.load(name)
     cfg = compose.settings_from(chosen, plain)
     chosen.ready(cfg)

@@ -1,7 +1,6 @@
 """Lines, warnings, tables and progress. Output that cannot be written never ends the work."""
 
 import contextlib
-import html
 import os
 import re
 import shutil
@@ -11,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from io import StringIO
-from types import ModuleType
 from typing import Any, TextIO
 
 from megastep.agents.errors import UserError
@@ -154,15 +152,8 @@ def restore() -> None:
         sys.stdout.flush()
 
 
-def _notebook() -> ModuleType | None:
-    """Returns IPython's module of what a notebook shows; None outside notebooks."""
-    ipython = sys.modules.get("IPython")
-    shell = ipython and ipython.get_ipython()
-    return getattr(ipython, "display", None) if hasattr(shell, "kernel") else None
-
-
 class Progress:
-    """A context: a bar on a terminal and in a notebook, elsewhere a line every 10 seconds."""
+    """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
 
     def __init__(self) -> None:
         from rich import progress  # only for those who wait
@@ -175,8 +166,6 @@ class Progress:
             disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
         )
         self.task = self.bar.add_task("starting", total=1)
-        self.notebook = None if prefix or is_silent else _notebook()
-        self.cell = None
 
     def __enter__(self) -> "Progress":
         self.bar.start()
@@ -189,21 +178,9 @@ class Progress:
         """Shows words on one line; `fraction` of the work is done, None if it has no end."""
         text, total = (" · " if is_unicode() else "  ").join(words), None if fraction is None else 1
         self.bar.update(self.task, completed=fraction or 0, total=total, description=text)
-        if self.notebook is not None:
-            self._show_in_notebook(fraction, text)
-        elif self.bar.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
+        if self.bar.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
             self.shown_at = time.monotonic()
             say(text)
-
-    def _show_in_notebook(self, fraction, text) -> None:
-        """Replaces what the notebook's cell shows."""
-        assert self.notebook is not None
-        done = "" if fraction is None else f' value="{min(max(fraction, 0), 1):.4f}"'
-        shown = self.notebook.HTML(f"<progress{done}></progress> {html.escape(visible(text))}")
-        if self.cell is None:
-            self.cell = self.notebook.display(shown, display_id=True)
-        else:
-            self.cell.update(shown)
 
 
 def number(value: float) -> str:

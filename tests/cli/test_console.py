@@ -6,7 +6,6 @@ import pty
 import struct
 import sys
 import termios
-import types
 
 import pytest
 
@@ -63,25 +62,3 @@ def test_cells_of_a_narrow_terminal_are_broken():
     lines = console.table(head, [[*rows[0], "2"]], width=40).splitlines()
     assert max(map(len, lines[:-1])) <= 40 and lines[-1].endswith("in the file: x")
     assert "learner.lr=0.001," in "\n".join(lines), "no text is lost"
-
-
-def test_progress_in_a_notebook_replaces_its_cell(monkeypatch, capsys):
-    shown = []
-
-    class Cell:
-        def update(self, text):
-            shown.append(text)
-
-    def display(text, display_id):
-        shown.append(text)
-        return Cell()
-
-    shell = types.SimpleNamespace(kernel=object())
-    notebook = types.SimpleNamespace(HTML=str, display=display)
-    ipython = types.SimpleNamespace(get_ipython=lambda: shell, display=notebook)
-    monkeypatch.setitem(sys.modules, "IPython", ipython)
-    with console.Progress() as progress:
-        progress.show(0.5, ["<5 samples>", "10 s left"])
-        progress.show(None, ["done"])
-    assert shown[0].startswith('<progress value="0.5000"></progress> &lt;5 samples&gt;')
-    assert shown[1] == "<progress></progress> done" and not capsys.readouterr().out
