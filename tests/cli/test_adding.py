@@ -138,25 +138,6 @@ def test_custom_environment(outside, capsys):
     assert train.main([*sizes, *RUN]) == 0 and capsys.readouterr().out.count("done") >= 2
 
 
-def test_custom_geometry(outside):
-    source = """
-        from megastep import toys
-
-
-        def rooms(n=3, split="training", seed=1, width: float = 4.0):
-            assert split in ("training", "test", "all")
-            return [toys.box(width + i) for i in range(n)]
-        """
-    outside({"plans.py": source})
-    words = [*MINIMAL, *SMALL, "samples=64", "logging.every=1"]
-    assert train.main([*words, "geometry=plans:rooms", "geometry.width=6"]) == 0
-    expected = {"name": "plans:rooms", "n": 3, "seed": 1, "width": 6.0}
-    assert saved().config["train"]["geometry"] == expected
-    assert evaluate.main(["run=latest", "episodes=4", "baseline=false"]) == 0
-    (table,) = (leftovers()[0] / "evaluations").glob("rooms-test-64.json")
-    assert json.loads(table.read_text())["rows"][0]["homes"] == 3
-
-
 def test_custom_learner(outside, capsys):
     """REINFORCE without a baseline, with its own storage and estimate of memory."""
     learner = '''
@@ -251,28 +232,6 @@ MEAN = '''
                 outputs.append(self.layer(total))
             return torch.stack(outputs), arrdict(total=total)
     '''
-
-
-def test_custom_encoder(outside):
-    encoder = '''
-        from torch import nn
-
-
-        class Rows(nn.Module):
-            """The mean of each row of an image: (..., A, C, H, W) -> (..., A C H)."""
-
-            def __init__(self, space):
-                super().__init__()
-                self.n_features = space.n_agents * space.C * space.H
-
-            def forward(self, obs):
-                return obs.mean(-1).flatten(-3)
-        '''
-    outside({"rows.py": encoder})
-    words = [*MINIMAL, *SMALL, "samples=64", "agent.encoder=rows:Rows"]
-    assert train.main(words) == 0
-    assert saved().state["policy"]["intake.project.weight"].shape[0] == 8
-    assert evaluate.main(["run=latest", "episodes=4"]) == 0
 
 
 # ---- Classes that cannot be used ----
@@ -417,15 +376,3 @@ def test_init_takes_environment_geometry_and_agent_unless_typed(outside):
     assert train.main([*common, *words, "folder=third"]) == 0
     config = checkpoint.load_latest("third/checkpoints").config["train"]
     assert config["env"]["limit"] == 6 and config["geometry"]["name"].endswith(":column")
-
-
-def test_record_random_actions_without_a_run(outside, capsys):
-    words = ["env=minimal", "env.res=8", "steps=2", "device=cpu"]
-    assert record.main([*words, "geometry=box", "file=box.mp4"]) == 0
-    assert record.main(words) == 0
-    assert pathlib.Path("box.mp4").exists() and pathlib.Path("video.mp4").exists()
-    capsys.readouterr()
-    assert record.main(["steps=2"]) == 2
-    assert "env=explorer" in capsys.readouterr().err
-    assert record.main(["run=x", "env=minimal"]) == 2
-    assert "env: cannot be combined with run" in capsys.readouterr().err

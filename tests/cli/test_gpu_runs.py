@@ -14,7 +14,6 @@ from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.training import loggers
-from megastep.agents.training.trainer import Trainer
 from tests.helpers import tiny
 from tests.helpers.weights import of_run as weights
 
@@ -62,12 +61,6 @@ def is_captured(trainer):
     return is_updated and isinstance(trainer.collect.graph, capture.Graph)
 
 
-def test_interrupted_run_is_saved(stopped):
-    assert [row["samples"] for row in rows(stopped)] == [(i + 1) * UPDATE for i in range(6)]
-    loaded = checkpoint.load_latest(stopped / "checkpoints")
-    assert loaded.step == STOPPED and nonfinite_leaf(loaded.state) is None
-
-
 def test_resumed_run_uses_cuda_graphs(stopped, trainers):
     before = weights(stopped)
     assert train.main([f"resume={stopped}", f"samples={2 * STOPPED}"]) == 0
@@ -82,24 +75,6 @@ def test_resumed_run_uses_cuda_graphs(stopped, trainers):
     assert trainer.nonfinite_guard.value is None
     assert trainer.env.core.agents.positions.isfinite().all()
     assert checkpoint.load_latest(stopped / "checkpoints").step == 2 * STOPPED
-
-
-def test_rollouts_differ_after_resume(stopped, trainers):
-    """A captured call advances the hidden state and the generator."""
-    collected = []
-
-    def store(self, real=Trainer.report):
-        real(self)
-        rollout = self.rollout
-        collected.append((rollout.actions.clone(), rollout.state.cell.clone()))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "report", store)
-        assert train.main([f"resume={stopped}", f"samples={2 * STOPPED}"]) == 0
-    assert is_captured(trainers[0])
-    assert len(collected) == 6
-    for (actions, cells), (next_actions, next_cells) in zip(collected, collected[1:]):
-        assert not torch.equal(actions, next_actions) and not torch.equal(cells, next_cells)
 
 
 def test_init(stopped, trainers, monkeypatch, tmp_path):
@@ -147,36 +122,3 @@ def test_non_finite_reward_in_a_cuda_graph(monkeypatch, tmp_path, capsys, traine
     assert "The last 20 updates were skipped" in sentence
     assert "reward of lane 5 was nan" in sentence and is_captured(trainers[0])
     assert nonfinite_leaf(checkpoint.load_latest(tmp_path / "run" / "checkpoints").state) is None
-
-
-@pytest.mark.parametrize(
-    "core, layers", [("gru", 1), ("mingru", 1), ("none", 1), ("lstm", 2), ("mingru", 2)]
-)
-def test_every_core_in_cuda_graphs(core, layers, trainers, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    words = f"agent.core={core}", f"agent.layers={layers}", f"samples={6 * UPDATE}"
-    assert train.main([*TINY, *words]) == 0
-    assert is_captured(trainers[0]) and trainers[0].nonfinite_guard.value is None
-
-
-REPLAY = "learner.replay.capacity=4096"
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["learner=vtrace", "learner.lag=1"],
-        ["learner=vtrace", "learner.lag=2", "learner.buffer=replay", REPLAY],
-        ["learner=r2d2", REPLAY, "learner.replay.burn_in=4"],
-    ],
-)
-def test_every_learner_resumes(words, trainers, monkeypatch, tmp_path):
-    train_until_interrupted(tmp_path, *words)
-    assert is_captured(trainers[0])
-    monkeypatch.chdir(tmp_path)
-    assert train.main(["resume=run", f"samples={2 * STOPPED}"]) == 0
-    assert is_captured(trainers[1]) and trainers[1].nonfinite_guard.value is None
-    reports = rows(tmp_path / "run")
-    assert [row["updates"] for row in reports] == list(range(1, 13))
-    assert all(row["loss/skipped_steps"] == 0 for row in reports)
-    assert evaluate.main(["run=run", "episodes=16", "device=cuda"]) == 0

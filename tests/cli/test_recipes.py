@@ -4,7 +4,7 @@ import textwrap
 
 import pytest
 
-from megastep.agents.cli import blocks, evaluate, sweeps, train
+from megastep.agents.cli import blocks, evaluate, train
 from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
 from megastep.agents.errors import ConfigErrors
@@ -90,13 +90,6 @@ def test_wrong_keys_of_blocks_are_named(here):
     for words in (["experiment=value"], ["cpu.seed=2"]):
         with pytest.raises(ConfigErrors, match="cpu.*: no such key"):
             composed(*words)
-
-
-def test_no_block_is_left_in_settings_or_in_what_is_printed(here, capsys):
-    here("conf/experiment/mine.yaml", RECIPE)
-    assert train.main(["--config-dir", "conf", "experiment=mine", "--cfg", "job"]) == 0
-    text = capsys.readouterr().out
-    assert "n_envs: 5" in text and not {"cpu:", "gpu:", "ppo:"} & {*text.split()}
 
 
 def test_files_of_environments_say_nothing_of_training_in_evaluations(capsys):
@@ -191,9 +184,3 @@ def test_an_environment_passes_arguments_on(own):
     cfg = tiny.settings(f"env={own}:Rover", "env.patience=9", "env.mine=4").env
     assert (cfg.patience, cfg.mine, cfg.n_envs) == (9, 4, 256)
     assert train.main([f"env={own}:Rover", "env.fov=90", *tiny.TINY[1:], "samples=32"]) == 0
-
-
-def test_jobs_of_a_sweep_have_the_blocks_of_their_learners(own):
-    composer = Composer(load("train"))
-    _, jobs, _ = sweeps.jobs_of(composer, [f"learner=ppo,r2d2,{own}:MyR2D2"])
-    assert [cfg.learner.lr for cfg in jobs] == [3e-3, 5e-4, 5e-4]

@@ -16,7 +16,6 @@ import cloudpickle
 import pytest
 import torch
 import yaml
-from omegaconf import OmegaConf
 
 from megastep.agents.cli import evaluate, sweeps, train
 from megastep.agents.cli.command import load
@@ -406,24 +405,7 @@ def test_sweep_that_has_too_few_gpus(here, gpus, capsys, words, text):
     assert text in capsys.readouterr().err and not (here / "sweeps").exists()
 
 
-def test_slurm_jobs_are_given_their_gpus_elsewhere(gpus):
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    gpus(0)  # of the login node
-    words = [*SLURM, "ranks=2", "seed=1,2", "hydra.launcher.gpus_per_node=3"]
-    _, jobs, hydra = sweeps.jobs_of(Composer(load("train")), words)
-    gpu_slots.check(jobs, hydra)
-
-
 # ---- Names and scores ----
-
-
-def test_job_folder_names():
-    def name(text):
-        return OmegaConf.create({"x": "${file_name:${y}}", "y": text}).x
-
-    assert name("geometry=a/b:C_init=x y_learner.lr=2") == "geometry=a-b-C_init=x-y_learner.lr=2"
-    assert name("") == "default"
-    assert len(name("folder=" + 1000 * "ü").encode()) <= 200
 
 
 def report(step, count, window, mean):
