@@ -160,7 +160,8 @@ def _import_database(cfg) -> None:
         file, digest = imported.write(source, geometries, numbers)
         sheet, report = (imported.folder() / f"{source}.{kind}" for kind in ("png", "md"))
         sheets.write(sheet, [(one.name[-40:], *imports.first_home(options, one)) for one in shown])
-        report.write_text(_report(source, path, plans, geometries, f"{file.name}, sha256 {digest}"))
+        about = f"{file.name}, sha256 {digest}"
+        report.write_text(_report(source, path, plans, len(geometries), about))
     n_refused = sum(not plan.geometries for plan in plans)
     console.say(
         f"{len(geometries):,} floor plans of {len(plans):,} files in {file}\n"
@@ -170,16 +171,10 @@ def _import_database(cfg) -> None:
     )
 
 
-def _report(source, path, plans, geometries, file) -> str:
+def _report(source, path, plans, n, file) -> str:
     """Returns the report of an import in Markdown."""
-    from megastep.geometries.plans import imports
-
     title, _, licence = DATABASES[source]
     notes = [(plan.name, note) for plan in plans for note in plan.notes]
-    some = geometries[:: max(1, len(geometries) // 500)]
-    columns = [imports.quantiles(some), imports.quantiles(imports.generated_homes())]
-    rows = [[key, *(column[key] for column in columns)] for key in columns[0]]
-    head = "quantiles 5 / 25 / 50 / 75 / 95 %", source, "generated homes"
     refused = [(plan.name, plan.refusal) for plan in plans if plan.refusal]
     kinds = Counter(refusal for _, refusal in refused)
     n_rooms, n_reachable = (sum(note[i] for _, note in notes) for i in (0, 1))
@@ -188,10 +183,9 @@ def _report(source, path, plans, geometries, file) -> str:
         f"# Import of {title}",
         f"- from {path}, licence {licence}",
         f"- {file}",
-        f"- {len(geometries):,} floor plans of {len(plans):,} files; {len(refused):,} are refused",
+        f"- {n:,} floor plans of {len(plans):,} files; {len(refused):,} are refused",
         f"- {n_reachable:,} of {n_rooms:,} rooms can be reached; agents spawn in these alone",
         f"- {sum(note.n_sealed for _, note in notes):,} doors to the outside are closed",
-        f"\n{console.table(head, rows, is_markdown=True)}\n",
         "## Refused",
         *(f"- {n:,} times: {text}" for text, n in kinds.most_common()),
         *[f"- {name}: {text}" for name, text in refused][:MAX_LINES],

@@ -1,7 +1,6 @@
 """megastep inspect RUN: what is in a run's checkpoints, or an agent's file, every byte verified."""
 
 import datetime
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,8 +12,6 @@ from megastep.agents.runs import agent_file, checkpoint, folders
 from megastep.settings import frozen
 
 if TYPE_CHECKING:
-    import torch
-
     from megastep.agents.types import StateDict
 
 HELP = """Verifies a run's checkpoints and prints what is in them.
@@ -65,7 +62,7 @@ def _lines(path: Path) -> Iterator[str]:
         yield f"  {'; '.join(f'{name} {value}' for name, value in loaded.made_with.items())}"
     for name, entry in manifest["files"].items():
         yield f"  {name:<14}{console.number(entry['bytes'])} bytes, sha256 {entry['sha256'][:16]}"
-    yield _table(loaded.state)
+    yield from _parts(loaded.state)
 
 
 def _lines_of_agent(path: Path) -> Iterator[str]:
@@ -73,34 +70,20 @@ def _lines_of_agent(path: Path) -> Iterator[str]:
     loaded, about = agent_file.read(path, "cpu"), agent_file.read_metadata(path)
     yield f"{path}: intact, {console.number(path.stat().st_size)} bytes"
     yield from (f"  {name}: {value}" for name, value in about["facts"].items())
-    yield _table(loaded.state)
+    yield from _parts(loaded.state)
     for table in about["tables"]:
         yield f"  {table['title']}: {len(table['rows'])} rows"
 
 
-def _table(state: "StateDict | None") -> str:
-    """Returns a table of what is in the parts of a state."""
-    rows = []
+def _parts(state: "StateDict | None") -> Iterator[str]:
+    """Yields a line for each part of a state."""
+    from torch.utils._pytree import tree_leaves
+
     for name, part in (state or {}).items():
-        if isinstance(part, dict):
-            tensors = dict(_tensors(part))
-            n_numbers = sum(math.prod(leaf.shape) for leaf in tensors.values())
-            n_bytes = sum(leaf.nbytes for leaf in tensors.values())
-            numbers = [*map(console.number, (len(tensors), n_numbers, n_bytes))]
-            largest = max(tensors, key=lambda path: tensors[path].nbytes, default=None)
-            shape = f"{largest.lstrip('.')} {tuple(tensors[largest].shape)}" if largest else ""
-            rows.append([name, *numbers, shape])
-    lines = console.table(["part", "tensors", "numbers", "bytes", "largest"], rows).splitlines()
-    return "\n".join(f"  {line}" for line in lines)
-
-
-def _tensors(tree, path="") -> "Iterator[tuple[str, torch.Tensor]]":
-    """Yields (path, tensor) of nested dicts and lists."""
-    if hasattr(tree, "nbytes"):
-        yield path, tree
-    elif isinstance(tree, (dict, list, tuple)):
-        for key, part in tree.items() if isinstance(tree, dict) else enumerate(tree):
-            yield from _tensors(part, f"{path}.{key}")
+        tensors = [leaf for leaf in tree_leaves(part) if hasattr(leaf, "nbytes")]
+        if tensors:
+            n_bytes = console.number(sum(leaf.nbytes for leaf in tensors))
+            yield f"  {name}: {len(tensors)} tensors, {n_bytes} bytes"
 
 
 COMMAND = Command("inspect", Inspect, HELP)

@@ -15,7 +15,6 @@ import shapely
 from megastep import workers
 from megastep.dotdict import dotdict
 from megastep.geometries import checks
-from megastep.geometries.homes import database
 from megastep.geometries.plans import cubicasa, houseexpo, maps, outlines, safe, svg
 from megastep.geometries.plans.outlines import Drawing, Notes
 
@@ -221,21 +220,4 @@ def statistics(g: dotdict) -> dict[str, float]:
         "longer side, m": float(np.ptp(g.walls, axis=(0, 1)).max()),
         "straight walls, % of length": 100 * float(lengths[is_straight].sum() / lengths.sum()),
         "floor nearer than 0.3 m to a wall, %": 100 * float((distance[rooms > 0] < 0.3).mean()),
-    }
-
-
-def generated_homes() -> list[dotdict]:
-    """Returns the homes that reports compare with, the first 200 of the package's."""
-    return [database.home(seed) for seed in range(200)]
-
-
-def quantiles(geometries: list[dotdict]) -> dict[str, str]:
-    """Returns the 5, 25, 50, 75 and 95 % quantiles of each statistic, as text."""
-    rows = [statistics(g) for g in geometries]
-    return {
-        key: " / ".join(
-            f"{value:.3g}"
-            for value in np.quantile([row[key] for row in rows], (0.05, 0.25, 0.5, 0.75, 0.95))
-        )
-        for key in rows[0]
     }
