@@ -20,6 +20,7 @@ from hydra.core import plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import Container, DictConfig, OmegaConf
 
+from megastep.agents import package
 from megastep.agents.factory import check, components
 from megastep.agents.launch import gpu
 from megastep.imports import import_object
@@ -48,12 +49,12 @@ class BlockSource(FileConfigSource):
 class Folders(SearchPathPlugin):
     """Has Hydra read the files of our folder, and of --config-dir, with their blocks."""
 
-    main, beside = "", ""
+    beside = ""
 
     def manipulate_search_path(self, search_path) -> None:
         for entry in search_path.get_path():
-            if entry.path.removeprefix("file://") == self.main:
-                entry.path = f"blocks://{self.main}"
+            if entry.path.removeprefix("file://") == str(package.CONFIGS):
+                entry.path = f"blocks://{package.CONFIGS}"
                 if self.beside:
                     search_path.append("command-line", f"blocks://{self.beside}")
                 break

@@ -27,17 +27,13 @@ OPTIONS = {
         "choices": ("job", "hydra", "all"),
         "help": "print the composed configuration and stop; hydra, all: with Hydra's part of it",
     },
-    "--resolve": {"action": "store_true", "help": "with --cfg hydra: print interpolated values"},
-    "-p --package": {"metavar": "KEY", "help": "with --cfg: print a part, such as env"},
     "-cd --config-dir": {"metavar": "DIR", "help": "groups and files of your own beside ours"},
     "-cn --config-name": {"metavar": "FILE", "help": "another file than the script's own"},
-    "-cp --config-path": {"metavar": "DIR", "help": "a folder in place of ours"},
     "-i --info": {
         "nargs": "?",
         "const": "all",
         "help": "print what the configuration is composed of: defaults-tree, searchpath, ...",
     },
-    "--hydra-help": {"action": "store_true", "help": "print Hydra's own help and stop"},
 }
 #: Options of every command.
 COMMON = {
@@ -126,9 +122,7 @@ def _run_composed(command, options, argv, parser) -> int:
     """Runs a command that files configure. Returns the exit code."""
     from megastep.agents.cli import compose, sweeps
 
-    composer = compose.Composer(
-        command, options.config_name, options.config_dir, options.config_path
-    )
+    composer = compose.Composer(command, options.config_name, options.config_dir)
     words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
     if options.help:
         parser.epilog = "groups, chosen with group=member:" + "".join(
@@ -139,8 +133,9 @@ def _run_composed(command, options, argv, parser) -> int:
         jobs = sweeps.jobs_of(composer, words)[0] if options.multirun else [words]
         for i, job in enumerate(jobs):
             print("---\n" * (i > 0), end="", flush=True)
-            print(composer.shown(job, options.package), end="", flush=True)
-    elif options.cfg or options.info or options.hydra_help:
+            tree = check.as_tree(composer.settings(job))
+            print(compose.OmegaConf.to_yaml(tree), end="", flush=True)
+    elif options.cfg or options.info:
         flags = [one for one in argv if one not in (*options.overrides, "-m", "--multirun")]
         with user_errors(kinds=compose.HYDRA_ERRORS):
             composer.call_hydra(flags + words)

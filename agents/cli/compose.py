@@ -38,6 +38,7 @@ OPEN = {
     key: OmegaConf.create({}, flags={"struct": False})
     for key in (*components.CHOSEN, *components.SINGLE)
 }
+MAIN = str(package.CONFIGS)
 #: The learner whose blocks are tried first where none is typed.
 GUESS = "ppo"
 #: Resolvers that settings may call: none that reads what is not in the configuration.
@@ -79,29 +80,20 @@ class Composer:
     Args:
         name: another file than the command's own.
         folder: a folder whose files and groups are found beside ours.
-        main: a folder in place of ours.
     """
 
-    def __init__(
-        self,
-        command: "Command",
-        name: str | None = None,
-        folder: str | None = None,
-        main: str | None = None,
-    ):
+    def __init__(self, command: "Command", name: str | None = None, folder: str | None = None):
         self.command, self.name, self.folder = command, name or command.name, folder
-        self.main = os.path.abspath(main or package.CONFIGS)
-        if absent := [p for p in (folder, self.main) if p and not os.path.isdir(p)]:
-            raise UserError(f"There is no folder {absent[0]} with configurations")
+        if folder and not os.path.isdir(folder):
+            raise UserError(f"There is no folder {folder} with configurations")
         for group in components.CHOSEN:
             for member, path in components.members(group).items():
                 if not os.path.exists(package.CONFIGS / group / f"{member}.yaml"):
                     store_member(group, member, path)
         STORE.store(group="logger", name="none", node={})
-        blocks.Folders.main = self.main
         blocks.Folders.beside = os.path.abspath(folder) if folder else ""
         global_hydra.GlobalHydra.instance().clear()
-        hydra.initialize_config_dir(self.main, job_name=command.name, version_base="1.3")
+        hydra.initialize_config_dir(MAIN, job_name=command.name, version_base="1.3")
         self.loader = global_hydra.GlobalHydra.instance().config_loader()
         self.members = functools.cache(self.loader.get_group_options)
         self.composed = functools.cache(self._composed)
@@ -246,17 +238,11 @@ class Composer:
                 return config
             learner = learner or chosen  # which a block may not choose
 
-    def shown(self, words: list[str], key: str | None = None) -> str:
-        """Returns the settings of words, or a part of them, as YAML."""
-        config = OmegaConf.create(check.as_tree(self.settings(words)))
-        part = OmegaConf.select(config, key) if key else config
-        return OmegaConf.to_yaml(part) if OmegaConf.is_config(part) else f"{part}\n"
-
     def call_hydra(self, arguments: list[str], task: Callable | None = None) -> None:
         """Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv."""
         os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", arguments
         global_hydra.GlobalHydra.instance().clear()
-        hydra.main(config_path=self.main, config_name=self.name, version_base="1.3")(
+        hydra.main(config_path=MAIN, config_name=self.name, version_base="1.3")(
             task or self.command.run
         )()
 

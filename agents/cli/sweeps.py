@@ -154,7 +154,7 @@ def new_job(composer: Composer, folder: Path) -> "Job":
     """Returns what Hydra is to call for the jobs of a sweep."""
     records = folder.absolute() / ".jobs" / uuid.uuid4().hex[:8]
     records.mkdir(parents=True)
-    source = composer.command.name, composer.name, composer.folder, composer.main
+    source = composer.command.name, composer.name, composer.folder
     return Job(source, str(folder.absolute()), str(records), os.getpid(), os.getcwd())
 
 

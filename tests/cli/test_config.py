@@ -370,8 +370,6 @@ def test_cfg_prints_composed_config(capsys):
     assert tree == as_tree(compose("logging.every=2"))
     assert set(yaml.safe_load(printed("--cfg", "hydra"))) == {"hydra"}
     assert "hydra" in yaml.safe_load(printed("--cfg", "all"))
-    assert yaml.safe_load(printed("--cfg", "job", "-p", "env")) == tree["env"]
     assert "seed: 1" in printed("-m", "seed=1,2", "--cfg", "job").split("---")[0]
     assert "blocks://" in printed("--info", "searchpath")
     assert "env: explorer" in printed("--info", "defaults-tree")
-    assert "hydra/launcher: basic" in printed("--hydra-help")
