@@ -17,7 +17,6 @@ from megastep.agents.evaluation.statistics import interval
 from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.arrdict import arrdict
-from megastep.envs.pong import Tracker
 from tests.cli.test_train import configured
 from tests.helpers.games import Always, Matrix
 
@@ -276,27 +275,6 @@ class Elsewhere(Always):
         super().__init__(3)
 
 
-def test_duel_needs_two_agents(here, capsys):
-    assert evaluate.main(["run=minimal", "against=random", "device=cpu"]) == 2
-    assert "at least two agents, and Minimal has one" in capsys.readouterr().err
-    assert record.main(["run=null", "env=pong", "against=b"]) == 2
-    assert "against: needs run=" in capsys.readouterr().err
-
-
-def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
-    """Pong has two lanes for the duel; the trained agent has the left one."""
-    lone = [word for word in PONG if word != "env.self_play=true"]
-    train.run(configured("samples=1", "folder=lone", tiny=lone))
-    assert evaluate.main(["run=lone", "against=bot", "episodes=8", "device=cpu"]) == 0
-    (path,) = (here / "lone" / "evaluations").glob("duels-*bot.json")
-    assert [row["duels"] for row in json.loads(path.read_text())["rows"]] == [8, 4, 4]
-    players = []
-    monkeypatch.setattr(recording, "film_all", lambda both, *_, **look: players.extend(both))
-    assert record.main(["run=lone", "against=bot", "device=cpu"]) == 0
-    ((env, both, *_),) = players
-    assert env.n_agents == 2 and isinstance(both.policies[1], Tracker)
-
-
 MATRIX = ["env=tests.helpers.games:Matrix", "env.n_envs=4", *PONG[3:], "samples=1", "folder=run"]
 
 
@@ -321,24 +299,6 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     table = json.loads(path.read_text())
     assert table["rows"][0]["homes"] == 7
     assert "matrix: 28 duels in 7 homes, geometry=homes, split=test, seed 1" in table["title"]
-
-
-def test_duels_in_each_source_of_a_suite(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    train.run(configured("env.n_agents=2", "geometry=box", tiny=MATRIX))
-    parts = "geometry.parts={dense: {source: homes, n: 3, density: 1.5}, maze: {n: 2, size: 3}}"
-    words = ["run=run", "geometry=suite", parts, "episodes=12", "device=cpu"]
-    assert evaluate.main([*words, "against=[tests.helpers.games:High,random]"]) == 0
-    (path,) = (tmp_path / "run" / "evaluations").glob("duels-suite-test-*.json")
-    table = json.loads(path.read_text())
-    assert "matrix: 12 duels in each source in 5 homes, geometry=suite" in table["title"]
-    rows = [row for row in table["rows"] if row["against"].endswith("High")]
-    assert rows == table["rows"][:4] and len(table["rows"]) == 8
-    dense, tail, maze, worst = rows
-    assert [row["source"] for row in rows[:3]] == ["dense", "dense", "maze"]
-    assert [row["duels"] for row in rows[:3]] == [12, 4, 12]
-    assert tail["tail"] == 0.05 and tail["homes"] == 1 and tail["won"] <= dense["won"]
-    assert worst["is_worst"] and worst["won"] == min(dense["won"], maze["won"])
 
 
 def test_worst_homes_of_duels():

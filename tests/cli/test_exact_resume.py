@@ -252,21 +252,13 @@ def test_interrupted_run_has_the_same_bits(here, monkeypatch):
     assert differences(*states) == []
 
 
-SIDE_BY_SIDE = {
-    "cpu": (2, [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=512"]),
-    "cuda": (8, ["env=explorer", "geometry=bench", "samples=20_000_000"]),
-}
-
-
-@pytest.mark.parametrize(
-    "device", [pytest.param("cpu", marks=slow), pytest.param("cuda", marks=pytest.mark.cuda)]
-)
-def test_processes_side_by_side_have_the_same_bits(here, device):
+@pytest.mark.cuda
+def test_processes_side_by_side_have_the_same_bits(here):
     """Those of a run alone. On a GPU they take turns, so each of its kernels may stop and go on
     anywhere; a fault that shows in one of many runs may still pass.
     """
-    n_processes, words = SIDE_BY_SIDE[device]
-    words = [*words, f"device={device}", "finish.evaluate=false", "finish.record=false"]
+    words = ["env=explorer", "geometry=bench", "samples=20_000_000", "device=cuda"]
+    words += ["finish.evaluate=false", "finish.record=false"]
     processes = []
 
     def begin(name):
@@ -279,7 +271,7 @@ def test_processes_side_by_side_have_the_same_bits(here, device):
             assert process.returncode == 0, err
         processes.clear()
 
-    names = [f"run{i}" for i in range(n_processes)]
+    names = [f"run{i}" for i in range(8)]
     try:
         begin("alone")
         wait()

@@ -11,7 +11,7 @@ import torch
 
 from megastep import capture
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
-from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli import train
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.training import loggers
 from tests.helpers import tiny
@@ -77,16 +77,6 @@ def test_resumed_run_uses_cuda_graphs(stopped, trainers):
     assert checkpoint.load_latest(stopped / "checkpoints").step == 2 * STOPPED
 
 
-def test_init(stopped, trainers, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    words = [*TINY, f"init={stopped}", f"samples={4 * UPDATE}", "learner.lr=1e-12", "folder=second"]
-    assert train.main(words) == 0
-    ours, theirs = weights(tmp_path / "second"), weights(stopped)
-    name = "intake.project.weight"
-    torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=1e-6)
-    assert is_captured(trainers[0])
-
-
 def test_resume_on_another_device(stopped, capsys):
     """On the GPU again, then on the CPU, then back on the GPU."""
     for i, (device, moves) in enumerate([("cuda", False), ("cpu", True), ("cuda", True)], 1):
@@ -95,13 +85,6 @@ def test_resume_on_another_device(stopped, capsys):
         lines = capsys.readouterr().out.splitlines()
         assert any("not bit for bit" in line and "device was" in line for line in lines) == moves
         assert checkpoint.load_latest(stopped / "checkpoints").step == samples
-
-
-def test_evaluate_and_record(stopped):
-    assert evaluate.main([f"run={stopped}", "episodes=16", "device=cuda"]) == 0
-    assert list(stopped.glob("evaluations/*.json"))
-    assert record.main([f"run={stopped}", "steps=3", "device=cuda"]) == 0
-    assert (stopped / "video.mp4").stat().st_size > 1000
 
 
 def test_non_finite_reward_in_a_cuda_graph(monkeypatch, tmp_path, capsys, trainers):

@@ -10,7 +10,6 @@ import pathlib
 import signal
 import sys
 import tempfile
-import time
 
 import cloudpickle
 import pytest
@@ -24,7 +23,7 @@ from megastep.agents.factory.components import kind_of
 from megastep.agents.launch import gpu_slots
 from megastep.agents.runs import folders, scores
 from tests.helpers import tiny
-from tests.helpers.processes import HUNG, ROOT, finished, is_running, start, wait_until
+from tests.helpers.processes import HUNG, ROOT, finished, start, wait_until
 
 PAYER = '''
 import os
@@ -225,21 +224,6 @@ def test_optuna_maximises_and_skips_failed_trials(here):
 
 
 @pytest.mark.nightly
-def test_submitit_job_of_two_ranks(here):
-    """One rank of a job fails: the other jobs and the table stand."""
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    words = ["ranks=2", "env.mood=lost,fine", "hydra/launcher=submitit_local"]
-    code, _, err = finished("train", *SHORT, "-m", *words, "hydra.sweep.dir=mine")
-    lost, fine = rows("mine")
-    assert code == 1 and "Traceback" not in err, err
-    assert lost["state"].startswith("FAILED: rank 1 on ")
-    assert (fine["state"], float(fine["score"])) == ("done", 4)
-    lines = (here / "mine/1_env.mood=fine/metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line)["samples"] for line in lines] == [2 * UPDATE]  # of both ranks
-    assert list((here / "mine/.submitit").rglob("*_log.out"))
-
-
-@pytest.mark.nightly
 def test_preempted_submitit_job_continues_its_checkpoint(here):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     total = f"samples={400 * UPDATE}"
@@ -270,36 +254,6 @@ def test_job_that_ends_its_process_leaves_the_others(here):
     records = [json.loads(path.read_text()) for path in (here / "mine/.jobs").glob("*/*.json")]
     assert len({record["process"] for record in records}) == 2
     assert "job 1: Training on cpu in mine/1_env.mood=fine" in out
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("victim", ["job", "sweep"])
-def test_kill_9(here, victim):
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    words = "seconds=8", "checkpoints.seconds=1", "env.mood=slow", "-m", "seed=1,2,3"
-    process = start("train", *SMALL, *words, *JOBLIB)
-
-    def jobs():
-        return [json.loads(path.read_text()) for path in here.glob("mine/.jobs/*/*.json")]
-
-    wait_until(lambda: n_learning(here) == 2, process)
-    pids = {"sweep": [process.pid]}
-    pids["job"] = [job["process"] for job in jobs()]
-    os.kill(pids[victim][-1], signal.SIGKILL)
-    if victim == "sweep":
-        process.communicate(timeout=HUNG)
-        deadline = time.monotonic() + 5
-        while any(is_running(pid) for pid in pids["job"]):
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        assert all("interrupted" in job["state"] for job in jobs())
-        return
-    _, err = process.communicate(timeout=HUNG)
-    assert process.returncode == 1 and "Traceback" not in err, err
-    states = {row["job"]: row["state"] for row in rows("mine")}
-    (killed,) = [job["number"] for job in jobs() if job["process"] == pids["job"][-1]]
-    assert states.pop(str(killed)) == sweeps.LOST
-    assert set(states.values()) == {"done"} and len(states) == 2
 
 
 # ---- Where jobs run ----
@@ -350,24 +304,6 @@ def test_jobs_share_gpus(gpus):
     for n_gpus, word in ((1, "device=cuda"), (3, "device=cuda:2"), (3, "device=cpu")):
         with gpu_slots.taken(gpus(n_gpus, word)) as cfg:
             assert f"device={cfg.device}" == word and not gpus.current
-
-
-def test_jobs_of_several_gpus(gpus, monkeypatch):
-    def enter(job):  # as another process would
-        job.__enter__()
-        visible = os.environ["CUDA_VISIBLE_DEVICES"]
-        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
-        return visible
-
-    cfg = gpus(5, "ranks=2")
-    jobs = [gpu_slots.taken(cfg) for _ in range(4)]
-    assert [enter(job) for job in jobs[:3]] == ["0,1", "2,3", "0,1"]  # the fifth GPU stays idle
-    with gpu_slots.taken(gpus(5, "device=cuda")) as single:
-        assert single.device == "cuda:4"  # which no rank is on
-    jobs[1].__exit__(None, None, None)
-    assert enter(jobs[3]) == "2,3"
-    for job in (jobs[0], *jobs[2:]):
-        job.__exit__(None, None, None)
 
 
 def test_ranks_see_the_gpus_of_their_place_only(gpus, monkeypatch):
