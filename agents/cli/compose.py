@@ -111,7 +111,7 @@ class Composer:
         """Returns words as Hydra's grammar reads them."""
 
         def is_left_out_anyway(one) -> bool:  # a group, for which Hydra has no word
-            is_none = one.value() is None and self.members(one.key_or_group)
+            is_none = one.value() is None and bool(self.members(one.key_or_group))
             return is_none and self.composed().hydra.runtime.choices.get(key_of(one)) is None
 
         overrides = parse(words, lists_of(self.command.kind), self.cure_for_value, self.loader)

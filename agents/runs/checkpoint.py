@@ -137,12 +137,12 @@ def save(
                 save_tensors(temporary / name, part)
         _write(temporary / "config.json", typed_json.dumps(config, indent=2).encode())
         add_files(temporary)
-        manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
-        manifest |= dict(made_with=made_with or {}, files={})
+        files = {}
         for file in sorted(temporary.iterdir()):
             with open(file, "rb") as data:
-                entry = {"sha256": _digest(data), "bytes": file.stat().st_size}
-            manifest["files"][file.name] = entry
+                files[file.name] = {"sha256": _digest(data), "bytes": file.stat().st_size}
+        manifest: Row = dict(format=FORMAT, step=step, score=score, numbers=numbers)
+        manifest |= dict(made_with=made_with or {}, files=files)
         _write(temporary / "manifest.json", sealed(manifest))
     set_aside_after(folder, step)
     _prune(folder, keep_checkpoints, step)
