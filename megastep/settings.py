@@ -162,7 +162,13 @@ def settings_of(
                 if default is inspect.Parameter.empty:
                     default = (missing or {}).get(name, default)
                 fields[name] = _field(hints.get(name), default)
-        return _frozen(_class(constructor.__name__, fields), is_finite, is_strict)
+        body: dict = {"__annotations__": {key: field[0] for key, field in fields.items()}}
+        for key, (_, *default) in fields.items():
+            if default and type(default[0]).__hash__ is None:  # it could change, such as a list
+                body[key] = dataclasses.field(default_factory=lambda value=default[0]: value)
+            elif default:
+                body[key] = default[0]
+        return _frozen(type(constructor.__name__, (), body), is_finite, is_strict)
     except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
         raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
 
@@ -220,17 +226,6 @@ def _has_members(protocol, value) -> object:
     return value
 
 
-def _class(name, fields) -> type:
-    """Returns a class with annotations, and defaults as attributes, for `dataclass` to decorate."""
-    body: dict = {"__annotations__": {key: field[0] for key, field in fields.items()}}
-    for key, (_, *default) in fields.items():
-        if default and type(default[0]).__hash__ is None:  # one that could change, such as a list
-            body[key] = dataclasses.field(default_factory=lambda value=default[0]: value)
-        elif default:
-            body[key] = default[0]
-    return type(name, (), body)
-
-
 def checked(function: F) -> F:
     """Decorator: checks a function's arguments against its annotations. The function gets its
     arguments as they are, not copies, unlike with `pydantic.validate_call`.
@@ -245,7 +240,11 @@ def checked(function: F) -> F:
     def wrapped(*args, **kwargs) -> object:
         arguments = signature.bind(*args, **kwargs).arguments
         fields = settings().__pydantic_fields__
-        values = {name: _plain(value) for name, value in arguments.items() if name in fields}
+        values = {name: value for name, value in arguments.items() if name in fields}
+        for name, value in values.items():  # NumPy's numbers are Python's
+            if isinstance(value, numbers.Real) and not isinstance(value, (bool, int, float)):
+                is_whole = isinstance(value, numbers.Integral)
+                values[name] = int(value) if is_whole else float(value)
         try:
             settings()(**values)
         except ValidationError as error:
@@ -257,13 +256,6 @@ def checked(function: F) -> F:
         return function(*args, **kwargs)
 
     return typing.cast(F, wrapped)
-
-
-def _plain(value) -> object:
-    """Converts NumPy's numbers to Python's."""
-    if isinstance(value, numbers.Real) and not isinstance(value, (bool, int, float)):
-        return int(value) if isinstance(value, numbers.Integral) else float(value)
-    return value
 
 
 # ---- What is wrong, in words ----
