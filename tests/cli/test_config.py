@@ -33,13 +33,14 @@ MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
 
 @pytest.mark.slow
 def test_every_group_member_composes():
-    groups = Composer(load("train")).groups()
+    composer = Composer(load("train"))
+    groups = composer.groups()
     parts = {"env", "geometry", "agent", "learner", "curriculum", "logger"}
     assert set(groups) == parts | {"experiment"}
     assert set(groups["env"]) == set(envs.ENVS)
     assert set(groups["geometry"]) == set(geometries.SOURCES)
     for choice in [f"{group}={member}" for group in groups for member in groups[group]]:
-        assert isinstance(compose(choice, *MORE.get(choice, ())), Train)
+        assert isinstance(composer.settings([choice, *MORE.get(choice, ())]), Train)
 
 
 def test_settings_round_trip():
@@ -365,11 +366,8 @@ def test_cfg_prints_composed_config(capsys):
         assert train.main([*words]) == 0
         return capsys.readouterr().out
 
-    assert "lr: 0.5" in printed("--cfg", "job", "learner.lr=0.5")
     tree = yaml.safe_load(printed("--cfg", "job", "logging.every=${checkpoints.keep}"))
     assert tree == as_tree(compose("logging.every=2"))
-    assert set(yaml.safe_load(printed("--cfg", "hydra"))) == {"hydra"}
     assert "hydra" in yaml.safe_load(printed("--cfg", "all"))
     assert "seed: 1" in printed("-m", "seed=1,2", "--cfg", "job").split("---")[0]
     assert "blocks://" in printed("--info", "searchpath")
-    assert "env: explorer" in printed("--info", "defaults-tree")

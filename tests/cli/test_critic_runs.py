@@ -1,9 +1,9 @@
-"""Runs with either critic: train, resume, evaluate, record and init."""
+"""Runs with either critic: train, resume, evaluate and init."""
 
 import pytest
 import torch
 
-from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli import evaluate, train
 from megastep.agents.errors import UserError
 from megastep.agents.runs import checkpoint
 from megastep.envs import Explorer
@@ -33,7 +33,7 @@ def refuse_privileged(monkeypatch):
 
 
 @pytest.mark.parametrize("critic", ["asymmetric", "plain"])
-def test_train_resume_evaluate_record_and_init(critic, monkeypatch):
+def test_train_resume_evaluate_and_init(critic, monkeypatch):
     run = trained(f"samples={2 * UPDATE}", f"agent.critic={critic}")
     has_intake = "critic.intake.project.weight" in weights(run)
     assert has_intake == ("prediction.weight" in weights(run)) == (critic == "asymmetric")
@@ -44,10 +44,9 @@ def test_train_resume_evaluate_record_and_init(critic, monkeypatch):
     first = "intake.project.weight"
     torch.testing.assert_close(weights(second)[first], weights(run)[first], rtol=0, atol=1e-6)
 
-    # evaluating and recording compute no privileged observations
+    # evaluating computes no privileged observations
     refuse_privileged(monkeypatch)
     assert evaluate.main([f"run={run}", "episodes=3", "baseline=false", "device=cpu"]) == 0
-    assert record.main([f"run={run}", "steps=1", "device=cpu"]) == 0
 
 
 def test_plain_critic_does_not_compute_privileged(monkeypatch):

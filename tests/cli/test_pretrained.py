@@ -352,7 +352,7 @@ FIRST_EPISODES = {
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if "explorer" in name else pytest.mark.nightly)
+        pytest.param(name, marks=pytest.mark.slow if "goal" in name else pytest.mark.nightly)
         for name in FIRST_EPISODES
     ],
 )

@@ -10,9 +10,9 @@ import pytest
 import reference
 
 from megastep.agents.cli import entry, evaluate, reproduce, train
+from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.reproduce import Interval, Result, Row
 from megastep.agents.launch import gpu
-from tests.helpers import tiny
 
 LAB = Path(__file__).parents[2] / "docs" / "lab"
 ROWS = reproduce.read()
@@ -39,12 +39,13 @@ def test_page_states_the_results_of_the_rows(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", ROWS.values(), ids=ROWS)
-def test_words_of_a_row_compose(row):
-    tiny.settings(*row.train.split(), f"device={row.device}")
-    for result in row.results:
-        words = result.evaluate.split()
-        tiny.settings("run=runs/x", *words, script="evaluate")
+def test_words_of_rows_compose():
+    composer = Composer(train.COMMAND)
+    for row in ROWS.values():
+        composer.settings([*row.train.split(), f"device={row.device}"])
+    composer = Composer(evaluate.COMMAND)
+    for words in {result.evaluate for result in RESULTS}:
+        composer.settings(["run=runs/x", *words.split()])
 
 
 # ---- Verdicts ----

@@ -286,8 +286,9 @@ print(newest, *sorted(os.listdir(folder)))
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
-@pytest.mark.parametrize("steps", ["new", pytest.param("again", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kills", [5, pytest.param(40, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    "kills, steps", [(5, "new"), pytest.param(40, "again", marks=pytest.mark.nightly)]
+)
 def test_kill_9_at_random_leaves_the_newest_checkpoint_intact(tmp_path, kills, steps):
     process = subprocess.run(
         [sys.executable, "-W", "error", "-c", SAVES_UNTIL_KILLED, tmp_path, str(kills), steps],
