@@ -228,13 +228,13 @@ class Composer:
         """
         typed = dict(word.lstrip("+").split("=", 1) for word in groups if "=" in word)
         applied = blocks.blocks_of(device or "auto", learner or typed.get("learner", GUESS))
-        is_ours = self.folder is None and not any("hydra" in word for word in groups)
-        from_files = _from_files if is_ours else _from_files.__wrapped__
         while True:
-            before, config = applied, from_files(self.name, groups, tuple(applied.items()))
+            blocks.BlockSource.blocks = applied
+            config = hydra.compose(self.name, [*groups], return_hydra_config=True)
             chosen = OmegaConf.select(config, "learner.name")
             applied = blocks.blocks_of(device or config.get("device") or "auto", learner or chosen)
-            if applied == before:
+            if applied == blocks.BlockSource.blocks:
+                OmegaConf.set_struct(config, False)
                 return config
             learner = learner or chosen  # which a block may not choose
 
@@ -245,15 +245,6 @@ class Composer:
         hydra.main(config_path=MAIN, config_name=self.name, version_base="1.3")(
             task or self.command.run
         )()
-
-
-@functools.cache
-def _from_files(name: str, groups: tuple[str, ...], applied: tuple) -> DictConfig:
-    """Returns the configuration of files with the blocks that apply. Ours never change."""
-    blocks.BlockSource.blocks = dict(applied)
-    config = hydra.compose(name, [*groups], return_hydra_config=True)
-    OmegaConf.set_struct(config, False)
-    return config
 
 
 def store_member(group: str, member: str, path: str) -> None:
