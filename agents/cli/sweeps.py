@@ -7,6 +7,7 @@ Jobs of joblib run in processes of their own, so that one that is killed leaves 
 import contextlib
 import csv
 import dataclasses
+import importlib
 import io
 import itertools
 import json
@@ -30,7 +31,6 @@ from omegaconf import OmegaConf
 
 from megastep import workers
 from megastep.agents import console, package
-from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.words import key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
@@ -227,7 +227,9 @@ class Job:
         self.record(row)
         try:
             with signals.interrupting():
-                composer = Composer(load(self.source[0]), *self.source[1:])
+                name, *rest = self.source
+                module = importlib.import_module(f"megastep.agents.cli.{name}")
+                composer = Composer(module.COMMAND, *rest)
                 cfg = composer.settings(words)
                 if isinstance(cfg, settings.Train):
                     cfg = self.own_settings(cfg, row["folder"], is_again)
