@@ -96,7 +96,7 @@ class Run:
         return record(self, **settings)
 
     def export(self, format: str, file: "str | os.PathLike | None" = None) -> Path:
-        """Writes the agent for another runtime, "onnx", "torch", "safetensors" or "hub", by default
+        """Writes the agent for another runtime, "onnx", "torch" or "safetensors", by default
         into the run's folder. Returns the path.
         """
         from megastep.agents.cli import export

@@ -1,4 +1,4 @@
-"""Records videos of environments. Worker processes draw the frames in parallel.
+"""Films of environments.
 
 ::
 
@@ -14,40 +14,29 @@ from __future__ import annotations
 
 import base64
 import collections
-import contextlib
-import functools
-import importlib
-import inspect
-import itertools
 import os
 import pathlib
 import sys
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from megastep import plotting, workers
+from megastep import plotting
 from megastep.arrdict import clone, numpyify
 from megastep.atomic_files import write_atomically
-from megastep.moments import film_moments
-from megastep.types import Tree, optional
+from megastep.types import Tree, n_lanes, optional
 from megastep.video import GifWriter, Mp4Writer, as_image
 
 if TYPE_CHECKING:
     from IPython.display import HTML  # pyright: ignore[reportMissingImports]
-    from loky import ProcessPoolExecutor
 
     from megastep.types import Env, PolicyLike
 
 __all__ = ["Film", "ParallelEncoder", "Player", "draw", "film", "film_all"]
-
-MAX_WORKERS = 8  # about 80 figures per second; each imports torch, about half a gigabyte of memory
 
 WRITERS = {"mp4": Mp4Writer, "gif": GifWriter}
 VIDEO, IMAGE = "<video controls autoplay loop muted {}></video>", "<img {}>"
@@ -58,6 +47,7 @@ ENDINGS = {  # of films and pictures: their types, and how pages show them
     ".svg": ("image/svg+xml", IMAGE),
     ".pdf": ("application/pdf", '<embed width="100%" height="720" {}>'),
 }
+MAX_RETURNS = 4  # of as many agents, one by one
 
 
 class ParallelEncoder:
@@ -68,82 +58,64 @@ class ParallelEncoder:
 
     Args:
         plot_state: takes a numpyified state, returns a matplotlib figure or an (H, W, 3) uint8
-            array. Functions, classmethods and staticmethods run in worker processes. A method of an
-            object runs in this process, with a warning, because the whole object would have to be
-            sent to the workers.
+            array.
         fps: frames per second of the video.
-        n_workers: number of worker processes; by default one per core, at most 8.
         format: mp4 or gif.
 
     Raises:
         RuntimeError: a frame could not be drawn; names the first such frame. Raised by any method.
     """
 
-    def __init__(
-        self,
-        plot_state: Callable,
-        fps: float = 20,
-        n_workers: int | None = None,
-        format: str = "mp4",
-    ):
+    def __init__(self, plot_state: Callable, fps: float = 20, format: str = "mp4"):
         if not 0 < fps <= 1000:
             raise ValueError(
                 f"fps must be more than 0 and at most 1000 frames per second, but {fps} was given"
             )
-        if n_workers is not None and n_workers < 1:
-            raise ValueError(f"n_workers must be at least 1, but {n_workers} was given")
         if format not in WRITERS:
             raise ValueError(f"format must be {' or '.join(WRITERS)}, but {format!r} was given")
-        self._plot_state, self._pickled_plot_state = plot_state, _pickled(plot_state)
-        self._format, self._style = format, plotting.current()
-        self._fps, self._n_workers = fps, n_workers
-        self._pool: ProcessPoolExecutor | None = None
-        self._writer: Mp4Writer | None = None
+        self._plot_state, self._fps, self._format = plot_state, fps, format
+        self._writer: Mp4Writer | GifWriter | None = None
         self._bytes: bytes | None = None
-        self._pending = collections.deque()  # (frame number, image or future), oldest first
 
     def __enter__(self) -> ParallelEncoder:
-        writer = WRITERS[self._format](self._fps)
-        self._writer, self._bytes, self._n_frames = writer, None, 0
+        self._writer, self._bytes, self._n_frames = WRITERS[self._format](self._fps), None, 0
         return self
 
     def __call__(self, state: Tree) -> None:
-        """Draws a state, a tree of tensors or arrays, as the next frame. The state is copied."""
-        self._check_open()
-        state = numpyify(clone(state))
-        if self._pickled_plot_state is None:
-            with _frame_errors(self._n_frames):
-                self._add(draw(self._plot_state, state))
-        else:
-            with workers.terminal_signals_blocked():
-                future = self._workers().submit(
-                    _draw_pickled, self._pickled_plot_state, state, plotting.current()
-                )
-            self._add(future)
+        """Draws a state, a tree of tensors or arrays, as the next frame."""
+        self._add(draw, self._plot_state, numpyify(clone(state)))
 
     def frame(self, array: ArrayLike) -> None:
         """Adds an image as the next frame: (H, W, 3), uint8 or floats in [0, 1].
 
         All frames must have the same size.
         """
-        self._check_open()
-        self._add(as_image(array))
+        self._add(np.asarray, as_image(array))
+
+    def _add(self, draw: Callable[..., np.ndarray], *arguments: Any) -> None:
+        if self._writer is None:
+            raise RuntimeError(
+                "frames can only be added inside the with block: with ParallelEncoder(...) as "
+                "encoder"
+            )
+        try:
+            self._writer.add(draw(*arguments))
+        except Exception as error:  # signals pass unchanged
+            first_line = next(iter(str(error).splitlines()), "")
+            raise RuntimeError(
+                f"frame {self._n_frames} could not be recorded: {type(error).__name__}: "
+                f"{first_line}"
+            ) from error
+        self._n_frames += 1
 
     def __exit__(self, kind, error, trace) -> None:
+        writer, self._writer = self._writer, None
+        assert writer is not None
         try:
-            if kind is None:
-                self._encode_until(0)
-                self._close()
-        finally:
-            self._stop_workers(kill=bool(self._pending))
-            if self._bytes is None:  # raise the error that ended the block, not one of closing
-                with contextlib.suppress(Exception):
-                    self._close()
-            self._writer = None
-
-    def _close(self) -> None:
-        assert self._writer is not None
-        self._bytes = self._writer.close()
+            self._bytes = writer.close()
+        except Exception:
+            if kind is None:  # otherwise the error that ended the block is raised
+                raise
 
     def save(self, path: str | os.PathLike) -> Film:
         """Writes the video to ``path``, an mp4 or GIF as ``format`` says, and returns the path.
@@ -173,13 +145,6 @@ class ParallelEncoder:
     def _repr_html_(self) -> str:
         return _html(self._finished(), f".{self._format}")
 
-    def _check_open(self) -> None:
-        if self._writer is None:
-            raise RuntimeError(
-                "frames can only be added inside the with block: with ParallelEncoder(...) as "
-                "encoder"
-            )
-
     def _finished(self) -> bytes:
         if self._bytes is None:
             raise RuntimeError(
@@ -191,95 +156,6 @@ class ParallelEncoder:
             )
         return self._bytes
 
-    def _workers(self) -> ProcessPoolExecutor:
-        """Returns the pool of worker processes, started at the first call."""
-        if self._pool is None:
-            import loky
-
-            self._n_workers = self._n_workers or min(loky.cpu_count(), MAX_WORKERS)
-            self._pool = workers.pool(self._n_workers)
-        return self._pool
-
-    def _add(self, image: np.ndarray | Future) -> None:
-        self._pending.append((self._n_frames, image))
-        self._n_frames += 1
-        self._encode_until(2 * (self._n_workers or 0) if self._pool else 0)
-
-    def _encode_until(self, n_pending: int) -> None:
-        """Encodes the oldest frames until ``n_pending`` are left, then those that are ready."""
-        assert self._writer is not None
-        while self._pending:
-            number, image = self._pending[0]
-            if len(self._pending) <= n_pending and not _is_ready(image):
-                break
-            with _frame_errors(number):
-                self._writer.add(image if isinstance(image, np.ndarray) else image.result())
-            self._pending.popleft()
-
-    def _stop_workers(self, kill) -> None:
-        self._pending.clear()
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, kill_workers=kill)
-            self._pool = None
-
-
-def _is_ready(image: np.ndarray | Future) -> bool:
-    return isinstance(image, np.ndarray) or image.done()
-
-
-@contextlib.contextmanager
-def _frame_errors(number: int) -> Iterator[None]:
-    """Adds the frame's number to an exception. Signals pass unchanged."""
-    try:
-        yield
-    except Exception as error:
-        first_line = next(iter(str(error).splitlines()), "")
-        raise RuntimeError(
-            f"frame {number} could not be recorded: {type(error).__name__}: {first_line}"
-        ) from error
-
-
-# ---- Drawing ----
-
-
-def _pickled(plot_state: Callable) -> bytes | None:
-    """Returns ``plot_state`` as bytes for the workers. If it must stay in this process, warns and
-    returns None.
-    """
-    function = plot_state
-    while isinstance(function, functools.partial):
-        function = function.func
-    if inspect.ismethod(function) and not isinstance(function.__self__, type):
-        reason = f"{function.__name__} is a method of a {type(function.__self__).__name__} object"
-    else:
-        import cloudpickle
-
-        try:
-            return cloudpickle.dumps(plot_state)
-        except Exception as error:
-            reason = (
-                f"plot_state cannot be sent to another process ({type(error).__name__}: {error})"
-            )
-    warnings.warn(
-        f"{reason}, so frames are drawn in this process, one by one. Use a classmethod, a "
-        "staticmethod or a function of a module to draw in parallel",
-        stacklevel=3,
-    )
-    return None
-
-
-@functools.lru_cache(1)
-def _unpickled(pickled: bytes) -> Callable:
-    import cloudpickle
-
-    return cloudpickle.loads(pickled)
-
-
-def _draw_pickled(pickled: bytes, state: Tree, style: plotting.Style) -> np.ndarray:
-    """Draws a state in a worker process."""
-    with plotting.styled(**vars(style)):
-        return draw(_unpickled(pickled), state)
-
 
 def draw(plot_state: Callable, state: Tree) -> np.ndarray:
     """Returns what ``plot_state`` draws of a numpyified state, as (H, W, 3) uint8.
@@ -287,39 +163,24 @@ def draw(plot_state: Callable, state: Tree) -> np.ndarray:
     Closes the figure if pyplot knows it. Below the note and the title of the current
     :class:`megastep.plotting.Style`, if there are any.
     """
-    with _drawn(plot_state, state) as drawing:
-        return plotting.rasterise(drawing) if hasattr(drawing, "savefig") else drawing
+    return _drawn(plot_state(state))
 
 
-@contextlib.contextmanager
-def _drawn(plot_state, state) -> Iterator:
-    """What ``plot_state`` draws: a figure, or an image (H, W, 3) uint8."""
-    drawing = plot_state(state)
+def _drawn(drawing) -> np.ndarray:
+    style = plotting.current()
     if isinstance(drawing, np.ndarray):
-        drawing = as_image(drawing)
-        yield _captioned(drawing)
-        return
-    if not hasattr(drawing, "savefig"):
+        image = as_image(drawing)
+    elif hasattr(drawing, "savefig"):
+        image = plotting.rasterise(drawing)
+        if "matplotlib.pyplot" in sys.modules:
+            sys.modules["matplotlib.pyplot"].close(drawing)
+    else:
         raise TypeError(
             "plot_state must return a matplotlib figure or an array, but it returned a "
             f"{type(drawing).__name__}"
         )
-    try:
-        if isinstance(drawing, plotting.Picture):
-            yield drawing
-        else:
-            yield _captioned(plotting.rasterise(drawing)) if _has_caption() else drawing
-    finally:
-        if "matplotlib.pyplot" in sys.modules:
-            sys.modules["matplotlib.pyplot"].close(drawing)
-
-
-def _has_caption() -> bool:
-    return bool(plotting.current().note or plotting.current().title)
-
-
-def _captioned(image) -> Any:
-    return plotting.captioned(image) if _has_caption() else image
+    has_caption = isinstance(drawing, plotting.Picture) or not (style.note or style.title)
+    return image if has_caption else plotting.captioned(image)
 
 
 # ---- Files ----
@@ -334,25 +195,13 @@ class Film(type(pathlib.Path())):
 
 def _html(content: bytes, ending: str) -> str:
     kind, tag = ENDINGS[ending]
-    source = f'src="data:{kind};base64,{base64.b64encode(content).decode()}"'
-    return tag.format(source)
+    return tag.format(f'src="data:{kind};base64,{base64.b64encode(content).decode()}"')
 
 
 def _write(path: Film, content: bytes) -> Film:
-    """Writes a file atomically, in a folder that is made if it is missing. Returns the path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, content)
     return path
-
-
-def _check_packages(*names: str) -> None:
-    """Raises ImportError if a package that films need cannot be imported, saying why."""
-    for name in names:
-        try:
-            importlib.import_module(name)
-        except Exception as error:  # also of a backend that MPLBACKEND names
-            reason = next(iter(str(error).splitlines()), "")
-            raise ImportError(f"drawing needs {name}, which fails: {reason}") from error
 
 
 def check_path(path: str | os.PathLike) -> None:
@@ -367,22 +216,11 @@ def check_path(path: str | os.PathLike) -> None:
 
 
 class Player(NamedTuple):
-    """What is filmed: the environment of a lane of ``env``, played by ``policy``. Players of the
-    same ``env`` have the same policy.
-
-    Attributes:
-        title: above the picture.
-        lane: number of the lane.
-        steps: frames, if other than the film's.
-        expected: what the lane's return must be in the last frame, if not None.
-    """
+    """What is filmed: environment 0 of ``env``, played by ``policy``, below a ``title``."""
 
     env: Env
     policy: PolicyLike
     title: str | None = None
-    lane: int = 0
-    steps: int | None = None
-    expected: float | None = None
 
 
 def film(
@@ -406,9 +244,8 @@ def film(
         OSError: the file cannot be written.
         RuntimeError: naming the first frame that failed.
     """
-    return film_all(
-        [Player(env, policy, look.pop("title", None))], path, steps, greedy, seed, **look
-    )
+    player = Player(env, policy, look.pop("title", None))
+    return film_all([player], path, steps, greedy, seed, **look)
 
 
 @torch.no_grad()
@@ -427,7 +264,6 @@ def film_all(
     """Films several environments at once, in a grid; otherwise as :func:`film`.
 
     Args:
-        steps: frames of each player. Who is at the end before others stays as it was there.
         theme: light or dark.
         dpi: pixels per inch; an environment's picture has 720 lines at 100.
         speed: how much faster than the environment's own frames per second.
@@ -446,46 +282,16 @@ def film_all(
         raise ValueError(f"{path} is a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
-    _check_packages("matplotlib", *["av"] * (path.suffix[1:] in WRITERS))
-    moments = film_moments(players, steps, greedy, seed, trail)
+    moments = zip(*(film_moments(player, steps, greedy, seed, trail) for player in players))
     with plotting.styled(theme=theme, dpi=dpi, axes=axes):
-        if path.suffix[1:] in WRITERS:
-            fps = optional(players[0].env, "fps") * speed
-            return _film(players, moments, fps, path)
-        (last,) = collections.deque(moments, maxlen=1)
-        return _write(path, _still(players, last, path.suffix[1:]))
-
-
-def _film(players, moments, fps, path) -> Film:
-    """Draws pictures and images, which are fast, in this process, others in worker processes."""
-    format, plot_state = path.suffix[1:], players[0].env.plot_state
-    first = next(moments)
-    with _frame_errors(0):
-        in_workers = len(players) == 1 and not _is_fast(players[0], first[0])
-    # the encoder draws nothing itself if it is given images
-    with ParallelEncoder(plot_state if in_workers else _frame_errors, fps, None, format) as encoder:
-        for number, moment in enumerate(itertools.chain([first], moments)):
-            if in_workers:
-                with plotting.styled(title=players[0].title, note=moment[0].note):
-                    encoder(moment[0].state)
-            else:
-                with _frame_errors(number):
-                    image = _image(players, moment)
-                encoder.frame(image)
-    return encoder.save(path)
-
-
-def _is_fast(player, moment) -> bool:
-    with _drawing(player, moment) as drawing:
-        return isinstance(drawing, (np.ndarray, plotting.Picture))
-
-
-@contextlib.contextmanager
-def _drawing(player, moment) -> Iterator:
-    """The drawing of a moment, in the style of the film."""
-    with plotting.styled(title=player.title, note=moment.note):
-        with _drawn(player.env.plot_state, moment.state) as drawing:
-            yield drawing
+        if (format := path.suffix[1:]) not in WRITERS:
+            (last,) = collections.deque(moments, maxlen=1)
+            return _write(path, _still(players, last, format))
+        fps = optional(players[0].env, "fps") * speed
+        with ParallelEncoder(_image, fps, format) as encoder:
+            for each in moments:
+                encoder._add(_image, players, each)
+        return encoder.save(path)
 
 
 def _image(players, moments) -> np.ndarray:
@@ -498,7 +304,63 @@ def _image(players, moments) -> np.ndarray:
 
 def _still(players, moments, format) -> bytes:
     """Returns a picture of the moments as a file of that format."""
-    with _drawing(players[0], moments[0]) as drawing:
-        if len(players) > 1 or not hasattr(drawing, "savefig"):
-            drawing = plotting.framed(_image(players, moments))
+    if len(players) > 1:
+        return plotting.encoded(plotting.framed(_image(players, moments)), format)
+    with plotting.styled(title=players[0].title, note=moments[0].note):
+        drawing = players[0].env.plot_state(moments[0].state)
+        if not isinstance(drawing, plotting.Picture):
+            drawing = plotting.framed(_drawn(drawing))
         return plotting.encoded(drawing, format)
+
+
+class Moment(NamedTuple):
+    """A frame to be: a numpyified state, and the return so far."""
+
+    state: Tree
+    note: str
+
+
+def film_moments(player: Player, steps: int, greedy, seed, trail) -> Iterator[Moment]:
+    """Plays for some steps from a reset, and yields the moment before each."""
+    env, policy = player.env, player.policy
+    n_agents, generator = optional(env, "n_agents"), torch.Generator(env.device).manual_seed(seed)
+    returns = np.zeros(n_agents, np.float32)
+    trails, views = collections.deque(maxlen=trail + 1), []
+    world, hidden = env.reset(), policy.initial(n_lanes(env), env.device)
+    for t in range(steps):
+        if t:
+            decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
+            world = env.step(decision)
+        rewards, starts = (world[k][:n_agents].cpu().numpy().ravel() for k in ("reward", "reset"))
+        returns = np.where(starts, np.float32(0), returns + rewards)
+        state: Any = numpyify(clone(env.state(0)))
+        core = state.get("core") if isinstance(state, dict) else None
+        if isinstance(core, dict) and "distances" in core:
+            _add_past(core, starts, trails, views)
+        note = f"mean return {returns.mean():.1f}"
+        if n_agents <= MAX_RETURNS:
+            note = "return " + ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in returns)
+        yield Moment(state, note)
+
+
+def _add_past(core: dict, starts: np.ndarray, trails: collections.deque, views: list) -> None:
+    """Adds to a core's state where agents were in this episode, and what they saw: see
+    :meth:`megastep.core.Core.state`. ``starts`` (A,) says whose episodes begin.
+    """
+    for positions in trails:
+        positions[starts] = np.nan
+    trails.append(np.array(core["positions"], float))
+    core["trail"] = np.stack(trails)
+    if starts.all():
+        views.clear()
+    seen = [
+        [
+            plotting.view_polygon(position, angle + yaw, core["fov"], distances)
+            for yaw, distances in zip(core["yaws"], of_agent, strict=True)
+        ]
+        for position, angle, of_agent in zip(
+            core["positions"], core["angles"], core["distances"], strict=True
+        )
+    ]
+    views.append(np.array(seen, np.float32))
+    core["views"] = np.stack(views)

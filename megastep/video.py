@@ -3,8 +3,6 @@
 import io
 import itertools
 import os
-import zlib
-from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from fractions import Fraction
 from typing import Any
@@ -17,7 +15,6 @@ __all__ = ["GifWriter", "Mp4Writer", "as_image"]
 
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"
-MAX_PENDING = 4  # images that wait for the encoder
 
 
 class Mp4Writer:
@@ -42,36 +39,30 @@ class Mp4Writer:
         self._stream.options = {"crf": QUALITY, "preset": "veryfast"}
         self._shape = None
         self._thread = ThreadPoolExecutor(1)
-        self._pending: deque[Future] = deque()
+        self._last = Future()
+        self._last.set_result(None)
 
     def add(self, image: np.ndarray) -> None:
         """Adds a frame, (H, W, 3) uint8. Odd sizes are padded to even.
 
         Raises:
             ValueError: its size differs from the first frame's.
-            Exception: an earlier one could not be encoded.
         """
-        if self._shape is None:
-            self._stream.height, self._stream.width = (size + size % 2 for size in image.shape[:2])
-        self._shape = check_size(image, self._shape)
-        self._pending.append(self._thread.submit(self._add, image))
-        self._wait(MAX_PENDING)
-
-    def _wait(self, n_pending) -> None:
-        while len(self._pending) > n_pending:
-            self._pending.popleft().result()
-
-    def _add(self, image) -> None:
         padding = [(0, size % 2) for size in image.shape[:2]]  # yuv420p halves both sides
         padded = np.pad(image, [*padding, (0, 0)], mode="edge")
-        self._container.mux(self._stream.encode(self._from_array(padded, format="rgb24")))
+        if self._shape is None:
+            self._stream.height, self._stream.width = padded.shape[:2]
+        self._shape = check_size(image, self._shape)
+        self._last.result()
+        self._last = self._thread.submit(self._encode, padded)
+
+    def _encode(self, image) -> None:
+        self._container.mux(self._stream.encode(self._from_array(image, format="rgb24")))
 
     def close(self) -> bytes:
         """Returns the finished file, empty if there were no frames."""
-        try:
-            self._wait(0)
-        finally:
-            self._thread.shutdown(cancel_futures=True)
+        self._thread.shutdown()
+        self._last.result()
         if self._shape is None:
             return b""
         self._container.mux(self._stream.encode(None))
@@ -102,7 +93,7 @@ def small_gif(path: str | os.PathLike, height: int, n_frames: int) -> tuple[byte
 
 
 class GifWriter:
-    """Encodes images into a GIF in memory, with one palette of 256 colours.
+    """Encodes images into a GIF in memory, with a palette of 256 colours each.
 
     A GIF counts in hundredths of a second, and browsers show frames of one hundredth for ten: above
     50 frames per second some frames are left out.
@@ -112,41 +103,35 @@ class GifWriter:
     """
 
     def __init__(self, fps: float):
-        self._fps, self._shape = fps, None
-        self._frames: list[bytes] = []  # compressed: the palette is known when all are there
+        self._fps, self._shape, self._n_added = fps, None, 0
+        self._every = int(np.ceil(fps / 50))
+        self._frames: list[Image.Image] = []
 
     def add(self, image: np.ndarray) -> None:
         """Adds a frame, (H, W, 3) uint8. Raises ValueError if its size is not the first's."""
         self._shape = check_size(image, self._shape)
-        self._frames.append(zlib.compress(image.tobytes(), 1))
+        if self._n_added % self._every == 0:
+            frame = Image.fromarray(image)
+            method, dither = Image.Quantize.FASTOCTREE, Image.Dither.NONE
+            self._frames.append(frame.quantize(256, method, dither=dither))
+        self._n_added += 1
 
     def close(self) -> bytes:
         """Returns the finished file, empty if there were no frames."""
         if not self._frames:
             return b""
-        every = int(np.ceil(self._fps / 50))
-        self._frames = self._frames[::every]
-        buffer, n = io.BytesIO(), len(self._frames)
-        sample = np.concatenate([self._image(i) for i in np.linspace(0, n - 1, 12).astype(int)])
-        palette = Image.fromarray(sample).quantize(256, Image.Quantize.FASTOCTREE)
-        images = (
-            Image.fromarray(self._image(i)).quantize(palette=palette, dither=Image.Dither.NONE)
-            for i in range(n)
-        )
-        ends = np.round(np.arange(n + 1) * 100 * every / self._fps)  # hundredths of a second
-        next(images).save(
-            buffer,
+        first, *others = self._frames
+        ends = np.round(np.arange(len(self._frames) + 1) * 100 * self._every / self._fps)
+        first.save(
+            buffer := io.BytesIO(),
             "GIF",
             save_all=True,
-            append_images=images,
-            duration=(10 * np.diff(ends)).astype(int).tolist(),
+            append_images=others,
+            duration=(10 * np.diff(ends)).astype(int).tolist(),  # of hundredths of a second
             loop=0,
             optimize=False,
         )
         return buffer.getvalue()
-
-    def _image(self, i) -> np.ndarray:
-        return np.frombuffer(zlib.decompress(self._frames[i]), np.uint8).reshape(self._shape)
 
 
 def check_size(image: np.ndarray, shape: tuple[int, ...] | None) -> tuple[int, ...]:

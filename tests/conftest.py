@@ -10,7 +10,6 @@ os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")  # each worker imports torch, i
 import functools
 import pickle
 
-import loky
 import pytest
 import torch
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -20,7 +19,6 @@ from megastep.agents import package
 from megastep.agents.cli import blocks
 from megastep.agents.launch import run as launch_run
 from megastep.agents.runs import provenance
-from tests.helpers.in_this_process import InThisProcess
 
 torch.set_num_threads(1)
 
@@ -135,14 +133,6 @@ def no_curves():
 def with_curves(no_curves, monkeypatch):
     """Has runs in this test draw curves.png."""
     monkeypatch.setattr("megastep.agents.training.curves.plot_curves", no_curves)
-
-
-@pytest.fixture
-def drawn_in_this_process(monkeypatch):
-    """Replaces pools of worker processes, which test_recording.py and scripts in processes of their
-    own have.
-    """
-    monkeypatch.setattr(loky, "ProcessPoolExecutor", InThisProcess)
 
 
 @pytest.fixture(scope="session")

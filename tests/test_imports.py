@@ -142,7 +142,6 @@ OWN_USERS = {
 OUTSIDE_USERS = {
     "IPython": ("megastep/recording.py",),
     "av": ("megastep/video.py",),
-    "cloudpickle": ("megastep/recording.py",),
     "cuda": ("megastep/kernels/build/compile.py",),
     "gymnasium": (
         "megastep/adapters/*.py",
@@ -156,7 +155,6 @@ OUTSIDE_USERS = {
     "loky": (
         "megastep/geometries/homes/database.py",
         "megastep/geometries/plans/imports.py",
-        "megastep/recording.py",
         "megastep/hosting/processes.py",
         "megastep/workers.py",
     ),

@@ -187,7 +187,7 @@ def test_random_actions_run():
     assert ((positions > 1 + 0.1) & (positions < 6 - 0.1)).all()
 
 
-def test_the_whole_notebook_records_a_video(tmp_path, drawn_in_this_process):
+def test_the_whole_notebook_records_a_video(tmp_path):
     import av
 
     names = notebook("plot state")
@@ -198,16 +198,14 @@ def test_the_whole_notebook_records_a_video(tmp_path, drawn_in_this_process):
 
 
 def test_the_tutorial_functions_make_an_environment_that_can_be_recorded(tmp_path):
-    """The functions become methods of a class whose `plot_state` is not a classmethod."""
+    """The functions become methods of a class."""
     names = notebook("plot state")
     methods = {name: names[name] for name in ("reset", "step", "state", "plot_state")}
     env = type("Typed", (), methods)()
     env.core = names["self"].core
     env.rgb, env.movement = modules.RGB(env.core), modules.SimpleMovement(env.core)
 
-    with pytest.warns(UserWarning, match="plot_state is a method of a Typed object"):
-        encoder = recording.ParallelEncoder(env.plot_state)
-    with encoder:
+    with recording.ParallelEncoder(env.plot_state) as encoder:
         env.reset()
         for _ in range(2):
             world = env.step(arrdict.arrdict(actions=env.core.agent_full(3)))

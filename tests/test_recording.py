@@ -1,13 +1,9 @@
-"""Videos: order and size of frames, worker processes, errors, files."""
+"""Videos: order and size of frames, errors, files."""
 
 import io
 import os
-import subprocess
 import sys
-import threading
-import time
 import types
-import warnings
 
 import av
 import numpy as np
@@ -21,52 +17,21 @@ from megastep.core import AGENT_RADIUS
 from megastep.geometries import sample
 from megastep.recording import ParallelEncoder
 from megastep.video import GifWriter
-from tests.helpers.processes import HUNG, is_running, wait_until
 
 SIZE = 32
 TOLERANCE = 6  # grey levels: the loss of h264 at this quality on a flat colour
 
 
 def plot_grey(state):
-    """Draws a flat grey image. Early frames take longest, so workers finish out of order."""
-    time.sleep(0.2 / (1 + state.i))
+    """Draws a flat grey image."""
     return np.full((SIZE, SIZE, 3), state.grey, np.uint8)
-
-
-def plot_facts(state):
-    """Writes facts about the worker process to the file `state.path`."""
-    import matplotlib
-
-    facts = [
-        os.getpid(),
-        matplotlib.get_backend().capitalize(),
-        torch.get_num_threads(),
-        torch.cuda.is_initialized(),
-        os.environ["CUDA_VISIBLE_DEVICES"],
-        type(state).__name__,
-        type(state.x).__name__,
-    ]
-    with open(state.path, "w") as file:
-        file.write(" ".join(map(str, facts)))
-    return np.zeros((SIZE, SIZE, 3), np.uint8)
 
 
 def plot_badly(state):
     return 1 / state.x
 
 
-def plot_fatally(state):
-    os._exit(3)
-
-
 class Env:
-    def __init__(self):
-        self.pids = []
-
-    @classmethod
-    def plot_class(cls, state):
-        return np.full((SIZE, SIZE, 3), os.getpid() % 2, np.uint8)
-
     @staticmethod
     def plot_static(state):
         return np.full((SIZE, SIZE, 3), state.grey, np.uint8)
@@ -74,7 +39,6 @@ class Env:
     def plot_state(self, state):
         from matplotlib import pyplot
 
-        self.pids.append(os.getpid())
         figure = pyplot.figure(figsize=(1.01, 0.65), dpi=100)
         figure.add_subplot().plot(state.xs)
         return figure
@@ -93,14 +57,6 @@ def frames(path):
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
-@pytest.mark.slow
-def test_frames_keep_their_order(tmp_path):
-    greys = [int(grey) for grey in np.linspace(0, 255, 12)]
-    states = [arrdict(i=i, grey=torch.tensor(grey)) for i, grey in enumerate(greys)]
-    path = record(plot_grey, states, n_workers=2).save(tmp_path / "video.mp4")
-    assert np.abs(frames(path).mean((1, 2, 3)) - greys).max() < TOLERANCE
-
-
 def test_file_is_h264_in_yuv420p_at_the_given_fps(tmp_path):
     with ParallelEncoder(plot_grey, fps=12.5) as encoder:
         for _ in range(25):
@@ -113,9 +69,8 @@ def test_file_is_h264_in_yuv420p_at_the_given_fps(tmp_path):
     assert os.listdir(tmp_path / "new") == ["video.mp4"]
 
 
-@pytest.mark.slow
 def test_images_and_states_can_be_mixed(tmp_path):
-    with ParallelEncoder(plot_grey, n_workers=1) as encoder:
+    with ParallelEncoder(plot_grey) as encoder:
         encoder(arrdict(i=0, grey=50))
         encoder.frame(np.full((SIZE, SIZE, 3), 100, np.uint8))
         encoder.frame(np.full((SIZE, SIZE, 3), 150 / 255))
@@ -131,114 +86,45 @@ def test_odd_sizes_are_padded_to_even(tmp_path):
     assert video.shape == (1, 34, 48, 3) and abs(video[0, -1, -1].mean() - 200) < TOLERANCE
 
 
-@pytest.mark.slow
-def test_states_are_copied(tmp_path):
-    state = arrdict(i=0, grey=torch.tensor(200))
-    with ParallelEncoder(plot_grey, n_workers=1) as encoder:
-        encoder(state)
-        state.grey.zero_()
-    assert abs(frames(encoder.save(tmp_path / "video.mp4")).mean() - 200) < TOLERANCE
-
-
-@pytest.mark.slow
-def test_workers_have_one_thread_and_no_gpu(tmp_path):
-    record(plot_facts, [arrdict(path=str(tmp_path / "facts"), x=torch.zeros(1))], n_workers=1)
-    pid, *facts = (tmp_path / "facts").read_text().split(" ")
-    assert int(pid) != os.getpid()
-    assert facts == ["Agg", "1", "False", "", "arrdict", "ndarray"]
-
-
-@pytest.mark.parametrize(
-    "plot_state", [Env.plot_class, Env().plot_class, Env.plot_static, Env().plot_static]
-)
-def test_classmethods_and_staticmethods_run_in_workers(plot_state):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert ParallelEncoder(plot_state)._pickled_plot_state is not None
-
-
-def test_bound_method_draws_in_this_process_with_a_warning(tmp_path):
+def test_figures_of_pyplot_are_closed(tmp_path):
     from matplotlib import pyplot
 
-    env, open_before = Env(), pyplot.get_fignums()
-    with pytest.warns(
-        UserWarning, match="plot_state is a method of a Env object.*this process"
-    ) as warned:
-        encoder = record(env.plot_state, [arrdict(xs=torch.arange(i)) for i in range(3)])
-    assert len(warned) == 1 and warned[0].filename == __file__
-    assert env.pids == 3 * [os.getpid()] and pyplot.get_fignums() == open_before
+    open_before = pyplot.get_fignums()
+    encoder = record(Env().plot_state, [arrdict(xs=torch.arange(i)) for i in range(3)])
+    assert pyplot.get_fignums() == open_before
     assert frames(encoder.save(tmp_path / "video.mp4")).shape == (3, 66, 102, 3)
 
 
-def test_unpicklable_function_draws_in_this_process_with_a_warning(tmp_path):
-    lock = threading.Lock()
-    with pytest.warns(UserWarning, match="cannot be sent to another process"):
-        encoder = record(lambda state, lock=lock: np.zeros((SIZE, SIZE, 3)), [arrdict()])
-    assert len(frames(encoder.save(tmp_path / "video.mp4"))) == 1
-
-
-def test_error_in_a_worker_names_the_frame():
-    with pytest.raises(
-        RuntimeError, match="frame 0 could not be recorded: TypeError: plot_state must return"
-    ):
-        record(plot_badly, [arrdict(x=1), arrdict(x=0)], n_workers=1)
-
-
-@pytest.mark.slow
-def test_killed_worker_names_the_frame():
-    with pytest.raises(
-        RuntimeError, match="^frame 0 could not be recorded: TerminatedWorkerError: .*"
-    ):
-        record(plot_fatally, [arrdict()], n_workers=1)
-
-
-def test_error_in_this_process_names_the_frame():
-    def plot_state(self, state):
-        return 1 / state.x
-
-    bound = types.MethodType(plot_state, Env())
-    with (
-        pytest.warns(UserWarning),
-        pytest.raises(RuntimeError, match="frame 0 could not be recorded: ZeroDivision"),
-    ):
-        record(bound, [arrdict(x=0)])
-
-
-def test_exception_in_the_block_is_not_changed():
-    with pytest.raises(KeyError, match="mine"), ParallelEncoder(plot_grey, n_workers=1) as encoder:
-        encoder(arrdict(i=0, grey=0))
-        raise KeyError("mine")
+@pytest.mark.parametrize("x, error", [(0, "ZeroDivision"), (1, "TypeError: plot_state must retu")])
+def test_an_error_names_the_frame(x, error):
+    with pytest.raises(RuntimeError, match=f"frame 1 could not be recorded: {error}"):
+        with ParallelEncoder(plot_badly) as encoder:
+            encoder.frame(np.zeros((SIZE, SIZE, 3)))
+            encoder(arrdict(x=x))
 
 
 class Stopped(BaseException):
     """What a signal handler raises."""
 
 
-@pytest.mark.parametrize(
-    "moment",
-    ["drawing", *(pytest.param(m, marks=pytest.mark.slow) for m in ("waiting", "encoding"))],
-)
-def test_signal_is_not_changed(moment, monkeypatch):
-    """While waiting for a worker, drawing here, or encoding, and if closing the video fails too."""
+def test_a_signal_is_not_changed(monkeypatch):
+    """Also if closing the video fails too."""
 
-    def stop(*args, **options):
+    def stop(*_):
         raise Stopped
 
     def broken(self):
         raise OSError("the container is broken")
 
-    plot_state = types.MethodType(stop, Env()) if moment == "drawing" else plot_grey
-    if moment == "waiting":
-        monkeypatch.setattr(recording, "_is_ready", stop)
-    if moment == "encoding":
-        monkeypatch.setattr(recording.Mp4Writer, "add", stop)
     monkeypatch.setattr(recording.Mp4Writer, "close", broken)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        encoder = ParallelEncoder(plot_state, n_workers=1)
-    with pytest.raises(Stopped), encoder:
-        encoder(arrdict(i=9, grey=0))
-    assert encoder._pool is None
+    with pytest.raises(Stopped), ParallelEncoder(stop) as encoder:
+        encoder(arrdict(grey=0))
+
+
+def test_exception_in_the_block_is_not_changed():
+    with pytest.raises(KeyError, match="mine"), ParallelEncoder(plot_grey) as encoder:
+        encoder(arrdict(i=0, grey=0))
+        raise KeyError("mine")
 
 
 def test_frames_before_an_error_can_be_saved(tmp_path):
@@ -282,13 +168,6 @@ def test_frames_are_added_inside_the_block_and_saved_after_it(tmp_path):
     assert not os.listdir(tmp_path)
 
 
-@pytest.mark.parametrize("settings", [dict(fps=0), dict(fps=float("nan")), dict(n_workers=0)])
-def test_bad_settings_are_named(settings):
-    (name,) = settings
-    with pytest.raises(ValueError, match=f"{name} must be"):
-        ParallelEncoder(plot_grey, **settings)
-
-
 def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
     with ParallelEncoder(plot_grey) as encoder:
         encoder.frame(np.zeros((SIZE, SIZE, 3)))
@@ -318,73 +197,6 @@ def test_notebook_embeds_the_video(monkeypatch):
     monkeypatch.setitem(sys.modules, "IPython.display", None)
     with pytest.raises(ImportError, match="pip install ipython"):
         encoder.notebook()
-
-
-SCRIPT = """
-import numpy as np
-from megastep import arrdict, recording
-from matplotlib import pyplot as plt
-
-class Env:
-    @classmethod
-    def plot_state(cls, state):
-        figure = plt.figure(figsize=(1, 1), dpi=64)
-        figure.add_subplot().plot(state.xs)
-        return figure
-
-print('started')
-with recording.ParallelEncoder(Env().plot_state, n_workers=2) as encoder:
-    for i in range(4):
-        encoder(arrdict.arrdict(xs=np.arange(i)))
-encoder.save('video.mp4')
-"""
-
-
-@pytest.mark.slow
-def test_script_without_a_main_guard_can_record(tmp_path):
-    (tmp_path / "script.py").write_text(SCRIPT)
-    root = os.path.dirname(os.path.dirname(recording.__file__))
-    process = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", "script.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=HUNG,
-        env={**os.environ, "PYTHONPATH": root},
-    )
-    assert (process.returncode, process.stdout) == (0, "started\n"), process.stderr
-    assert frames(tmp_path / "video.mp4").shape == (4, 64, 64, 3)
-
-
-LEFT_BEHIND = """
-import os, pathlib, time
-from megastep import arrdict, recording
-
-class Env:
-    @staticmethod
-    def plot_state(state):
-        pathlib.Path(str(os.getpid())).touch()
-        time.sleep(1000)
-
-with recording.ParallelEncoder(Env.plot_state, n_workers=2) as encoder:
-    for i in range(2):
-        encoder(arrdict.arrdict(i=i))
-"""
-
-
-@pytest.mark.slow
-def test_workers_end_with_a_killed_parent(tmp_path):
-    root = os.path.dirname(os.path.dirname(recording.__file__))
-    process = subprocess.Popen(
-        [sys.executable, "-c", LEFT_BEHIND], cwd=tmp_path, env={**os.environ, "PYTHONPATH": root}
-    )
-    wait_until(lambda: len(os.listdir(tmp_path)) == 2, process)
-    process.kill()
-    process.wait()
-    deadline = time.monotonic() + 5
-    while any(is_running(pid) for pid in os.listdir(tmp_path)):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
 
 
 # ---- Films ----

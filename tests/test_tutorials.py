@@ -53,7 +53,6 @@ def follow(page, folder, patch):
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=TIERS[p in LONG]) for p in PAGES])
-@pytest.mark.usefixtures("drawn_in_this_process")
 def test_page_runs_and_draws_its_picture(page, tmp_path, monkeypatch):
     follow(page, tmp_path, monkeypatch)
     last = re.findall(r"\S*\.(?:png|svg|mp4|gif|html)\b", blocks(page)[-1])

@@ -17,7 +17,7 @@ COMMANDS = {
     "report": "writes a page about a run or several: curves, evaluations, homes; --help says more",
     "compare": "draws a metric of several runs, averaged over seeds; --help says more",
     "web": "writes a page that plays an agent in a browser; --help says more",
-    "export": "writes an agent for ONNX, torch.export, a hub, or in one file; --help says more",
+    "export": "writes an agent for ONNX, torch.export, or in one file; --help says more",
     "reproduce": "lists the results in docs/lab; makes one again; --help says more",
     "import": "imports floor plans: CubiCasa5k, HouseExpo, your own; --help says more",
     "check": "checks the floor plans of a file: closed, reachable, ...; --help says more",

@@ -14,57 +14,46 @@ HELP = """Writes a trained agent for use elsewhere.
 
   megastep export run=RUN format=onnx           one step for ONNX runtimes: policy.onnx
   megastep export run=RUN format=torch          the same for torch.export.load: policy.pt2
-  megastep export run=RUN format=safetensors    an agent file with its card: agent.safetensors
-  megastep export run=RUN format=hub            a folder for the Hugging Face Hub: hub/
-  ... file=my_agent.onnx                        this file or folder instead of one in RUN
+  megastep export run=RUN format=safetensors    an agent file: agent.safetensors
+  ... file=my_agent.onnx                        this file instead of one in RUN
   ... member=3                                  an agent of a population; without it, the best
 
 run= takes a run, one of its checkpoints, latest, or a packaged agent."""
-#: The formats, and the file or folder of each.
-FORMATS = {
-    "onnx": "policy.onnx",
-    "torch": "policy.pt2",
-    "safetensors": "agent.safetensors",
-    "hub": "hub",
-}
+#: The formats, and the file of each.
+FORMATS = {"onnx": "policy.onnx", "torch": "policy.pt2", "safetensors": "agent.safetensors"}
 
 
 @frozen
 class Export:
     run: str
-    format: Literal["onnx", "torch", "safetensors", "hub"]
+    format: Literal["onnx", "torch", "safetensors"]
     file: str | None = None
     member: settings.PopulationMember = None
 
 
 def run(cfg: Export) -> Path:
-    """Writes an agent's file or folder, and says what was written. Returns its path."""
+    """Writes an agent's file, and says what was written. Returns its path."""
     kind, run = cfg.format, with_member({"run": cfg.run, "member": cfg.member}, "run")["run"]
     source, suffix = folders.find(run), Path(FORMATS[kind]).suffix
     path = folders.folder_of(source) / FORMATS[kind] if cfg.file is None else Path(cfg.file)
-    if suffix and path.suffix != suffix:
+    if path.suffix != suffix:
         raise UserError(f"file={path} must end with {suffix} for format={kind}")
     from megastep.agents import pretrained  # with PyTorch
-    from megastep.agents.export import agent, hub, runtimes
-    from megastep.agents.export.step import Step
+    from megastep.agents.export import agent, runtimes
 
     if kind == "safetensors":
-        console.say("\n".join(f"Wrote {written}" for written in agent.write(run, path)))
+        agent.write(run, path)
+        console.say(f"Wrote {path}")
         return path
-    policy, env = pretrained.load_with_env(run, "cpu", films=kind == "hub")
-    name = folders.name_of(source)
-    if kind == "hub":
-        written = hub.write(run, path, name, policy, env)
-        console.say("\n".join(f"Wrote {file}" for file in written))
-        return path
+    policy, env = pretrained.load_with_env(run, "cpu")
     with user_errors(f"{path} cannot be written: "):
         path.parent.mkdir(parents=True, exist_ok=True)
-    step = Step(policy, env.obs_space, env.reset().get("mask"))
+    step = runtimes.Step(policy, env.obs_space, env.reset().get("mask"))
     write, runner = runtimes.write_torch, runtimes.run_torch
     if kind == "onnx":
         write, runner = runtimes.write_onnx, runtimes.run_onnx
     with user_errors(f"{path} cannot be written: ", (OSError,)):
-        write(step, path, name)
+        write(step, path, folders.name_of(source))
     found = runtimes.compare(step, runner(path), policy, env)
     runtimes.check(path, found)
     inputs, outputs = (", ".join(p.name for p in side) for side in (step.inputs, step.outputs))

@@ -15,7 +15,6 @@ The most common words:
   against=RUN      its duel with another run's agent, a bot, or an import path, in one home
   home=3           another of the unseen homes; split=training: one it was trained in
   homes=[1,2,3,4]  several homes in a grid
-  worst=3          the worst episodes of the run's newest evaluation, as they were; episode=12: one
   runs=[A,B]       several runs side by side, in one home from the same spawn
   theme=dark       also title=, dpi=200, speed=2, trail=0, axes=true
   file=out.mp4     this file, overwritten if it exists; out.gif: the same as a GIF; out.png, out.svg
@@ -24,7 +23,7 @@ The most common words:
 
 
 def run(cfg: settings.Record) -> Path:
-    """Films an agent; see `megastep.agents.evaluation.record.run`."""
+    """Films an agent; see `megastep.agents.evaluation.filming.run`."""
     from megastep.agents.evaluation import filming  # with PyTorch
 
     return filming.run(cfg)

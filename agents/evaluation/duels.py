@@ -10,16 +10,14 @@ import numpy as np
 import torch
 
 from megastep.agents import factory
-from megastep.agents.evaluation import players, tables
-from megastep.agents.evaluation.eval_env import EvalEnv
+from megastep.agents.evaluation import eval_env, tables
 from megastep.agents.evaluation.playing import step_until
-from megastep.agents.evaluation.statistics import TAIL, interval, lanes_by_source, worst_homes
+from megastep.agents.evaluation.statistics import TAIL, by_part, interval, worst_homes
 from megastep.agents.factory import settings
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.runs import checkpoint, restore
-from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.selfplay.slots import rotating_slots, score_pairs
-from megastep.arrdict import arrdict
+from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_slots, score_pairs
+from megastep.arrdict import arrdict, numpyify
 from megastep.types import Env, PolicyLike, n_lanes, optional
 
 if TYPE_CHECKING:
@@ -33,10 +31,8 @@ MAX_STEPS = 500
 def duel_policy(
     policy: PolicyLike, opponent: PolicyLike, slots: torch.Tensor, n_agents: int
 ) -> MixedPolicy:
-    """Returns a policy that is `policy` in one slot per environment and `opponent` in the others.
-
-    Args:
-        slots: (N, 1) int64.
+    """Returns a policy that is `policy` in one slot per environment, of (N, 1) int64, and
+    `opponent` in the others.
     """
     in_slot = torch.zeros(len(slots), n_agents, dtype=torch.bool, device=slots.device)
     in_slot = in_slot.scatter(1, slots, True).flatten()
@@ -123,29 +119,26 @@ class Duels:
         device: torch.device,
     ):
         self.cfg, self.run = cfg, run
-        self.where = EvalEnv(env, homes, cfg.episodes, cfg.seed, device, is_duel=True)
-        self.env, self.sample = self.where.env, self.where.sample
-        self.agent = players.load_player(run, self.sample, run)
+        where = eval_env.EvalEnv(env, homes, cfg.episodes, cfg.seed, device, is_duel=True)
+        self.where, self.env = where, where.env
+        self.agent = eval_env.load_player(run, where.sample, run)
         restore.load_wrappers(self.env, run)
         self.others = [self.player(name) for name in cfg.against or ()]
-        shard = self.where.shard
-        slots = rotating_slots(shard.n_envs, optional(self.env, "n_agents"), self.env.device)
-        self.slots = slots[[*shard.envs]]
-        self.where.warn_without_layout()
+        n_envs, n_agents = where.shard.n_envs, optional(self.env, "n_agents")
+        self.slots = rotating_slots(n_envs, n_agents, self.env.device)[[*where.shard.envs]]
+        where.warn_without_layout()
 
-    def player(self, name: str) -> players.Player:
+    def player(self, name: str) -> eval_env.Player:
         """Returns who plays in the environment, see `find_player`."""
-        where, trust = self.where.settings, self.cfg.trust
-        player = players.find_player(name, self.run, where, self.sample, trust)
-        return player._replace(policy=factory.in_env(player.policy, where, self.env))
+        return self.where.find_player(name, self.run, self.cfg.trust)
 
-    def play(self, player: players.Player, opponent: players.Player) -> arrdict:
+    def play(self, player: eval_env.Player, opponent: eval_env.Player) -> arrdict:
         """Returns the duels of two players, those of all ranks."""
+        both = player.policy, opponent.policy
+        max_steps = self.cfg.max_steps or MAX_STEPS
         with factory.errors():
             played = play(
-                *(self.env, player.policy, opponent.policy, self.where.seed, self.cfg.greedy),
-                max_steps=self.cfg.max_steps or MAX_STEPS,
-                slots=self.slots,
+                self.env, *both, self.where.seed, self.cfg.greedy, max_steps, slots=self.slots
             )
         return self.where.shard.with_others(played)
 
@@ -165,45 +158,35 @@ class Duels:
 
 
 def summaries(
-    played: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
+    duels: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
 ) -> "list[Row]":
-    """Returns table rows for the result of `play`: one overall, then one per role and one per
-    source of homes.
+    """Returns the table rows, `by_part`, of the result of `play`. A role's row has the duels in
+    which `policy` played it.
 
     `won` is the fraction of duels won, a draw counting half; `lower` and `upper` are its 95 %
     interval over homes, or over duels if there are no homes.
 
     Args:
-        roles: the role of each agent slot. A role's row has the duels in which `policy` played it.
+        roles: the role of each agent slot.
         sources: the source of each home.
     """
-    arrays = {key: values.cpu().numpy() for key, values in played.items()}
-    rows, slots = [_summary(arrays)], arrays["slots"]
-    roles = roles or ()
-    for role in dict.fromkeys(roles):
-        has_role = np.array([name == role for name in roles])[slots]
-        if has_role.any():
-            rows.append({"role": role, **_summary(_of(arrays, has_role))})
-    for source, in_source in lanes_by_source(arrays.get("homes"), sources).items():
-        rows.append({"source": source, **_summary(_of(arrays, in_source))})
-    return rows
+    played = numpyify(duels)
+    every, homes = np.ones(len(played["score"]), bool), played.get("homes")
+    role_of = np.array(roles)[played["slots"]] if roles else None
+    return by_part(lambda lanes: _summary(played, lanes), every, role_of, roles, homes, sources)
 
 
-def worst_summary(played: Mapping) -> "Row":
+def worst_summary(duels: Mapping) -> "Row":
     """Returns a table row of the worst homes, `statistics.worst_homes`, from a result of `play`."""
-    arrays = {key: values.cpu().numpy() for key, values in played.items()}
-    numbers, means = worst_homes({"won": arrays["score"]}, arrays["homes"])
+    played = numpyify(duels)
+    numbers, means = worst_homes({"won": played["score"]}, played["homes"])
     won = means["won"]
-    row = _summary(_of(arrays, np.isin(arrays["homes"], numbers)))
+    row = _summary(played, np.isin(played["homes"], numbers))
     return row | {"won": won["mean"], "lower": won["lower"], "upper": won["upper"]}
 
 
-def _of(arrays, is_included) -> dict[str, np.ndarray]:
-    return {key: values[is_included] for key, values in arrays.items()}
-
-
-def _summary(arrays) -> "Row":
-    score, homes = arrays["score"], arrays.get("homes")
+def _summary(played, lanes) -> "Row":
+    score, homes = played["score"][lanes], played["homes"][lanes] if "homes" in played else None
     mean, lower, upper = interval(score, homes)
     return {
         "won": mean,
@@ -212,7 +195,7 @@ def _summary(arrays) -> "Row":
         "wins": int((score == 1).sum()),
         "losses": int((score == 0).sum()),
         "draws": int(((score != 1) & (score != 0)).sum()),
-        "length": float(arrays["lengths"].mean()),
+        "length": float(played["lengths"][lanes].mean()),
         "duels": len(score),
         "homes": None if homes is None else len(np.unique(homes)),
     }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.evaluation import players, playing, ratings, statistics, tables
+from megastep.agents.evaluation import playing, ratings, statistics, tables
 from megastep.agents.evaluation.duels import Duels
 from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory import env_failures, settings
@@ -16,10 +16,7 @@ from megastep.env_state import EnvState
 from megastep.types import optional
 
 if TYPE_CHECKING:
-    import torch
-
     from megastep.agents.types import Row
-    from megastep.arrdict import arrdict
 
 ORACLE = "oracle"  # the bot that knows where everything is
 
@@ -33,8 +30,7 @@ def run(cfg: settings.Evaluate) -> Path:
     Writes .json, .md and .csv, which has a row per episode, into the run's folder `evaluations`,
     one of each per source of geometries (per environment where it has none), split and checkpoint.
     Of `geometry=suite` plays as many episodes in each source, and adds the worst source and the
-    worst dense homes. With `cfg.against` plays duels instead; with `cfg.ratings` writes ratings.csv
-    and ratings.svg.
+    worst dense homes. With `cfg.against` plays duels; with `cfg.ratings` writes ratings.csv.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
@@ -48,19 +44,12 @@ def run(cfg: settings.Evaluate) -> Path:
             duels = Duels(cfg, loaded, env_settings, homes, device)
             path = ratings.write(duels, tables.labels(duels.where, geometry, cfg.split))
         else:
-            path = measure(cfg, loaded, env_settings, geometry, homes, device)
+            path = _measure(cfg, loaded, env_settings, geometry, homes, device)
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
 
 
-def measure(
-    cfg: settings.Evaluate,
-    loaded: checkpoint.Checkpoint,
-    env_settings: settings.Env,
-    geometry: settings.Geometry,
-    homes: list,
-    device: "torch.device",
-) -> Path:
+def _measure(cfg, loaded, env_settings, geometry, homes, device) -> Path:
     """Plays episodes, or with `cfg.against` duels, of a suite in each source. Prints and writes a
     table, and returns the path of its .json.
     """
@@ -71,7 +60,8 @@ def measure(
             duels = Duels(cfg, loaded, env_settings, part, device)
             where, of_part = duels.where, duels.rows(source)
         else:
-            where, of_part, each = play(cfg, loaded, env_settings, part, device, source)
+            where = EvalEnv(env_settings, part, cfg.episodes, cfg.seed, device)
+            of_part, each = play(cfg, loaded, where, source)
             if source:  # the number among all homes, not among those of the source
                 for row in each:
                     if "home" in row:
@@ -82,86 +72,60 @@ def measure(
         return folders.folder_of(loaded.path)
     labels = tables.labels(where, geometry, cfg.split)
     title, rows = tables.title_of(labels, geometry, rows, "duels" if cfg.against else "lanes")
+    names = [labels.source, "env" if cfg.env else "", cfg.split, str(loaded.step)]
     if cfg.against is not None:
         names = ["duels", labels.source, cfg.split, str(loaded.step), "against", *cfg.against]
-        title, cells = f"{duels.agent.name}, in {title}, seed {cfg.seed}", tables.duel_cells
+        title = f"{duels.agent.name}, in {title}, seed {cfg.seed}"
     else:
-        names = [labels.source, "env" if cfg.env else "", cfg.split, str(loaded.step)]
         title += f", after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}"
-        cells = tables.cells
-    n_ranks = where.shard.n_ranks
-    return tables.write_table(cfg, loaded, names, title, rows, [*map(cells, rows)], single, n_ranks)
+    return tables.write_table(cfg, loaded, names, title, rows, single)
 
 
 def play(
-    cfg: settings.Evaluate,
-    loaded: checkpoint.Checkpoint,
-    env_settings: settings.Env,
-    homes: list,
-    device: "torch.device",
-    source: str | None = None,
-) -> "tuple[EvalEnv, list[Row], list[Row]]":
-    """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns where, the rows of
-    the table, and those of the episodes.
+    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, where: EvalEnv, source: str | None
+) -> "tuple[list[Row], list[Row]]":
+    """Plays `cfg.episodes` with the run's agent and each of `cfg.baseline`, in homes of a `source`
+    or of several. Returns the rows of the table, and those of the episodes.
+
+    If the bot `oracle` is among them, all play the same episodes, and have a further metric,
+    `oracle_fraction`: what they found divided by what the oracle found in the same episode.
     """
-    where = EvalEnv(env_settings, homes, cfg.episodes, cfg.seed, device)
-    env, roles, sources = where.env, optional(where.env, "roles"), factory.sources_of(where.homes)
-    rows, single, is_first = [], [], process_group.rank() == 0
-    playing_ones = players_of(cfg, loaded, where)
-    for (player, _), played in zip(playing_ones, play_all(cfg, where, playing_ones), strict=True):
+    env, policy = where.env, restore.policy_of(loaded, where.env)
+    restore.load_wrappers(env, loaded)
+    all_play = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
+    for name in cfg.baseline:
+        player = where.find_player(name, loaded, cfg.trust)
+        all_play.append((player.name, player.policy, cfg.greedy and player.step is not None))
+    names = [name for name, *_ in all_play]
+    state = EnvState(env) if ORACLE in names else None
+    # a copy, as the state's tensors are the environment's own
+    first = {} if state is None else copy.deepcopy(state.state_dict())
+    all_played = []
+    for _, policy, greedy in all_play:
+        if state is not None:
+            state.load_state_dict(first)
+        played = playing.first_episodes(env, policy, where.seed, greedy, cfg.max_steps)
+        all_played.append(where.shard.with_others(played))
+    if state is not None:
+        found = all_played[names.index(ORACLE)]["metrics"]["found"]
+        for played in all_played:
+            played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found.clamp(min=1)
+    roles, sources, rows, single = optional(env, "roles"), factory.sources_of(where.homes), [], []
+    is_first = process_group.rank() == 0
+    for name, played in zip(names, all_played, strict=True):
         n_cut = int((~played["done"]).sum())
         if n_cut and is_first:
             limit = cfg.max_steps or optional(env, "max_episode_steps")
             console.warn(
-                f"{player.name}: {n_cut:,} of {len(played['done']):,} episodes had not ended after "
+                f"{name}: {n_cut:,} of {len(played['done']):,} episodes had not ended after "
                 f"{limit:,} steps and are counted as truncated there; max_steps= sets the limit"
             )
         summaries = statistics.summaries(played, roles, None if source else sources)
         if source == tables.DENSE and "homes" in played:
             summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(played)})
-        rows += [{"agent": player.name, **row} for row in summaries]
+        rows += [{"agent": name, **row} for row in summaries]
         each = statistics.rows_of(played, cfg.seed, where.numbers, sources, roles)
-        single += [{"agent": player.name, **row} for row in each]
+        single += [{"agent": name, **row} for row in each]
     if is_first:
         where.warn_without_layout()
-    return where, rows, single
-
-
-def play_all(
-    cfg: settings.Evaluate, where: EvalEnv, playing_ones: list[tuple[players.Player, bool]]
-) -> "list[arrdict]":
-    """Returns the first episodes of each player on all ranks, see `playing.first_episodes`.
-
-    If the bot `oracle` is among them, all play the same episodes, and have a further metric,
-    `oracle_fraction`: what they found divided by what the oracle found in the same episode.
-    """
-    names = [player.name for player, _ in playing_ones]
-    has_oracle = ORACLE in names
-    # a copy, as the state's tensors are the environment's own
-    state = EnvState(where.env) if has_oracle else None
-    first = copy.deepcopy(state.state_dict()) if state is not None else {}
-    all_played = []
-    for player, greedy in playing_ones:
-        if state is not None:
-            state.load_state_dict(first)
-        settings_of = where.env, player.policy, where.seed, greedy, cfg.max_steps
-        all_played.append(where.shard.with_others(playing.first_episodes(*settings_of)))
-    if has_oracle:
-        found = all_played[names.index(ORACLE)]["metrics"]["found"]
-        for played in all_played:
-            played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found.clamp(min=1)
-    return all_played
-
-
-def players_of(
-    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, where: EvalEnv
-) -> list[tuple[players.Player, bool]]:
-    """Returns who plays, the run's agent and each of `cfg.baseline`, and whether it is greedy."""
-    policy = restore.policy_of(loaded, where.env)
-    restore.load_wrappers(where.env, loaded)
-    every = [(players.Player("trained, greedy" if cfg.greedy else "trained", policy), cfg.greedy)]
-    for name in cfg.baseline:
-        player = players.find_player(name, loaded, where.settings, where.sample, cfg.trust)
-        own = factory.in_env(player.policy, where.settings, where.env)
-        every.append((player._replace(policy=own), cfg.greedy and player.step is not None))
-    return every
+    return rows, single

@@ -1,7 +1,6 @@
 """Evaluations of a policy while it trains."""
 
 import contextlib
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -37,11 +36,12 @@ class Evaluator:
     """
 
     def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: "Ranks"):
-        rank = (0, 1) if ranks.n == 1 else None
         homes = factory.homes(cfg.env, cfg.geometry, "test")
         self.trained_in, self.state, self.start = trained_in, None, None
         with _generators_kept(device):
-            self.where = EvalEnv(cfg.env, homes, cfg.evaluation.episodes, cfg.seed, device, rank)
+            self.where = EvalEnv(
+                cfg.env, homes, cfg.evaluation.episodes, cfg.seed, device, ranks.n > 1
+            )
             names = ["return", "length", *self.where.env.reset().get("metrics", {})]
             if optional(self.where.env, "resumable"):
                 self.state = EnvState(self.where.env)
@@ -52,7 +52,9 @@ class Evaluator:
                 raise ConfigErrors([(f"evaluation.stop.{name}", text)])
 
     def __call__(self, policy: Policy) -> dict[str, float]:
-        """Returns the means of `return`, `length` and each metric of the environment."""
+        """Returns the means of `return`, `length` and each metric of the environment, over the
+        finished episodes of the lanes that learn, or of all if none does; NaN without one.
+        """
         env = self.where.env
         with _generators_kept(env.device):
             if self.state is not None:
@@ -60,18 +62,11 @@ class Evaluator:
             if learnt := optional(self.trained_in, "wrapper_state")():
                 optional(env, "load_wrapper_state")(learnt, True)
             played = playing.first_episodes(env, policy.actor(), self.where.seed)
-        return means(played)
-
-
-def means(played: Mapping) -> dict[str, float]:
-    """Returns the means of finished episodes of `playing.first_episodes`, NaN without one, over the
-    lanes that learn, or all if none does.
-    """
-    learns = played["learns"] if played["learns"].any() else ~played["learns"]
-    counted = learns & played["done"]
-    columns = {"return": played["returns"], "length": played["lengths"], **played["metrics"]}
-    values = {name: column[counted].double() for name, column in columns.items()}
-    return {name: float(x[x.isfinite()].mean()) for name, x in values.items()}
+        learns = played["learns"] if played["learns"].any() else ~played["learns"]
+        counted = learns & played["done"]
+        columns = {"return": played["returns"], "length": played["lengths"], **played["metrics"]}
+        values = {name: column[counted].double() for name, column in columns.items()}
+        return {name: float(x[x.isfinite()].mean()) for name, x in values.items()}
 
 
 def _generators_kept(device: torch.device) -> contextlib.ExitStack:

@@ -13,8 +13,6 @@ from megastep.types import Env, PolicyLike, Tree, World, n_lanes, optional
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
 #: costs more than a few superfluous steps.
 CHECK_EVERY = 64
-
-
 #: Steps of a CUDA graph, a divisor of `CHECK_EVERY`.
 STEPS_PER_GRAPH = 16
 
@@ -35,13 +33,9 @@ def step_until(
 
     Args:
         is_over: bool of any shape, which `step` changes in place.
-        step: acts by `policies`, steps `env`, and changes only what is below them and `roots`.
-        world: the current world.
-        state: the hidden state before the first step.
-        env: the environment.
-        policies: the policies that act.
-        roots: what else `step` changes, see `megastep.capture.capture`.
-        max_steps: maximum number of steps.
+        step: acts by `policies`, steps `env`, and changes only what is below them and `roots`, see
+            `megastep.capture.capture`.
+        world, state: the current world, and the hidden state before the first step.
     """
 
     def several(world, state, n_steps=STEPS_PER_GRAPH) -> tuple[World, Tree]:
@@ -99,18 +93,17 @@ def first_episodes(
             unfinished episodes have `done` False.
 
     Returns:
-        An arrdict on the environment's device:
+        An arrdict on the environment's device, (B,) each:
 
-        - returns, lengths: (B,) float32; lengths in steps
-        - done, terminal: (B,) bool, true if the episode ended or is not played, and if it was not
-          truncated
+        - returns, lengths (steps): float32
+        - done, terminal: bool, true if the episode ended or is not played; if it was not truncated
+        - learns: bool, from the first world; all true if worlds have no `learns`
+        - metrics: name -> float32, from the last world of the episode; nan if unfinished
+        - envs: int64, the lane's environment
+        - homes: int32, the lane's layout; only if `env.layout` exists. Layouts change only at
+          respawns, so the whole episode is played in it.
         - starts: (B, 3) float32, where each agent was put: x and y in metres, degrees; only of
           environments with a `core`
-        - learns: (B,) bool, from the first world; all true if worlds have no `learns`
-        - metrics: name -> (B,) float32, from the last world of the episode; nan if unfinished
-        - envs: (B,) int64, the lane's environment
-        - homes: (B,) int32, the lane's layout; only if `env.layout` exists. Layouts change only at
-          respawns, so the whole episode is played in it.
     """
     device, n_agents = torch.device(env.device), optional(env, "n_agents")
     draws = SeededGenerator(seed)
@@ -119,7 +112,10 @@ def first_episodes(
     envs = torch.arange(env.n_envs, device=device).repeat_interleave(n_agents)
     homes = {} if layout is None else {"homes": layout.repeat_interleave(n_agents)}
     agents = getattr(getattr(env, "core", None), "agents", None)
-    starts = {} if agents is None else {"starts": _poses(agents)}
+    starts = {}
+    if agents is not None:
+        poses = torch.cat([agents.positions, agents.angles[..., None]], -1)
+        starts["starts"] = poses.flatten(0, 1).float().clone()
     returns, lengths = (torch.zeros(n_lanes(env), device=device) for _ in range(2))
     done, terminal = torch.zeros(2, n_lanes(env), dtype=torch.bool, device=device)
     learns = torch.ones_like(done) if "learns" not in world else world["learns"].clone()
@@ -144,20 +140,5 @@ def first_episodes(
     changed = draws, returns, lengths, metrics, terminal
     most: int = optional(env, "max_episode_steps") if max_steps is None else max_steps
     step_until(done, step, world, state, env, (policy,), changed, most)
-    return arrdict(
-        returns=returns,
-        lengths=lengths,
-        done=done,
-        terminal=terminal,
-        learns=learns,
-        metrics=metrics,
-        envs=envs,
-        **homes,
-        **starts,
-    )
-
-
-def _poses(agents) -> torch.Tensor:
-    """Returns (B, 3): x and y in metres, degrees."""
-    poses = torch.cat([agents.positions, agents.angles[..., None]], -1)
-    return poses.flatten(0, 1).float().clone()
+    played = arrdict(returns=returns, lengths=lengths, done=done, terminal=terminal)
+    return arrdict(played, learns=learns, metrics=metrics, envs=envs, **homes, **starts)

@@ -1,15 +1,24 @@
 """Means of episodes with their confidence intervals, overall and in the worst homes."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
+
+from megastep.arrdict import numpyify
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
+
+#: How an episode ended: terminal or truncated, as the environment said, or cut off at the limit of
+#: steps.
+ENDS = "cut off", "truncated", "terminal"
+#: What tells how well an episode went, the first that there is; homes of all sizes compare by it.
+SCORES = "success", "coverage", "won", "return"
+TAIL = 0.05  # fraction of homes that `worst_homes` averages
+BOUNDS = "mean", "lower", "upper"
 
 
 def resamples(n: int, n_resamples: int = 2000, seed: int = 1) -> np.ndarray:
@@ -53,30 +62,32 @@ def interval(
     return float(values.mean()), float(lower), float(upper)
 
 
-def lanes_by_source(
-    homes: np.ndarray | None, sources: Sequence[str] | None
-) -> dict[str, np.ndarray]:
-    """Returns {source: (B,) bool, the lanes that played in its homes}; empty if nothing is known.
+def by_part(
+    summary: Callable[[np.ndarray], "Row"],
+    counted: np.ndarray,
+    role_of: np.ndarray | None,
+    roles: Sequence[str] | None,
+    homes: np.ndarray | None,
+    sources: Sequence[str] | None,
+) -> "list[Row]":
+    """Returns table rows: one overall, then one per role and one per source of homes.
 
     Args:
+        summary: makes the row of some lanes, (B,) bool.
+        counted: (B,) bool, all lanes that count.
+        role_of: (B,), the role of each lane, one of `roles`.
         homes: (B,) integers, the home of each lane.
         sources: the source of each home.
     """
-    if homes is None or sources is None:
-        return {}
-    source_of_lane = np.array(sources)[homes]
-    lanes = {source: source_of_lane == source for source in dict.fromkeys(sources)}
-    return {source: played for source, played in lanes.items() if played.any()}
-
-
-#: How an episode ended: terminal or truncated, as the environment said, or cut off at the limit of
-#: steps.
-ENDS = "cut off", "truncated", "terminal"
-#: What tells how well an episode went, the first that there is; homes of all sizes compare by it.
-SCORES = "success", "coverage", "won", "return"
-
-
-TAIL = 0.05  # fraction of homes that `worst_homes` averages
+    rows = [summary(counted)]
+    parts: list[tuple] = [("role", role_of, roles)]
+    if homes is not None and sources is not None:
+        parts.append(("source", np.array(sources)[homes], sources))
+    for key, part_of, names in parts:
+        for name in dict.fromkeys(names or ()):
+            if (lanes := counted & (part_of == name)).any():
+                rows.append({key: name, **summary(lanes)})
+    return rows
 
 
 def score_of(row: Mapping) -> float:
@@ -87,13 +98,10 @@ def score_of(row: Mapping) -> float:
 
 
 def worst_homes(
-    columns: Mapping[str, ArrayLike],
-    homes: ArrayLike,
-    level: float = 0.95,
-    n_resamples: int = 2000,
-    seed: int = 1,
-) -> tuple[np.ndarray, dict[str, dict[str, float]]]:
-    """Returns the worst `TAIL` of all homes, and the means of `columns` in them.
+    columns: Mapping[str, ArrayLike], homes: ArrayLike
+) -> tuple[np.ndarray, dict[str, dict[str, float | None]]]:
+    """Returns the numbers of the worst `TAIL` of all homes, and {name: {mean, lower, upper}} of
+    `columns` in them, None for each if no episode in them has a number.
 
     Homes are ordered by the mean, over their episodes, of the first of `SCORES` among the columns;
     in the worst, that mean is the conditional value at risk (CVaR; Rockafellar and Uryasev 2000).
@@ -102,41 +110,32 @@ def worst_homes(
     Args:
         columns: name -> (B,). What is not finite is left out of a home's mean.
         homes: (B,) integers, the home of each episode.
-
-    Returns:
-        The numbers of the homes, and {name: {mean, lower, upper}}, None for each if no episode in
-        them has a number.
     """
     numbers, homes = np.unique(np.asarray(homes), return_inverse=True)
-    means = {name: _means_by_home(np.asarray(v, float), homes) for name, v in columns.items()}
+    means = {}
+    for name, values in columns.items():
+        values, is_finite = np.asarray(values, float), np.isfinite(values)
+        sums = np.bincount(homes, np.where(is_finite, values, 0.0))
+        means[name] = _divided(sums, np.bincount(homes, is_finite))
     # of homes with equal scores, those that do worse by the next score come first
     order = np.lexsort([means[name] for name in reversed(SCORES) if name in means])
-    n_worst, n_homes = max(1, round(TAIL * len(numbers))), len(numbers)
-    drawn = resamples(n_homes, n_resamples, seed)
+    n_worst, drawn = max(1, round(TAIL * len(numbers))), resamples(len(numbers))
     worst = order[np.sort(order.argsort()[drawn], 1)[:, :n_worst]]
     result = {}
     for name, by_home in means.items():
         mean, resampled = _finite_mean(by_home[order[:n_worst]]), _finite_mean(by_home[worst])
-        numbers_in_worst = [None] * 3
-        if np.isfinite(mean):
-            numbers_in_worst = [float(mean), *bounds(resampled, level).tolist()]
-        result[name] = dict(zip(("mean", "lower", "upper"), numbers_in_worst, strict=True))
+        values = [float(mean), *bounds(resampled).tolist()] if np.isfinite(mean) else 3 * [None]
+        result[name] = dict(zip(BOUNDS, values, strict=True))
     return numbers[order[:n_worst]], result
 
 
 def _finite_mean(values) -> np.ndarray:
     """Returns the mean over the last axis of what is finite, nan if there is none."""
     is_finite = np.isfinite(values)
-    counts = is_finite.sum(-1)
-    means = np.where(is_finite, values, 0.0).sum(-1) / np.maximum(counts, 1)
-    return np.where(counts > 0, means, np.nan)
+    return _divided(np.where(is_finite, values, 0.0).sum(-1), is_finite.sum(-1))
 
 
-def _means_by_home(values, homes) -> np.ndarray:
-    """Returns the mean of each home's finite values, nan if there is none."""
-    is_finite = np.isfinite(values)
-    counts = np.bincount(homes[is_finite], minlength=homes.max() + 1)
-    sums = np.bincount(homes[is_finite], values[is_finite], len(counts))
+def _divided(sums, counts) -> np.ndarray:
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
@@ -145,11 +144,10 @@ def worst_summary(episodes: Mapping) -> "Row":
 
     A metric without a number in them is left out. Unfinished episodes are not counted.
     """
-    learns, done, homes = (episodes[k].cpu().numpy() for k in ("learns", "done", "homes"))
-    lanes = (learns if learns.any() else ~learns) & done
-    columns = dict(episodes["metrics"], length=episodes["lengths"])
-    columns["return"] = episodes["returns"]
-    columns = {name: values.cpu().numpy()[lanes] for name, values in columns.items()}
+    played = numpyify(episodes)
+    lanes, homes = _counted(played["learns"]) & played["done"], played["homes"]
+    columns = {**played["metrics"], "length": played["lengths"], "return": played["returns"]}
+    columns = {name: values[lanes] for name, values in columns.items()}
     columns = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     numbers, means = worst_homes(columns, homes[lanes])
     length, of_return = means.pop("length")["mean"], means.pop("return")
@@ -165,11 +163,15 @@ def worst_summary(episodes: Mapping) -> "Row":
     }
 
 
+def _counted(learns) -> np.ndarray:
+    """Returns the lanes that learn, or all lanes if none does."""
+    return learns if learns.any() else ~learns
+
+
 def summaries(
     episodes: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
 ) -> "list[Row]":
-    """Returns table rows for the result of `first_episodes`: one overall, then one per role and one
-    per source of homes.
+    """Returns the table rows, `by_part`, of the result of `first_episodes`.
 
     Only lanes that learn are counted, or all lanes if none learns. An episode whose metric is not
     finite is left out of that metric; a warning names the metric.
@@ -178,105 +180,88 @@ def summaries(
         roles: the role of each agent slot, repeated over environments.
         sources: the source of each home.
     """
-    learns = episodes["learns"].cpu().numpy()
-    learns = learns if learns.any() else ~learns
-    is_counted = learns & episodes["done"].cpu().numpy()
-    for name, values in episodes["metrics"].items():
-        if n_left_out := int((~np.isfinite(values.cpu().numpy()[is_counted])).sum()):
+    played = numpyify(episodes)
+    learns = _counted(played["learns"])
+    is_counted = learns & played["done"]
+    for name, values in played["metrics"].items():
+        if n_left_out := int((~np.isfinite(values[is_counted])).sum()):
             warnings.warn(
                 f"metrics.{name} was not finite at the end of {n_left_out:,} of "
                 f"{is_counted.sum():,} episodes, which are left out of its mean",
                 stacklevel=2,
             )
-    rows = [_summary(episodes, learns)]
-    role_of_lane = np.resize(np.array(roles or ()), len(learns))
-    for role in dict.fromkeys(roles or ()):
-        if (lanes := learns & (role_of_lane == role)).any():
-            rows.append({"role": role, **_summary(episodes, lanes)})
-    homes = episodes["homes"].cpu().numpy() if "homes" in episodes else None
-    for source, lanes in lanes_by_source(homes, sources).items():
-        if (lanes := learns & lanes).any():
-            rows.append({"source": source, **_summary(episodes, lanes)})
-    return rows
+    role_of, homes = np.resize(np.array(roles or ()), len(learns)), played.get("homes")
+    return by_part(lambda lanes: _summary(played, lanes), learns, role_of, roles, homes, sources)
 
 
-def _summary(episodes, lanes) -> "Row":
+def _summary(played, lanes) -> "Row":
     """Returns a table row for some lanes, (B,) bool.
 
     Intervals are over homes, or over environments if there are no homes or only one.
     """
-    keys = [key for key in ("returns", "lengths", "done", "envs", "homes") if key in episodes]
-    arrays = {key: episodes[key].cpu().numpy()[lanes] for key in keys}
-    homes, done = arrays.get("homes"), arrays["done"]
-    groups = arrays["envs"] if homes is None or len(np.unique(homes)) == 1 else homes
-    mean, lower, upper = interval(arrays["returns"], groups)
+    homes, done = played["homes"][lanes] if "homes" in played else None, played["done"][lanes]
+    n_homes = None if homes is None else len(np.unique(homes))
+    groups = played["envs"][lanes] if homes is None or n_homes == 1 else homes
+    metrics = {}
+    for name, values in played["metrics"].items():
+        values = values[lanes][done]
+        is_finite = np.isfinite(values)
+        numbers = (None,) * 3
+        if is_finite.any():
+            numbers = interval(values[is_finite], groups[done][is_finite])
+        metrics[name] = dict(zip(BOUNDS, numbers, strict=True))
+    mean, lower, upper = interval(played["returns"][lanes], groups)
     return {
         "return": mean,
         "lower": lower,
         "upper": upper,
-        "length": float(arrays["lengths"].mean()),
+        "length": float(played["lengths"][lanes].mean()),
         "lanes": int(lanes.sum()),
-        "homes": None if homes is None else len(np.unique(homes)),
+        "homes": n_homes,
         "unfinished": int((~done).sum()),
-        "metrics": {
-            name: _metric(values.cpu().numpy()[lanes][done], groups[done])
-            for name, values in episodes["metrics"].items()
-        },
+        "metrics": metrics,
     }
 
 
-def _metric(values, groups) -> dict[str, float | None]:
-    """Returns the mean of finite values with its 95 % interval by name; None for each if there are
-    none.
-    """
-    is_finite = np.isfinite(values)
-    values, groups = values[is_finite], groups[is_finite]
-    numbers = interval(values, groups) if len(values) else (None,) * 3
-    return dict(zip(("mean", "lower", "upper"), numbers, strict=True))
-
-
 def rows_of(
-    played: Mapping,
+    episodes: Mapping,
     seed: int,
-    numbers: Sequence[int] | None = None,
+    numbers: Sequence[int],
     sources: Sequence[str] | None = None,
     roles: Sequence[str] | None = None,
 ) -> "list[Row]":
-    """Returns a dict per episode for the result of `playing.first_episodes`.
-
-    Only lanes that learn have one, or all lanes if none learns, as in `summaries`. Keys,
-    those of what is known:
+    """Returns a dict per episode for the result of `playing.first_episodes`, of the lanes that
+    `summaries` counts. Keys, those of what is known:
 
     - episode: the number of the lane; seed: of the evaluation
     - home, source: its number in the split, and the source it is from
     - role: of the agent
     - start_x, start_y, start_angle: where the agent was put, metres and degrees
     - return, length (steps), and each metric by its name, None if it is not finite
-    - ended: terminal, truncated, or cut off at the limit of steps
+    - ended: one of `ENDS`
 
     Args:
-        numbers: the number of each home in the split; by default its index.
+        numbers: the number of each home in the split.
         sources: the source of each home.
         roles: the role of each agent slot, repeated over environments.
     """
-    arrays = {k: v.cpu().numpy() for k, v in played.items() if isinstance(v, torch.Tensor)}
-    learns = arrays["learns"]
-    lanes = np.flatnonzero(learns if learns.any() else ~learns)
+    played = numpyify(episodes)
+    lanes = np.flatnonzero(_counted(played["learns"]))
     columns = {"episode": lanes.tolist(), "seed": [seed] * len(lanes)}
-    if (homes := arrays.get("homes")) is not None:
-        known = homes[lanes].tolist()
-        columns["home"] = [home if numbers is None else numbers[home] for home in known]
-        columns |= {"source": [sources[home] for home in known]} if sources else {}
+    if "homes" in played:
+        homes = played["homes"][lanes].tolist()
+        columns["home"] = [numbers[home] for home in homes]
+        columns |= {"source": [sources[home] for home in homes]} if sources else {}
     if roles:
         columns["role"] = [roles[lane % len(roles)] for lane in lanes]
-    if (starts := arrays.get("starts")) is not None:
+    if "starts" in played:
         names = "start_x", "start_y", "start_angle"
-        columns |= dict(zip(names, starts[lanes].T.tolist(), strict=True))
-    columns["return"] = arrays["returns"][lanes].tolist()
-    columns["length"] = arrays["lengths"][lanes].astype(int).tolist()
-    ended = arrays["done"][lanes].astype(int) + arrays["terminal"][lanes]
+        columns |= dict(zip(names, played["starts"][lanes].T.tolist(), strict=True))
+    columns["return"] = played["returns"][lanes].tolist()
+    columns["length"] = played["lengths"][lanes].astype(int).tolist()
+    ended = played["done"][lanes].astype(int) + played["terminal"][lanes]
     columns["ended"] = [ENDS[how] for how in ended]
     for name, values in played["metrics"].items():
-        finite = [x if np.isfinite(x) else None for x in values.cpu().numpy()[lanes].tolist()]
+        finite = [x if np.isfinite(x) else None for x in values[lanes].tolist()]
         columns[name + "_" * (name in columns)] = finite
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

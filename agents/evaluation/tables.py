@@ -38,11 +38,8 @@ class Labels(NamedTuple):
     choice: str
 
     def title(self, what: str, n_homes: int | None) -> str:
-        """Returns `minimal: 1,024 episodes in 512 homes, geometry=homes, split=test`.
-
-        Args:
-            what: such as `1,024 episodes`.
-            n_homes: number of homes, if known.
+        """Returns `minimal: 1,024 episodes in 512 homes, geometry=homes, split=test` of `what`,
+        such as `1,024 episodes`.
         """
         homes = f" in {n_homes:,} home{'s' * (n_homes > 1)}" if n_homes else ""
         return f"{self.env}: {what}{homes}{self.choice}"
@@ -50,14 +47,14 @@ class Labels(NamedTuple):
 
 def labels(where: EvalEnv, geometry: Geometry, split: str) -> Labels:
     """Returns how tables name an environment and its homes."""
-    env = where.settings
+    env = env_name(where.settings)
     if not where.homes:
-        return Labels(env_name(env), env_name(env), "")
+        return Labels(env, env, "")
     path = Path(getattr(geometry, "path", None) or "")
-    is_ours = geometry.name.startswith("megastep.")
-    name = label(geometry.name) if is_ours else geometry.name
+    short = label(geometry.name)
+    name = short if geometry.name.startswith("megastep.") else geometry.name
     choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
-    return Labels(env_name(env), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
+    return Labels(env, "-".join(filter(None, [short, path.stem])), choice)
 
 
 def write_table(
@@ -66,48 +63,38 @@ def write_table(
     names: list[str],
     title: str,
     rows: list,
-    cells: list[dict],
-    episodes: Sequence[Mapping] = (),
-    n_ranks: int = 1,
+    episodes: Sequence[Mapping],
 ) -> Path:
-    """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
-    and `rows` for programs, .json. Returns the latter's path.
+    """Prints a table, and writes it into the run's folder `evaluations`: as .md, for people, and
+    as .json, for programs. Returns the latter's path.
 
     Args:
+        names: parts of the files' name.
         episodes: a row per episode, for the .csv and, by column, the .json.
-        n_ranks: number of ranks that played them.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
-    folder, name = folder_of(loaded.path) / "evaluations", for_file("-".join(names))
-    head, lines = [*cells[0]], [[*row.values()] for row in cells]
+    path = folder_of(loaded.path) / "evaluations" / f"{for_file('-'.join(names))[:200]}.json"
+    head, lines = grid(rows)
     result = dict(
         title=title,
         checkpoint=str(loaded.path),
         step=loaded.step,
         evaluation=encoded(as_tree(cfg)),
-        ranks=n_ranks,
         rows=rows,
     )
+    files = {"md": f"{title}\n\n{console.table(head, lines, is_markdown=True)}\n"}
     text = json.dumps(result, indent=2)
-    if columns := columns_of(episodes):
+    if episodes:
+        columns = {key: None for row in episodes for key in row}
+        columns = {key: [row.get(key) for row in episodes] for key in columns}
         text = f'{text[:-2]},\n  "episodes": {json.dumps(columns)}\n}}'
+        files["csv"] = as_csv(episodes, [*columns])
     console.say(f"{title}\n{console.table(head, lines, width=console.terminal_width())}")
-    with user_errors(f"{folder} cannot be written: "):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(
-            folder / f"{name[:200]}.md",
-            f"{title}\n\n{console.table(head, lines, is_markdown=True)}\n".encode(),
-        )
-        if columns:
-            write_atomically(folder / f"{name[:200]}.csv", as_csv(episodes, [*columns]).encode())
-        write_atomically(folder / f"{name[:200]}.json", text.encode())
-    return folder / f"{name[:200]}.json"
-
-
-def columns_of(rows: Sequence[Mapping]) -> dict[str, list]:
-    """Returns {name: the values of all rows}, None where a row has none."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: [row.get(name) for row in rows] for name in names}
+    with user_errors(f"{path.parent} cannot be written: "):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for ending, content in {**files, "json": text}.items():
+            write_atomically(path.with_name(f"{path.stem}.{ending}"), content.encode())
+    return path
 
 
 def as_csv(rows: Sequence[Mapping], columns: list[str]) -> str:
@@ -119,25 +106,10 @@ def as_csv(rows: Sequence[Mapping], columns: list[str]) -> str:
     return text.getvalue()
 
 
-#: Columns of a table of duels, and of one of ratings, as templates.
-DUELS = {
-    "against": "{against}",
-    "won": "{won:.3f}",
-    INTERVAL: "{lower:.3f} to {upper:.3f}",
-    **{name: f"{{{name}}}" for name in ("wins", "draws", "losses")},
-    "length": "{length:.0f}",
-    "duels": "{duels}",
-    "homes": "{homes}",
-}
-
-
-RATINGS = {
-    "player": "{player}",
-    "rating": "{rating:.2f}",
-    "sigma": "{sigma:.2f}",
-    "won": "{won:.3f}",
-    "duels": "{duels}",
-}
+def grid(rows: Sequence[dict]) -> tuple[list[str], list[list[str]]]:
+    """Returns the head and the lines of a table, of evaluations or of duels."""
+    shown = [*map(duel_cells if "won" in rows[0] else cells, rows)]
+    return [*shown[0]], [[*row.values()] for row in shown]
 
 
 def cells(row: dict) -> dict[str, str]:
@@ -157,6 +129,19 @@ def cells(row: dict) -> dict[str, str]:
     }
 
 
+def duel_cells(row: dict) -> dict[str, str]:
+    """Returns the cells of an opponent's duels, by column."""
+    return {
+        "against": f"{row['against']}{part_of(row).replace(': ', ', as ')}",
+        "won": f"{row['won']:.3f}",
+        INTERVAL: f"{row['lower']:.3f} to {row['upper']:.3f}",
+        **{name: str(row[name]) for name in ("wins", "draws", "losses")},
+        "length": f"{row['length']:.0f}",
+        "duels": str(row["duels"]),
+        "homes": str(row["homes"] or "none"),
+    }
+
+
 def part_of(row: dict) -> str:
     """Returns which of its agent's episodes a row has, `: hunter` or `, in maze`; empty for all."""
     worst = f", worst {row['tail']:.0%} of homes" if "tail" in row else ""
@@ -165,24 +150,12 @@ def part_of(row: dict) -> str:
     return role + (f", in {row['source']}{worst}" if "source" in row else "")
 
 
-def duel_cells(row: dict) -> dict[str, str]:
-    """Returns the cells of an opponent's duels, by column."""
-    against = f"{row['against']}{part_of(row).replace(': ', ', as ')}"
-    row = row | {"against": against, "homes": row["homes"] or "none"}
-    return {key: form.format_map(row) for key, form in DUELS.items()}
-
-
 # ---- Suites: geometries of several sources, which are evaluated one by one ----
-
-
-def is_suite(geometry: Geometry) -> bool:
-    """Returns whether the homes are evaluated by source."""
-    return geometry.name == components.SUITE
 
 
 def parts_of(geometry: Geometry, homes: list) -> list[tuple[str | None, list]]:
     """Returns [(source, its homes)] of a suite, and [(None, homes)] of all other geometries."""
-    if not is_suite(geometry):
+    if geometry.name != components.SUITE:
         return [(None, homes)]
     parts = {}
     for home in homes:
@@ -200,12 +173,13 @@ def title_of(
         what: the key of the number of episodes, `lanes` or `duels`.
     """
     who, name = ("agent", "episodes") if what == "lanes" else ("against", what)
-    text = f"{rows[0][what]:,} {name}{' in each source' * is_suite(geometry)}"
+    is_suite = geometry.name == components.SUITE
+    text = f"{rows[0][what]:,} {name}{' in each source' * is_suite}"
     by_source = {}
     for row in rows:
         by_source.setdefault(row.get("source"), row["homes"] or 0)
     title = labels.title(text, by_source.get(None) or sum(by_source.values()))
-    if not is_suite(geometry):
+    if not is_suite:
         return title, rows
     ordered = []
     for one in dict.fromkeys(row[who] for row in rows):

@@ -1,1 +1,1 @@
-"""Takes a trained agent out of megastep: ONNX, torch.export, an agent file, a folder for a hub."""
+"""Takes a trained agent out of megastep: ONNX, torch.export, an agent file, a web page."""

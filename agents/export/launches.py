@@ -29,19 +29,12 @@ ACTIVATIONS = {torch.relu: 1, torch.tanh: 2}
 
 
 class Acting(NamedTuple):
-    """Where a program's policy has what a page shows.
+    """Where a program's policy has what a page shows."""
 
-    Attributes:
-        section: the name of its launches.
-        lanes: the lanes that it acts in.
-        logits: (B, A, n) of these lanes.
-        states: (B, W) each, the hidden state.
-    """
-
-    section: str
-    lanes: range
-    logits: Leaf
-    states: list[Leaf]
+    section: str  # the name of its launches
+    lanes: range  # that it acts in
+    logits: Leaf  # (B, A, n) of these lanes
+    states: list[Leaf]  # (B, W) each, the hidden state
 
 
 def add_policy(
@@ -59,30 +52,27 @@ def add_policy(
     Raises:
         UserError: it has a core or an encoder of the user's, or actions of several kinds.
     """
+    lowering = _Lowering(program, policy, lanes, seed)
+    width, policy = policy.width, lowering.policy
     with torch.no_grad():
-        return _Lowering(program, policy, lanes, section, seed).acting()
+        x = lowering.scratch(width)
+        columns, n_columns = lowering.intake()
+        activation = ACTIVATIONS[policy.intake.activation]
+        lowering.linear(columns, policy.intake.project, x, n_columns, width, activation)
+        core = cast(nn.Module, policy.core)
+        for one in core if isinstance(core, Stack) else [core]:
+            lowering.core(one, x, width)
+        logits = lowering.output(x, width)
+    program.sections[section] = lowering.launches
+    return Acting(section, lanes, logits, lowering.states)
 
 
 class _Lowering:
-    def __init__(self, program, policy, lanes, section, seed) -> None:
+    def __init__(self, program, policy, lanes, seed) -> None:
         self.program, self.policy, self.lanes = program, policy.actor(), lanes
-        self.section, self.seed, self.n = section, seed, len(lanes)
+        self.seed, self.n = seed, len(lanes)
         self.launches: list[Launch] = []
         self.states: list[Leaf] = []
-
-    def acting(self) -> Acting:
-        """Adds everything."""
-        width = self.policy.width
-        x = self.scratch(width)
-        columns, n_columns = self.intake()
-        activation = ACTIVATIONS[self.policy.intake.activation]
-        self.linear(columns, self.policy.intake.project, x, n_columns, width, activation)
-        core = cast(nn.Module, self.policy.core)
-        for one in core if isinstance(core, Stack) else [core]:
-            self.core(one, x, width)
-        logits = self.output(x, width)
-        self.program.sections[self.section] = self.launches
-        return Acting(self.section, self.lanes, logits, self.states)
 
     def launch(self, operation: str, **values) -> None:
         """Adds a launch. Words that are not given are 0, or null pointers."""
@@ -100,19 +90,10 @@ class _Lowering:
         return None if tensor is None else self.program.add(tensor.detach().float().cpu())
 
     def linear(self, x, layer: nn.Linear, out, n_in, n_out, activation=0, adds=0) -> None:
-        """Adds a linear layer."""
+        sizes = dict(n_in=n_in, n_out=n_out, x_stride=n_in, out_stride=n_out)
+        parts = dict(weight=self.weights(layer.weight), bias=self.weights(layer.bias))
         self.launch(
-            "policy_linear",
-            x=x,
-            weight=self.weights(layer.weight),
-            bias=self.weights(layer.bias),
-            out=out,
-            n_in=n_in,
-            n_out=n_out,
-            x_stride=n_in,
-            out_stride=n_out,
-            adds=adds,
-            activation=activation,
+            "policy_linear", x=x, out=out, **parts, **sizes, adds=adds, activation=activation
         )
 
     # ---- Intake ----
@@ -138,7 +119,6 @@ class _Lowering:
         return columns, n
 
     def normalise(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
-        """Adds the normalisation of a leaf."""
         if leaf.dtype not in KINDS:
             raise UserError(f"a page has no observations of {leaf.dtype}")
         shape, n_axes = leaf.shape[1:], len(leaf.shape) - 1

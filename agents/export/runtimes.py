@@ -1,7 +1,15 @@
-"""Files of other runtimes: ONNX, and the format of `torch.export`; and whether they act alike."""
+"""One step of a policy as a function of tensors alone, in files of other runtimes: ONNX, and the
+format of `torch.export`; and whether they act alike.
+
+B lanes. Inputs in this order: `obs` or `obs.NAME` for each leaf of the observation; `mask` or
+`mask.NAME`, if the environment has action masks; `reset`; and `state.0`, `state.1`, ... for the
+leaves of the hidden state. Outputs: `action`, `logits` (or `action.NAME`, `logits.NAME`) and
+`next_state.0`, ...
+"""
 
 import contextlib
 import importlib
+import io
 import json
 import logging
 import warnings
@@ -10,20 +18,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
+from torch import nn
 
+from megastep import spaces
 from megastep.agents import package
 from megastep.agents.errors import UserError, shortened
-from megastep.agents.export.step import Step
 from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.outputs import FORBIDDEN
 from megastep.arrdict import arrdict
 from megastep.atomic_files import write_atomically
-from megastep.dotdict import leaves
-from megastep.types import Env, n_lanes
+from megastep.dotdict import leaves, mapping
+from megastep.types import Env, Space, Tree, n_lanes
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
 
+FLOAT = torch.float32  # of the floating-point inputs
 #: Version of ONNX's operators.
 OPSET = 18
 #: Largest difference of logits, as a fraction of the largest logit (or of 1), that is no error.
@@ -33,6 +43,116 @@ RESETS = 0.02
 
 #: Outputs, as NumPy arrays or tensors, from inputs.
 Runner = Callable[[Sequence[torch.Tensor]], Sequence[torch.Tensor]]
+
+
+class Port(NamedTuple):
+    """An input or output."""
+
+    name: str  # as at the head of this file
+    shape: tuple[int, ...]  # without the axis B
+    dtype: str  # of PyTorch, without `torch.`
+
+
+class Step(nn.Module):
+    """Acts greedily for one step, as `policy(world, state, sample=False)` does on a CPU.
+
+    Args:
+        policy: the policy, which acts.
+        obs_space: its observation space.
+        mask: an action mask of the environment. None: it has none.
+    """
+
+    def __init__(self, policy: "Policy", obs_space: Space, mask: Tree = None):
+        super().__init__()
+        self.policy, self.obs_space = policy.actor().eval(), obs_space
+        self.masks = {} if mask is None else spaces.leaves(mask)
+        self.n_state = len(leaves(self.policy.initial(1)))
+        self.example = self.tensors(self._world(2), self.policy.initial(2))
+        self.inputs = [*map(_port, self._input_names(), self.example)]
+        self.outputs = [*map(_port, self._output_names(), self(*self.example))]
+
+    @property
+    def ports(self) -> str:
+        """The inputs and outputs as JSON."""
+        sides = {"inputs": self.inputs, "outputs": self.outputs}
+        return json.dumps({name: [port._asdict() for port in side] for name, side in sides.items()})
+
+    @torch.no_grad()
+    def forward(self, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns the outputs for the inputs, (B, ...) each."""
+        obs, mask, reset, state = self._trees(tensors)
+        obs = mapping(torch.unsqueeze)(obs, 0)
+        features, state = self.policy._features(obs, reset[None], state)
+        logits = self.policy.output.masked(self.policy.output(features[0]), mask)
+        actions = self.policy.output.greedy(logits)
+        return *leaves(actions), *leaves(logits), *leaves(state)
+
+    def tensors(self, world: arrdict, state: arrdict) -> tuple[torch.Tensor, ...]:
+        """Returns the inputs for a world and a hidden state."""
+        obs = spaces.leaves(world["obs"])
+        values = [obs[path] for path in self.policy.intake.paths]
+        values = [leaf.to(FLOAT) if leaf.is_floating_point() else leaf for leaf in values]
+        masks = spaces.leaves(world["mask"]) if self.masks else {}
+        return *values, *(masks[path] for path in self.masks), world["reset"], *leaves(state)
+
+    def trees(self, outputs: Sequence[torch.Tensor]) -> tuple[list, list, arrdict]:
+        """Returns leaves of actions, leaves of logits and the hidden state of outputs."""
+        n = (len(outputs) - self.n_state) // 2
+        state = _filled(self.policy.initial(1), [*outputs[2 * n :]])
+        return [*outputs[:n]], [*outputs[n : 2 * n]], state
+
+    def _world(self, n_lanes) -> arrdict:
+        def zeros(space) -> torch.Tensor:
+            integers = isinstance(space, spaces.MultiDiscrete)
+            dtype = torch.int64 if integers else getattr(space, "dtype", None) or FLOAT
+            return torch.zeros(n_lanes, *space.shape, dtype=dtype)
+
+        reset = torch.ones(n_lanes, dtype=torch.bool)
+        masks = {path: leaf.new_ones(n_lanes, *leaf.shape[1:]) for path, leaf in self.masks.items()}
+        obs = spaces.map(zeros, self.obs_space)
+        return arrdict(obs=obs, reset=reset, **({"mask": _nested(masks)} if masks else {}))
+
+    def _trees(self, tensors) -> tuple[Tree, Tree, torch.Tensor, arrdict]:
+        paths = self.policy.intake.paths
+        n, end = len(paths), len(paths) + len(self.masks)
+        mask = _nested(dict(zip(self.masks, tensors[n:end]))) if self.masks else None
+        state = _filled(self.policy.initial(1), [*tensors[end + 1 :]])
+        return _nested(dict(zip(paths, tensors[:n]))), mask, tensors[end], state
+
+    def _input_names(self) -> list[str]:
+        parts = [("obs", self.policy.intake.paths), ("mask", self.masks)]
+        names = [f"{kind}.{path}".rstrip(".") for kind, paths in parts for path in paths]
+        return [*names, "reset", *(f"state.{i}" for i in range(self.n_state))]
+
+    def _output_names(self) -> list[str]:
+        obs, *_ = self._trees(self.example)
+        logits = self.policy.output(self.policy.intake(mapping(torch.unsqueeze)(obs, 0))[0])
+        paths = [*spaces.leaves(logits)]
+        names = [f"{kind}.{path}".rstrip(".") for kind in ("action", "logits") for path in paths]
+        return [*names, *(f"next_state.{i}" for i in range(self.n_state))]
+
+
+def _port(name, tensor) -> Port:
+    return Port(name, tuple(tensor.shape[1:]), str(tensor.dtype).removeprefix("torch."))
+
+
+def _filled(tree, values) -> arrdict:
+    """Returns a tree with other leaves, taken from the front of a list."""
+    return tree.map(lambda leaf: values.pop(0)) if tree else tree
+
+
+def _nested(flat) -> Tree:
+    """Returns the tree of leaves by dotted path."""
+    if [*flat] == [""]:
+        return flat[""]
+    tree: dict = {}
+    for path, leaf in flat.items():
+        *groups, name = path.split(".")
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[name] = leaf
+    return tree
 
 
 class Comparison(NamedTuple):
@@ -48,6 +168,9 @@ class Comparison(NamedTuple):
     difference: float
     n_apart: int
     largest: float
+
+
+# ---- Files ----
 
 
 def program(step: Step, name: str = "") -> "torch.export.ExportedProgram":
@@ -71,13 +194,10 @@ def program(step: Step, name: str = "") -> "torch.export.ExportedProgram":
 def write_torch(step: Step, path: Path, name: str = "") -> None:
     """Writes a file for `torch.export.load`, with its ports as the extra file `ports.json`."""
     made = program(step, name)
-    temporary = path.with_name(f".{path.stem}.pt2")
-    try:
-        with _quiet():
-            torch.export.save(made, temporary, extra_files={"ports.json": _ports(step)})
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    content = io.BytesIO()
+    with _quiet():
+        torch.export.save(made, content, extra_files={"ports.json": step.ports})
+    write_atomically(path, content.getvalue())
 
 
 def write_onnx(step: Step, path: Path, name: str = "") -> None:
@@ -87,7 +207,8 @@ def write_onnx(step: Step, path: Path, name: str = "") -> None:
         UserError: the packages are missing; or as `program`.
     """
     require("onnx", "onnxscript")
-    made, names = program(step, name), [[port.name for port in p] for p in _sides(step)]
+    made, sides = program(step, name), (step.inputs, step.outputs)
+    names = [[port.name for port in side] for side in sides]
     with _quiet():
         model = torch.onnx.export(
             made,
@@ -99,7 +220,7 @@ def write_onnx(step: Step, path: Path, name: str = "") -> None:
             verbose=False,
         )
     assert model is not None
-    model.model.metadata_props["megastep"] = _ports(step)
+    model.model.metadata_props["megastep"] = step.ports
     write_atomically(path, model.model_proto.SerializeToString())
 
 
@@ -175,24 +296,10 @@ def require(*names: str) -> list:
         raise UserError(f"format=onnx needs {error.name}: {cure}") from None
 
 
-def _sides(step) -> tuple:
-    return step.inputs, step.outputs
-
-
-def _ports(step) -> str:
-    inputs, outputs = ([port._asdict() for port in side] for side in _sides(step))
-    return json.dumps({"inputs": inputs, "outputs": outputs})
-
-
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Leaves out what exporters say of packages that are not needed."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

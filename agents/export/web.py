@@ -5,7 +5,7 @@ from typing import cast
 
 from megastep.agents import factory
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import eval_env, players
+from megastep.agents.evaluation import eval_env
 from megastep.agents.export.launches import add_policy
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
@@ -51,7 +51,7 @@ def make(
     lanes, names = n_lanes(env), {0: (name, policy)}
     if against is not None:
         eval_env.check_duels(env)
-        player = players.find_player(against, loaded, trained.env, env, False)
+        player = eval_env.find_player(against, loaded, trained.env, env, False)
         if not isinstance(player.policy, Policy):
             raise UserError(f"against={against} is scripted, and a page has trained agents alone")
         names[1] = player.name.partition(",")[0], player.policy

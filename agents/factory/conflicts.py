@@ -68,10 +68,9 @@ def of_training(cfg: "Train") -> Iterator[tuple[str, str]]:
 def of_recording(cfg: "Record") -> Iterator[tuple[str, str]]:
     """Yields what is wrong with the settings of a film."""
     has_run, has_env = cfg.run is not None or cfg.runs is not None, cfg.env is not None
-    stored = [name for name in ("worst", "episode") if getattr(cfg, name) is not None]
     if not (has_run or has_env):
         yield "run", "is missing; without a run, env=explorer records random actions"
-    if has_run and has_env and not stored:
+    if has_run and has_env:
         yield "env", "cannot be combined with run, which has its own"
     if cfg.runs is not None and cfg.run is not None:
         yield "runs", "cannot be combined with run; list all runs in runs"
@@ -82,13 +81,6 @@ def of_recording(cfg: "Record") -> Iterator[tuple[str, str]]:
         yield "file", f"{cfg.file!r} {text}"
     if cfg.against is not None and cfg.run is None:
         yield "against", "needs run=, the agent that plays against it"
-    if len(stored) == 2:
-        yield "episode", "cannot be combined with worst"
-    for name in stored if cfg.run is None else ():
-        yield name, "needs run=, whose newest evaluation it is about"
-    for name in ("geometry", "homes", "against", "env") if stored else ():
-        if getattr(cfg, name) is not None:
-            yield name, f"cannot be combined with {stored[0]}, whose evaluation has its own"
 
 
 def _fields(cfg: "Train") -> Iterator[tuple[str, Any, Any]]:

@@ -342,8 +342,6 @@ class Record(Played):
     steps: Steps
     home: Home | None
     homes: Annotated[tuple[Home, ...], Field(min_length=1, max_length=16)] | None = None
-    worst: Annotated[int, Field(ge=1, le=16)] | None = None
-    episode: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
     against: str | None = None
     file: str | None
     title: str | None = None

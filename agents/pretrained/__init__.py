@@ -49,27 +49,25 @@ def load(name: str, device: str = "auto") -> "Policy":
         UserError: there is none; or it names modules outside megastep that you have not trained
             with here.
     """
-    where = make_device(device)
-    loaded = folders.load_checkpoint(folders.find(name), False, where)
+    where, loaded = _loaded(name, device)
     return restore.policy_of(loaded, device=where)
 
 
-def load_with_env(name: str, device: str = "auto", **options: bool) -> "tuple[Policy, Env]":
-    """Returns what `load` does, and a small environment that it acts in.
+def _loaded(name, device) -> tuple:
+    where = make_device(device)
+    return where, folders.load_checkpoint(folders.find(name), False, where)
 
-    Args:
-        name, device: as for `load`.
-        options: further arguments of the environment, such as `films=True`.
-    """
+
+def load_with_env(name: str, device: str = "auto") -> "tuple[Policy, Env]":
+    """Returns what `load` does, and a small environment that it acts in."""
     from megastep.agents import factory  # which a policy alone does not need
     from megastep.agents.factory import components
 
-    where = make_device(device)
-    loaded = folders.load_checkpoint(folders.find(name), False, where)
+    where, loaded = _loaded(name, device)
     trained = factory.config_of(loaded)
     geometry = components.settings_for("geometry", _HOMES, n=_N_HOMES)
     homes = factory.homes(trained.env, geometry, "test")
-    env = factory.make_sample(trained.env, homes, seed=trained.seed, device=where, **options)
+    env = factory.make_sample(trained.env, homes, seed=trained.seed, device=where)
     restore.load_wrappers(env, loaded)
     return restore.policy_of(loaded, env), env
 
@@ -86,12 +84,11 @@ def make_env(
     wrappers had learnt then.
 
     Args:
-        name: as for `load`.
+        name, device: as for `load`.
         geometries: floor plans, such as `geometries.sample("homes", 64, "test")`, of an environment
             that takes any.
         n_envs: number of environments.
         seed: of the environment.
-        device: as for `load`.
         changes: other settings of the environment, such as `resample=False`.
 
     Raises:
@@ -100,8 +97,7 @@ def make_env(
     from megastep.agents import factory
     from megastep.agents.factory import settings
 
-    where = make_device(device)
-    loaded = folders.load_checkpoint(folders.find(name), False, where)
+    where, loaded = _loaded(name, device)
     trained = factory.config_of(loaded).env
     if unknown := [key for key in changes if not hasattr(trained, key)]:
         raise UserError(

@@ -1,87 +1,54 @@
 """The part of a report that is about a population: lineage, settings over time, best and median."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from megastep.agents.reports.runs import Run
 from megastep.agents.runs import populations
 
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
-
-#: A column of the chart of scores, and what it is of the members' scores.
+#: A line of the chart of scores, and what it is of the members' scores.
 SUMMARIES = {"best": np.nanmax, "median": np.nanmedian}
 
 
-def section(every: Sequence[Run], charts: "list[Row]", table: Callable[..., str]) -> list[str]:
+def section(
+    every: Sequence[Run], chart: Callable[..., str], table: Callable[..., str]
+) -> list[str]:
     """Returns the HTML about the population whose members the runs are; nothing if they are none.
 
     Args:
         every: the runs.
-        charts: what charts show; those of the population are appended.
+        chart: adds a chart of a title, x and lines, and returns its place.
         table: makes a table of a head and rows.
     """
-    roots = {run.folder.parent for run in every}
-    path = min(roots) / populations.FILE
-    if len(roots) > 1 or len(every) < 2 or not path.is_file():
+    path = min(run.folder.parent for run in every) / populations.FILE
+    if len({run.folder.parent for run in every}) > 1 or not path.is_file():
         return []
     generations = populations.read(path)
-    n = len(generations[0]) if generations else 0
+    n = len(every)
     generations = [rows for rows in generations if len(rows) == n]
-    if not generations or n != len(every):
+    if n < 2 or not generations:
         return []
-    return [
-        "<h2>Population</h2>",
-        table(["member", "descends from", "copied at generation", "diverged"], _rows(generations)),
-        f'<div class="grid">{"".join(_places(generations, charts))}</div>',
-    ]
-
-
-def _rows(generations) -> list[list[str]]:
-    rows = []
-    for member in range(len(generations[0])):
-        copied = [
-            f"{row['generation']} from {row['from']}"
-            for row in (rows[member] for rows in generations)
-            if row["from"] != member
-        ]
-        n_diverged = sum(int(rows[member].get("diverged", 0)) for rows in generations)
+    lines = []
+    for member in range(n):
+        own = [rows[member] for rows in generations]
+        copied = [f"{r['generation']} from {r['from']}" for r in own if r["from"] != member]
         line = populations.lineage(generations, member)
         ancestors = [str(n) for i, n in enumerate(line) if i == 0 or n != line[i - 1]]
-        rows.append(
-            [str(member), " → ".join(ancestors), ", ".join(copied) or "never", str(n_diverged)]
-        )
-    return rows
-
-
-def _places(generations, charts) -> list[str]:
-    """Returns the places of the charts: best and median score, then each setting by member."""
-    samples = [int(rows[0]["samples"]) for rows in generations]
-    scores = np.array([[_number(row.get("score")) for row in rows] for rows in generations])
-    lines: dict[str, dict[str, list]] = {}
+        n_diverged = str(sum(int(row.get("diverged", 0)) for row in own))
+        lines.append([str(member), " → ".join(ancestors), ", ".join(copied) or "never", n_diverged])
+    x, shown = [int(rows[0]["samples"]) for rows in generations], {}
+    scores = np.array([[row.get("score") for row in rows] for rows in generations], float)
     if not np.isnan(scores).all():
-        lines["score of the population"] = {
-            name: [None if np.isnan(row).all() else float(of(row)) for row in scores]
+        shown["score of the population"] = {
+            name: [np.nan if np.isnan(row).all() else float(of(row)) for row in scores]
             for name, of in SUMMARIES.items()
         }
     for key in populations.settings_of(generations[0][0]):
-        lines[key] = {
+        shown[key] = {
             f"member {member}": [populations.settings_of(rows[member])[key] for rows in generations]
-            for member in range(len(generations[0]))
+            for member in range(n)
         }
-    places = []
-    for title, series in lines.items():
-        chart = dict(id=f"chart-{len(charts)}", title=title, x_label="samples", sync="samples")
-        shown = [
-            dict(label=label, colour=i, is_bound=False, y=y)
-            for i, (label, y) in enumerate(series.items())
-        ]
-        charts.append(chart | dict(x=samples, series=shown, bands=[]))
-        places.append(f'<div class="chart" id="{chart["id"]}"></div>')
-    return places
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+    places = [chart(title, x, series) for title, series in shown.items()]
+    head = ["member", "descends from", "copied at generation", "diverged"]
+    return ["<h2>Population</h2>", table(head, lines), f'<div class="grid">{"".join(places)}</div>']

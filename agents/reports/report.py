@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +18,6 @@ from megastep.agents.evaluation import tables
 from megastep.agents.reports import homes, populations, runs, seeds
 from megastep.agents.runs import checkpoint
 from megastep.atomic_files import write_atomically
-
-if TYPE_CHECKING:
-    from megastep.agents.types import Row
 
 HERE = Path(__file__).parent
 #: Most points of a curve.
@@ -42,8 +38,7 @@ def write(paths: Sequence[Path], file: Path) -> Path:
     Raises:
         UserError: a folder is no run, runs share no metric, or the file cannot be written.
     """
-    every = [*map(runs.read, paths)]
-    charts: list[Row] = []
+    every, charts = [*map(runs.read, paths)], Charts()
     body = _one(every[0], charts, file) if len(every) == 1 else _several(every, charts)
     title = every[0].folder.name if len(every) == 1 else f"{len(every)} runs"
     parts = {
@@ -66,165 +61,144 @@ def write(paths: Sequence[Path], file: Path) -> Path:
 # ---- One run ----
 
 
-def _one(run: runs.Run, charts: list, file: Path) -> str:
-    """Returns the body of a report of one run. Appends its charts."""
-    samples = run.metrics[-1]["samples"]
+def _one(run: runs.Run, charts: "Charts", file: Path) -> str:
+    """Returns the body of a report of one run. Adds its charts."""
+    samples, score = run.metrics[-1]["samples"], run.score()
     seconds = run.perf[-1].get("perf/seconds", 0) if run.perf else 0
-    score, parts = run.score(), [f"<h1>{_text(run.folder.name)}</h1>"]
     result = f"{samples:,} samples in {console.duration(seconds)}"
     if score is not None:
         result += f", mean return {score:.4g} in training"
-    parts += [f"<p>{_text(run.task)}</p>", f'<p class="result">{_text(result)}</p>']
-    parts += ["<h2>What it was</h2>", _facts(run)]
-    if rows := _evaluations(run):
-        parts += ["<h2>Evaluations</h2>", *rows]
-    parts += homes.section(run)
-    parts += ["<h2>Curves</h2>", _charts(_drawn(run), [([run], "")], charts)]
-    parts += _films(run, file)
-    parts += ["<h2>Checkpoints</h2>", _checkpoints(run)]
-    return "\n".join(parts)
-
-
-def _facts(run: runs.Run) -> str:
     facts = {}
     for row in run.provenance[-1:]:
         shown = "command", "time", "commit", "megastep", "torch", "python", "device"
         facts = {name: row[name] for name in shown if row.get(name)}
     if len(run.provenance) > 1:
         facts["resumed"] = f"{len(run.provenance) - 1} times"
-    facts |= {f"{k}": v for k, v in typed(run).items()}
-    return _table([], [[key, str(value)] for key, value in facts.items()], heads=True)
-
-
-def typed(run: runs.Run) -> "Row":
-    """Returns the settings that the command of a run's first start named, as the run has them."""
+    # the settings that the command of the first start named, as the run has them
     words = str(run.provenance[0].get("command", "")).split() if run.provenance else []
     keys = {word.lstrip("-+").partition("=")[0] for word in words if "=" in word}
-    chosen = dict(runs.leaves(run.config))
-    return {key: value for key, value in chosen.items() if key in keys}
-
-
-def _evaluations(run: runs.Run) -> list[str]:
-    parts = []
+    facts |= {key: value for key, value in runs.leaves(run.config) if key in keys}
+    parts = [f"<h1>{_text(run.folder.name)}</h1>", f"<p>{_text(run.task)}</p>"]
+    parts += [f'<p class="result">{_text(result)}</p>', "<h2>What it was</h2>"]
+    parts.append(_table([], [[key, str(value)] for key, value in facts.items()], heads=True))
+    evaluations = []
     for table in run.evaluations:
-        make = tables.duel_cells if "won" in table["rows"][0] else tables.cells
         try:
-            cells = [make(row) for row in table["rows"]]
-            rows = [[*map(str, row.values())] for row in cells]
+            head, rows = tables.grid(table["rows"])
         except (KeyError, TypeError, ValueError, AttributeError):
             continue  # of another version, or a stranger's
-        parts += [f"<p>{_text(str(table.get('title', '')))}</p>", _table([*cells[0]], rows)]
-    return parts
-
-
-def _films(run: runs.Run, file: Path) -> list[str]:
-    films = sorted(run.folder.glob("*.mp4"))
-    links = [os.path.relpath(film, file.parent) for film in films]
-    shown = [f'<video controls loop muted src="{_text(link)}"></video>' for link in links]
-    return ["<h2>Films</h2>", *shown] if shown else []
-
-
-def _checkpoints(run: runs.Run) -> str:
+        evaluations += [f"<p>{_text(str(table.get('title', '')))}</p>", _table(head, rows)]
+    parts += ["<h2>Evaluations</h2>", *evaluations] if evaluations else []
+    parts += homes.section(run)
+    parts += ["<h2>Curves</h2>", _curves([run], [([run], "")], charts)]
+    films = [os.path.relpath(film, file.parent) for film in sorted(run.folder.glob("*.mp4"))]
+    shown = [f'<video controls loop muted src="{_text(link)}"></video>' for link in films]
+    parts += ["<h2>Films</h2>", *shown] if shown else []
     rows = []
     for path in checkpoint.list_checkpoints(run.folder / "checkpoints"):
         n_bytes = sum(part.stat().st_size for part in path.glob("*") if part.is_file())
         rows.append([path.name, f"{checkpoint.step_of(path):,}", f"{n_bytes / 1e6:.1f} MB"])
-    return _table(["checkpoint", "samples", "size"], rows) if rows else "<p>None is kept.</p>"
+    kept = _table(["checkpoint", "samples", "size"], rows) if rows else "<p>None is kept.</p>"
+    return "\n".join([*parts, "<h2>Checkpoints</h2>", kept])
 
 
 # ---- Several runs ----
 
 
-def _several(every: list[runs.Run], charts: list) -> str:
-    """Returns the body of a report that compares runs. Appends its charts."""
+def _several(every: list[runs.Run], charts: "Charts") -> str:
+    """Returns the body of a report that compares runs. Adds its charts."""
     groups = runs.groups_of(every)
-    tasks = ", ".join(sorted({run.task for run in every}))
+    tasks = "; ".join(dict.fromkeys(run.task for run in every))
     parts = [f"<h1>{len(every)} runs</h1>", f"<p>{_text(tasks)}</p>"]
     head = ["runs", "seeds", "IQM of the return", "95 % interval", "mean", "samples"]
     rows, scored = [], {}
     for name, group in groups.items():
         values = [score for run in group if (score := run.score()) is not None]
         samples = max(run.metrics[-1]["samples"] for run in group)
-        cells = [name, str(len(group))]
+        numbers = 3 * ["none"]
         if values:
             scored[name] = values
             middle, lower, upper = seeds.interval([values])
-            cells += [f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}", f"{np.mean(values):.4g}"]
-        rows.append([*cells, *["none"] * (5 - len(cells)), f"{samples:,}"])
-    parts += ["<h2>Results</h2>", _table(head, rows)]
-    parts += [f"<p>{METHOD}</p>"]
+            numbers = [f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}", f"{np.mean(values):.4g}"]
+        rows.append([name, str(len(group)), *numbers, f"{samples:,}"])
+    parts += ["<h2>Results</h2>", _table(head, rows), f"<p>{METHOD}</p>"]
     if keys := runs.differing(every):
         values = [[key, *(str(g[0].settings().get(key)) for g in groups.values())] for key in keys]
         parts += ["<h2>Settings that differ</h2>", _table(["setting", *groups], values)]
-    parts += populations.section(every, charts, _table)
-    parts += ["<h2>Curves</h2>"]
-    parts += [_charts(_drawn(*every), [(group, name) for name, group in groups.items()], charts)]
+    parts += populations.section(every, charts.add, _table)
+    named = [(group, name) for name, group in groups.items()]
+    parts += ["<h2>Curves</h2>", _curves(every, named, charts)]
     if scored:
-        parts += ["<h2>Performance profiles</h2>", _profiles(scored, charts)]
+        all_scores = np.concatenate([*scored.values()])
+        limits = np.linspace(all_scores.min() - 1e-9, all_scores.max(), 200)
+        lines = {name: seeds.profile([values], limits) for name, values in scored.items()}
+        place = charts.add("seeds above a return", limits, lines, "return")
+        parts += ["<h2>Performance profiles</h2>", f'<div class="grid">{place}</div>']
     return "\n".join(parts)
-
-
-def _profiles(scored: Mapping[str, list[float]], charts: list) -> str:
-    every = np.concatenate([*scored.values()])
-    limits = np.linspace(every.min() - 1e-9, every.max(), 200)
-    lines = [
-        dict(label=name, colour=i, is_bound=False, y=_plain(seeds.profile([values], limits)))
-        for i, (name, values) in enumerate(scored.items())
-    ]
-    chart = dict(id="profiles", title="seeds above a return", x_label="return", sync="profiles")
-    charts.append(chart | dict(x=_plain(limits), series=lines, bands=[]))
-    return '<div class="grid"><div class="chart" id="profiles"></div></div>'
 
 
 # ---- Charts and tables ----
 
 
-def _drawn(*every: runs.Run) -> list[str]:
-    """Returns the metrics that have charts, what matters first, without those that never change."""
+class Charts(list):
+    """What the charts of a page show."""
+
+    def add(
+        self,
+        title: str,
+        x: Iterable[float],
+        lines: Mapping[str, Iterable],
+        x_label: str = "samples",
+    ) -> str:
+        """Adds a chart, and returns its place.
+
+        Args:
+            lines: {label: y, or (mean, upper, lower) to draw with a band}.
+        """
+        series, bands = [], []
+        for i, (label, y) in enumerate(lines.items()):
+            one = dict(label=label, colour=i, is_bound=False)
+            if not isinstance(y, tuple):
+                series.append({**one, "y": _plain(y)})
+                continue
+            bands.append([3 * i + 2, 3 * i + 3, i])
+            for name, values in zip(("", " upper", " lower"), y, strict=True):
+                about = dict(label=f"{label}{name}", is_bound=bool(name), y=_plain(values))
+                series.append(one | about)
+        place = f"chart-{len(self)}"
+        about = dict(id=place, title=title, x_label=x_label, sync=x_label, x=_plain(x))
+        self.append({**about, "series": series, "bands": bands})
+        return f'<div class="chart" id="{place}"></div>'
+
+
+def _curves(every: Sequence[runs.Run], groups: Sequence[tuple[list, str]], charts: Charts) -> str:
+    """Returns the places of the metrics' charts, what matters first, without those that never
+    change: a line per group in each.
+    """
     names = [name for name in runs.metrics_of(every) if name not in NOT_DRAWN]
     kept = [n for n in names if n in ORDER or len({y for r in every for y in r.curve(n)[1]}) > 1]
     rank = {n: next((i for i, start in enumerate(ORDER) if n.startswith(start)), 9) for n in kept}
-    return sorted(kept, key=rank.__getitem__)
-
-
-def _charts(names: list[str], groups: Sequence[tuple[list, str]], charts: list) -> str:
-    """Returns the places of charts, a line per group in each, and appends the charts."""
     places = []
-    for name in names:
+    for name in sorted(kept, key=rank.__getitem__):
         curves = [[run.curve(name) for run in group] for group, _ in groups]
         if not all(x for group in curves for x, _ in group):
             continue
-        chart = dict(id=f"chart-{len(charts)}", title=name, x_label="samples", sync="samples")
         if len(groups) == len(curves[0]) == 1:
-            x, y = _thinned(*curves[0][0])
-            lines, bands = [dict(label=name, colour=0, is_bound=False, y=y)], []
+            x, y = curves[0][0]
+            n = -(-len(x) // N_POINTS)  # neighbours that are averaged
+            x, y = ([np.mean(v[i : i + n]) for i in range(0, len(x), n)] for v in (x, y))
+            lines = {name: y}
         else:
-            x, lines, bands = _averaged(curves, [label for _, label in groups])
-        charts.append(chart | dict(x=x, series=lines, bands=bands))
-        places.append(f'<div class="chart" id="{chart["id"]}"></div>')
+            averaged = [seeds.band(group) for group in curves]
+            x = np.unique(np.concatenate([one["x"] for one in averaged]))
+            x, lines = x[:: max(1, len(x) // N_POINTS)], {}
+            for one, (_, label) in zip(averaged, groups, strict=True):
+                lines[label] = tuple(
+                    np.interp(x, one["x"], one[bound], left=np.nan, right=np.nan)
+                    for bound in ("mean", "upper", "lower")
+                )
+        places.append(charts.add(name, x, lines))
     return f'<div class="grid">{"".join(places)}</div>'
-
-
-def _averaged(curves: Sequence, labels: list[str]) -> tuple[list, list, list]:
-    """Returns (x, lines, bands) of groups of curves, on one axis."""
-    averaged = [seeds.band(group) for group in curves]
-    x = np.unique(np.concatenate([one["x"] for one in averaged]))
-    x = x[:: max(1, len(x) // N_POINTS)]
-    lines, bands = [], []
-    for i, (one, label) in enumerate(zip(averaged, labels, strict=True)):
-        for name in ("mean", "upper", "lower"):
-            y = np.interp(x, one["x"], one[name], left=np.nan, right=np.nan)
-            text = label if name == "mean" else f"{label} {name}"
-            lines.append(dict(label=text, colour=i, is_bound=name != "mean", y=_plain(y)))
-        bands.append([3 * i + 2, 3 * i + 3, i])
-    return _plain(x), lines, bands
-
-
-def _thinned(x: Sequence[float], y: Sequence[float]) -> tuple[list, list]:
-    """Returns at most `N_POINTS` points, each the mean of as many neighbours."""
-    n = -(-len(x) // N_POINTS)
-    chunks = range(0, len(x), n)
-    return tuple(_plain([np.mean(v[i : i + n]) for i in chunks]) for v in (x, y))  # type: ignore
 
 
 def _plain(values: Iterable[float]) -> list:
@@ -237,11 +211,7 @@ def _text(text: str) -> str:
 
 
 def _table(head: list[str], rows: Iterable[Sequence[str]], heads: bool = False) -> str:
-    """Returns a table.
-
-    Args:
-        heads: the first cell of each row is its head.
-    """
+    """Returns a table, with `heads` of rows whose first cell is their head."""
     lines = ["".join(f"<th>{_text(cell)}</th>" for cell in head)] if head else []
     for first, *others in rows:
         cell = f"<th>{_text(first)}</th>" if heads else f"<td>{_text(first)}</td>"

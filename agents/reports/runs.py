@@ -63,40 +63,27 @@ class Run(NamedTuple):
 
 def read(folder: Path) -> Run:
     """Returns what a run's folder holds. Raises UserError if it is no run."""
-    path = folders.find(str(folder))
-    folder = folders.folder_of(path)
-    config = _config(folder)
-    rows = []
-    for name in ("metrics.jsonl", "perf.jsonl", "provenance.jsonl"):
-        with contextlib.suppress(FileNotFoundError):
-            rows.append(json_lines.read(folder / name))
-            continue
-        rows.append([])
-    if not rows[0]:
-        raise UserError(f"{folder} has no metrics yet; its first report writes metrics.jsonl")
-    tables = sorted((folder / "evaluations").glob("*.json"))
-    return Run(folder, config, *rows, evaluations=[*filter(None, map(_evaluation, tables))])
-
-
-def _config(folder: Path) -> "Config":
-    path = folder / "config.yaml"
-    try:
-        config = yaml.safe_load(path.read_bytes())
-    except FileNotFoundError:
-        raise UserError(f"{folder} is not a run: it has no config.yaml") from None
-    except (ValueError, yaml.YAMLError, RecursionError):
-        config = None
+    folder = folders.folder_of(folders.find(str(folder)))
+    path, config, rows = folder / "config.yaml", None, []
+    with contextlib.suppress(ValueError, yaml.YAMLError, RecursionError):
+        try:
+            config = yaml.safe_load(path.read_bytes())
+        except FileNotFoundError:
+            raise UserError(f"{folder} is not a run: it has no config.yaml") from None
     if not isinstance(config, dict) or not isinstance(config.get("env"), dict):
         raise UserError(f"{path} does not hold the settings of a run")
-    return config
-
-
-def _evaluation(path: Path) -> "Row | None":
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        table = json.loads(path.read_bytes())
-        if isinstance(table, dict) and isinstance(table.get("rows"), list) and table["rows"]:
-            return table
-    return None
+    for name in ("metrics.jsonl", "perf.jsonl", "provenance.jsonl"):
+        is_there = (folder / name).exists()
+        rows.append(json_lines.read(folder / name) if is_there else [])
+    if not rows[0]:
+        raise UserError(f"{folder} has no metrics yet; its first report writes metrics.jsonl")
+    tables = []
+    for path in sorted((folder / "evaluations").glob("*.json")):
+        with contextlib.suppress(OSError, ValueError, RecursionError):
+            table = json.loads(path.read_bytes())
+            if isinstance(table, dict) and isinstance(table.get("rows"), list) and table["rows"]:
+                tables.append(table)
+    return Run(folder, config, *rows, evaluations=tables)
 
 
 def expanded(names: Sequence[str]) -> list[Path]:

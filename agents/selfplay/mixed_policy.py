@@ -1,6 +1,7 @@
-"""Several policies that act in one environment, each in a fixed set of lanes.
+"""Several policies that act in one environment, each in a fixed set of lanes; and who has won.
 
-Axes: B lanes of the environment, M lanes of the mixed policy (M = B unless others act too).
+Axes: B lanes of the environment, M lanes of the mixed policy (M = B unless others act too); N
+environments of A agents, whose index is their slot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +18,8 @@ class MixedPolicy:
     """A policy made of several policies, each with a fixed set of lanes.
 
     Call it like any policy if it has all lanes of the environment. Use `start` and `finish` if
-    other policies act in the remaining lanes.
-
-    On a GPU each policy runs on a separate CUDA stream, also inside a CUDA graph, because one small
-    network does not fill the GPU.
+    other policies act in the remaining lanes. On a GPU each policy runs on a separate CUDA stream,
+    also inside a CUDA graph, because one small network does not fill the GPU.
 
     Args:
         policies: the policies. A bot that reads the environment has the method `in_lanes(lanes)`,
@@ -66,7 +65,7 @@ class MixedPolicy:
 
     def select_lanes(self, world: World) -> arrdict:
         """Returns a copy of `obs`, `reset` and, if there is one, `mask`, in the lanes of the
-        policies, in their order.
+        policies.
         """
         parts = {key: world[key] for key in ("obs", "reset", "mask") if key in world}
         return select_tree(arrdict(parts), self.lanes)
@@ -78,9 +77,8 @@ class MixedPolicy:
         sample: bool = True,
         generator: torch.Generator | None = None,
     ) -> list[tuple[Mapping, arrdict]]:
-        """Acts on the result of `select_lanes`. Returns what `finish` takes.
-
-        Until then nothing may use the results, and `world` and `state` must not change.
+        """Acts on the result of `select_lanes`. Returns what `finish` takes: until then nothing may
+        use the results, and `world` and `state` must not change.
         """
         for stream in self.streams:
             stream.wait_stream(torch.cuda.current_stream(self.lanes.device))
@@ -97,3 +95,38 @@ class MixedPolicy:
             torch.cuda.current_stream(self.lanes.device).wait_stream(stream)
         actions = cat([decision["actions"] for decision, _ in started])
         return actions, arrdict({str(i): state for i, (_, state) in enumerate(started)})
+
+
+def score_pairs(
+    terminal: torch.Tensor, returns: torch.Tensor, slots: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scores one agent of each environment against each other agent, on a single step.
+
+    A pair is decided when either agent's episode is terminal. If only one is, the other agent has
+    won. If both are, as in a game that ends for all, the higher return wins, and equal returns are
+    a draw.
+
+    Args:
+        terminal: (N, A) bool, of this step.
+        returns: (N, A), rewards since each agent's episode began.
+        slots: (N, 1) int64, the agent that is scored.
+
+    Returns:
+        Two (N,) float32: pairs won, with a draw as half, and pairs decided.
+    """
+    slot_terminal, slot_return = terminal.gather(1, slots), returns.gather(1, slots)
+    sign = torch.where(
+        terminal == slot_terminal, slot_return - returns, terminal.float() - slot_terminal.float()
+    ).sign()
+    decided = (terminal | slot_terminal).scatter(1, slots, False)
+    won = torch.where(decided, (1 + sign) / 2, 0.0).sum(1)
+    return won, decided.float().sum(1)
+
+
+def rotating_slots(
+    n_envs: int, n_agents: int, device: torch.device | str | None = None
+) -> torch.Tensor:
+    """Returns one slot per environment, (N, 1) int64: slot 0 for the first N / A environments, and
+    so on.
+    """
+    return (torch.arange(n_envs, device=device) * n_agents // n_envs)[:, None]

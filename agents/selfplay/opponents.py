@@ -13,8 +13,7 @@ from pydantic import Field, SkipValidation
 
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
-from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.selfplay.slots import rotating_slots, score_pairs
+from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_slots, score_pairs
 from megastep.agents.storage.rollout import copy_tree
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
@@ -34,32 +33,26 @@ class Opponents:
 
     In an environment with opponents, one agent learns and a single opponent controls all others.
     The learning agent's slot rotates across environments. In the remaining environments, which come
-    first, the current policy controls every agent and learns from all of them.
-
-    Opponents' lanes have `learns` False, and `step` ignores the decision's actions in them.
+    first, the current policy controls every agent and learns from all of them. Opponents' lanes
+    have `learns` False, and `step` ignores the decision's actions in them.
 
     Args:
         env: environment with at least two agents.
         policy: the policy that learns. Snapshots are copies of its actor.
         scripted: the bot, a policy; needed if `bot` > 0.
-        past: fraction of environments played against snapshots.
-        bot: fraction of environments played against `scripted`.
-        league: fraction of environments played against other members of a population, of which
-            there are as many snapshots again.
+        past, bot, league: fractions of environments played against snapshots, against `scripted`,
+            and against other members of a population, of which there are as many snapshots again.
         snapshots: number of snapshots. Each gets the same number of environments.
         every: updates between two refreshes; each replaces the oldest snapshot.
         seed: of the opponents' actions.
 
-    Attributes:
+    Attributes, beside those of `env`:
         learners: (B,) bool, lanes whose transitions are used for learning. Never changes, so CUDA
             graphs stay valid.
         matchups: (B,) bool by name, the lanes of environments played against "now" (the current
             policy), "past", "league" and "bot". Names without environments are absent.
-        snapshots: the snapshots, as policies. Refreshed in place.
-        rivals: those of other members, which `refresh_rival` sets; until then, of the policy.
+        snapshots, rivals: those of the policy and of other members, refreshed in place.
         scripted: the bot, or None if it does not play.
-
-    All other attributes are those of `env`.
 
     Raises:
         ValueError: the environment has one agent, `past + league + bot` is 0 or above 1, `bot > 0`
@@ -98,11 +91,15 @@ class Opponents:
         self.generator = SeededGenerator(stream_seed(seed, "opponents"))
         n_by_opponent = [n_per_snapshot] * len(self.snapshots) + [n_per_rival] * len(self.rivals)
         n_by_opponent += [n_bot] * (n_bot > 0)
-        self.n_past, self.n_opposed = n_per_snapshot * len(self.snapshots), sum(n_by_opponent)
-        self.n_league = n_per_rival * len(self.rivals)
-
-        slots = [rotating_slots(n, self.n_agents, device) for n in n_by_opponent]
-        self.slots = torch.cat(slots)  # (M, 1)
+        self.n_opposed = sum(n_by_opponent)
+        self.n_by_kind = {
+            "past": n_per_snapshot * len(self.snapshots),
+            "league": n_per_rival * len(self.rivals),
+            "bot": n_bot,
+        }
+        self.slots = torch.cat(  # (M, 1)
+            [rotating_slots(n, self.n_agents, device) for n in n_by_opponent]
+        )
         learners = torch.ones(env.n_envs, self.n_agents, dtype=torch.bool, device=device)
         learners[-self.n_opposed :] = torch.zeros_like(self.slots, dtype=torch.bool)
         learners[-self.n_opposed :].scatter_(1, self.slots, True)
@@ -111,17 +108,13 @@ class Opponents:
         n_lanes_by_opponent = [n * (self.n_agents - 1) for n in n_by_opponent]
         opponents = [*self.snapshots, *self.rivals, scripted][: len(n_by_opponent)]
         self.mixed_policy = MixedPolicy(opponents, opponent_lanes.split(n_lanes_by_opponent))
-        self.matchups = self._matchups({"past": self.n_past, "league": self.n_league, "bot": n_bot})
+        n_by_kind = {"now": env.n_envs - self.n_opposed, **self.n_by_kind}
+        n_lanes = torch.tensor(list(n_by_kind.values())) * self.n_agents
+        kind = torch.arange(len(n_by_kind)).repeat_interleave(n_lanes).to(device)
+        self.matchups = {name: kind == i for i, name in enumerate(n_by_kind) if n_by_kind[name]}
         # (2, M): pairs of a learning agent and an opponent that were won and decided since `pop`
         self.pairs = torch.zeros(2, self.n_opposed, device=device)
         self.returns = torch.zeros(self.n_opposed, self.n_agents, device=device)
-
-    def _matchups(self, n_by_kind) -> dict[str, torch.Tensor]:
-        """Returns {name: (B,) bool} from the number of environments per kind of opponent."""
-        n_by_kind = {"now": self.env.n_envs - self.n_opposed, **n_by_kind}
-        n_lanes = torch.tensor(list(n_by_kind.values())) * self.n_agents
-        kind = torch.arange(len(n_by_kind)).repeat_interleave(n_lanes).to(self.env.device)
-        return {name: kind == i for i, name in enumerate(n_by_kind) if n_by_kind[name]}
 
     def __getattr__(self, name: str) -> Any:
         if name == "env":  # not set yet while the object is being copied
@@ -143,7 +136,7 @@ class Opponents:
     @torch.no_grad()
     def begin_step(self) -> None:
         """Has the opponents choose the actions of the next step; on a GPU beside whatever comes
-        until then. If it is not called, `step` does it.
+        until then. `step` does it otherwise.
         """
         generator = self.generator.on(self.learners.device)
         self.acting = self.mixed_policy.start(
@@ -152,9 +145,8 @@ class Opponents:
 
     @torch.no_grad()
     def step(self, decision: Mapping) -> World:
-        """Steps the environment.
-
-        Uses `decision.actions`, (B, ...), in the lanes that learn; the opponents act in the others.
+        """Steps the environment by `decision.actions`, (B, ...), in the lanes that learn; the
+        opponents act in the others.
         """
         if self.acting is None:
             self.begin_step()
@@ -193,10 +185,7 @@ class Opponents:
         self.returns.masked_fill_(terminal | truncated, 0.0)
 
     def refresh_snapshots(self, policy: Policy, n_updates: int) -> None:
-        """Copies the policy into the oldest snapshot, every `every` updates. Called after each one.
-
-        Also clears that snapshot's hidden state.
-        """
+        """Copies the policy into the oldest snapshot, every `every` updates. Called after each."""
         if not self.snapshots or n_updates % self.every:
             return
         self._refresh((n_updates // self.every - 1) % len(self.snapshots), policy)
@@ -206,8 +195,8 @@ class Opponents:
         return bool(self.rivals) and n_updates % self.every == 0
 
     def next_rival(self, member: int, size: int, n_updates: int) -> int:
-        """Returns whose policy `refresh_rival` is to copy after so many updates: the members of a
-        population take turns, beginning with the one after this member.
+        """Returns whose policy `refresh_rival` is to copy: the members of a population take turns,
+        beginning with the one after this member.
         """
         return (member + 1 + (n_updates // self.every - 1) % (size - 1)) % size
 
@@ -226,9 +215,8 @@ class Opponents:
     def pop_win_rates(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
     ) -> dict[str, float]:
-        """Returns the fraction of decided pairs that were won since the last call. Synchronises.
-
-        A kind of opponent without a decided pair is absent.
+        """Returns the fraction of decided pairs that were won since the last call, of each kind of
+        opponent that has one. Synchronises.
 
         Metrics:
             episode/won/KIND: fraction of pairs won against past snapshots (past), other members of
@@ -238,23 +226,17 @@ class Opponents:
         Args:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.
         """
-        win_rates, by_kind = {}, self._pairs_by_kind()
-        sums = torch.stack([pairs.double().sum(1) for pairs in by_kind.values()])
-        for name, (won, decided) in zip(by_kind, sum_over_ranks(sums).tolist(), strict=True):
+        win_rates, parts = {}, self.pairs.split([*self.n_by_kind.values()], 1)
+        sums = sum_over_ranks(torch.stack([pairs.double().sum(1) for pairs in parts]))
+        for name, (won, decided) in zip(self.n_by_kind, sums.tolist(), strict=True):
             if decided:
                 win_rates[f"episode/won/{name}"] = won / decided
         self.pairs.zero_()
         return win_rates
 
-    def _pairs_by_kind(self) -> dict[str, torch.Tensor]:
-        """Returns the parts of `pairs`, (2, m) by kind of opponent. They are views."""
-        ends = [self.n_past, self.n_past + self.n_league]
-        past, league, bot = self.pairs.tensor_split(ends, 1)
-        return {"past": past, "league": league, "bot": bot}
-
     def state_dict(self) -> StateDict:
         """Returns the snapshots, the generator's state, and by lane what opponents see and remember
-        and the scores of the episodes in progress. The environment has a state of its own.
+        and the scores of the episodes in progress.
         """
         opponents = [*self.snapshots, *self.rivals]
         return dict(
@@ -264,10 +246,8 @@ class Opponents:
         )
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Restores a `state_dict`. Without `lanes`, the opponents begin new episodes.
-
-        Raises:
-            ValueError: the state has another number of snapshots.
+        """Restores a `state_dict`. Without `lanes`, the opponents begin new episodes. Raises
+        ValueError if it has another number of snapshots.
         """
         opponents = [*self.snapshots, *self.rivals]
         if len(state["snapshots"]) != len(opponents):
@@ -290,10 +270,7 @@ def count_environments(
     env: Env, n_envs: int, past: float, bot: float, snapshots: int, league: float = 0.0
 ) -> tuple[int, int, int]:
     """Returns the number of environments per snapshot, against the bot, and per snapshot of another
-    member, of `n_envs` like `env`.
-
-    Raises:
-        ValueError: as for `Opponents`.
+    member, of `n_envs` like `env`. Raises ValueError as `Opponents`.
     """
     if optional(env, "n_agents") < 2:
         raise ValueError(
@@ -310,9 +287,8 @@ def count_environments(
             f"opponents.past={past}{others} and opponents.bot={bot} are fractions of the "
             "environments, so their sum must be at most 1"
         )
-    n_bot = round(bot * n_envs)
-    for name, share in {"past": past, "league": league}.items():
-        n = round(share * n_envs)
+    n_past, n_bot, n_league = (round(share * n_envs) for share in (past, bot, league))
+    for name, share, n in (("past", past, n_past), ("league", league, n_league)):
         if share and n < snapshots:
             raise ValueError(
                 f"opponents.{name}={share} of {n_envs:,} environments is {n:,} environments, too "
@@ -324,5 +300,4 @@ def count_environments(
             f"opponents.bot={bot} of {n_envs:,} environments is none: raise opponents.bot or "
             "env.n_envs"
         )
-    n_past, n_league = round(past * n_envs), round(league * n_envs)
     return n_past // snapshots, n_bot, n_league // snapshots

@@ -94,21 +94,12 @@ class Plan:
         from matplotlib.backends.backend_agg import RendererAgg
 
         if not isinstance(renderer, RendererAgg):
-            self._floor(renderer)
-            self._see_floor(renderer, 0)
-            self._walls(renderer, np.full(len(self.texels), self.seen is None))
+            self.draw_floor(renderer)
+            self.draw_views(renderer, 0)
+            self.draw_walls(renderer, np.full(len(self.texels), self.seen is None))
             if self.seen is not None:
-                self._walls(renderer, self.seen, self.seen)
+                self.draw_walls(renderer, self.seen, self.seen)
             return
-        pixels = self._pixels(renderer)
-        frame, shown = np.asarray(renderer.buffer_rgba()), pixels.update(self)
-        x0, y0, x1, y1 = np.round(self.area.bbox.extents).astype(int)
-        height = len(frame)
-        rows, columns = slice(max(height - y1, 0), height - y0), slice(max(x0, 0), x1)
-        frame[rows, columns] = shown[rows, columns]
-
-    def _pixels(self, renderer) -> _Pixels:
-        """Returns what is kept of this plan at this place and size."""
         key = (
             *(part.tobytes() for part in (self.lines, self.texels)),
             self.area.transform.get_matrix().tobytes(),
@@ -120,33 +111,34 @@ class Plan:
             if len(_KEPT) > MAX_KEPT:
                 _KEPT.popitem(last=False)
         _KEPT.move_to_end(key)
-        return _KEPT[key]
+        frame, shown = np.asarray(renderer.buffer_rgba()), _KEPT[key].update(self)
+        x0, y0, x1, y1 = np.round(self.area.bbox.extents).astype(int)
+        height = len(frame)
+        rows, columns = slice(max(height - y1, 0), height - y0), slice(max(x0, 0), x1)
+        frame[rows, columns] = shown[rows, columns]
 
-    def _floor(self, renderer) -> None:
+    def draw_floor(self, renderer) -> None:
         """Draws the floor, hatched if it counts where agents looked."""
-        theme, area = self.area.style.colours, self.area
-        x0, y0, x1, y1 = area.bbox.extents
         from matplotlib.path import Path
         from matplotlib.transforms import IdentityTransform
 
+        theme, area = self.area.style.colours, self.area
+        x0, y0, x1, y1 = area.bbox.extents
         page = Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
         area.draw_path(renderer, page, IdentityTransform(), theme.outside)
         rooms = _rooms(self.lines.tobytes(), _points(self.lights).tobytes())
-        if self.views is None:
-            area.draw_path(renderer, rooms, area.transform, theme.floor)
-        else:
-            area.draw_path(renderer, rooms, area.transform, theme.unseen, hatch=theme.hatch)
+        fill, hatch = (theme.floor, None) if self.views is None else (theme.unseen, theme.hatch)
+        area.draw_path(renderer, rooms, area.transform, fill, hatch=hatch)
 
-    def _see_floor(self, renderer, first) -> None:
+    def draw_views(self, renderer, first) -> None:
+        """Draws the floor that was seen, from the view of a number on."""
         from matplotlib.path import Path
 
+        area, floor = self.area, self.area.style.colours.floor
         for view in () if self.views is None else self.views[first:]:
-            floor = self.area.style.colours.floor
-            self.area.draw_path(
-                renderer, Path(view, closed=False), self.area.transform, floor, floor, 0.5
-            )
+            area.draw_path(renderer, Path(view, closed=False), area.transform, floor, floor, 0.5)
 
-    def _walls(self, renderer, is_seen, only: slice | np.ndarray = slice(None)) -> None:
+    def draw_walls(self, renderer, is_seen, only: slice | np.ndarray = slice(None)) -> None:
         """Draws texels, all or some: grey where they are not seen."""
         from matplotlib.collections import LineCollection
 
@@ -178,48 +170,33 @@ class _Pixels:
 
         size = renderer.width, renderer.height, renderer.dpi
         self.floor, self.walls = RendererAgg(*size), RendererAgg(*size)
-        plan._floor(self.floor)
-        plan._walls(self.walls, np.full(len(plan.texels), plan.seen is None))
-        self._floor, self._walls = (np.asarray(x.buffer_rgba()) for x in (self.floor, self.walls))
-        self._start = self._floor.copy(), self._walls.copy()
-        # walls are few of the pixels, and always the same ones
-        opacity = self._walls[..., 3].ravel()
-        self._solid = np.flatnonzero(opacity == 255)
-        self._edges = np.flatnonzero((opacity > 0) & (opacity < 255))
-        self._opacity = opacity[self._edges, None] / np.float32(255)
-        self._joined = None
-        self._forget(plan)
-
-    def _forget(self, plan) -> None:
-        self._floor[:], self._walls[:] = self._start
-        self._joined, self._views, self._seen = (
-            None,
-            np.zeros((0, 0, 2)),
-            np.zeros(len(plan.texels), bool),
-        )
+        plan.draw_floor(self.floor)
+        plan.draw_walls(self.walls, np.full(len(plan.texels), plan.seen is None))
+        self.layers = [np.asarray(layer.buffer_rgba()) for layer in (self.floor, self.walls)]
+        self.start = [layer.copy() for layer in self.layers]
+        self.views, self.seen = np.zeros((0, 0, 2)), np.zeros(len(plan.texels), bool)
+        self.joined: Any = None
 
     def update(self, plan: Plan) -> np.ndarray:
         """Draws what was seen since the last call. Returns the image, (H, W, 4)."""
-        seen, views, n = plan.seen, plan.views, len(self._views)
-        if (seen is not None and (self._seen & ~seen).any()) or (
-            views is not None and n and (n > len(views) or (views[n - 1] != self._views[-1]).any())
-        ):
-            self._forget(plan)  # another episode
-            n = 0
-        if views is not None and len(views) > n:
-            plan._see_floor(self.floor, n)
-            self._views, self._joined = views, None
-        if seen is not None and (seen & ~self._seen).any():
-            plan._walls(self.walls, seen, seen & ~self._seen)
-            self._seen, self._joined = seen, None
-        if self._joined is None:
-            self._joined = self._floor.copy()
-            joined, walls = (x.view(np.uint32).ravel() for x in (self._joined, self._walls))
-            joined[self._solid] = walls[self._solid]
-            joined, walls = (x.reshape(-1, 4) for x in (self._joined, self._walls))
-            below = joined[self._edges, :3].astype(np.float32)
-            joined[self._edges, :3] = below + self._opacity * (walls[self._edges, :3] - below)
-        return self._joined
+        from PIL import Image
+
+        seen = self.seen if plan.seen is None else plan.seen
+        views, n = self.views if plan.views is None else plan.views, len(self.views)
+        if (self.seen & ~seen).any() or (
+            n and (n > len(views) or (views[n - 1] != self.views[-1]).any())
+        ):  # another episode
+            for layer, start in zip(self.layers, self.start):
+                layer[:] = start
+            self.seen, self.joined, n = np.zeros_like(seen), None, 0
+        new = seen & ~self.seen
+        if self.joined is None or len(views) > n or new.any():
+            plan.draw_views(self.floor, n)
+            if new.any():
+                plan.draw_walls(self.walls, seen, new)
+            self.joined = np.array(Image.alpha_composite(*map(Image.fromarray, self.layers)))
+        self.views, self.seen = views, seen
+        return self.joined
 
 
 def _joined(parts, dtype, empty) -> np.ndarray:

@@ -22,65 +22,41 @@ class Ref(NamedTuple):
 
 
 class Launch(NamedTuple):
-    """A launch of an operation.
-
-    Attributes:
-        library: the library that has it.
-        operation: its name.
-        values: {name of a word of its struct: number, place, or None for a null pointer}.
-    """
+    """A launch of an operation of a library."""
 
     library: KernelLibrary
     operation: str
-    values: dict[str, int | float | Ref | None]
+    values: dict[str, int | float | Ref | None]  # by word of its struct; None for a null pointer
 
 
 class Buffer(NamedTuple):
-    """A part of a program's memory.
-
-    Attributes:
-        n_bytes: its size.
-        contents: what it holds at the start; None: anything.
-        is_float: whether that is float32 alone.
-    """
+    """A part of a program's memory."""
 
     n_bytes: int
-    contents: bytes | None = None
-    is_float: bool = False
+    contents: bytes | None = None  # what it holds at the start; None: anything
+    is_float: bool = False  # that is float32 alone
 
 
 class Leaf(NamedTuple):
-    """A tensor in a program's memory.
+    """A tensor in a program's memory."""
 
-    Attributes:
-        ref: the place of its first number.
-        shape: (B, ...).
-        strides: numbers between neighbours along each axis.
-        dtype: of its numbers.
-    """
-
-    ref: Ref
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
+    ref: Ref  # the place of its first number
+    shape: tuple[int, ...]  # (B, ...)
+    strides: tuple[int, ...]  # numbers between neighbours along each axis
     dtype: torch.dtype
 
 
 @dataclass
 class Program:
-    """An environment, and what acts in it, as launches.
+    """An environment, and what acts in it, as launches."""
 
-    Attributes:
-        buffers: the memory.
-        sections: {name: launches}, such as `reset`, `step` and `policy`.
-        copies: (from, to), whole buffers that are copied after `reset`.
-        world: {dotted path: leaf} of the world that a step returns.
-        actions: the actions that a step takes, (B, ...).
-    """
-
-    actions: Leaf
+    actions: Leaf  # that a step takes, (B, ...)
     buffers: list[Buffer] = field(default_factory=list)
+    #: Such as `reset`, `step` and `policy`.
     sections: dict[str, list[Launch]] = field(default_factory=dict)
+    #: (from, to), whole buffers that are copied after `reset`.
     copies: list[tuple[int, int]] = field(default_factory=list)
+    #: {dotted path: leaf} of the world that a step returns.
     world: dict[str, Leaf] = field(default_factory=dict)
 
     def add(self, tensor: torch.Tensor) -> Ref:

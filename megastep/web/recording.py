@@ -32,12 +32,86 @@ N_CHECKED = 16
 ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided")
 
 
-class Memory:
-    """The storages of tensors, by address. Keeps them, so that no address is used twice."""
+class Written(NamedTuple):
+    """An operator of PyTorch that computed something."""
 
-    def __init__(self) -> None:
+    operator: str
+    start: int  # address of the storage that it wrote
+    is_late: bool  # a launch had used the storage before
+
+
+class Tape(TorchDispatchMode):
+    """Notes launches of kernels, and operators of PyTorch that compute.
+
+    Attributes:
+        launches: places are an address and an offset.
+        used: addresses of the storages that launches use.
+        made: those that operators reserved.
+        written: operators that compute.
+    """
+
+    def __init__(self, recorder: "Recorder", is_first: bool = True):
+        super().__init__()
+        self.recorder, self.is_first = recorder, is_first
+        self.launches: list[Launch] = []
+        self.used: set[int] = set()
+        self.made: dict[int, None] = {}
+        self.written: list[Written] = []
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # otherwise PyTorch imports its compiler, which takes seconds
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None) -> object:
+        result = func(*args, **(kwargs or {}))
+        name, returns = func._schema.name.rpartition("::")[2], func._schema.returns
+        aliases = [one.alias_info for one in returns]
+        if aliases and all(alias is not None and not alias.is_write for alias in aliases):
+            return result  # a view
+        for one in result if isinstance(result, (list, tuple)) else [result]:
+            if isinstance(one, torch.Tensor):
+                start = self.recorder.add(one)
+                if not any(aliases):
+                    self.made[start] = None
+                if name not in ALLOCATIONS:
+                    self.written.append(Written(name.strip("_"), start, start in self.used))
+        return result
+
+    def observe(self, library: KernelLibrary, operation: str, packed: bytes) -> None:
+        """Notes a launch."""
+        values = {}
+        for word in library.words[library.cpu_operations[operation]]:
+            (value,) = struct.unpack_from(word.kind, packed, word.offset)
+            if word.kind == "P" and value:
+                start = self.recorder.find(value)
+                self.used.add(start)
+                if self.is_first:
+                    self.recorder.use(start)
+                value = Ref(start, value - start)
+            values[word.name] = None if word.kind == "P" and not value else value
+        self.launches.append(Launch(library, operation, values))
+
+
+class Recorder:
+    """Records an environment on a CPU.
+
+    Keeps the storages of tensors, by address, so that no address is used twice; and has a buffer of
+    each that launches use.
+    """
+
+    def __init__(self, env: Env):
+        self.name = type(env).__name__
         self.starts: list[int] = []
         self.storages: dict[int, torch.UntypedStorage] = {}
+        self.index: dict[int, int] = {}  # of the buffer of each storage
+        self.buffers: list[Buffer] = []
+        self.scan()
+
+    def refusal(self, reason: str) -> ValueError:
+        """Returns the error that says why the environment cannot be recorded."""
+        return ValueError(f"{self.name} cannot be exported: {reason}")
+
+    # ---- Storages ----
 
     def add(self, tensor: torch.Tensor) -> int:
         """Adds a tensor's storage. Returns its address."""
@@ -49,11 +123,7 @@ class Memory:
         return start
 
     def find(self, address: int) -> int:
-        """Returns the address of the storage that an address lies in.
-
-        Raises:
-            ValueError: if no tensor has it.
-        """
+        """Returns the address of the storage that an address lies in."""
         for scan in (None, self.scan):
             if scan:
                 scan()
@@ -76,124 +146,43 @@ class Memory:
         """Returns what a storage holds."""
         return ctypes.string_at(start, self.storages[start].nbytes())
 
-
-class Written(NamedTuple):
-    """An operator of PyTorch that computed something.
-
-    Attributes:
-        operator: its name.
-        start: address of the storage that it wrote.
-        is_late: whether a launch had used the storage before.
-    """
-
-    operator: str
-    start: int
-    is_late: bool
-
-
-class Tape(TorchDispatchMode):
-    """Notes launches of kernels, and operators of PyTorch that compute.
-
-    Args:
-        memory: gets the storages of all results.
-        use: called with the address of each storage that a launch uses, before it.
-
-    Attributes:
-        launches: places are an address and an offset.
-        used: addresses of the storages that launches use.
-        made: those that operators reserved.
-        written: operators that compute.
-    """
-
-    def __init__(self, memory: Memory, use: Callable[[int], object]):
-        super().__init__()
-        self.memory, self.use = memory, use
-        self.launches: list[Launch] = []
-        self.used: set[int] = set()
-        self.made: dict[int, None] = {}
-        self.written: list[Written] = []
-
-    @classmethod
-    def _should_skip_dynamo(cls) -> bool:
-        return False  # otherwise PyTorch imports its compiler, which takes seconds
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None) -> object:
-        result = func(*args, **(kwargs or {}))
-        name, returns = func._schema.name.rpartition("::")[2], func._schema.returns
-        aliases = [one.alias_info for one in returns]
-        if aliases and all(alias is not None and not alias.is_write for alias in aliases):
-            return result  # a view
-        for one in result if isinstance(result, (list, tuple)) else [result]:
-            if isinstance(one, torch.Tensor):
-                start = self.memory.add(one)
-                if not any(aliases):
-                    self.made[start] = None
-                if name not in ALLOCATIONS:
-                    self.written.append(Written(name.strip("_"), start, start in self.used))
-        return result
-
-    def observe(self, library: KernelLibrary, operation: str, packed: bytes) -> None:
-        """Notes a launch."""
-        values = {}
-        for word in library.words[library.cpu_operations[operation]]:
-            (value,) = struct.unpack_from(word.kind, packed, word.offset)
-            if word.kind == "P" and value:
-                start = self.memory.find(value)
-                self.used.add(start)
-                self.use(start)
-                value = Ref(start, value - start)
-            values[word.name] = None if word.kind == "P" and not value else value
-        self.launches.append(Launch(library, operation, values))
-
-
-class Recorder:
-    """Records an environment on a CPU."""
-
-    def __init__(self, env: Env):
-        self.env, self.memory = env, Memory()
-        self.index: dict[int, int] = {}  # of the buffer of each storage
-        self.buffers: list[Buffer] = []
-        self.memory.scan()
+    # ---- Buffers ----
 
     def use(self, start: int) -> int:
         """Returns the index of a storage's buffer. A new one has what the storage holds now."""
         if start not in self.index:
             self.index[start] = len(self.buffers)
-            contents = self.memory.contents(start)
+            contents = self.contents(start)
             self.buffers.append(Buffer(len(contents), contents))
         return self.index[start]
 
-    def run(self, call: Callable[[], World]) -> tuple[Tape, dict[str, torch.Tensor]]:
+    def run(self, call: Callable[[], World], is_reset: bool) -> tuple[Tape, dict]:
         """Calls a function of the environment, and makes buffers for what it uses. Returns its tape
-        and the leaves of its world.
+        and the leaves of its world. Refuses what PyTorch computes where a replay would go without
+        it.
         """
-        tape = Tape(self.memory, self.use)
+        tape = Tape(self)
         with tape, observed(tape.observe):
             world = call()
         leaves = world_leaves(world)
+        used = tape.used | {self.add(leaf) for leaf in leaves.values()}
         for leaf in leaves.values():
-            self.use(self.memory.add(leaf))
+            self.use(self.add(leaf))
         computed = {written.start for written in tape.written}
         for start in tape.made:
             if start in self.index and start not in computed:
                 i = self.index[start]
                 self.buffers[i] = Buffer(self.buffers[i].n_bytes)
-        return tape, leaves
-
-    def refuse(self, tape: Tape, leaves: dict[str, torch.Tensor], is_reset: bool) -> None:
-        """Refuses what PyTorch computes where a replay would go without it."""
-        used = tape.used | {self.memory.add(leaf) for leaf in leaves.values()}
+        if any(path.partition(".")[0] == "mask" for path in leaves):
+            raise self.refusal("a page has no action masks")
         for operator, start, is_late in tape.written:
             if is_late if is_reset else start in used:
-                raise ValueError(
-                    f"{self.name} cannot be exported: in {'reset' if is_reset else 'a step'}, "
-                    f"PyTorch's operation {operator} computes between its kernels, and a page has "
-                    f"kernels alone; move it into one (docs/kernels.md)"
+                raise self.refusal(
+                    f"in {'reset' if is_reset else 'a step'}, PyTorch's operation {operator} "
+                    "computes between its kernels, and a page has kernels alone; move it into one "
+                    "(docs/kernels.md)"
                 )
-
-    @property
-    def name(self) -> str:
-        return type(self.env).__name__
+        return tape, leaves
 
     def launches(self, tape: Tape) -> list[Launch]:
         """Returns launches of a tape with places in buffers."""
@@ -209,8 +198,36 @@ class Recorder:
     def leaf(self, tensor: torch.Tensor) -> Leaf:
         """Returns a tensor as a leaf of the program."""
         offset = int(tensor.storage_offset()) * tensor.itemsize
-        ref = Ref(self.use(self.memory.add(tensor)), offset)
+        ref = Ref(self.use(self.add(tensor)), offset)
         return Leaf(ref, tuple(tensor.shape), tensor.stride(), tensor.dtype)
+
+    def copies(self, first: dict, later: dict) -> list[tuple[int, int]]:
+        """Returns what is copied after a reset, so that its world lies where a step's does."""
+        found = {}
+        for path in later:
+            if path not in first:
+                raise self.refusal(f"its reset gives no {path}")
+            source, target = (self.leaf(tree[path]) for tree in (first, later))
+            sizes = [self.buffers[leaf.ref.buffer].n_bytes for leaf in (source, target)]
+            if source.ref.offset != target.ref.offset or sizes[0] != sizes[1]:
+                raise self.refusal(f"its reset and its steps have another {path}")
+            if source.ref.buffer != target.ref.buffer:
+                found[source.ref.buffer, target.ref.buffer] = None
+        return [*found]
+
+    def refuse_changes(self, one: list[Launch], other: list[Launch]) -> None:
+        """Refuses two steps that launch different operations, or with different numbers."""
+        names = [[launch.operation for launch in launches] for launches in (one, other)]
+        if names[0] != names[1]:
+            one_step, next_step = map(", ".join, names)
+            raise self.refusal(f"a step launches {one_step}, and the next {next_step}")
+        for before, after in zip(one, other):
+            for field, value in before.values.items():
+                if not isinstance(value, Ref) and value != after.values[field]:
+                    raise self.refusal(
+                        f"{field} of {before.operation} changes from step to step; keep what "
+                        "changes in a tensor that kernels write"
+                    )
 
 
 def record(env: Env) -> Program:
@@ -227,48 +244,60 @@ def record(env: Env) -> Program:
     """
     recorder, generator = Recorder(env), torch.Generator().manual_seed(1)
     if isinstance(env.action_space, dict):
-        raise ValueError(f"{recorder.name} cannot be exported: it takes several actions at once")
+        raise recorder.refusal("it takes several actions at once")
     if not optional(env, "capturable"):
-        raise ValueError(f"{recorder.name} cannot be exported: it steps in Python, not by kernels")
+        raise recorder.refusal("it steps in Python, not by kernels")
 
     def draw() -> torch.Tensor:
         return random_actions(env.action_space, n_lanes(env), generator=generator)
 
     actions = draw()
-    recorder.use(recorder.memory.add(actions))
-    decision = arrdict(actions=actions)
-    reset, first = recorder.run(env.reset)
-    if any(path.partition(".")[0] == "mask" for path in first):
-        raise ValueError(f"{recorder.name} cannot be exported: a page has no action masks")
-    recorder.refuse(reset, first, True)
-    expected = [snapshot(recorder, first, {})]
-    step, leaves = recorder.run(lambda: env.step(decision))
-    recorder.refuse(step, leaves, False)
+    recorder.use(recorder.add(actions))
+    decision, taken, expected = arrdict(actions=actions), [], []
+
+    def note(leaves) -> None:
+        """Notes copies of a world's leaves, and what the storages `kept` hold by buffer."""
+        world = {path: leaf.clone() for path, leaf in leaves.items()}
+        taken.append(actions.clone())
+        expected.append((world, {i: recorder.contents(start) for start, i in kept.items()}))
+
+    kept: dict[int, int] = {}
+    reset, first = recorder.run(env.reset, True)
+    note(first)
+    step, leaves = recorder.run(lambda: env.step(decision), False)
     if not step.launches:
-        raise ValueError(f"{recorder.name} cannot be exported: its steps launch no kernels")
+        raise recorder.refusal("its steps launch no kernels")
     program = Program(recorder.leaf(actions), recorder.buffers)
     program.sections = dict(reset=recorder.launches(reset), step=recorder.launches(step))
     program.world = {path: recorder.leaf(leaf) for path, leaf in leaves.items()}
-    program.copies = copies(recorder, first, leaves)
-    kept = {
-        start: i
-        for start, i in recorder.index.items()
-        if start not in step.made and start not in reset.made
-    }
-    taken = [actions.clone()]
-    expected.append(snapshot(recorder, leaves, kept))
+    program.copies = recorder.copies(first, leaves)
+    made = {**step.made, **reset.made}
+    kept.update({start: i for start, i in recorder.index.items() if start not in made})
+    note(leaves)
     actions.copy_(draw())
-    again = Tape(recorder.memory, lambda start: None)
+    again = Tape(recorder, is_first=False)
     with again, observed(again.observe):
         leaves = world_leaves(env.step(decision))
-    refuse_changes(recorder.name, step.launches, again.launches)
-    taken.append(actions.clone())
-    expected.append(snapshot(recorder, leaves, kept))
+    recorder.refuse_changes(step.launches, again.launches)
+    note(leaves)
     for _ in range(N_CHECKED):
         actions.copy_(draw())
-        taken.append(actions.clone())
-        expected.append(snapshot(recorder, world_leaves(env.step(decision)), kept))
-    compare(recorder.name, program, taken, expected)
+        note(world_leaves(env.step(decision)))
+    replay = Replay(program)
+    for t, (leaves, memory) in enumerate(expected):
+        if t:
+            replay.tensor(program.actions).copy_(taken[t])
+        replay.run("step" if t else "reset")
+        world = replay.world()
+        different = [path for path in leaves if not _same(world[path], leaves[path])]
+        different += [
+            f"memory of {_place(program, i)}" for i in memory if replay.memory[i] != memory[i]
+        ]
+        if different:
+            raise recorder.refusal(
+                f"a replay of its kernels differs in {different[0]} "
+                f"{f'in step {t}' if t else 'at the reset'}, so something else computes it"
+            )
     return program
 
 
@@ -281,72 +310,11 @@ def world_leaves(world: World) -> dict[str, torch.Tensor]:
     }
 
 
-def copies(recorder: Recorder, first, later) -> list[tuple[int, int]]:
-    """Returns what is copied after a reset, so that its world lies where a step's does."""
-    found = {}
-    for path in later:
-        if path not in first:
-            raise ValueError(f"{recorder.name} cannot be exported: its reset gives no {path}")
-        source, target = (recorder.leaf(tree[path]) for tree in (first, later))
-        sizes = [recorder.buffers[leaf.ref.buffer].n_bytes for leaf in (source, target)]
-        if source.ref.offset != target.ref.offset or sizes[0] != sizes[1]:
-            raise ValueError(
-                f"{recorder.name} cannot be exported: its reset and its steps have another {path}"
-            )
-        if source.ref.buffer != target.ref.buffer:
-            found[source.ref.buffer, target.ref.buffer] = None
-    return [*found]
-
-
-def refuse_changes(name: str, one: list[Launch], other: list[Launch]) -> None:
-    """Refuses two steps that launch different operations, or with different numbers."""
-    names = [[launch.operation for launch in launches] for launches in (one, other)]
-    if names[0] != names[1]:
-        raise ValueError(
-            f"{name} cannot be exported: a step launches {', '.join(names[0])}, and the next "
-            f"{', '.join(names[1])}"
-        )
-    for before, after in zip(one, other):
-        for field, value in before.values.items():
-            if not isinstance(value, Ref) and value != after.values[field]:
-                raise ValueError(
-                    f"{name} cannot be exported: {field} of {before.operation} changes from step "
-                    f"to step; keep what changes in a tensor that kernels write"
-                )
-
-
-def snapshot(recorder: Recorder, leaves, kept: dict[int, int]) -> tuple[dict, dict]:
-    """Returns copies of a world's leaves, and what the storages `kept` hold by buffer."""
-    return (
-        {path: leaf.clone() for path, leaf in leaves.items()},
-        {i: recorder.memory.contents(start) for start, i in kept.items()},
-    )
-
-
-def compare(name: str, program: Program, taken, expected) -> None:
-    """Raises ValueError if a replay differs from the environment in a bit."""
-    replay = Replay(program)
-    for t, (leaves, kept) in enumerate(expected):
-        if t:
-            replay.tensor(program.actions).copy_(taken[t - 1])
-        replay.run("step" if t else "reset")
-        world = replay.world()
-        different = [path for path in leaves if not _same(world[path], leaves[path])]
-        different += [
-            f"memory of {place_of(program, i)}" for i in kept if replay.memory[i] != kept[i]
-        ]
-        if different:
-            raise ValueError(
-                f"{name} cannot be exported: a replay of its kernels differs in {different[0]} "
-                f"{f'in step {t}' if t else 'at the reset'}, so something else computes it"
-            )
-
-
 def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
     return one.contiguous().numpy().tobytes() == other.contiguous().numpy().tobytes()
 
 
-def place_of(program: Program, buffer: int) -> str:
+def _place(program: Program, buffer: int) -> str:
     """Returns the first field of a launch that lies in a buffer."""
     for launch in program.launches:
         for name, value in launch.values.items():

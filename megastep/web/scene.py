@@ -91,12 +91,11 @@ def goal(program: Program) -> dict | None:
         values: dict = launch.values
         if launch.operation == "pointgoal_step":
             base, index = values["points"], values["goal_index"]
-            return _goal(base, 2 * values["n_goals"], 2, index, 0.2)
-        if launch.operation in ("memory_step", "keys_step"):
+            stride, per_layout = 2, 2 * values["n_goals"]
+        elif launch.operation in ("memory_step", "keys_step"):
             index = values["cue"] if "cue" in values else values["n_colours"]  # the goal's object
-            return _goal(values["objects.objects"], 0, OBJECT_BYTES // 4, index, 0.2)
+            base, stride, per_layout = values["objects.objects"], OBJECT_BYTES // 4, 0
+        else:
+            continue
+        return dict(base=base, per_layout=per_layout, stride=stride, index=index, radius=0.2)
     return None
-
-
-def _goal(base, per_layout, stride, index, radius) -> dict:
-    return dict(base=base, per_layout=per_layout, stride=stride, index=index, radius=radius)

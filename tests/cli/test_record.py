@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import signal
-import sys
 
 import numpy as np
 import pytest
@@ -135,15 +134,6 @@ def test_disk_that_fills_up_while_the_film_is_written(trained, here, capsys):
     with faults.full_disk(2000):
         assert record.main([f"run={trained}", "steps=3", "device=cpu", "file=film.mp4"]) == 2
     assert "File too large" in capsys.readouterr().err and not os.listdir()
-
-
-@pytest.mark.parametrize("name, text", [("matplotlib", "needs matplotlib"), ("av", "needs av")])
-def test_missing_package(trained, here, monkeypatch, capsys, name, text):
-    for module in [m for m in sys.modules if m.split(".")[0] == name or "plotting.pict" in m]:
-        monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, name, None)
-    assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=film.mp4"]) == 2
-    assert text in capsys.readouterr().err and not os.listdir()
 
 
 @pytest.mark.parametrize(

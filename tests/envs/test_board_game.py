@@ -80,7 +80,6 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("board", None)
 
 
-@pytest.mark.usefixtures("drawn_in_this_process")
 def test_a_board_game_is_trained_evaluated_and_recorded(folder, capsys):
     assert train.main([*WORDS, "folder=run"]) == 0
     rows = [json.loads(line) for line in (folder / "run/metrics.jsonl").read_text().splitlines()]

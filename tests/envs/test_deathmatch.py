@@ -349,7 +349,6 @@ def rows_of(run):
     return json.loads(table.read_text())["rows"]
 
 
-@pytest.mark.usefixtures("drawn_in_this_process")
 def test_train_evaluate_and_record_in_self_play(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ["env.n_envs=4", "env.n_agents=3", "env.limit=20", "learner.n_minibatches=2"]

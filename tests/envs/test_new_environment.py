@@ -3,13 +3,11 @@
 import re
 from pathlib import Path
 
-import loky
 import pytest
 import torch
 
 from megastep import arrdict, capture, contract, types
 from tests.helpers import pages
-from tests.helpers.in_this_process import InThisProcess
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "new-environment.md"
 
@@ -20,13 +18,11 @@ def names(tmp_path_factory):
     variables = {"__name__": "__main__", "folder": tmp_path_factory.mktemp("page")}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(variables["folder"])
-        patch.setattr(loky, "ProcessPoolExecutor", InThisProcess)
         for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
             exec(compile(block, str(PAGE), "exec"), variables)
     return variables
 
 
-@pytest.mark.usefixtures("drawn_in_this_process")
 def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
     """The commands of the first parts, in an empty folder. test_two_agents.py has the last one's.
     Safe has only what is required, so it trains and is evaluated, but cannot be filmed.

@@ -178,7 +178,6 @@ def rows_of(run):
     return json.loads(newest.read_text())["rows"]
 
 
-@pytest.mark.usefixtures("drawn_in_this_process")
 def test_evaluate_self_play_against_itself_and_the_tracker(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ["env.n_envs=8", "learner.n_minibatches=2", "agent.width=8", "device=cpu"]

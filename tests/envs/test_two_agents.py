@@ -34,7 +34,6 @@ def convoy(section, tmp_path, monkeypatch):
     del sys.modules["convoy"]
 
 
-@pytest.mark.usefixtures("drawn_in_this_process")
 @pytest.mark.slow
 def test_commands_train_evaluate_and_record(section, convoy, tmp_path, capsys):
     commands = re.findall(r"^python (\S+\.py) (.*)$", section, re.M)

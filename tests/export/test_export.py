@@ -5,19 +5,16 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
 from megastep import spaces
-from megastep.agents import pretrained
-from megastep.agents.cli import evaluate, export, train
+from megastep.agents.cli import export, train
 from megastep.agents.errors import UserError
-from megastep.agents.export import hub, runtimes
-from megastep.agents.export.step import Step
+from megastep.agents.export import runtimes
+from megastep.agents.export.runtimes import Step
 from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict
-from megastep.types import n_lanes
-from tests.helpers.tiny import SHORT_EPISODES, TINY
+from tests.helpers.tiny import TINY
 
 IMAGE, VECTOR = spaces.MultiImage(1, 3, 1, 64), spaces.MultiVector(1, 3)
 MANY = {"rgb": IMAGE, "self": {"imu": VECTOR, "id": spaces.MultiDiscrete(2, 4)}}
@@ -183,23 +180,3 @@ def test_a_core_that_cannot_be_exported_is_one_sentence(tmp_path):
 def test_bad_words_are_one_sentence(words, text, here, capsys):
     assert export.main(words) == 2 and text in capsys.readouterr().err
     assert not any(here.iterdir())
-
-
-def test_a_folder_for_a_hub(here, monkeypatch, capsys):
-    assert train.main([*TINY, *SHORT_EPISODES, "samples=256", "folder=run"]) == 0
-    parts = "geometry.parts={bench: 2, braided: {source: maze, n: 2, braid: 1}}"
-    assert evaluate.main(["run=run", "geometry=suite", parts, "episodes=8"]) == 0
-    monkeypatch.setattr(hub, "N_STEPS", 2)
-    assert export.main(["run=run", "format=hub", "file=mine"]) == 0
-    names = sorted(path.name for path in Path("mine").iterdir())
-    assert names == ["README.md", "agent.safetensors", "config.json", "replay.mp4"]
-    _, head, card = Path("mine/README.md").read_text().split("---\n", 2)
-    about = yaml.safe_load(head)
-    assert about["library_name"] == "megastep" and "minimal" in about["tags"]
-    metric = about["model-index"][0]["results"][0]["metrics"][0]
-    assert metric["type"] == "mean_reward" and "+/-" in metric["value"]
-    assert "# run" in card and "## Limits" in card
-    policy, env = pretrained.load_with_env("mine/agent.safetensors", "cpu")
-    assert policy(env.reset(), policy.initial(n_lanes(env)))[0]["actions"].shape == (1, 1)
-    assert export.main(["run=run", "format=hub", "file=mine"]) == 2
-    assert "The folder mine is not empty" in capsys.readouterr().err

@@ -14,12 +14,11 @@ from megastep.agents.errors import UserError
 from megastep.agents.evaluation import duels
 from megastep.agents.evaluation.playing import first_episodes
 from megastep.agents.selfplay.bots import BOTS
-from megastep.agents.selfplay.bots.explorer import Explorer
 from megastep.agents.selfplay.bots.hunter import Hunter
 from megastep.agents.selfplay.bots.plans import Plans
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.agents.selfplay.bots.seekers import Mapper, Oracle, Wanderer
-from megastep.agents.selfplay.bots.walker import Walker
+from megastep.agents.selfplay.bots.walker import Explorer, Walker
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
 from megastep.modules.spawning import distances

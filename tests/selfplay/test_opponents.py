@@ -12,8 +12,8 @@ from megastep import contract, envs, toys
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs.saver import Saver
+from megastep.agents.selfplay.mixed_policy import score_pairs
 from megastep.agents.selfplay.opponents import Opponents
-from megastep.agents.selfplay.slots import score_pairs
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict

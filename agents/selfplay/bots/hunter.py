@@ -1,14 +1,13 @@
 """A bot that plays Deathmatch. n lanes, A agents per environment, L landmarks per plan."""
 
-import copy
 import math
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 
-from megastep.agents.selfplay.bots.explorer import SIGHT, Explorer
-from megastep.agents.selfplay.bots.steering import HORIZON, SLACK, Pose
+from megastep.agents.selfplay.bots.steering import HORIZON, SIGHT, SLACK, Pose
+from megastep.agents.selfplay.bots.walker import Explorer
 from megastep.arrdict import arrdict
 
 BEHIND = 0.3  # metres by which the wall that a pixel shows may be nearer than the agent there
@@ -21,9 +20,9 @@ SEARCHED = 3.0  # metres of floor around an agent lost from sight that it search
 CHASE = 60  # steps that it goes after an agent lost from sight
 
 
-class Hunter:
-    """Explores as `Explorer` does until it sees another agent, then aims at it and approaches. It
-    searches around where it lost one from sight, and turns to the nearest when it is hit.
+class Hunter(Explorer):
+    """Explores until it sees another agent, then aims at it and approaches. It searches around
+    where it lost one from sight, and turns to the nearest when it is hit.
 
     It knows what an `Explorer` knows, and the pose and velocity of the agents that it sees.
 
@@ -35,32 +34,16 @@ class Hunter:
     """
 
     def __init__(self, env: Any):
-        self.explorer = Explorer(env)
+        super().__init__(env)
         if not {"d", "health"} <= {*env.obs_space} or env.n_agents < 2:
             raise ValueError("it hunts by the observations d and health, as Deathmatch has them")
 
-    def in_lanes(self, lanes: torch.Tensor) -> "Hunter":
-        """Returns one that plays in lanes (n,) int64 of the environment."""
-        hunter = copy.copy(self)
-        hunter.explorer = self.explorer.in_lanes(lanes)
-        return hunter
-
-    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state, that of an `Explorer`."""
-        return self.explorer.initial(n_lanes, device)
-
-    def __call__(
-        self,
-        world: Mapping,
-        state: Mapping,
-        sample: bool = True,
-        generator: torch.Generator | None = None,
+    def act(
+        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Returns (arrdict(actions (n, 1)), next state)."""
-        steering, obs = self.explorer.steering, world["obs"]
-        pose = steering.pose()
-        near = steering.near(pose)
-        state = self.explorer.explore(world["reset"], state, pose, near)
+        """Explores, fights, or searches."""
+        steering, obs = self.steering, world["obs"]
+        state = self.explore(world["reset"], state, pose, near)
         other, sees = self._nearest(pose, obs["d"])
         # where to search for the other once it is lost from sight
         lengths = steering.lengths(steering.near(other))
@@ -91,7 +74,7 @@ class Hunter:
         """Returns the pose of the nearest other agent, first of those in view, and whether it is
         in view (n,).
         """
-        steering = self.explorer.steering
+        steering = self.steering
         core, lanes, n_pixels = steering.core, steering.lanes[:, None], depth.shape[-1]
         slots = lanes + torch.arange(1, core.n_agents, device=lanes.device)
         others = lanes - lanes % core.n_agents + slots % core.n_agents  # (n, A - 1)

@@ -35,7 +35,6 @@ class Plans:
     """Clearances and shortest paths in the layouts of a scenery. Constant.
 
     Args:
-        scenery: the scenery.
         spawns: (D, S, 2) metres, where agents begin. Nodes can be reached from there.
         radius: of the agents, in metres.
         goals: (D, L, 2) metres, the targets. Default: landmarks.
@@ -103,9 +102,7 @@ class Plans:
         self.exits, self.metres = map(torch.cat, zip(*exits))
 
     def _exits(self, plan, nodes, offsets) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the nodes (m, K) int32 near the nodes of a plan (m, 2), and the lengths (m, K)
-        float16 of the straight ways there.
-        """
+        """Returns the nodes (m, K) near those of a plan (m, 2), and the lengths of the ways."""
         plan = torch.full((len(nodes),), plan, device=nodes.device)
         exits = self.around(plan, nodes[:, None] + offsets)
         metres = self.straight(plan, nodes, self.nodes[exits])
@@ -158,7 +155,7 @@ def _area(walls) -> float:
 
 
 def _stack(tensors, value=0) -> torch.Tensor:
-    """Returns tensors (h, w) of different sizes, padded at their ends by a value, as one."""
+    """Returns tensors (h, w) of different sizes as one, padded at their ends."""
     height, width = np.max([tensor.shape for tensor in tensors], 0).tolist()
     ends = [(0, width - tensor.shape[1], 0, height - len(tensor)) for tensor in tensors]
     return torch.stack([pad(tensor, end, value=value) for tensor, end in zip(tensors, ends)])
@@ -204,9 +201,7 @@ def _grid(graph, d, block) -> tuple[torch.Tensor, ...]:
 
 
 def _best(values, side) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the highest of the values (H, W) in each square of `side` x `side`, (h, w), and its
-    flat index.
-    """
+    """Returns the highest of the values (H, W) in each square, (h, w), and its flat index."""
     rows, columns = (n // side for n in values.shape)
     parts = values.view(rows, side, columns, side).transpose(1, 2).reshape(rows, columns, -1)
     highest, index = parts.max(-1)

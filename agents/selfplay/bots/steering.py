@@ -4,6 +4,7 @@ N environments of A agents, n of their N A lanes, K exits per node.
 """
 
 import copy
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -21,6 +22,8 @@ DETOUR = 100.0  # metres that each of these is worth
 AT_NODE = 0.1  # metres within which an agent has reached a node
 TOUCH = 0.01  # metres to a wall that may have stopped an agent
 GAIN = 3.2  # of the share of its speed that an agent loses per step: 4/s with momentum
+SIGHT = 10.0  # metres to which a place is in view
+BENT = 1.05, 0.2  # a way this many times as long as straight, and metres more, is in view
 AHEAD = (0.02, 0.1, 0.2)  # seconds of coasting for which an agent looks out for walls
 KEPT = (0.004, 100.0), (0.02, 10.0)  # metres kept from walls, and m/s that each less is worth
 HORIZON = 0.3  # seconds ahead to turn for
@@ -110,9 +113,7 @@ class Steering:
         return (off.abs() < self.core.fov / 2).any(-1)
 
     def aim(self, pose: Pose, near: tuple, target: torch.Tensor) -> torch.Tensor:
-        """Returns the points (n, 2) to walk straight to from where it is `near`, on the way to
-        targets (n,).
-        """
+        """Returns the points (n, 2) to walk straight to, on the way to targets (n,)."""
         nodes, metres = near
         best = (metres + self.plans.lengths[nodes, target[:, None]]).argmin(1, True)
         node = nodes.gather(1, best)[:, 0]
@@ -144,10 +145,10 @@ class Steering:
     ) -> arrdict:
         """Returns the decision that walks towards points and turns to others, (n, 2) each.
 
-        Args:
-            turning: how much turning counts beside walking, a number or (n, 1).
-            slack: degrees off that do not matter, a number or (n, 1).
-            horizon: seconds ahead to turn for, a number or (n, 1).
+        Args, numbers or (n, 1) each:
+            turning: how much turning counts beside walking.
+            slack: degrees off that do not matter.
+            horizon: seconds ahead to turn for.
         """
         agents, damping = self.core.agents, 1 - self.retained
         pushes = to_global(pose.angle[:, None], self.moves[:, :2])
@@ -170,3 +171,57 @@ class Steering:
         is_stopped = (pose.velocity == 0).all(1) & (here < agents.radius + TOUCH)
         cost = torch.where(is_stopped[:, None], -room[:, 0], cost)
         return arrdict(actions=self.actions[cost.argmin(1)].unsqueeze(1))
+
+
+class SteeredBot:
+    """A bot that is steered: a policy, whose subclasses have `act` and `initial`.
+
+    Args:
+        env: the environment that it plays in.
+    """
+
+    block = BLOCK
+
+    def __init__(self, env: Any):
+        self.steering = Steering(env, block=self.block)
+
+    def in_lanes(self, lanes: torch.Tensor) -> "SteeredBot":
+        """Returns one that plays in lanes (n,) int64 of the environment."""
+        bot = copy.copy(self)
+        bot.steering = self.steering.in_lanes(lanes)
+        return bot
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the initial state, (n,) int64 each: the target's number, and steps of `patience`
+        until it is given up.
+        """
+        target, patience = torch.zeros(2, n_lanes, dtype=torch.int64, device=device).unbind()
+        return arrdict(target=target, patience=patience)
+
+    def __call__(
+        self,
+        world: Mapping,
+        state: Mapping,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> tuple[arrdict, arrdict]:
+        """Returns (arrdict(actions (n, 1)), next state)."""
+        pose = self.steering.pose()
+        return self.act(world, state, pose, self.steering.near(pose), generator)
+
+    def act(
+        self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
+    ) -> tuple[arrdict, arrdict]:
+        """Returns what a call does, from the poses of its lanes and the nodes near them."""
+        raise NotImplementedError
+
+    def sees(
+        self, lengths: torch.Tensor, away: torch.Tensor, bearing: torch.Tensor
+    ) -> torch.Tensor:
+        """Returns whether places are in view, (n, K) bool: the way there is straight.
+
+        Args:
+            lengths, away, bearing: (n, K), metres of the way there and straight, and degrees.
+        """
+        is_straight = (lengths < BENT[0] * away + BENT[1]) & (away < SIGHT)
+        return is_straight & self.steering.are_in_view(bearing)
