@@ -19,7 +19,7 @@ import pathlib
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -322,7 +322,7 @@ class Moment(NamedTuple):
 
 def film_moments(player: Player, steps: int, greedy, seed, trail) -> Iterator[Moment]:
     """Plays for some steps from a reset, and yields the moment before each."""
-    env, policy = player.env, player.policy
+    env, policy = cast(Any, player.env), player.policy
     n_agents, generator = optional(env, "n_agents"), torch.Generator(env.device).manual_seed(seed)
     returns = np.zeros(n_agents, np.float32)
     trails, views = collections.deque(maxlen=trail + 1), []

@@ -92,7 +92,7 @@ def play(
     """
     env, policy = where.env, restore.policy_of(loaded, where.env)
     restore.load_wrappers(env, loaded)
-    all_play = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
+    all_play: list = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
     for name in cfg.baseline:
         player = where.find_player(name, loaded, cfg.trust)
         all_play.append((player.name, player.policy, cfg.greedy and player.step is not None))
