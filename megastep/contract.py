@@ -50,11 +50,7 @@ class ContractError(AssertionError):
 
 
 def check_environment(env: Env) -> None:
-    """Checks the attributes of an environment, the required and the optional ones.
-
-    Raises:
-        ContractError: if one is missing or wrong.
-    """
+    """Checks the required and the optional attributes of an environment. Raises ContractError."""
     _raise_first(env, _problems_of_environment(env))
 
 
@@ -99,15 +95,10 @@ def _is_name(word) -> bool:
 
 
 def check_world(env: Env, world: World, last: World | None = None) -> None:
-    """Checks one world against the contract.
+    """Checks a world of an environment. Raises ContractError if it breaks a clause.
 
     Args:
-        env: the environment that returned it.
-        world: the world to check.
         last: the world one step earlier; None if ``world`` came from ``reset``.
-
-    Raises:
-        ContractError: if the world breaks a clause.
     """
     _raise_first(env, _problems_of_world(env, world, last))
 
@@ -121,11 +112,12 @@ def _problems_of_world(env, world, last) -> Iterator[str]:
     yield from _problems_per_lane(env, "reward", world["reward"], torch.float32)
     for key in FLAGS:
         yield from _problems_per_lane(env, key, world[key], torch.bool)
-    yield from _problems_of_keys(env.obs_space, world["obs"], "obs")
-    values = spaces.leaves(world["obs"], "obs")
-    for path, space in spaces.leaves(env.obs_space, "obs").items():
-        yield from _problems_of_observation(env, path, space, values[path])
-    yield from _problems_of_privileged(env, world)
+    yield from _problems_of_observation(env, "obs", env.obs_space, world)
+    privileged = optional(env, "privileged_space")
+    if ("privileged" in world) != (privileged is not None):
+        yield "privileged must be in the world if, and only if, privileged_space is not None"
+    if privileged is not None:
+        yield from _problems_of_observation(env, "privileged", privileged, world)
     yield from _problems_of_episodes(env, world, last)
     yield from _problems_of_metrics(env, world, last)
     for key in ("learns", "mask"):
@@ -153,44 +145,28 @@ def _problems_per_lane(env, path, values, dtype) -> Iterator[str]:
     return _problems_of_tensor(env, path, values, (n_lanes(env),), (dtype,))
 
 
-def _problems_of_keys(space, values, name) -> Iterator[str]:
-    expected, present = spaces.leaves(space, name), spaces.leaves(values, name)
+def _problems_of_observation(env, name, space, world) -> Iterator[str]:
+    expected, present = spaces.leaves(space, name), spaces.leaves(world[name], name)
     if expected.keys() != present.keys():
         has = f"{', '.join(expected)}, as {name}_space has, not {', '.join(present)}"
         yield f"the world must have {has}"
-
-
-def _problems_of_observation(env, path, space, values) -> Iterator[str]:
-    shape = n_lanes(env), *space.shape
-    if isinstance(space, spaces.MultiDiscrete):
-        yield from _problems_of_tensor(env, path, values, shape, INTEGERS, "integers")
-        if not bool(((values >= 0) & (values < space.n_actions)).all()):
-            yield f"{path} must be from 0 to {space.n_actions - 1}"
-        return
-    dtype = getattr(space, "dtype", None)
-    yield from _problems_of_tensor(env, path, values, shape, (dtype,) if dtype else FLOATS)
-    if not bool(values.isfinite().all()):
-        yield f"{path} must be finite"
-    if getattr(space, "low", None) is not None or getattr(space, "high", None) is not None:
-        low, high = space.bounds(values.device)
-        outside = values[(values < low) | (values > high)].float().tolist()[:1]
-        if outside:
-            yield f"{path} must be within {space.low} and {space.high}, not {outside}"
-
-
-def _problems_of_privileged(env, world) -> Iterator[str]:
-    space = optional(env, "privileged_space")
-    if ("privileged" in world) != (space is not None):
-        yield "privileged must be in the world if, and only if, privileged_space is not None"
-    if space is None:
-        return
-    yield from _problems_of_keys(space, world["privileged"], "privileged")
-    values = spaces.leaves(world["privileged"], "privileged")
-    for path, leaf in spaces.leaves(space, "privileged").items():
-        shape = n_lanes(env), *leaf.shape
-        yield from _problems_of_tensor(env, path, values[path], shape, (torch.float32,))
-        if not bool(values[path].isfinite().all()):
+    for path, leaf in expected.items():
+        shape, values = (n_lanes(env), *leaf.shape), present[path]
+        if isinstance(leaf, spaces.MultiDiscrete):
+            yield from _problems_of_tensor(env, path, values, shape, INTEGERS, "integers")
+            if not bool(((values >= 0) & (values < leaf.n_actions)).all()):
+                yield f"{path} must be from 0 to {leaf.n_actions - 1}"
+            continue
+        dtypes = (leaf.dtype,) if getattr(leaf, "dtype", None) else FLOATS
+        dtypes = dtypes if name == "obs" else (torch.float32,)
+        yield from _problems_of_tensor(env, path, values, shape, dtypes)
+        if not bool(values.isfinite().all()):
             yield f"{path} must be finite"
+        if getattr(leaf, "low", None) is not None or getattr(leaf, "high", None) is not None:
+            low, high = leaf.bounds(values.device)
+            outside = values[(values < low) | (values > high)].float().tolist()[:1]
+            if outside:
+                yield f"{path} must be within {leaf.low} and {leaf.high}, not {outside}"
 
 
 def _problems_of_mask(env, mask) -> Iterator[str]:
@@ -253,11 +229,8 @@ def _problems_of_metrics(env, world, last) -> Iterator[str]:
 
 def check_resets(env: Env) -> None:
     """Checks ``reset(seed, mask)`` of an environment that :func:`~megastep.types.takes_masks`.
-    Leaves its tensors as they were.
-
-    Raises:
-        ContractError: if a masked reset changes other lanes or begins no episode in its own, or one
-            seed gives two first worlds.
+    Leaves its tensors as they were. Raises ContractError if a masked reset changes other lanes or
+    begins no episode in its own, or one seed gives two first worlds.
     """
     before = snapshot(env)
     _raise_first(env, _problems_of_resets(env))
@@ -295,16 +268,8 @@ def random_actions(env: Env, generator: torch.Generator, mask: Tree = None) -> T
 
 
 def rollout(env: Env, n_steps: int, seed: int = 1, check: bool = True) -> list[arrdict]:
-    """Resets an environment and takes random steps. Returns copies of the ``n_steps`` + 1 worlds.
-
-    Args:
-        env: the environment.
-        n_steps: number of steps after the reset.
-        seed: of the random actions.
-        check: check the environment and every world against the contract.
-
-    Raises:
-        ContractError: if a checked world breaks a clause.
+    """Resets an environment and takes ``n_steps`` random steps. Returns copies of the ``n_steps`` +
+    1 worlds. With ``check``, raises ContractError if the environment or a world breaks a clause.
     """
     if check:
         check_environment(env)

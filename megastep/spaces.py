@@ -42,7 +42,7 @@ class _Space:
                 )
 
     def _sizes(self) -> dict[str, int]:
-        return {f.name: getattr(self, f.name) for f in fields(self) if not f.kw_only}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.type is int}
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -130,17 +130,8 @@ class MultiDiscrete(_Space):
 
 @dataclass(frozen=True)
 class MultiContinuous(_Space):
-    """``dim`` float32 numbers per agent, within bounds: shape (n_agents, dim). A space of actions.
-
-    Args:
-        n_agents: A.
-        dim: D.
-        low: smallest values, a number for all or one per dimension. Kept as a tuple.
-        high: largest values, likewise.
-
-    Raises:
-        ValueError: if a size is no positive integer, or the bounds are not finite, not one per
-            dimension, or not in order.
+    """``dim`` float32 numbers per agent, within finite bounds: shape (n_agents, dim). A space of
+    actions. ``low`` and ``high`` are a number for all or one per dimension, kept as tuples.
     """
 
     n_agents: int
@@ -170,9 +161,6 @@ class MultiContinuous(_Space):
             raise ValueError(
                 f"MultiContinuous needs each low below its high, not {self.low} and {self.high}"
             )
-
-    def _sizes(self) -> dict[str, int]:
-        return {"n_agents": self.n_agents, "dim": self.dim}
 
     def tensors(
         self, device: torch.device | str | None = None
@@ -214,11 +202,8 @@ def random_actions(
     generator: torch.Generator | None = None,
     mask: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns uniformly random actions of a leaf space for B lanes: (B, ...).
-
-    Args:
-        generator: on the same device.
-        mask: (B, A, n) bool, the allowed ones of integers. None: all.
+    """Returns uniformly random actions of a leaf space for B lanes: (B, ...). ``mask``, (B, A, n)
+    bool, says which integers are allowed.
     """
     options: dict = dict(device=device, generator=generator)
     shape = n_lanes, *space.shape
@@ -263,11 +248,8 @@ def are_actions(space: MultiDiscrete | MultiContinuous, values: torch.Tensor) ->
 
 
 def leaves(space: object, name: str = "") -> dict[str, Any]:
-    """Returns the leaves of a tree by dotted path, such as ``{"obs.rgb": MultiImage(...)}``.
-
-    Args:
-        space: a space or a (nested) dict of spaces; also any other tree, such as an observation.
-        name: the path of the tree itself. A tree that is no dict is the one leaf of this path.
+    """Returns the leaves of a tree of spaces, observations or others by dotted path, such as
+    ``{"obs.rgb": MultiImage(...)}``. A tree that is no dict is the one leaf of the path ``name``.
     """
     if not isinstance(space, Mapping):
         return {name: space}
@@ -279,15 +261,8 @@ def leaves(space: object, name: str = "") -> dict[str, Any]:
 
 def map(function: Callable, space: object, *trees: Any) -> Any:
     """Returns ``function(leaf_space, *leaf_values)`` for each leaf, as an arrdict with the keys of
-    the space. For a space that is no dict, returns the function's result itself.
-
-    Args:
-        function: takes a leaf space and one value from each of ``trees``.
-        space: a space or a (nested) dict of spaces.
-        trees: dicts with at least the keys of the space, such as observations or actions.
-
-    Raises:
-        KeyError: if a tree lacks a key of the space.
+    the space; of a space that is no dict, the function's result itself. ``trees`` have at least the
+    keys of the space.
     """
     if not isinstance(space, Mapping):
         return function(space, *trees)

@@ -69,43 +69,39 @@ class Env(Protocol):
     """N copies of a game that are stepped together on one device.
 
     Optional attributes, whose defaults are in ``DEFAULTS``; read them with :func:`optional`:
-        n_agents: number of lanes per environment, A. Default: 1.
-        fps: steps per second of simulated time, for videos. Default: 10.
-        capturable: False if it steps on the host, where no CUDA graph can repeat a step. Default:
-            True.
+        n_agents: number of lanes per environment, A.
+        fps: steps per second of simulated time, for videos.
+        capturable: False if it steps on the host, where no CUDA graph can repeat a step.
         resumable: False if a checkpoint cannot hold its state: a resumed run begins new episodes.
-            Default: True.
         check(): raises the errors that were flagged on the device. Synchronises host and device.
         layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
-            of an evaluation are over layouts. Default: None, intervals are over environments.
+            of an evaluation are over layouts; without, they are over environments.
         weigh_layouts(): has new episodes take place in layouts drawn by weights from now on.
             Returns the cumulative weights, (D,) int32 on the device, which a curriculum changes in
-            place. Default: none, there are no layouts to draw.
+            place.
         bot: class of a scripted policy for this environment, whose arguments are settings of the
             environment, or `env`, the environment itself. It plays as ``opponents.bot`` and
-            ``against=bot``. Default: none.
+            ``against=bot``.
         controls: {key of a keyboard: action}, by which a person drives an agent in a page that
-            ``megastep web`` writes. Default: None, movement by arrow keys, or digits.
+            ``megastep web`` writes. Default: movement by arrow keys, or digits.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
-        privileged_space: space of ``world.privileged``. Default: None, there is none.
+        privileged_space: space of ``world.privileged``.
         coefficients: a tuple of `megastep.coefficients.Coefficients`, such as weights of rewards,
-            which training has follow their schedules. Default: none.
-        close(): ends what it started, such as processes. Called after training. Default: none.
+            which training has follow their schedules.
+        close(): ends what it started, such as processes. Called after training.
         wrapper_state(), load_wrapper_state(state, is_frozen): what wrappers around the environments
             have learnt, such as running statistics, as tensors and numbers by name. It belongs to
-            the policy: evaluations give it to their environments and freeze it, and `init` gives
-            it to those of the next run. Default: none.
-        max_episode_steps: steps at which an evaluation cuts an episode off. Default: 100,000.
+            the policy: evaluations give it to their environments and freeze it.
+        max_episode_steps: steps at which an evaluation cuts an episode off.
         reset(seed=None, mask=None): a reset that takes a seed and a mask. With a mask, (B,) bool,
             only these lanes begin an episode; the others keep state and observation to the bit, and
             their rows are those of the last world. With a seed, an integer or (B,) int64, a seed
             per lane, the episodes from now on are the same each time. Neither synchronises. See
             :func:`takes_masks`.
         game_over: (N,) bool, environments whose game ended with the last world, and with it the
-            episodes of all agents. Default: None, a game ends where all its lanes end at once.
-        desync(): gives every lane a random age, as if its episode had been going on for some steps.
-            Training calls it after ``reset``, so that lanes do not end their episodes in the same
-            steps. Default: none.
+            episodes of all agents. Default: where all lanes of one end at once.
+        desync(): gives every lane a random age, as if its episode had been going on for some steps,
+            so that lanes do not end their episodes in the same steps. Called after ``reset``.
         state(e), plot_state(state): draw environment ``e``. Without them there are no videos.
     """
 
@@ -152,13 +148,7 @@ DEFAULTS: dict[str, Any] = {
 
 
 def optional(owner: object, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
-    """Returns an optional attribute of an environment, or its default.
-
-    Args:
-        owner: an environment, or whatever else ``defaults`` are for.
-        name: a key of ``defaults``.
-        defaults: the default of each optional attribute.
-    """
+    """Returns an optional attribute of an environment, or of another owner, or its default."""
     return getattr(owner, name, defaults[name])
 
 
@@ -196,13 +186,9 @@ class PolicyLike(Protocol):
         sample: bool = True,
         generator: torch.Generator | None = None,
     ) -> tuple[Mapping, Tree]:
-        """Returns (decision, next hidden state). The decision has the key ``actions``.
-
-        Args:
-            world: the current world.
-            state: the hidden state before this step.
-            sample: draw from the action distribution; otherwise take the most likely action.
-            generator: random number generator of the draws.
+        """Returns (decision, next hidden state), from the hidden state before this step. The
+        decision has the key ``actions``: drawn from their distribution, or with ``sample=False``
+        the most likely.
         """
         ...
 

@@ -1,10 +1,15 @@
 """Wrappers around any environment, on its device: `env.wrappers=[sticky_actions]`."""
 
-from megastep.wrappers.actions import ActionRepeat, NoisyActions, StickyActions
+from megastep.wrappers.actions import ActionRepeat, NoisyActions, StickyActions, TimeLimit
 from megastep.wrappers.base import Wrapper
-from megastep.wrappers.observations import DropSensor, FrameStack, NoisySensor
-from megastep.wrappers.rewards import ClipReward, ScaleReward, ShapeReward
-from megastep.wrappers.time_limit import TimeLimit
+from megastep.wrappers.worlds import (
+    ClipReward,
+    DropSensor,
+    FrameStack,
+    NoisySensor,
+    ScaleReward,
+    ShapeReward,
+)
 
 __all__ = [
     "WRAPPERS",

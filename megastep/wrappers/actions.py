@@ -1,7 +1,7 @@
-"""Wrappers that change actions."""
+"""Wrappers that change actions or the length of episodes."""
 
 from collections.abc import Mapping
-from typing import Annotated, cast
+from typing import Annotated, Any, cast
 
 import torch
 from pydantic import Field
@@ -10,15 +10,11 @@ from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.settings import checked
 from megastep.types import Env, Tree, n_lanes, optional
-from megastep.wrappers.base import Draws, Wrapper
+from megastep.wrappers.base import Draws, Wrapper, along
 
-__all__ = ["ActionRepeat", "NoisyActions", "StickyActions"]
+__all__ = ["ActionRepeat", "NoisyActions", "StickyActions", "TimeLimit"]
 
 Probability = Annotated[float, Field(ge=0, le=1)]
-
-
-def _along(values: torch.Tensor, leaf: torch.Tensor) -> torch.Tensor:
-    return values.view(-1, *[1] * (leaf.ndim - 1))
 
 
 class _Random(Wrapper):
@@ -37,12 +33,9 @@ class StickyActions(_Random):
     2018). The first action of an episode is always the policy's.
 
     Args:
-        env: the environment inside.
+        env: the environment inside, without action masks.
         probability: of repeating, in each step.
         seed: of the draws.
-
-    Raises:
-        ValueError: worlds have action masks.
     """
 
     @checked
@@ -62,7 +55,7 @@ class StickyActions(_Random):
         repeats = (self.draws()[:, 0] < self.probability) & ~self.is_first
 
         def stick(_, last, new) -> torch.Tensor:
-            return last.copy_(torch.where(_along(repeats, new), last, new)).clone()
+            return last.copy_(torch.where(along(repeats, new), last, new)).clone()
 
         return spaces.map(stick, self.action_space, self.last, actions)
 
@@ -77,14 +70,11 @@ class NoisyActions(_Random):
     ones.
 
     Args:
-        env: the environment inside.
+        env: the environment inside, without action masks.
         probability: of a random action, in each step, per agent of a lane.
         std: standard deviation of the noise, in units of half the range of an action. Actions stay
             within their bounds.
         seed: of the draws.
-
-    Raises:
-        ValueError: worlds have action masks.
     """
 
     @checked
@@ -133,9 +123,6 @@ class ActionRepeat(Wrapper):
     Args:
         env: the environment inside, with ``reset(seed=None, mask=None)``.
         n: steps of the environment inside per step.
-
-    Raises:
-        ValueError: the environment cannot begin episodes of some lanes alone.
     """
 
     @checked
@@ -153,14 +140,13 @@ class ActionRepeat(Wrapper):
     def step(self, decision: Mapping) -> arrdict:
         """Takes n steps. Returns a world."""
         is_over, total = self.ended.clone(), torch.zeros(n_lanes(self.env), device=self.device)
-        kept = world = None
+        kept: Any = None
         for _ in range(self.n):
             world = self.env.step(arrdict(actions=decision["actions"]))
             total = total + world.reward.masked_fill(is_over, 0.0)
             ends = (world.terminal | world.truncated) & ~is_over
             is_over = is_over | ends
             kept = world.clone() if kept is None else _where(ends, world, kept)
-        assert kept is not None
         ended_now = is_over & ~self.ended
         world = _where(ended_now, kept, self.restarted(self.ended))
         world = arrdict(world, reward=total.masked_fill(world.reset, 0.0))
@@ -178,4 +164,37 @@ def _where(condition, chosen, other) -> arrdict:
     if isinstance(chosen, Mapping):
         parts = {key: _where(condition, part, other[key]) for key, part in chosen.items()}
         return arrdict(parts)
-    return cast(arrdict, torch.where(_along(condition, chosen), chosen, other))
+    return cast(arrdict, torch.where(along(condition, chosen), chosen, other))
+
+
+class TimeLimit(Wrapper):
+    """Truncates episodes after a number of steps. The next step begins a new one, which costs a
+    second rendering of every step.
+
+    Metrics of an episode that it truncates are what the environment gives at that step: 0, where it
+    computes them at the end of its own episodes.
+
+    Args:
+        env: the environment inside, with ``reset(seed=None, mask=None)``.
+        n: steps after the first observation.
+    """
+
+    @checked
+    def __init__(self, env: Env, *, n: Annotated[int, Field(ge=1, le=10**9)]):
+        super().__init__(env)
+        self.require_masks("begins episodes of lanes that it has truncated")
+        self.n = n
+        self.ages = torch.zeros(n_lanes(env), dtype=torch.int32, device=env.device)
+        self.is_cut = torch.zeros(n_lanes(env), dtype=torch.bool, device=env.device)
+
+    def step(self, decision: Mapping) -> arrdict:
+        """Takes one step. Returns a world."""
+        self.env.step(decision)
+        return self._resets.keep(self.after(self.restarted(self.is_cut)))
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world, truncated where an episode is at its limit."""
+        self.ages.add_(1).masked_fill_(world.reset, 0)
+        ends = world.terminal | world.truncated
+        self.is_cut.copy_((self.ages >= self.n) & ~ends & ~world.reset)
+        return arrdict(world, truncated=world.truncated | self.is_cut)

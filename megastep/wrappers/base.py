@@ -5,14 +5,13 @@ from typing import cast
 
 import torch
 
-from megastep import engine, spaces
+from megastep import engine
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.modules.lifecycle import CounterGenerator
-from megastep.settings import closest
 from megastep.types import Env, Space, Tree, n_lanes, takes_masks
 
-__all__ = ["Draws", "Wrapper", "chosen", "replaced"]
+__all__ = ["Draws", "Wrapper"]
 
 
 class Wrapper:
@@ -20,9 +19,8 @@ class Wrapper:
     attributes are those of the environment inside.
 
     A subclass has `before`, `after` or both, sets `obs_space` or `action_space` if it changes them,
-    and keeps whatever changes in tensors with a row per lane, which it changes in place:
-    checkpoints hold them, and CUDA graphs repeat them. Its other constructor arguments are
-    settings.
+    and keeps what changes in tensors with a row per lane, changed in place: checkpoints hold them,
+    and CUDA graphs repeat them. Its other constructor arguments are settings.
 
     Args:
         env: the environment inside.
@@ -122,26 +120,6 @@ class Draws:
         return self.generator(self.all).view(self.shape)
 
 
-def chosen(wrapper: Wrapper, space: Space, sensor: str, kinds: tuple[type, ...]) -> Space:
-    """Returns the leaf of an observation space by its dotted path, "" for one that is no dict.
-
-    Raises:
-        ValueError: there is none of that name, or it is of another kind.
-    """
-    leaves = spaces.leaves(space)
-    name = type(wrapper).__name__
-    if sensor not in leaves:
-        hint = "leave sensor out" if "" in leaves else closest(sensor, leaves)
-        raise ValueError(f"{name}: there is no sensor {sensor!r}; {hint}")
-    if not isinstance(leaves[sensor], kinds):
-        words = " or ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"{name}: {sensor or 'obs'} is {leaves[sensor]!r}, and not {words}")
-    return leaves[sensor]
-
-
-def replaced(tree: Tree, path: str, value: object) -> Tree:
-    """Returns a tree with another leaf at a dotted path."""
-    if not path:
-        return value
-    key, _, rest = path.partition(".")
-    return type(tree)({**tree, key: replaced(tree[key], rest, value)})
+def along(values: torch.Tensor, leaf: torch.Tensor) -> torch.Tensor:
+    """Returns values (B,) in a shape that broadcasts with a leaf (B, ...)."""
+    return values.view(-1, *[1] * (leaf.ndim - 1))

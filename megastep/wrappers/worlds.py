@@ -1,0 +1,226 @@
+"""Wrappers that change observations or rewards."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Annotated
+
+import torch
+from pydantic import Field
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.coefficients import Coefficients
+from megastep.imports import import_object
+from megastep.schedules import Number, Scheduled
+from megastep.settings import checked, closest
+from megastep.types import Env, Space, Tree, n_lanes
+from megastep.wrappers.actions import Probability, normal
+from megastep.wrappers.base import Draws, Wrapper, along
+
+__all__ = ["ClipReward", "DropSensor", "FrameStack", "NoisySensor", "ScaleReward", "ShapeReward"]
+
+NUMBERS = spaces.MultiImage, spaces.MultiVector
+Reward = Annotated[float, Field(ge=-(10**6), le=10**6)]
+
+
+def _sensor(wrapper, sensor) -> Space:
+    """Returns the image or vector at a dotted path of the observation space, "" for one that is no
+    dict. Raises ValueError if there is none.
+    """
+    leaves, name = spaces.leaves(wrapper.env.obs_space), type(wrapper).__name__
+    if sensor not in leaves:
+        hint = "leave sensor out" if "" in leaves else closest(sensor, leaves)
+        raise ValueError(f"{name}: there is no sensor {sensor!r}; {hint}")
+    if not isinstance(leaves[sensor], NUMBERS):
+        words = " or ".join(kind.__name__ for kind in NUMBERS)
+        raise ValueError(f"{name}: {sensor or 'obs'} is {leaves[sensor]!r}, and not {words}")
+    return leaves[sensor]
+
+
+def _replaced(tree, path, value) -> Tree:
+    """Returns a tree with another leaf at a dotted path."""
+    if not path:
+        return value
+    key, _, rest = path.partition(".")
+    return type(tree)({**tree, key: _replaced(tree[key], rest, value)})
+
+
+class FrameStack(Wrapper):
+    """Adds the last observations to each: images get more channels, vectors more numbers, the
+    oldest first. At the start of an episode all are the first observation.
+
+    Args:
+        env: the environment inside.
+        n: number of observations.
+        sensors: dotted paths of those to stack. Default: all images and vectors.
+    """
+
+    @checked
+    def __init__(
+        self,
+        env: Env,
+        *,
+        n: Annotated[int, Field(ge=2, le=64)] = 4,
+        sensors: tuple[str, ...] | None = None,
+    ):
+        super().__init__(env)
+        if sensors is None:
+            leaves = spaces.leaves(env.obs_space)
+            sensors = tuple(name for name, one in leaves.items() if isinstance(one, NUMBERS))
+        self.n, self.obs_space = n, env.obs_space
+        self.frames: dict[str, torch.Tensor] = {}  # (B, n, A, ...) each
+        for sensor in sensors or ("",):
+            space = _sensor(self, sensor)
+            self.obs_space = _replaced(self.obs_space, sensor, _stacked(space, n))
+            shape, dtype = (n_lanes(env), n, *space.shape), space.dtype or torch.float32
+            self.frames[sensor] = torch.zeros(shape, dtype=dtype, device=env.device)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world with stacked observations."""
+        leaves, obs = spaces.leaves(world.obs), world.obs
+        for sensor, frames in self.frames.items():
+            new = leaves[sensor][:, None].to(frames.dtype)
+            older = torch.cat([frames[:, 1:], new], 1)
+            frames.copy_(torch.where(along(world.reset, frames), new, older))
+            # (B, n, A, C, ...) -> (B, A, n C, ...)
+            stacked = frames.transpose(1, 2).flatten(2, 3)
+            obs = _replaced(obs, sensor, stacked.to(leaves[sensor].dtype))
+        return arrdict(world, obs=obs)
+
+
+def _stacked(space, n) -> "spaces.MultiImage | spaces.MultiVector":
+    pairs = ((name, getattr(space, name)) for name in ("low", "high"))
+    bounds = {name: n * value for name, value in pairs if isinstance(value, tuple)}
+    size = {"C": n * space.C} if isinstance(space, spaces.MultiImage) else {"dim": n * space.dim}
+    return dataclasses.replace(space, **size, **bounds)
+
+
+class DropSensor(Wrapper):
+    """Sets a sensor's values to 0 with a probability, as if it failed.
+
+    Args:
+        env: the environment inside.
+        sensor: its dotted path in observations, such as `rgb`.
+        probability: in each step, per lane.
+        seed: of the draws.
+    """
+
+    @checked
+    def __init__(
+        self, env: Env, *, sensor: str = "", probability: Probability = 1.0, seed: int = 1
+    ):
+        super().__init__(env)
+        _sensor(self, sensor)
+        self.sensor, self.probability, self.draws = sensor, probability, Draws(env, (), seed)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world without the sensor in some lanes."""
+        leaf = spaces.leaves(world.obs)[self.sensor]
+        fails = along(self.draws()[:, 0] < self.probability, leaf)
+        return arrdict(world, obs=_replaced(world.obs, self.sensor, leaf.masked_fill(fails, 0)))
+
+
+class NoisySensor(Wrapper):
+    """Adds nearly Gaussian noise to a sensor's values.
+
+    Args:
+        env: the environment inside.
+        sensor: its dotted path in observations, such as `d`.
+        std: standard deviation, in the units of the observation.
+        seed: of the draws.
+    """
+
+    @checked
+    def __init__(
+        self,
+        env: Env,
+        *,
+        sensor: str = "",
+        std: Annotated[float, Field(ge=0, le=10**6)] = 0.1,
+        seed: int = 1,
+    ):
+        super().__init__(env)
+        space = _sensor(self, sensor)
+        if space.dtype == torch.uint8:
+            raise ValueError(
+                f"NoisySensor: {sensor or 'obs'} has bytes, to which no noise is added"
+            )
+        self.sensor, self.std, self.draws = sensor, std, Draws(env, space.shape, seed)
+        unbounded = dataclasses.replace(space, low=None, high=None)
+        self.obs_space = _replaced(env.obs_space, sensor, unbounded)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world with noise."""
+        leaf = spaces.leaves(world.obs)[self.sensor]
+        noisy = (leaf.float() + self.std * normal(self.draws())).to(leaf.dtype)
+        return arrdict(world, obs=_replaced(world.obs, self.sensor, noisy))
+
+
+class ScaleReward(Wrapper):
+    """Multiplies rewards by a factor.
+
+    Args:
+        env: the environment inside.
+        factor: a number or a schedule.
+    """
+
+    @checked
+    def __init__(
+        self, env: Env, *, factor: Annotated[Number, Scheduled(ge=-(10**6), le=10**6)] = 1.0
+    ):
+        super().__init__(env)
+        self.own_coefficients = (Coefficients(env.device, factor=factor),)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world with scaled rewards."""
+        (numbers,) = self.own_coefficients
+        return arrdict(world, reward=world.reward * numbers.tensors["factor"])
+
+
+class ClipReward(Wrapper):
+    """Clips rewards.
+
+    Args:
+        env: the environment inside.
+        min: smallest reward, at most 0: the first reward of an episode is 0.
+        max: largest reward, at least 0.
+    """
+
+    @checked
+    def __init__(self, env: Env, *, min: Reward = -1.0, max: Reward = 1.0):
+        super().__init__(env)
+        if not min <= 0 <= max:
+            raise ValueError(f"ClipReward: 0 must be between min={min:g} and max={max:g}")
+        self.min, self.max = min, max
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world with clipped rewards."""
+        return arrdict(world, reward=world.reward.clamp(self.min, self.max))
+
+
+class ShapeReward(Wrapper):
+    """Replaces rewards by those of a function.
+
+    Args:
+        env: the environment inside.
+        function: import path of a function of a world, `module:function`, or the function. It
+            returns the new rewards, (B,) float32, and does not change the world.
+    """
+
+    @checked
+    def __init__(self, env: Env, *, function: str | Callable):
+        super().__init__(env)
+        self.function = import_object(function) if isinstance(function, str) else function
+        if not callable(self.function):
+            raise ValueError(f"ShapeReward: {function} is no function")
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world with other rewards; 0 at the start of an episode."""
+        reward, expected = self.function(world), world.reward
+        if not isinstance(reward, torch.Tensor) or reward.shape != expected.shape:
+            given = tuple(reward.shape) if isinstance(reward, torch.Tensor) else repr(reward)
+            raise ValueError(
+                f"ShapeReward: {getattr(self.function, '__name__', 'the function')} must return "
+                f"rewards of shape {tuple(expected.shape)}, not {given}"
+            )
+        return arrdict(world, reward=reward.to(expected.dtype).masked_fill(world.reset, 0.0))
