@@ -31,13 +31,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Writes a file as `replacing` does.
-
-    Args:
-        mode: permissions, less those that the umask takes.
-
-    Raises:
-        OSError: the disk is full or not writable. The old file is unchanged.
+    """Writes a file as `replacing` does, with permissions less those that the umask takes. If it
+    raises OSError, the old file is unchanged.
     """
     with replacing(path) as temporary:
         with open(temporary, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
@@ -62,17 +57,8 @@ def delete(path: Path) -> None:
 
 
 class AppendedFile:
-    """A file that bytes are appended to. Those that a full disk refuses are written with the next.
-
-    Args:
-        path: the file, which need not exist.
-        n_bytes: length to cut the file to; None leaves it.
-
-    Attributes:
-        unwritten: bytes that the next `flush` writes.
-
-    Raises:
-        OSError: the file cannot be opened.
+    """A file that bytes are appended to, cut to ``n_bytes`` first. Bytes that a full disk refuses
+    are in `unwritten`, and are written with the next. All methods raise OSError.
     """
 
     def __init__(self, path: Path, n_bytes: int | None = None):
@@ -82,21 +68,16 @@ class AppendedFile:
             self.file.truncate(n_bytes)
 
     def write(self, data: bytes) -> None:
-        """Appends bytes.
-
-        Raises:
-            OSError: the disk is full or not writable.
-        """
         self.unwritten += data
         self.flush()
 
     def flush(self) -> None:
-        """Writes `unwritten`. Raises as `write`."""
+        """Writes `unwritten`."""
         while self.unwritten:
             del self.unwritten[: self.file.write(self.unwritten)]
 
     def sync(self) -> None:
-        """Writes `unwritten` and flushes the file to disk. Raises as `write`."""
+        """Writes `unwritten` and flushes the file to disk."""
         self.flush()
         os.fsync(self.file.fileno())
 

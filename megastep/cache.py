@@ -1,11 +1,9 @@
 """A private cache on disk for built kernels and other results that are expensive to compute.
 
-The folder is ``$MEGASTEP_CACHE``, else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``,
-created with mode 0700. Libraries loaded from it run with the user's rights, so nothing is read that
-another user could have written. Each file ends in a SHA-256 of its name and content: a damaged or
-renamed file is detected and built again. Files are written under a temporary name and renamed, so
-processes can share the cache. If the cache cannot be used, there is one warning, and everything is
-built at each start.
+The folder is ``$MEGASTEP_CACHE``, else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``.
+Libraries loaded from it run with the user's rights, so nothing is read that another user could have
+written. Each file ends in a SHA-256 of its name and content: a damaged or renamed one is built
+again. If the cache cannot be used, there is one warning, and everything is built at each start.
 """
 
 import hashlib
@@ -27,9 +25,8 @@ DIGEST = 32  # bytes
 
 
 def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
-    """Returns a file's content and its path. If it is not cached, ``build`` makes the content.
-
-    The path is None if the cache cannot be used.
+    """Returns a file's content, which ``build`` makes if it is not cached, and its path, None if
+    the cache cannot be used.
     """
     path = _folder() / name
     problem = _problem(path.parent)
@@ -61,10 +58,8 @@ def arrays(
     """Returns arrays by name from the cache. Where it has none, ``build`` makes them.
 
     Args:
-        prefix: of the file's name.
+        prefix: of the file's name, of which at most ``max_files`` and ``max_bytes`` are kept.
         parts: what the arrays depend on: arrays, paths of sources, and what has a repr.
-        build: makes the arrays.
-        max_files, max_bytes: of all files with this prefix; older ones are deleted.
     """
     import numpy as np
 
@@ -87,7 +82,6 @@ def arrays(
 
 
 def warn(problem: str) -> None:
-    """Warns that the cache is not used."""
     warnings.warn(
         f"the cache is not used, so kernels, spawn points, shortest paths, visible texels and the "
         f"episodes of Keys are computed at each start: {problem}; set MEGASTEP_CACHE to a folder "
@@ -97,12 +91,7 @@ def warn(problem: str) -> None:
 
 
 def prune(prefix: str, keep: int, max_bytes: float = math.inf) -> None:
-    """Deletes old files whose names start with ``prefix``.
-
-    Args:
-        keep: number of newest files to keep.
-        max_bytes: total size to keep; the oldest files are deleted first.
-    """
+    """Deletes the oldest files whose names start with ``prefix``, beyond a number and a size."""
     try:
         paths = sorted(_folder().glob(f"{prefix}*"), key=lambda path: -path.stat().st_mtime)
         for number, path in enumerate(paths):
@@ -127,9 +116,7 @@ def intact(path: Path) -> bytes | None:
 
 
 def _digest(name, body) -> bytes:
-    digest = hashlib.sha256(f"{name}\0".encode())
-    digest.update(body)
-    return digest.digest()
+    return hashlib.sha256(f"{name}\0".encode() + body).digest()
 
 
 def _folder() -> Path:

@@ -18,10 +18,6 @@ class Coefficients:
         coefficients.follow(0.5)  # half of the budget is spent
         coefficients.set(gamma=0.995)  # from outside
 
-    Args:
-        device: where the tensors are.
-        settings: numbers and schedules by name.
-
     Attributes:
         values: the present numbers by name.
         tensors: the same as tensors (), float32, which keep their place in memory.
@@ -56,13 +52,8 @@ class Coefficients:
             self.tensors[name].fill_(value)
 
     def follow(self, fraction: float) -> dict[str, float]:
-        """Sets those with a schedule, and returns them by name.
-
-        Args:
-            fraction: of the budget that is spent, from 0 to 1.
-
-        Raises:
-            ValueError: a function fails, or gives no finite number.
+        """Sets those with a schedule by the fraction of the budget that is spent, and returns them
+        by name. Raises ValueError if a function fails, or gives no finite number.
         """
         values = {name: called(function, fraction) for name, function in self.schedules.items()}
         for name, value in values.items():

@@ -19,9 +19,7 @@ _n_threads = None  # None: as many as PyTorch
 
 def device(name: str | torch.device = "auto") -> torch.device:
     """Returns a device by name: auto (a GPU if there is one, else the CPU), cpu, cuda or cuda:1.
-
-    Raises:
-        EngineError: if the device does not exist.
+    Raises EngineError if there is none.
     """
     if name == "auto":
         return (
@@ -75,10 +73,8 @@ def _warn_of_spinning() -> None:
 
 
 def set_threads(n: int | None) -> None:
-    """Sets the number of CPU threads per operation; None means as many as PyTorch uses.
-
-    Raises:
-        ValueError: unless it is from 1 to 1,024, or to the number of processors if that is more.
+    """Sets the number of CPU threads per operation, from 1 to 1,024, or to the number of processors
+    if that is more; None means as many as PyTorch uses.
     """
     global _n_threads
     if n is not None and (type(n) is not int or not 1 <= n <= MAX_THREADS):
@@ -87,10 +83,8 @@ def set_threads(n: int | None) -> None:
 
 
 def fit(n: int, bytes_each: float, device: torch.device | str, what: str = "environments") -> None:
-    """Checks that ``n`` things of ``bytes_each`` bytes fit into the free memory of ``device``.
-
-    Raises:
-        EngineError: if they do not; it says how many fit.
+    """Raises EngineError, which says how many fit, if ``n`` things of ``bytes_each`` bytes do not
+    fit into the free memory of ``device``.
     """
     free = free_memory(device)
     if n * bytes_each > 0.95 * free:
@@ -121,10 +115,8 @@ def free_memory(device: torch.device | str) -> int:
 
 @functools.cache
 def n_resident_threads(device: torch.device, n_blocks: int | None = None) -> int:
-    """Returns how many threads a GPU can run at once, 0 for a CPU.
-
-    Args:
-        n_blocks: blocks of a kernel that a multiprocessor can hold. Default: no limit.
+    """Returns how many threads a GPU can run at once, if a multiprocessor holds at most
+    ``n_blocks`` blocks of a kernel; 0 for a CPU.
     """
     if device.type == "cpu":
         return 0

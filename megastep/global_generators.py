@@ -25,11 +25,7 @@ _NUMPY: Any = np.random  # whose types leave out the functions that exchange its
 
 
 class GlobalGenerators:
-    """The global generators as one environment finds them, each at a place of its own.
-
-    Args:
-        seed: integers from 0.
-    """
+    """The global generators as one environment finds them, each at a place of its own."""
 
     def __init__(self, seed: Sequence[int]):
         sequence = np.random.SeedSequence(seed)
@@ -74,19 +70,12 @@ class GlobalGenerators:
 @contextlib.contextmanager
 def kept() -> Iterator[None]:
     """Draws inside leave the global generators as they were."""
-    torch = sys.modules.get("torch")
-    numpy, python, of_torch = (
-        np.random.get_state(),
-        random.getstate(),
-        torch and torch.get_rng_state(),
-    )
+    outside = Held.current()
+    outside.copied().install()
     try:
         yield
     finally:
-        np.random.set_state(numpy)
-        random.setstate(python)
-        if torch:
-            torch.set_rng_state(of_torch)
+        outside.install()
 
 
 class Held(NamedTuple):

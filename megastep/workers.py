@@ -45,10 +45,7 @@ def terminal_signals_blocked() -> Iterator[None]:
 
 
 def end_with(is_running: Callable[[], bool]) -> None:
-    """Sends this process SIGTERM once `is_running()`, asked every second, is false.
-
-    For a process whose starter may be killed, which then stops nothing itself.
-    """
+    """Sends this process SIGTERM once `is_running()`, asked every second, is false."""
 
     def watch() -> None:
         while is_running():

@@ -29,28 +29,6 @@ def numbers(tree):
     }
 
 
-def test_repr_of_shapes():
-    tree = arrdict(rgb=torch.zeros(2, 1, 3, 1, 64), inner=arrdict(d=np.zeros(4)), n=torch.tensor(1))
-    assert repr(tree.shape) == "\n".join(
-        [
-            "arrdict:",
-            "rgb      (2, 1, 3, 1, 64)",
-            "inner    arrdict:",
-            "         d    (4,)",
-            "n        ()",
-        ]
-    )
-
-
-def test_indexing_applies_to_every_leaf():
-    tree = arrdict(a=torch.arange(6).view(2, 3), b=dotdict(c=torch.arange(4).view(2, 2)))
-    assert numbers(tree[1]) == {"a": [3, 4, 5], "b": {"c": [2, 3]}}
-    assert numbers(tree[:, -1]) == {"a": [2, 5], "b": {"c": [1, 3]}}
-    assert numbers(tree[torch.tensor([False, True])]) == {"a": [[3, 4, 5]], "b": {"c": [[2, 3]]}}
-    assert tree[..., None].a.shape == (2, 3, 1)
-    assert type(tree[0]) is arrdict and type(tree[0].b) is dotdict
-
-
 def test_indexing_with_a_tree_of_indices():
     tree = arrdict(a=torch.tensor([1, 2]), b=torch.tensor([3, 4]))
     assert numbers(tree[arrdict(a=0, b=1)]) == {"a": 1, "b": 4}
@@ -72,13 +50,6 @@ def test_assignment_of_a_tree_with_other_keys_is_refused_before_any_write():
     with pytest.raises(ValueError, match="one has a, b and the other a"):
         tree[0] = arrdict(a=1.0)
     assert tree.a.tolist() == [0, 0]
-
-
-def test_string_keys_are_items(tensors):
-    tensors["d"] = 5
-    assert tensors["d"] == tensors.d == 5
-    with pytest.raises(KeyError, match="its keys are a, b, d"):
-        tensors["e"]
 
 
 @pytest.mark.parametrize("name", OPERATORS.split())
@@ -123,12 +94,6 @@ def test_augmented_assignment_makes_a_new_tree():
     assert tree.a.tolist() == [True, True] and before.a.tolist() == [True, False]
     tree += 1
     assert tree.a.tolist() == [2, 2]
-
-
-def test_attributes_and_calls_of_leaves(tensors):
-    assert tensors.shape == {"a": (1,), "b": {"c": (1,)}}
-    assert tensors.float().b.c.dtype == torch.float32
-    assert repr((tensors + tensors)[0].item()) == "arrdict:\na    2\nb    arrdict:\n     c    4"
 
 
 def test_stack_makes_a_new_axis_and_cat_extends_one():
@@ -216,17 +181,3 @@ def test_pytrees_keep_the_type(kind):
     assert type(mapped) is type(mapped.b) is kind and mapped.b.c.tolist() == [3]
     paths = [_pytree.keystr(path) for path, _ in _pytree.tree_flatten_with_path(tree)[0]]
     assert paths == ["['a']", "['b']['c']"]
-
-
-@pytest.mark.slow
-def test_torch_compile_with_trees():
-    def f(tree):
-        total = tree.a * 2 + tree.b.c
-        return arrdict(total=total, tree=tree, parts=dotdict(x=total[0]))
-
-    torch._dynamo.reset()
-    out = torch.compile(f, backend="eager")(
-        arrdict(a=torch.tensor([1.0]), b=arrdict(c=torch.tensor([2.0])))
-    )
-    assert type(out) is arrdict and type(out.tree) is arrdict and type(out.parts) is dotdict
-    assert out.total.tolist() == [4] and out.tree.b.c.tolist() == [2] and out.parts.x == 4

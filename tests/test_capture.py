@@ -9,7 +9,6 @@ import gc
 import weakref
 from operator import attrgetter
 
-import pydantic
 import pytest
 import torch
 
@@ -71,21 +70,6 @@ def test_state_tree_finds_tensors_and_generators_by_path():
     } <= set(paths)
 
 
-def test_restoring_a_snapshot_repeats_the_episode():
-    env = envs.Explorer(3, device="cpu")
-    env.reset()
-    turn = arrdict.arrdict(actions=torch.full((3, 1), 5))
-    env.step(turn)
-    saved = capture.snapshot(env)
-    first = [env.step(turn) for _ in range(5)]
-    capture.restore(env, saved)
-    again = [env.step(turn) for _ in range(5)]
-    assert all(
-        torch.equal(a.obs.rgb, b.obs.rgb) and torch.equal(a.reward, b.reward)
-        for a, b in zip(first, again, strict=True)
-    )
-
-
 def test_restore_refuses_a_snapshot_of_another_environment():
     saved = capture.snapshot(envs.Explorer(3, device="cpu"))
     with pytest.raises(ValueError, match="which this Minimal does not have"):
@@ -98,22 +82,6 @@ def test_restore_refuses_a_snapshot_of_another_environment():
         ValueError, match=r"pair\[0\] is \(4,\) torch.float32, but this Counter needs"
     ):
         capture.restore(env, capture.snapshot(Counter()))
-
-
-def test_state_tree_leaves_out_read_only_tensors():
-    env = envs.Minimal(2, device="cpu")
-    paths = capture.state_tree(env)
-    assert ".core.scenery.layouts.wall_starts" not in paths
-    assert ".core.scenery.layouts.lines.vals" in paths
-
-
-def test_parameters_of_a_module_are_kept_in_place():
-    module = torch.nn.Linear(2, 1)
-    weight, before = module.weight, capture._StateBefore([module])
-    module.weight = torch.nn.Parameter(torch.ones(1, 2))
-    with torch.no_grad():
-        before.keep_in_place()
-    assert module.weight is weight and weight.tolist() == [[1, 1]]
 
 
 @pytest.mark.parametrize(
@@ -138,14 +106,6 @@ def test_rebound_tensors_are_kept_in_place_and_other_changes_are_refused(how, er
     else:
         state.keep_in_place()
         assert env.parts["total"] is before and before.tolist() == [1.0] * 4
-
-
-def test_a_tensor_may_move_to_another_attribute():
-    env = Counter()
-    state = capture._StateBefore([env])
-    env.first = env.parts
-    del env.parts
-    state.keep_in_place()
 
 
 def test_moved_tensors_and_outputs_keep_their_numbers():
@@ -192,10 +152,6 @@ def test_read_only_outputs_are_kept():
     state, view = capture._StateBefore([env]), ReadOnlyTensor(env.now, "now")
     env.now = torch.ones(2)
     assert torch.as_tensor(state.keep_in_place({"view": view})["view"]).tolist() == [0, 0]
-
-
-class Frozen(pydantic.BaseModel, frozen=True):
-    size: int = 4
 
 
 class Lazy:
@@ -328,26 +284,6 @@ def test_the_warning_names_the_attribute_or_the_line(fake_cuda):
 
     with pytest.warns(UserWarning, match=r"no graph of this at .*test_capture.py:\d+$"):
         assert capture.capture(fails, (), ()) is fails
-
-
-@pytest.mark.parametrize(
-    "error, text", [(AssertionError(), "AssertionError"), (KeyError("x"), "KeyError 'x'")]
-)
-def test_an_error_of_another_class_is_named(fake_cuda, error, text):
-    def fails():
-        raise error
-
-    with pytest.warns(UserWarning, match=rf"slower: {text} at .*test_capture.py:\d+$"):
-        assert capture.capture(fails, (), ()) is fails
-
-
-def test_only_the_actions_of_a_decision_reach_the_environment():
-    decisions = []
-    env = Counter()
-    env.step = decisions.append
-    decision = arrdict.arrdict(**actions("cpu"), logits=torch.zeros(4))
-    capture.Captured(env).step(decision)
-    assert set(decisions[0]) == {"actions"}
 
 
 def test_a_copy_steps_its_own_environment():

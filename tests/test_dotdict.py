@@ -21,24 +21,10 @@ def test_unknown_attributes_are_looked_up_on_leaves():
     assert type(tree.imag.b) is dotdict
 
 
-def test_calls_pass_their_arguments_to_leaves():
-    tree = dotdict(a="x-y", b=dotdict(c="z"))
-    assert tree.split("-") == {"a": ["x", "y"], "b": {"c": ["z"]}}
-    assert tree.replace("z", "w").b.c == "w"
-
-
-def test_a_key_of_nested_trees_is_an_attribute_of_the_parent():
-    assert dotdict(a=dotdict(x=1, y=2), b=dotdict(x=3)).x == {"a": 1, "b": 3}
-
-
 def test_methods_precede_keys_and_keys_precede_attributes_of_values():
     tree = dotdict(items=1, imag=2)
     assert list(tree.items()) == [("items", 1), ("imag", 2)]
     assert tree.imag == 2
-
-
-def test_empty_trees_are_kept():
-    assert dotdict(a="x", b=dotdict()).upper() == {"a": "X", "b": {}}
 
 
 def test_an_unknown_attribute_is_named_with_the_nearest_key():
@@ -106,17 +92,6 @@ def test_mapping():
     assert scale(dotdict(a=1, b={"c": 2}), 10, plus=1) == {"a": 11, "b": {"c": 21}}
     assert scale(3, 10) == 30
     assert scale.__name__ == "scale"
-
-
-def test_merge_keeps_the_type():
-    merged = dotdict(a=1, b=2) | {"b": 3}
-    assert type(merged) is dotdict and merged == {"a": 1, "b": 3}
-    assert type({"a": 1} | dotdict(b=2)) is dotdict
-
-
-def test_repr_is_nested(objs):
-    rows = ["dotdict:", "a    dotdict:", "     b    1", "     c    2", "d    3"]
-    assert repr(objs).split("\n") == str(objs).split("\n") == rows
 
 
 def test_repr_aligns_values_and_shortens_long_leaves():

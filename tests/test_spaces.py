@@ -11,13 +11,6 @@ from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
 
 
-def test_shapes():
-    assert spaces.MultiVector(2, 3).shape == (2, 3)
-    assert spaces.MultiImage(1, 3, 1, 64).shape == (1, 3, 1, 64)
-    assert spaces.MultiDiscrete(2, 7).shape == (2,)
-    assert spaces.MultiEmpty().shape == (0,)
-
-
 def test_equality_hash_repr_and_pickle_go_by_value():
     assert spaces.MultiVector(2, 3) == spaces.MultiVector(2, 3) != spaces.MultiVector(2, 4)
     assert spaces.MultiVector(2, 3) != spaces.MultiDiscrete(2, 3)
@@ -63,16 +56,6 @@ def test_map_gives_an_arrdict_with_the_keys_of_the_space():
     assert spaces.leaves(shapes) == {"rgb": (1, 3, 1, 8), "body.speed": (1, 2), "body.hands": (2,)}
     assert list(shapes) == list(TREE) and type(shapes) is type(shapes.body) is arrdict
     assert spaces.map(lambda space: space.shape, RGB) == (1, 3, 1, 8)
-
-
-def test_map_passes_the_values_of_each_leaf():
-    first, second = (dict(rgb=i, body=dict(speed=2 * i, hands=3 * i), nothing={}) for i in (1, 10))
-    sums = spaces.map(lambda space, a, b: (type(space).__name__, a + b), TREE, first, second)
-    assert spaces.leaves(sums) == {
-        "rgb": ("MultiImage", 11),
-        "body.speed": ("MultiVector", 22),
-        "body.hands": ("MultiDiscrete", 33),
-    }
 
 
 def test_bounds_of_continuous_actions_are_kept_per_number():

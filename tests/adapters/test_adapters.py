@@ -128,17 +128,6 @@ def test_numpys_wrappers_run_over_it():
         assert n_episodes or name != "RecordEpisodeStatistics"
 
 
-def test_statistics_of_gymnasium_are_those_of_the_episodes():
-    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(
-        adapters.VectorEnv(pong(points=3), SAME)
-    )
-    env.reset(seed=1)
-    for _ in range(200):
-        *_, infos = env.step(env.action_space.sample())
-        for lane in np.flatnonzero(infos.get("_episode", [])):
-            assert abs(infos["episode"]["r"][lane]) <= 3 and infos["episode"]["l"][lane] <= 90
-
-
 def test_what_does_not_fit_is_named_in_gymnasium():
     for mode in ("same_step", "disabled"):
         name = mode.upper()

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from megastep import contract, engine, envs, spaces, toys
-from megastep.agents.cli import evaluate, train
-from megastep.agents.factory import make
+from megastep.agents.cli import train
 from megastep.arrdict import arrdict
 from megastep.capture import Captured
 from megastep.wrappers import (
@@ -24,7 +23,7 @@ from megastep.wrappers import (
     TimeLimit,
 )
 from tests.helpers import pages
-from tests.helpers.tiny import TINY, settings
+from tests.helpers.tiny import TINY
 
 B = 64
 DEVICES = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -264,25 +263,6 @@ def test_wrong_spaces_and_environments_are_named():
         StickyActions(Masked()).reset()
     with pytest.raises(ValueError, match=r"must return rewards of shape \(64,\), not \(64, 1\)"):
         ShapeReward(Counting(), function=lambda world: world.reward[:, None]).reset()
-
-
-def test_wrappers_of_gymnasium_run_inside(here):
-    """Both kinds in one list, in any order; those of the package are around each environment."""
-    gym = "gymnasium.wrappers:NormalizeObservation"
-    words = ["env=gymnasium", "env.id=CartPole-v1", *TINY[2:3], *TINY[4:], "samples=256"]
-    listed = f"env.wrappers=[{{name:frame_stack,n:2}},{gym},clip_reward]"
-    assert train.main([*words, listed, "folder=run"]) == 0
-    assert evaluate.main(["run=run", "episodes=4", "device=cpu", "baseline=none"]) == 0
-
-
-def test_wrappers_of_pettingzoo_run_inside():
-    pytest.importorskip("pettingzoo")
-    words = "env=pettingzoo", "env.id=pettingzoo.sisl.multiwalker_v9:parallel_env", *TINY[2:3]
-    listed = "[{name:frame_stack,n:2},pettingzoo.utils.wrappers:BaseParallelWrapper]"
-    cfg = settings(*words, *TINY[4:], f"env.wrappers={listed}").env
-    inside, outside = make._wrappers_of(cfg, {"wrappers"})
-    assert inside == ["pettingzoo.utils.wrappers:BaseParallelWrapper"]
-    assert [one.name for one in outside] == ["megastep.wrappers:FrameStack"]
 
 
 def test_code_and_commands_of_the_page_work(here, monkeypatch):

@@ -62,12 +62,6 @@ def test_wrong_results_are_named(what, problem):
     assert "\n" not in str(error.value)
 
 
-def test_checks_can_be_left_out():
-    envs = HostedEnvs(lambda: Wrong("info"), 2, check=False)
-    envs.reset(seed=[1, 2])
-    envs.step(np.zeros(2, int))
-
-
 @pytest.mark.parametrize(
     "space, value, is_wrong",
     [

@@ -115,34 +115,12 @@ def test_episode_ends_with_its_true_last_observation(ends, flag):
         assert values[:, 1].tolist() == expected, key
 
 
-def test_end_of_both_kinds_is_terminal():
-    env = Gymnasium(1, id="TestCounter-v0", kwargs={"limit": 1, "ends": (True, True)}, device="cpu")
-    world = contract.rollout(env, 1)[-1]
-    assert world.terminal.all() and not world.truncated.any()
-
-
-def test_worlds_are_not_overwritten_by_later_ones():
-    env = cart_pole()
-    first = env.reset()
-    copy = first.clone()
-    env.step(do_nothing(env))
-    assert contract.same(first, copy)
-
-
 def test_each_environment_has_its_own_seed():
     first, again, other = (cart_pole(seed=seed).reset().obs for seed in (1, 1, 2))
     assert torch.equal(first, again) and not torch.equal(first, other)
     assert len({tuple(row) for row in torch.cat([first, other]).flatten(1).tolist()}) == 8
     env = cart_pole()
     assert not torch.equal(env.reset().obs, env.reset().obs), "a second reset begins other episodes"
-
-
-def test_wrappers_and_arguments():
-    name = f"{__name__}:Doubled"
-    env = Gymnasium(
-        1, id="TestCounter-v0", kwargs={"limit": 9}, wrappers=(name, name), device="cpu"
-    )
-    assert [world.obs.item() for world in contract.rollout(env, 2)] == [0, 4, 8]
 
 
 # ---- Processes ----

@@ -65,11 +65,6 @@ class Relay:
         pass
 
 
-class Undrawn(Relay):
-    def __init__(self, odd=False):
-        super().__init__(odd=odd)
-
-
 ID = f"{__name__}:Relay"
 
 

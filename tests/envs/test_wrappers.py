@@ -51,17 +51,6 @@ def test_what_a_wrapper_keeps_beyond_an_episode_is_carried_and_frozen(vectorizat
     other.close()
 
 
-def test_frozen_statistics_are_those_of_training():
-    env, raw = make(NORMALIZE, id="Pendulum-v1"), make(id="Pendulum-v1", seed=5)
-    contract.rollout(env, 40)
-    state, evaluated = env.wrapper_state(), make(NORMALIZE, id="Pendulum-v1", seed=5)
-    evaluated.load_wrapper_state(state, is_frozen=True)
-    mean, variance = (state[f"0.NormalizeObservation.obs_rms.{n}"] for n in ("mean", "var"))
-    for world, other in zip(played(raw), played(evaluated), strict=True):
-        expected = (world.obs - mean) / (variance + 1e-8).sqrt()
-        torch.testing.assert_close(other.obs, expected.float())
-
-
 def test_environment_in_other_wrappers_is_refused():
     state = {"0.NormalizeObservation.obs_rms.mean": torch.zeros(1)}
     with pytest.raises(ValueError, match="needs what its wrapper NormalizeObservation has learnt"):
