@@ -176,9 +176,8 @@ def end_failed_recording() -> None:
 class Graph:
     """A function recorded as a CUDA graph. Arguments are those of :func:`capture`.
 
-    A call copies the tensors of its arguments in, replays the graph, and returns the outputs. They
-    are valid until the next call. The tensors of ``roots`` live as long as the graph, which reads
-    and writes them, even if the objects themselves are gone.
+    A call copies the tensors of its arguments in, replays the graph, and returns the outputs, valid
+    until the next call. The tensors of ``roots`` live as long as the graph.
     """
 
     IS_STATELESS = True  # its tensors are copies, see :func:`megastep.engine.state_tree.walk`
@@ -252,9 +251,7 @@ class Graph:
         return self.with_leaves(leaves)
 
     def with_leaves(self, leaves: Sequence) -> Any:
-        """Calls it with the leaves of its arguments in a row, without looking at their trees, which
-        takes a host longer than everything else.
-        """
+        """Calls it with the leaves of its arguments, whose trees take longer than all else."""
         for buffer, leaf in zip(self._leaves, leaves):
             if isinstance(buffer, torch.Tensor):
                 if buffer.shape != leaf.shape:
@@ -278,17 +275,15 @@ def capture(
     """Records a function as a CUDA graph on the device of its state. Returns the :class:`Graph`, or
     ``function`` itself with one warning that names the line, if it cannot be captured.
 
-    A tensor that the function creates where an attribute was None is kept, with the value that the
-    last warm-up call gave it, because the graph writes into it. If it must start with another
-    value, create it before capturing.
+    A tensor that the function creates where an attribute was None is kept with the value of the
+    last warm-up call, because the graph writes into it.
 
     Args:
         function: takes ``args``. Changes only tensors and generators below ``roots``.
         args: example arguments, trees of tensors whose shapes stay fixed.
         roots: objects whose state the function changes. Their values are restored afterwards.
         warmup: number of calls before the recording.
-        changed: called after the recording, returns the name of what the function has changed
-            besides tensors, if anything.
+        changed: called after the recording, returns the name of what else has changed, if anything.
     """
     try:
         return Graph(function, args, roots, warmup, changed)
@@ -306,9 +301,6 @@ def capture(
 
 
 def _line(error) -> str:
-    """Returns the line outside PyTorch and this file that raised an error, as the end of a
-    sentence.
-    """
     if isinstance(error, CaptureError):
         return ""
     frames = traceback.extract_tb(error.__traceback__)
@@ -339,9 +331,8 @@ class Captured:
         return {"env": self.env, "_step": None}  # a copy records a graph of its own
 
     def step(self, decision: Mapping) -> World:
-        """Steps the environment by ``decision["actions"]``; other keys are dropped.
-
-        On a GPU the returned world is valid until the next step.
+        """Steps the environment by ``decision["actions"]``; other keys are dropped. On a GPU the
+        returned world is valid until the next step.
         """
         decision = cast("type[dict]", type(decision))(actions=decision["actions"])
         if self._step is None:

@@ -114,7 +114,7 @@ class SB3VecEnv(VecEnv):
     def set_attr(
         self, attr_name: str, value: object, indices: int | Iterable[int] | None = None
     ) -> None:
-        """Raises ValueError: lanes share one environment."""
+        """Raises ValueError: lanes share an environment."""
         raise ValueError(f"{attr_name} cannot be set in single lanes, which share an environment")
 
     def env_method(

@@ -37,7 +37,6 @@ class Hosted:
         envs: the environments.
         first: number of the first in messages.
         found: what a probe has found about them.
-        frozen: a state of their wrappers that does not change, if any.
         n_to_check: steps in which the form of what they return is still checked.
     """
 
@@ -50,26 +49,6 @@ class Hosted:
 
     def __init__(self, found: Probe | None, check: bool):
         self.found, self.n_to_check = found or Probe(), CHECKED_STEPS if check else 0
-        self.frozen: Tree = None
-
-    def wrapper_state(self) -> Tree:
-        """Returns what the wrappers of the first environment have learnt, by path."""
-        return wrapper_state(self.envs[0], self.found.learnt) if self.found.learnt else {}
-
-    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what others have learnt.
-
-        Args:
-            is_frozen: it stays as it is from now on.
-
-        Raises:
-            ValueError: the environments are not in such wrappers.
-        """
-        self.frozen = state if is_frozen else None
-        for env in self.envs:
-            load_wrapper_state(env, state)
-            if is_frozen:
-                freeze(env)
 
     def render(self) -> list[np.ndarray]:
         return [env.render() for env in self.envs]
@@ -87,8 +66,6 @@ class Hosted:
 
     def _checked(self, e, method, result, agents=None) -> Any:
         """Returns what environment e returned. Raises BadValue if its form is wrong."""
-        if self.frozen:
-            load_wrapper_state(self.envs[e], self.frozen)
         space = self.single_observation_space
         if self.n_to_check and (clause := problem(method, result, space, agents)):
             raise BadValue.of(clause, f"environment {self.first + e}")
@@ -143,6 +120,21 @@ class HostedEnvs(Hosted):
         is_recorded = TRUE_RETURN in self.found.names
         self.recorders: Any = [RewardRecorder.inside(env) for env in self.envs if is_recorded]
         self.true_returns = np.zeros(n_envs)
+        self.frozen: Tree = None  # a state of the wrappers that does not change
+
+    def wrapper_state(self) -> Tree:
+        """Returns what the wrappers of the first environment have learnt, by path."""
+        return wrapper_state(self.envs[0], self.found.learnt) if self.found.learnt else {}
+
+    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
+        """Gives the wrappers of all environments what others have learnt, which stays as it is if
+        it `is_frozen`. Raises ValueError if they are not in such wrappers.
+        """
+        self.frozen = state if is_frozen else None
+        for env in self.envs:
+            load_wrapper_state(env, state)
+            if is_frozen:
+                freeze(env)
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
         """Resets every environment. Returns (observations, infos)."""
@@ -192,6 +184,8 @@ class HostedEnvs(Hosted):
         """Calls an environment, which draws from global generators of its own."""
         with self.generators[e].installed(self.found.generators):
             result = getattr(self.envs[e], method)(*arguments, **settings)
+        if self.frozen:
+            load_wrapper_state(self.envs[e], self.frozen)
         return self._checked(e, method, result)
 
     def _keep_numbers(self, e, info) -> None:
@@ -203,9 +197,7 @@ class HostedEnvs(Hosted):
 
 def start_rendering(vector: Any) -> None:
     """Sets the render mode of environments to rgb_array, if they have it and no other was chosen.
-
-    Called before the first frame and not earlier: with a render mode, LunarLander simulates the
-    particles of its exhaust and steps at a third of the speed.
+    Not before the first frame: LunarLander then steps at a third of the speed.
     """
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame complains of no display

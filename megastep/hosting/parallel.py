@@ -11,9 +11,8 @@ import numpy as np
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
 from megastep.hosting.hosted import Hosted
-from megastep.hosting.probe import Probe, play_parallel, probe
+from megastep.hosting.probe import Probe
 from megastep.hosting.values import allowed_actions, masked_actions
-from megastep.hosting.wrapper_state import wrapper_state
 from megastep.types import Tree
 
 __all__ = ["ParallelEnvs"]
@@ -32,9 +31,6 @@ class ParallelEnvs(Hosted):
     Attributes:
         present: (N, A) bool, agents that act in the next step. An agent is not if the reset left it
             out or its episode has ended, until it is among the environment's agents again.
-
-    Raises:
-        ValueError: it is turn-based, or the spaces of two agents differ.
     """
 
     def __init__(
@@ -50,13 +46,12 @@ class ParallelEnvs(Hosted):
         if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             kwargs = {"render_mode": "rgb_array", **kwargs}
 
-        def make_one() -> Any:
+        self.envs = []
+        for _ in range(n_envs):
             env = _parallel(make(**kwargs))
             for wrapper in wrappers:
                 env = wrapper(env)
-            return env
-
-        self.envs = [make_one() for _ in range(n_envs)]
+            self.envs.append(env)
         self.render_mode, env = kwargs.get("render_mode"), self.envs[0]
         self.agents, self.metadata = list(env.possible_agents), env.metadata
         first = env.reset()
@@ -69,8 +64,7 @@ class ParallelEnvs(Hosted):
         self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]  # observations
         masks = _masks(*first) if isinstance(first, tuple) and len(first) == 2 else {}
         sizes = [masked_actions(self.single_action_space, one) for one in masks.values()]
-        learnt = probe(make_one, play=play_parallel).learnt if wrapper_state(env) else ()
-        self.found = Probe(learnt=learnt, n_masked=min(sizes, default=0))
+        self.found = Probe(n_masked=min(sizes, default=0))
         self.masks = np.ones((n_lanes, max(0, self.found.n_masked)), bool)
         shape = n_envs, len(self.agents)
         self.reward, self.present = np.zeros(shape), np.zeros(shape, bool)

@@ -1,5 +1,5 @@
-"""An episode of random actions in an environment of Gymnasium or PettingZoo, which finds what
-cannot be asked of it. Workers import it, so without PyTorch.
+"""An episode of random actions in an environment of Gymnasium, which finds what cannot be
+asked of it. Workers import it, so without PyTorch.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from megastep.hosting.values import masked_actions
 from megastep.hosting.wrapper_state import wrapper_state
 from megastep.types import Tree
 
-__all__ = ["TRUE_RETURN", "Probe", "RewardRecorder", "numbers_of", "play_parallel", "probe"]
+__all__ = ["TRUE_RETURN", "Probe", "RewardRecorder", "numbers_of", "probe"]
 
 #: Name of the sum of an episode's rewards before wrappers change them.
 TRUE_RETURN = "true_return"
@@ -73,7 +73,7 @@ def numbers_of(info: object) -> dict[str, float]:
     return values
 
 
-def play(env: Any, seed: int) -> Iterator[tuple]:
+def _play(env, seed) -> Iterator[tuple]:
     """Yields reward, whether the episode is over, and info, for each step by a random action."""
     actions = copy.deepcopy(env.action_space)  # which may be that of a class
     actions.seed(seed)
@@ -82,18 +82,7 @@ def play(env: Any, seed: int) -> Iterator[tuple]:
         yield reward, terminated or truncated, info
 
 
-def play_parallel(env: Any, seed: int) -> Iterator[tuple]:
-    """As `play`, in a parallel environment of PettingZoo, without rewards and info."""
-    spaces = {agent: copy.deepcopy(env.action_space(agent)) for agent in env.possible_agents}
-    for space in spaces.values():
-        space.seed(seed)
-    while True:
-        _, _, *flags, _ = env.step({agent: spaces[agent].sample() for agent in env.agents})
-        ended: Mapping[str, bool] = {a: any(f.get(a) for f in flags) for a in set().union(*flags)}
-        yield 0.0, not env.agents or all(ended.values()) or ended.get("__all__", False), {}
-
-
-def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
+def probe(make: Callable, seed: int = 0) -> Probe:
     """Makes an environment, plays an episode of at most `MAX_STEPS` and `MAX_SECONDS`, and closes
     it. Leaves the global generators as they were. An error ends the episode: the same one comes in
     training, which names it.
@@ -106,7 +95,7 @@ def probe(make: Callable, seed: int = 0, play: Callable = play) -> Probe:
             n_masked = masked_actions(env.action_space, env.reset(seed=seed)[1])
             first, end = wrapper_state(env), time.monotonic() + MAX_SECONDS
             recorder = RewardRecorder.inside(env)
-            for reward, is_over, info in itertools.islice(play(env, seed), MAX_STEPS):
+            for reward, is_over, info in itertools.islice(_play(env, seed), MAX_STEPS):
                 is_changed |= recorder is not None and bool(recorder.recorded_reward != reward)
                 names = sorted(numbers_of(info), key=lambda name: name != "is_success")
                 if is_over or time.monotonic() > end:

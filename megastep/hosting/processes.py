@@ -29,17 +29,9 @@ PATIENCE = 5
 
 
 class VectorProcesses:
-    """N environments in worker processes, with the interface of :class:`HostedEnvs`.
-
-    Each environment gets the same seed as in one process, so the numbers are the same. The workers
-    end with :meth:`close`, with this object, or with the process that made it, even if that is
-    killed.
-
-    Args:
-        make: makes one environment. It is sent to the workers.
-        n_envs: number of environments, N.
-        seed: of what the environments draw from global generators.
-        check: see :class:`HostedEnvs`.
+    """N environments in worker processes, with the interface and the numbers of
+    :class:`~megastep.hosting.hosted.HostedEnvs`. The workers end with :meth:`close`, with this
+    object, or with the process that made it, even if that is killed.
     """
 
     max_episode_steps: int | None = None
@@ -79,19 +71,14 @@ class VectorProcesses:
         self.latest_state: Tree = {}
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
-        """Resets every environment. Returns (observations, infos)."""
         obs, infos = zip(*self._ask("reset", seed=seed))
         return self._batch(obs), _joined(infos)
 
     def step(self, actions: Tree) -> tuple:
-        """Takes one step. Returns (observations, rewards, terminated, truncated, infos), which are
-        valid until the next call.
-        """
         obs, *results, infos = zip(*self._ask("step", actions=actions))
         return self._batch(obs), *map(np.concatenate, results), _joined(infos)
 
     def render(self) -> list:
-        """Returns a frame of every environment."""
         return [frame for frames in self._ask("render") for frame in frames]
 
     def wrapper_state(self) -> Tree:
@@ -107,14 +94,11 @@ class VectorProcesses:
         return self.latest_state
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """As :meth:`~megastep.hosting.hosted.Hosted.load_wrapper_state`."""
         self._ask("load_wrapper_state", state=state, is_frozen=is_frozen)
 
     def close(self) -> None:
         """Closes the environments and ends their processes, by force after `PATIENCE` seconds.
-
-        Raises:
-            EnvError: the first error of an environment that could not be closed.
+        Raises the first EnvError.
         """
         answers, pipes, end = [], [*self.pipes], time.monotonic() + PATIENCE
         for pipe in pipes:
@@ -140,11 +124,8 @@ class VectorProcesses:
         return _raise_first([self._receive(number) for number in range(len(self.pipes))])
 
     def _receive(self, number) -> Any:
-        """Returns the answer of a process, which may be an error of an environment.
-
-        Raises:
-            MemoryError: it was killed.
-            EnvError: it has ended otherwise.
+        """Returns the answer of a process, which may be an error of an environment. Raises
+        MemoryError if it was killed, EnvError if it has ended otherwise.
         """
         try:
             return self.pipes[number].recv()

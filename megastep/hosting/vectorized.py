@@ -37,21 +37,15 @@ class VectorizedEnv:
 
     Args:
         id: name of the environments in messages.
-        vector: has ``single_observation_space``, ``single_action_space``, ``metadata``,
-            ``render_mode``, ``reset(seed=)``, ``step(actions)``, ``render()`` and ``close()``, as
-            Gymnasium's vector environments do, with a row per lane. If it has ``found``, a
-            :class:`~megastep.hosting.probe.Probe`, its infos are those of
-            :class:`~megastep.hosting.hosted.HostedEnvs`; if it has ``present``, they have
-            ``present``, (B,) bool, the lanes whose next action is used.
+        vector: a vector environment of Gymnasium with a row per lane, or one with the same methods.
+            With ``found``, its infos are those of :class:`~megastep.hosting.hosted.HostedEnvs`;
+            with ``present``, they have the lanes whose next action is used.
         n_envs: number of environments, N.
         n_agents: lanes per environment, A.
         seeds: passed to the first ``vector.reset``, one per environment or one for all.
         device: where worlds and actions are. Default: a GPU if there is one.
         check: refuses actions that are not finite, and in the first `CHECKED_STEPS` observations
             that are not in their space; warns of those beyond the bounds of a Box.
-
-    Raises:
-        ValueError: if a space has no conversion, with its name and the cure.
     """
 
     capturable = False
@@ -101,22 +95,14 @@ class VectorizedEnv:
         self._n_to_check = CHECKED_STEPS if check else 0
 
     def reset(self) -> arrdict:
-        """Starts a new episode in every lane. Returns the first world.
-
-        Raises:
-            EnvError: an environment failed.
-        """
+        """Starts a new episode in every lane. Returns the first world. Raises EnvError."""
         obs, infos = self._call(self.vector.reset, seed=self._seeds)
         self._seeds = None
         self._ended[:] = True
         return self._world(obs, np.zeros(len(self._ended)), self._ended, self._ended, infos)
 
     def step(self, decision: Mapping) -> arrdict:
-        """Takes one step by ``decision["actions"]``. Returns a world.
-
-        Raises:
-            EnvError: an environment failed.
-        """
+        """Takes one step by ``decision["actions"]``. Returns a world. Raises EnvError."""
         chosen = decision["actions"]
         chosen = spaces.map(lambda _, leaf: leaf.cpu().numpy(), self.action_space, chosen)
         if self._checks:
@@ -131,14 +117,8 @@ class VectorizedEnv:
         return {path: _plain(value) for path, value in state.items()}
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what those of others have learnt.
-
-        Args:
-            state: of `wrapper_state`, on any device.
-            is_frozen: it stays as it is from now on.
-
-        Raises:
-            ValueError: the environments are not in such wrappers.
+        """Gives the wrappers of all environments what those of others have learnt, which stays as
+        it is if it `is_frozen`. Raises ValueError if they are not in such wrappers.
         """
         if not hasattr(self.vector, "load_wrapper_state"):
             raise ValueError(f"{self.id} is in no wrappers, as in the training of the agent")
@@ -156,19 +136,12 @@ class VectorizedEnv:
         return not hasattr(self.vector, "processes") and not EnvState(self).unreachable()
 
     def close(self) -> None:
-        """Closes the environments, and ends their processes.
-
-        Raises:
-            EnvError: an environment failed at it.
-        """
+        """Closes the environments, and ends their processes. Raises EnvError."""
         self._call(self.vector.close)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns the frame of environment ``e``, (H, W, 3) uint8, as the environment renders it.
-
-        Raises:
-            ValueError: if it renders no images.
-            EnvError: if it fails.
+        Raises ValueError if it renders no images.
         """
         from megastep.hosting.hosted import start_rendering
 
@@ -269,14 +242,8 @@ def _plain(value) -> object:
 
 
 def as_frame(rendered: object) -> np.ndarray:
-    """Returns a rendered frame as (H, W, 3) uint8.
-
-    Args:
-        rendered: (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), of which the last channel is left out;
-            uint8, other integers or floats from 0 to 255, or floats from 0 to 1.
-
-    Raises:
-        ValueError: it is none of these.
+    """Returns a rendered frame as (H, W, 3) uint8. It may be (H, W), (H, W, 1), (H, W, 3) or (H, W,
+    4), of uint8, other integers or floats from 0 to 255, or floats from 0 to 1.
     """
     frame = np.asarray(rendered)
     frame = frame[..., None] if frame.ndim == 2 else frame

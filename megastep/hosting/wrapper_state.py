@@ -1,5 +1,5 @@
-"""What the wrappers around an environment of Gymnasium or PettingZoo keep in their attributes, such
-as running statistics. Workers import it, so without PyTorch.
+"""What the wrappers around an environment of Gymnasium keep in their attributes, such as running
+statistics. Workers import it, so without PyTorch.
 """
 
 import collections
@@ -124,6 +124,6 @@ def _is_value(value) -> bool:
 def _may_own_values(value) -> bool:
     if isinstance(value, dict):
         return True
-    is_other = isinstance(value, OTHERS) or callable(value) or hasattr(value, "possible_agents")
+    is_other = isinstance(value, OTHERS) or callable(value)
     is_gymnasiums = type(value).__module__.startswith("gymnasium.envs")
     return hasattr(value, "__dict__") and not is_other and not is_gymnasiums

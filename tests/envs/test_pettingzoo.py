@@ -156,49 +156,6 @@ def test_agents_may_leave_and_join():
     assert rows("truncated")[1] == [0, 1, 0] and rows("reset")[2] == [0, 1, 0]
 
 
-class Learns:
-    """A wrapper that adds the number of episodes to observations, and counts steps."""
-
-    def __init__(self, env):
-        self.env, self.n_episodes, self.n_steps = env, 0, 0
-
-    def __getattr__(self, name):
-        return getattr(self.env, name)
-
-    @property
-    def unwrapped(self):
-        return self.env
-
-    def reset(self, seed=None, options=None):
-        self.n_steps = 0
-        return self.seen(self.env.reset(seed)[0]), {}
-
-    def step(self, actions):
-        obs, *others = self.env.step(actions)
-        self.n_steps += 1
-        self.n_episodes += not self.env.agents
-        return self.seen(obs), *others
-
-    def seen(self, obs):
-        return {agent: value + self.n_episodes for agent, value in obs.items()}
-
-
-def in_wrapper(habit="none"):
-    return Learns(Habits(habit))
-
-
-def test_what_a_wrapper_has_learnt_is_carried_and_frozen():
-    first, other = (PettingZoo(2, id=f"{__name__}:in_wrapper", device="cpu") for _ in range(2))
-    contract.rollout(first, 8)
-    state = first.wrapper_state()
-    assert state == {"0.Learns.n_episodes": 2}
-    other.load_wrapper_state(state, is_frozen=True)
-    worlds = contract.rollout(other, 8)
-    assert worlds[0].obs.flatten().tolist() == worlds[8].obs.flatten().tolist() == 6 * [2]
-    assert other.wrapper_state() == state
-    assert PettingZoo(2, id=ID, device="cpu").wrapper_state() == {}
-
-
 class Turns(Relay):
     """As turn-based environments are, which have no parallel `step`."""
 
