@@ -11,7 +11,7 @@ import torch
 
 from megastep import spaces
 from megastep.dotdict import mapping
-from megastep.types import Env, Space, Tree
+from megastep.types import Space, Tree
 
 NUMPY: Any = {torch.float16: np.float16, torch.float32: np.float32}
 
@@ -69,12 +69,6 @@ def to_numpy(leaf: torch.Tensor) -> np.ndarray:
 
 
 @mapping
-def int8(leaf: np.ndarray) -> np.ndarray:
-    """Returns a tree of arrays as int8, as Gymnasium's spaces take masks."""
-    return leaf.astype(np.int8)
-
-
-@mapping
 def row(leaf: Tree, lane: int | np.integer) -> Tree:
     """Returns one lane's values of a batch."""
     return leaf[lane]
@@ -85,13 +79,3 @@ def stacked(rows: Sequence[Tree]) -> Tree:
     if isinstance(rows[0], Mapping):
         return {key: stacked([one[key] for one in rows]) for key in rows[0]}
     return np.stack(rows)
-
-
-def render_modes(env: Env, given: str | None) -> list[str]:
-    """Returns the render modes of an environment. Raises ValueError if one is given that it has
-    not.
-    """
-    modes = ["rgb_array"] if hasattr(env, "plot_state") else []
-    if given is not None and given not in modes:
-        raise ValueError(f"render_mode must be None or one of {modes}, not {given!r}")
-    return modes

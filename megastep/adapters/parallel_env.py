@@ -1,26 +1,15 @@
 # pyright: reportMissingImports=false
 """An environment of several agents as PettingZoo's parallel environment."""
 
+import copy
 from collections.abc import Mapping
 
 import gymnasium
 import numpy as np
 import pettingzoo
-import torch
 
-from megastep.adapters.gymnasium_spaces import (
-    action_mask,
-    as_dtype,
-    gymnasium_space,
-    int8,
-    render_modes,
-    row,
-    stacked,
-    to_numpy,
-    without_agents,
-)
-from megastep.adapters.lane_steps import Lanes
-from megastep.plotting import rasterise
+from megastep.adapters.gymnasium_spaces import row, stacked
+from megastep.adapters.vector_env import VectorEnv
 from megastep.types import Env, Tree, optional
 
 __all__ = ["ParallelEnv"]
@@ -39,9 +28,6 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         env: the environment, of one environment. Agents have the names of its ``roles``, or
             ``agent_0``, ``agent_1``, ...
         render_mode: None or ``rgb_array``.
-
-    Raises:
-        ValueError: if there are several environments.
     """
 
     def __init__(self, env: Env, render_mode: str | None = None):
@@ -50,16 +36,14 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
                 f"a parallel environment has n_envs=1, but this {type(env).__name__} has "
                 f"{env.n_envs}"
             )
-        self.lanes, self.env = Lanes(env), env
-        roles = optional(env, "roles")
-        self.possible_agents = [*(roles or (f"agent_{i}" for i in range(self.lanes.n_lanes)))]
+        self.vector = vector = VectorEnv(env, render_mode=render_mode)
+        self.env, self.render_mode, roles = env, render_mode, optional(env, "roles")
+        self.possible_agents = [*(roles or (f"agent_{i}" for i in range(vector.num_envs)))]
         self.agents: list[str] = []
-        self.render_mode, modes = render_mode, render_modes(env, render_mode)
-        fps, name = optional(env, "fps"), type(env).__name__.lower()
-        self.metadata = dict(name=f"{name}_v0", render_modes=modes, render_fps=fps)
+        self.metadata = {**vector.metadata, "name": f"{type(env).__name__.lower()}_v0"}
         self.observation_spaces, self.action_spaces = (
-            {agent: gymnasium_space(space, torch.float32) for agent in self.possible_agents}
-            for space in (env.obs_space, env.action_space)
+            {agent: copy.deepcopy(space) for agent in self.possible_agents}
+            for space in (vector.single_observation_space, vector.single_action_space)
         )
 
     def observation_space(self, agent: str) -> gymnasium.Space:
@@ -75,52 +59,43 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
     ) -> tuple[dict[str, Tree], dict[str, dict]]:
         """Begins a game. Returns (observations, infos) by agent. ``options`` are ignored."""
         self.agents = [*self.possible_agents]
-        world = self.lanes.reset(seed)
-        return self._observations(world), self._masks(world)
+        obs, infos = self.vector.reset(seed=seed)
+        return self._rows(obs), self._masks(infos)
 
     def step(self, actions: Mapping[str, Tree]) -> tuple[dict, dict, dict, dict, dict]:
         """Steps all agents. Returns (observations, rewards, terminations, truncations, infos) by
         agent.
         """
-        world, _, ended = self.lanes.step(
-            stacked([actions[agent] for agent in self.possible_agents])
-        )
+        chosen = stacked([actions[agent] for agent in self.possible_agents])
+        obs, rewards, *flags, facts = self.vector.step(chosen)
         over = optional(self.env, "game_over")
-        is_over = bool(ended.all() if over is None else over.all())
-        names = "reward", "terminal", "truncated"
-        values = to_numpy({name: world[name] for name in names})
-        metrics = to_numpy(dict(world.get("metrics", {})))
-        infos = self._masks(world)
+        is_over = bool((flags[0] | flags[1]).all() if over is None else over.all())
+        infos = self._masks(facts)
         for i, agent in enumerate(self.agents):
-            flags = {name: True for name in names[1:] if values[name][i]}
-            infos[agent] |= flags and flags | {k: float(v[i]) for k, v in metrics.items()}
-        rewards, terminations, truncations = (
-            dict(zip(self.agents, values[name].tolist())) for name in names
-        )
+            ends = {k: True for k, flag in zip(("terminal", "truncated"), flags) if flag[i]}
+            metrics = {k: v for k, v in facts.items() if k[0] != "_" and k != "action_mask"}
+            infos[agent] |= ends and ends | {k: float(v[i]) for k, v in metrics.items()}
+        by_agent = (dict(zip(self.agents, values.tolist())) for values in (rewards, *flags))
+        rewards, terminations, truncations = by_agent
         if not is_over:
             terminations, truncations = (dict.fromkeys(self.agents, False) for _ in range(2))
-        observations = self._observations(world)
-        if is_over:
+        else:
             self.agents = []
-        return observations, rewards, terminations, truncations, infos
+        return self._rows(obs), rewards, terminations, truncations, infos
 
-    def _observations(self, world) -> dict[str, Tree]:
-        obs = as_dtype(without_agents(self.env.obs_space, world["obs"]), torch.float32)
-        batch = to_numpy(obs)
+    def _rows(self, batch) -> dict[str, Tree]:
         return {agent: row(batch, i) for i, agent in enumerate(self.possible_agents)}
 
-    def _masks(self, world) -> dict[str, dict]:
+    def _masks(self, infos) -> dict[str, dict]:
         """Returns an info for each agent, with the actions that are allowed to it now."""
-        if "mask" not in world:
-            return {agent: {} for agent in self.agents}
-        batch = int8(to_numpy(action_mask(self.env.action_space, world["mask"])))
-        return {agent: {"action_mask": row(batch, i)} for i, agent in enumerate(self.agents)}
+        masks = {key: infos[key] for key in ("action_mask",) if key in infos}
+        return {agent: row(masks, i) for i, agent in enumerate(self.agents)}
 
     def render(self) -> np.ndarray | None:
         """Returns a drawing (H, W, 3) uint8 if ``render_mode`` is ``rgb_array``."""
-        drawn: Tree = self.env
-        return None if self.render_mode is None else rasterise(drawn.display())
+        frames = self.vector.render()
+        return frames and frames[0]
 
     def close(self) -> None:
         """Closes the environment."""
-        self.lanes.close()
+        self.vector.close()

@@ -1,28 +1,17 @@
 # pyright: reportMissingImports=false
 """An environment of megastep as Stable-Baselines3's vector environment."""
 
-import warnings
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import torch
+from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from megastep.adapters.gymnasium_spaces import (
-    action_mask,
-    as_dtype,
-    gymnasium_space,
-    row,
-    to_numpy,
-    without_agents,
-)
-from megastep.adapters.lane_steps import Lanes
+from megastep.adapters.vector_env import VectorEnv
 from megastep.types import Env, Tree, optional
 
 __all__ = ["SB3VecEnv"]
 
-#: Lanes above which the library's Python and NumPy take most of the time.
-MANY_LANES = 4096
 #: What sb3-contrib's learners with masks call, in lanes that have it.
 ACTION_MASKS = "action_masks"
 
@@ -37,49 +26,24 @@ class SB3VecEnv(VecEnv):
 
     Args:
         env: the environment, whose resets take masks.
-
-    Raises:
-        ValueError: if they do not.
     """
 
     def __init__(self, env: Env):
-        self.lanes, self.env = Lanes(env, True, "Stable-Baselines3"), env
-        n = self.lanes.n_lanes
-        if n > MANY_LANES:
-            warnings.warn(
-                f"{n:,} lanes are more than {MANY_LANES:,}: Stable-Baselines3 handles each in "
-                "Python on the host, which takes most of the time; rsl_rl, TorchRL and our own "
-                "learners keep tensors on the device",
-                stacklevel=2,
-            )
-        self.render_mode = None
-        self._actions: Tree = None
-        self._masks: np.ndarray | None = None  # (B, n), of all agents of a lane side by side
-        super().__init__(
-            n,
-            gymnasium_space(env.obs_space, torch.float32),
-            gymnasium_space(env.action_space, torch.float32),
-        )
-
-    def _observations(self, world) -> Tree:
-        obs = without_agents(self.env.obs_space, world["obs"])
-        return to_numpy(as_dtype(obs, torch.float32))
-
-    def _keep_masks(self, world) -> None:
-        if "mask" in world:
-            masks = to_numpy(action_mask(self.env.action_space, world["mask"]))
-            self._masks = masks.reshape(self.num_envs, -1)
+        self.vector = VectorEnv(env, AutoresetMode.SAME_STEP)
+        self.env, self.render_mode = env, None
+        self._actions, self._infos = None, {}
+        spaces = self.vector.single_observation_space, self.vector.single_action_space
+        super().__init__(self.vector.num_envs, *spaces)
 
     def reset(self) -> Tree:
         """Begins episodes in all lanes, with the seeds of ``seed``, if it was called. Returns
         observations.
         """
         seeds = [*self._seeds]
-        world = self.lanes.reset(None if None in seeds else seeds)
+        obs, self._infos = self.vector.reset(seed=None if None in seeds else seeds)
         self._reset_seeds()
         self._reset_options()
-        self._keep_masks(world)
-        return self._observations(world)
+        return obs
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keeps the actions (B, ...) for ``step_wait``."""
@@ -87,22 +51,19 @@ class SB3VecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Tree, np.ndarray, np.ndarray, list[dict]]:
         """Returns (observations, rewards, dones, infos)."""
-        world, final, ended = self.lanes.step(self._actions)
-        self._keep_masks(world)
-        over, truncated = to_numpy(ended), to_numpy(final["truncated"])
+        obs, rewards, terminated, truncated, last = self.vector.step(self._actions)
+        self._infos, over = last, terminated | truncated
         infos: list[dict] = [{} for _ in range(self.num_envs)]
-        if over.any():
-            last = self._observations(final)
-            metrics = to_numpy(dict(final.get("metrics", {})))
-            for lane in np.flatnonzero(over):
-                infos[lane] = {name: float(values[lane]) for name, values in metrics.items()}
-                infos[lane]["terminal_observation"] = row(last, lane)
-                infos[lane]["TimeLimit.truncated"] = bool(truncated[lane])
-        return self._observations(world), to_numpy(final["reward"]), over, infos
+        for lane in np.flatnonzero(over):
+            metrics = last["final_info"].items()
+            infos[lane] = {k: float(v[lane]) for k, v in metrics if not k.startswith("_")}
+            infos[lane]["terminal_observation"] = last["final_obs"][lane]
+            infos[lane]["TimeLimit.truncated"] = bool(truncated[lane])
+        return obs, rewards, over, infos
 
     def close(self) -> None:
         """Closes the environment."""
-        self.lanes.close()
+        self.vector.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list:
         """Returns an attribute of the environment, once per lane."""
@@ -128,9 +89,10 @@ class SB3VecEnv(VecEnv):
         ``action_masks`` each lane's own, (n,) bool.
         """
         if method_name == ACTION_MASKS:
-            if self._masks is None:
+            if "action_mask" not in self._infos:
                 raise AttributeError(f"{type(self.env).__name__} masks no actions, or is not reset")
-            return [self._masks[lane] for lane in self._get_indices(indices)]
+            masks = self._infos["action_mask"].reshape(self.num_envs, -1).astype(bool)
+            return [masks[lane] for lane in self._get_indices(indices)]
         result = getattr(self.env, method_name)(*args, **kwargs)
         return [result for _ in self._get_indices(indices)]
 

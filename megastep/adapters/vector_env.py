@@ -15,14 +15,13 @@ from megastep.adapters.gymnasium_spaces import (
     action_mask,
     as_dtype,
     gymnasium_space,
-    int8,
-    render_modes,
     row,
     stacked,
     to_numpy,
     without_agents,
 )
 from megastep.adapters.lane_steps import Copies, Lanes, ended, fresh
+from megastep.dotdict import mapping
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
 
@@ -49,9 +48,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         copy: return copies, of which on a GPU up to 32 steps' share memory. Otherwise tensors are
             valid until the next step or reset.
         render_mode: None, or ``rgb_array``, a drawing of each environment.
-
-    Raises:
-        ValueError: if the environment has no masked resets, which all modes but ``NEXT_STEP`` need.
     """
 
     def __init__(
@@ -65,11 +61,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         render_mode: str | None = None,
     ):
         mode = _mode(autoreset_mode)
-        self.lanes = Lanes(
-            env,
-            mode is AutoresetMode.SAME_STEP,
-            None if mode is AutoresetMode.NEXT_STEP else f"autoreset_mode={mode.name}",
-        )
+        needs_masks = mode is not AutoresetMode.NEXT_STEP
+        purpose = f"autoreset_mode={mode.name}" if needs_masks else None
+        self.lanes = Lanes(env, mode is AutoresetMode.SAME_STEP, purpose)
         self.env, self.num_envs, self.device = env, self.lanes.n_lanes, self.lanes.device
         self.mode, self.to_numpy, self.copy = mode, to_numpy, copy
         self.dtype = dtype or (torch.float32 if to_numpy else torch.float16)
@@ -77,7 +71,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = gymnasium_space(env.action_space, torch.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        modes, fps = render_modes(env, render_mode), optional(env, "fps")
+        modes, fps = ["rgb_array"] if hasattr(env, "plot_state") else [], optional(env, "fps")
+        if render_mode is not None and render_mode not in modes:
+            raise ValueError(f"render_mode must be None or one of {modes}, not {render_mode!r}")
         self.render_mode = render_mode
         self.metadata = dict(autoreset_mode=mode, render_modes=modes, render_fps=fps)
         self._ended = np.zeros(self.num_envs, bool)
@@ -167,7 +163,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if not mask:
             return {}
         if self.to_numpy:
-            return int8(mask) | {"_action_mask": np.ones(self.num_envs, bool)}
+            mask = mapping(lambda leaf: leaf.astype(np.int8))(mask)
+            return mask | {"_action_mask": np.ones(self.num_envs, bool)}
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         return mask | {"_action_mask": everyone}
 
@@ -209,9 +206,6 @@ class SingleEnv(gymnasium.Env):
     Args:
         env: the environment, of one lane.
         render_mode: None or ``rgb_array``.
-
-    Raises:
-        ValueError: if the environment has several lanes.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
@@ -246,7 +240,7 @@ class SingleEnv(gymnasium.Env):
     def render(self) -> np.ndarray | None:
         """Returns a drawing (H, W, 3) uint8 if ``render_mode`` is ``rgb_array``."""
         frames = self.vector.render()
-        return None if frames is None else frames[0]
+        return frames and frames[0]
 
     def close(self) -> None:
         """Closes the environment."""
