@@ -261,9 +261,7 @@ def random_actions(env: Env, generator: torch.Generator, mask: Tree = None) -> T
     device. ``generator`` is a CPU generator, so the actions are the same on every device. ``mask``
     is a world's, or None.
     """
-    actions = spaces.random_action_tree(
-        env.action_space, n_lanes(env), generator=generator, mask=mask
-    )
+    actions = spaces.random_actions(env.action_space, n_lanes(env), generator=generator, mask=mask)
     return spaces.map(lambda _, leaf: leaf.to(env.device), env.action_space, actions)
 
 

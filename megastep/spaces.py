@@ -196,44 +196,31 @@ def from_text(text: str) -> _Space:
 
 
 def random_actions(
-    space: MultiDiscrete | MultiContinuous,
-    n_lanes: int,
-    device: torch.device | str | None = None,
-    generator: torch.Generator | None = None,
-    mask: torch.Tensor | None = None,
-) -> torch.Tensor:
-    """Returns uniformly random actions of a leaf space for B lanes: (B, ...). ``mask``, (B, A, n)
-    bool, says which integers are allowed.
-    """
-    options: dict = dict(device=device, generator=generator)
-    shape = n_lanes, *space.shape
-    if isinstance(space, MultiContinuous):
-        low, high = space.tensors(device)
-        return (low + (high - low) * torch.rand(shape, **options)).clamp(low, high)
-    if mask is not None:
-        scores = torch.rand((*shape, space.n_actions), **options)
-        return scores.masked_fill_(~mask.to(scores.device), -1.0).argmax(-1)
-    return torch.randint(space.n_actions, shape, **options)
-
-
-def random_action_tree(
     space: object,
     n_lanes: int,
     device: torch.device | str | None = None,
     generator: torch.Generator | None = None,
-    mask: object = None,
+    mask: Any = None,
 ) -> "Tree":
-    """Returns `random_actions` of a leaf space, or of each leaf of nested dicts of them."""
-    if not isinstance(space, Mapping):
-        leaf = cast("MultiDiscrete | MultiContinuous", space)
-        return random_actions(leaf, n_lanes, device, generator, cast("torch.Tensor | None", mask))
-    masks = mask if isinstance(mask, Mapping) else {}
-    return arrdict(
-        {
-            key: random_action_tree(child, n_lanes, device, generator, masks.get(key))
-            for key, child in space.items()
-        }
-    )
+    """Returns uniformly random actions (B, ...) for B lanes, of a space or a (nested) dict of them.
+    ``mask``, (B, A, n) bool, or a dict, says which integers are allowed.
+    """
+    if isinstance(space, Mapping):
+        masks = mask or {}
+        parts = space.items()
+        return arrdict(
+            {k: random_actions(one, n_lanes, device, generator, masks.get(k)) for k, one in parts}
+        )
+    options: dict = dict(device=device, generator=generator)
+    leaf = cast("MultiDiscrete | MultiContinuous", space)
+    shape = n_lanes, *leaf.shape
+    if isinstance(leaf, MultiContinuous):
+        low, high = leaf.tensors(device)
+        return (low + (high - low) * torch.rand(shape, **options)).clamp(low, high)
+    if mask is not None:
+        scores = torch.rand((*shape, leaf.n_actions), **options)
+        return scores.masked_fill_(~mask.to(scores.device), -1.0).argmax(-1)
+    return torch.randint(leaf.n_actions, shape, **options)
 
 
 def are_actions(space: MultiDiscrete | MultiContinuous, values: torch.Tensor) -> bool:

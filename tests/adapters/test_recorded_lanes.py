@@ -68,7 +68,7 @@ def test_any_order_of_calls_shows_what_plain_lanes_do(same_step, monkeypatch):
     generator, kinds = torch.Generator().manual_seed(1), torch.tensor([4.0, 2, 1, 1, 1])
     plain.reset(3)
     graphs.reset(3)
-    for _ in range(120):
+    for _ in range(60):
         kind = int(torch.multinomial(kinds, 1, generator=generator))
         mask = torch.rand(N, generator=generator) < 0.4
         actions = torch.randint(3, (N,), generator=generator)

@@ -147,11 +147,3 @@ def test_environments_draw_the_same_from_global_generators_in_any_process():
     assert torch.equal(first, again) and torch.equal(first, in_processes)
     assert len(first.unique()) == first.numel() and not torch.equal(first, numbers(seed=2))
     assert np.random.get_state()[1].tolist() == state
-
-
-def test_runs_that_draw_from_global_generators_have_the_same_file(here):
-    words = [*SMALL, f"env.id={HELPERS}:Draws-v0", "samples=256", "logging.every=1"]
-    for name in ("sync", "async"):
-        assert train.main([*words, f"env.vectorization={name}", f"folder={name}"]) == 0
-    files = [(here / name / "metrics.jsonl").read_bytes() for name in ("sync", "async")]
-    assert files[0] == files[1]

@@ -26,5 +26,5 @@ class RandomActions:
     ) -> tuple[arrdict, Tree]:
         n_lanes, device = len(state["lane"]), state["lane"].device
         mask = None if world is None else world.get("mask")
-        actions = spaces.random_action_tree(self.action_space, n_lanes, device, generator, mask)
+        actions = spaces.random_actions(self.action_space, n_lanes, device, generator, mask)
         return arrdict(actions=actions), state
