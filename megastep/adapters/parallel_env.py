@@ -94,7 +94,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
     def render(self) -> np.ndarray | None:
         """Returns a drawing (H, W, 3) uint8 if ``render_mode`` is ``rgb_array``."""
         frames = self.vector.render()
-        return frames and frames[0]
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Closes the environment."""

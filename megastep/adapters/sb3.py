@@ -51,8 +51,9 @@ class SB3VecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Tree, np.ndarray, np.ndarray, list[dict]]:
         """Returns (observations, rewards, dones, infos)."""
-        obs, rewards, terminated, truncated, last = self.vector.step(self._actions)
-        self._infos, over = last, terminated | truncated
+        obs, rewards, *flags, last = self.vector.step(self._actions)
+        self._infos, (terminated, truncated) = last, flags
+        over = np.logical_or(terminated, truncated)
         infos: list[dict] = [{} for _ in range(self.num_envs)]
         for lane in np.flatnonzero(over):
             metrics = last["final_info"].items()

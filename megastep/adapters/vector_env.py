@@ -240,7 +240,7 @@ class SingleEnv(gymnasium.Env):
     def render(self) -> np.ndarray | None:
         """Returns a drawing (H, W, 3) uint8 if ``render_mode`` is ``rgb_array``."""
         frames = self.vector.render()
-        return frames and frames[0]
+        return None if frames is None else frames[0]
 
     def close(self) -> None:
         """Closes the environment."""
