@@ -237,7 +237,7 @@ def film(
 
     Args:
         path: an .mp4 or .gif, or a .png, .svg or .pdf, which is the last frame.
-        look: theme, dpi, title, speed, trail and axes as in :func:`film_all`.
+        look: theme, dpi, title, speed and trail as in :func:`film_all`.
 
     Raises:
         ValueError: for another kind of file, or an environment that cannot be drawn.
@@ -259,7 +259,6 @@ def film_all(
     dpi: float = 100,
     speed: float = 1.0,
     trail: int = 60,
-    axes: bool = False,
 ) -> Film:
     """Films several environments at once, in a grid; otherwise as :func:`film`.
 
@@ -268,7 +267,6 @@ def film_all(
         dpi: pixels per inch; an environment's picture has 720 lines at 100.
         speed: how much faster than the environment's own frames per second.
         trail: steps of the agents' trails.
-        axes: draw axes in metres.
     """
     path = Film(path)
     check_path(path)
@@ -283,7 +281,7 @@ def film_all(
     path.parent.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path.parent).close()  # an error now, not when all is drawn
     moments = zip(*(film_moments(player, steps, greedy, seed, trail) for player in players))
-    with plotting.styled(theme=theme, dpi=dpi, axes=axes):
+    with plotting.styled(theme=theme, dpi=dpi):
         if (format := path.suffix[1:]) not in WRITERS:
             (last,) = collections.deque(moments, maxlen=1)
             return _write(path, _still(players, last, format))
@@ -303,7 +301,6 @@ def _image(players, moments) -> np.ndarray:
 
 
 def _still(players, moments, format) -> bytes:
-    """Returns a picture of the moments as a file of that format."""
     if len(players) > 1:
         return plotting.encoded(plotting.framed(_image(players, moments)), format)
     with plotting.styled(title=players[0].title, note=moments[0].note):

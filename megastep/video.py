@@ -18,12 +18,8 @@ QUALITY = "20"
 
 
 class Mp4Writer:
-    """Encodes images into an mp4 in memory: h264 in yuv420p, which every player can show.
-
-    A thread encodes, while the next image is drawn.
-
-    Args:
-        fps: frames per second.
+    """Encodes images into an mp4 in memory: h264 in yuv420p, which every player can show. A
+    thread encodes, while the next image is drawn.
     """
 
     def __init__(self, fps: float):
@@ -43,10 +39,8 @@ class Mp4Writer:
         self._last.set_result(None)
 
     def add(self, image: np.ndarray) -> None:
-        """Adds a frame, (H, W, 3) uint8. Odd sizes are padded to even.
-
-        Raises:
-            ValueError: its size differs from the first frame's.
+        """Adds a frame, (H, W, 3) uint8. Odd sizes are padded to even. Raises ValueError if it has
+        not the first's size.
         """
         padding = [(0, size % 2) for size in image.shape[:2]]  # yuv420p halves both sides
         padded = np.pad(image, [*padding, (0, 0)], mode="edge")
@@ -71,12 +65,8 @@ class Mp4Writer:
 
 
 def small_gif(path: str | os.PathLike, height: int, n_frames: int) -> tuple[bytes, tuple[int, int]]:
-    """Returns a film as a GIF, and its height and width in pixels.
-
-    Args:
-        path: of an mp4 or GIF.
-        height: the most pixels that its images are high.
-        n_frames: the most frames, evenly spaced over the film, which takes as long as before.
+    """Returns an mp4 or GIF as a GIF of at most so many pixels in height and frames, evenly
+    spaced, which takes as long as before; and its height and width.
     """
     import av
 
@@ -97,9 +87,6 @@ class GifWriter:
 
     A GIF counts in hundredths of a second, and browsers show frames of one hundredth for ten: above
     50 frames per second some frames are left out.
-
-    Args:
-        fps: frames per second.
     """
 
     def __init__(self, fps: float):
@@ -145,10 +132,8 @@ def check_size(image: np.ndarray, shape: tuple[int, ...] | None) -> tuple[int, .
 
 
 def as_image(array: ArrayLike) -> np.ndarray:
-    """Returns a copy of an image, uint8 or floats in [0, 1], as (H, W, 3) uint8.
-
-    Raises:
-        ValueError: it has another shape or dtype.
+    """Returns a copy of an image, uint8 or floats in [0, 1], as (H, W, 3) uint8. Raises ValueError
+    for another shape or dtype.
     """
     array = np.asarray(array)
     if array.ndim != 3 or array.shape[-1] != 3 or not array.size:

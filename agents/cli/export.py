@@ -54,12 +54,11 @@ def run(cfg: Export) -> Path:
         write, runner = runtimes.write_onnx, runtimes.run_onnx
     with user_errors(f"{path} cannot be written: ", (OSError,)):
         write(step, path, folders.name_of(source))
-    found = runtimes.compare(step, runner(path), policy, env)
-    runtimes.check(path, found)
+    difference = runtimes.compare(step, runner(path), policy, env, path)
     inputs, outputs = (", ".join(p.name for p in side) for side in (step.inputs, step.outputs))
     console.say(
         f"Wrote {path}: {inputs} -> {outputs}; in 1,000 steps its numbers differ from the policy's "
-        f"by at most {found.difference:.1g}"
+        f"by at most {difference:.1g}"
     )
     return path
 

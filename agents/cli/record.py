@@ -16,7 +16,7 @@ The most common words:
   home=3           another of the unseen homes; split=training: one it was trained in
   homes=[1,2,3,4]  several homes in a grid
   runs=[A,B]       several runs side by side, in one home from the same spawn
-  theme=dark       also title=, dpi=200, speed=2, trail=0, axes=true
+  theme=dark       also title=, dpi=200, speed=2, trail=0
   file=out.mp4     this file, overwritten if it exists; out.gif: the same as a GIF; out.png, out.svg
                    or out.pdf: the last frame only. Otherwise video.mp4 in the run folder, or
                    video-2.mp4, ... if there is one"""

@@ -62,12 +62,9 @@ def play(
         slots: (N, 1) int64, the agent that `policy` controls; by default `rotating_slots`.
 
     Returns:
-        An arrdict of
-
-        - score: (N,) float32, 1 if `policy` won, 0 if it lost, 0.5 for a draw
-        - lengths: (N,) float32, steps
-        - slots: (N,) int64, the agent that `policy` controlled
-        - homes: (N,) int32, the layouts after the reset; only if `env.layout` exists
+        An arrdict of `score`, float32: 1 if `policy` won, 0 if it lost, 0.5 for a draw; `lengths`,
+        float32 steps; `slots`, int64, the agent that `policy` controlled; and, if `env.layout`
+        exists, `homes`, int32, the layouts after the reset: (N,) each.
     """
     device, n_agents = torch.device(env.device), optional(env, "n_agents")
     shape = env.n_envs, n_agents
@@ -104,10 +101,6 @@ class Duels:
 
     Two agents play, or as many as the environment has if their number is fixed. Each home is played
     in from every agent's slot, equally often, in up to `cfg.episodes` duels.
-
-    Attributes:
-        agent, others: who plays: the run's agent, and each of `cfg.against`.
-        where: the environment.
     """
 
     def __init__(
@@ -165,10 +158,6 @@ def summaries(
 
     `won` is the fraction of duels won, a draw counting half; `lower` and `upper` are its 95 %
     interval over homes, or over duels if there are no homes.
-
-    Args:
-        roles: the role of each agent slot.
-        sources: the source of each home.
     """
     played = numpyify(duels)
     every, homes = np.ones(len(played["score"]), bool), played.get("homes")
@@ -177,7 +166,7 @@ def summaries(
 
 
 def worst_summary(duels: Mapping) -> "Row":
-    """Returns a table row of the worst homes, `statistics.worst_homes`, from a result of `play`."""
+    """A table row of the worst homes, `statistics.worst_homes`, from a result of `play`."""
     played = numpyify(duels)
     numbers, means = worst_homes({"won": played["score"]}, played["homes"])
     won = means["won"]

@@ -1,6 +1,5 @@
 """Where an evaluation plays, and who: agents of runs, packaged agents, and bots."""
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +22,8 @@ FOR_TWO = {"n_agents": 2, "self_play": True, "resample": False}
 
 
 class Player(NamedTuple):
+    """Who plays."""
+
     name: str
     policy: PolicyLike
     step: int | None = None  # the number of samples it has learnt from
@@ -32,25 +33,19 @@ class EvalEnv:
     """An environment in which each home is played equally often, each environment in one home.
 
     Args:
-        env: settings of the environment.
         homes: geometries; none if the environment takes none.
         episodes: number of episodes, one per lane. If there are fewer environments than homes, they
             are in evenly spaced ones; if more, their number is rounded up to a multiple of homes.
         seed: of spawns.
-        device: a name of PyTorch.
         is_shared: the ranks share the environments. Otherwise each makes all of them.
         is_duel: makes environments for two where the number of agents can be set, an episode each,
-            as many in each home as there are slots, or a multiple.
+            as many in each home as there are slots, or a multiple. Raises UserError for one agent.
 
     Attributes:
         env, sample: the environment, with this rank's share of all lanes, and a small one.
         settings: those of `env`.
-        homes: the geometries played in.
-        numbers: the index of each in the list that was given.
+        homes, numbers: the geometries played in, and the index of each in the list given.
         shard: this rank's share.
-
-    Raises:
-        UserError: a duel in an environment of one agent.
     """
 
     def __init__(
@@ -84,7 +79,7 @@ class EvalEnv:
         self.env: Env = factory.construct(self.settings, seed=self.seed, **where)
 
     def find_player(self, name: str, run: checkpoint.Checkpoint, trust: bool) -> Player:
-        """Returns who is to play in the environment, see the function `find_player`."""
+        """Returns who is to play in the environment, see `find_player`."""
         player = find_player(name, run, self.settings, self.sample, trust)
         return player._replace(policy=factory.in_env(player.policy, self.settings, self.env))
 
@@ -108,10 +103,8 @@ def check_duels(env: Env) -> None:
 
 
 def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpoint) -> Player:
-    """Returns the player of a checkpoint, to meet the agent of `run` in `env`.
-
-    Raises:
-        UserError: if one was trained in another environment.
+    """Returns the player of a checkpoint, to meet the agent of `run` in `env`. Raises UserError if
+    one was trained in another environment.
     """
     trained, own = factory.config_of(loaded), factory.config_of(run)
     if trained.env.name != own.env.name:
@@ -119,19 +112,8 @@ def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpo
             f"{loaded.path} was trained in {settings.label(trained.env.name)} and {run.path} in "
             f"{settings.label(own.env.name)}; choose a run in the same environment"
         )
-    policy = restore.policy_of(loaded, env)
-    if _of_wrappers(loaded) != _of_wrappers(run):
-        warnings.warn(
-            f"{loaded.path} observes through what the wrappers of {run.path} have learnt, not its "
-            "own",
-            stacklevel=3,
-        )
-    return Player(f"{folders.name_of(loaded.path)}, {loaded.step:,} samples", policy, loaded.step)
-
-
-def _of_wrappers(loaded) -> dict:
-    state = (loaded.state or {}).get("wrappers", {})
-    return {name: torch.as_tensor(value).tolist() for name, value in state.items()}
+    name = f"{folders.name_of(loaded.path)}, {loaded.step:,} samples"
+    return Player(name, restore.policy_of(loaded, env), loaded.step)
 
 
 def find_player(

@@ -50,9 +50,6 @@ def run(cfg: settings.Evaluate) -> Path:
 
 
 def _measure(cfg, loaded, env_settings, geometry, homes, device) -> Path:
-    """Plays episodes, or with `cfg.against` duels, of a suite in each source. Prints and writes a
-    table, and returns the path of its .json.
-    """
     rows, single = [], []
     numbers = {id(home): number for number, home in enumerate(homes)}
     for source, part in tables.parts_of(geometry, homes):

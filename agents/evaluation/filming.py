@@ -57,7 +57,7 @@ def run(cfg: settings.Record) -> Path:
                 titles.append(folders.name_of(loaded.path))
             title = ", ".join(text for text in titles if text is not None)
             shown.append(recording.Player(env, policy, title or cfg.title))
-    look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail", "axes")}
+    look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail")}
     with contextlib.ExitStack() as undo:
         path = Path(cfg.file or take_free_name(folder / "video.mp4"))
         if not cfg.file:

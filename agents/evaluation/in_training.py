@@ -70,7 +70,6 @@ class Evaluator:
 
 
 def _generators_kept(device: torch.device) -> contextlib.ExitStack:
-    """A context that leaves the global generators as they were."""
     stack = contextlib.ExitStack()
     stack.enter_context(global_generators.kept())
     if torch.device(device).type == "cuda":

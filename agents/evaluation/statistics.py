@@ -75,8 +75,7 @@ def by_part(
     Args:
         summary: makes the row of some lanes, (B,) bool.
         counted: (B,) bool, all lanes that count.
-        role_of: (B,), the role of each lane, one of `roles`.
-        homes: (B,) integers, the home of each lane.
+        role_of, homes: (B,), the role of each lane, one of `roles`, and its home.
         sources: the source of each home.
     """
     rows = [summary(counted)]
@@ -130,7 +129,7 @@ def worst_homes(
 
 
 def _finite_mean(values) -> np.ndarray:
-    """Returns the mean over the last axis of what is finite, nan if there is none."""
+    """Over the last axis, of what is finite; nan if there is none."""
     is_finite = np.isfinite(values)
     return _divided(np.where(is_finite, values, 0.0).sum(-1), is_finite.sum(-1))
 
@@ -140,9 +139,8 @@ def _divided(sums, counts) -> np.ndarray:
 
 
 def worst_summary(episodes: Mapping) -> "Row":
-    """Returns a table row of the worst homes, `worst_homes`, from the result of `first_episodes`.
-
-    A metric without a number in them is left out. Unfinished episodes are not counted.
+    """Returns a table row of the worst homes, `worst_homes`, from the result of `first_episodes`,
+    without unfinished episodes and metrics without a number.
     """
     played = numpyify(episodes)
     lanes, homes = _counted(played["learns"]) & played["done"], played["homes"]
@@ -195,10 +193,7 @@ def summaries(
 
 
 def _summary(played, lanes) -> "Row":
-    """Returns a table row for some lanes, (B,) bool.
-
-    Intervals are over homes, or over environments if there are no homes or only one.
-    """
+    """Intervals are over homes, or over environments if there are no homes or only one."""
     homes, done = played["homes"][lanes] if "homes" in played else None, played["done"][lanes]
     n_homes = None if homes is None else len(np.unique(homes))
     groups = played["envs"][lanes] if homes is None or n_homes == 1 else homes
@@ -230,8 +225,7 @@ def rows_of(
     sources: Sequence[str] | None = None,
     roles: Sequence[str] | None = None,
 ) -> "list[Row]":
-    """Returns a dict per episode for the result of `playing.first_episodes`, of the lanes that
-    `summaries` counts. Keys, those of what is known:
+    """Returns a dict per episode of the result of `first_episodes`, of the lanes that count:
 
     - episode: the number of the lane; seed: of the evaluation
     - home, source: its number in the split, and the source it is from
@@ -242,8 +236,7 @@ def rows_of(
 
     Args:
         numbers: the number of each home in the split.
-        sources: the source of each home.
-        roles: the role of each agent slot, repeated over environments.
+        sources, roles: as for `summaries`.
     """
     played = numpyify(episodes)
     lanes = np.flatnonzero(_counted(played["learns"]))

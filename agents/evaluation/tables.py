@@ -25,17 +25,11 @@ DENSE = "dense"
 
 
 class Labels(NamedTuple):
-    """Where a run is evaluated.
+    """Where a run is evaluated."""
 
-    Attributes:
-        env: the environment's name.
-        source: that of the homes, or of the environment if there are none, for file names.
-        choice: the choice of homes, for titles; empty if there are none.
-    """
-
-    env: str
-    source: str
-    choice: str
+    env: str  # the environment's name
+    source: str  # that of the homes, or of the environment if there are none, for file names
+    choice: str  # of homes, for titles; empty if there are none
 
     def title(self, what: str, n_homes: int | None) -> str:
         """Returns `minimal: 1,024 episodes in 512 homes, geometry=homes, split=test` of `what`,
@@ -167,10 +161,7 @@ def title_of(
     labels: Labels, geometry: Geometry, rows: list[dict], what: str
 ) -> tuple[str, list[dict]]:
     """Returns the title of a table, and its rows: of a suite with the worst source of each agent or
-    opponent once more at its end.
-
-    Args:
-        what: the key of the number of episodes, `lanes` or `duels`.
+    opponent once more at its end. `what` is the key of the number of episodes.
     """
     who, name = ("agent", "episodes") if what == "lanes" else ("against", what)
     is_suite = geometry.name == components.SUITE

@@ -36,10 +36,8 @@ PRIVATE = dict(
 
 
 def rounded(policy: Policy) -> dict[str, torch.Tensor]:
-    """Returns a policy's state with weights as float16; statistics keep their dtype.
-
-    Raises:
-        UserError: a weight is too large for float16.
+    """Returns a policy's state with weights as float16; statistics keep their dtype. Raises
+    UserError if a weight is too large.
     """
     weights = dict(policy.named_parameters())
     state = {k: v.half() if k in weights else v for k, v in policy.state_dict().items()}
@@ -114,8 +112,7 @@ def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
         max_error: bound of `rounding_error`.
 
     Raises:
-        UserError: the run acts otherwise once it is rounded, or cannot be written. Nothing was
-            written then.
+        UserError: the run acts otherwise once it is rounded, or cannot be written.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", file.stem):
         raise UserError(

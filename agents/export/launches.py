@@ -143,7 +143,6 @@ class _Lowering:
         )
 
     def convolve(self, leaf: Leaf, norm, encoder, out: Ref, out_stride: int) -> None:
-        """Adds the normalisation and the convolutions of a leaf."""
         n_agents, channels, height, width = leaf.shape[1:]
         shape: Sequence[int] = (channels, height, width)
         if isinstance(encoder, Conv):  # rows count as channels

@@ -73,13 +73,11 @@ class Step(nn.Module):
 
     @property
     def ports(self) -> str:
-        """The inputs and outputs as JSON."""
         sides = {"inputs": self.inputs, "outputs": self.outputs}
         return json.dumps({name: [port._asdict() for port in side] for name, side in sides.items()})
 
     @torch.no_grad()
     def forward(self, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the outputs for the inputs, (B, ...) each."""
         obs, mask, reset, state = self._trees(tensors)
         obs = mapping(torch.unsqueeze)(obs, 0)
         features, state = self.policy._features(obs, reset[None], state)
@@ -137,7 +135,6 @@ def _port(name, tensor) -> Port:
 
 
 def _filled(tree, values) -> arrdict:
-    """Returns a tree with other leaves, taken from the front of a list."""
     return tree.map(lambda leaf: values.pop(0)) if tree else tree
 
 
@@ -155,29 +152,12 @@ def _nested(flat) -> Tree:
     return tree
 
 
-class Comparison(NamedTuple):
-    """How far a file and its policy are apart.
-
-    Attributes:
-        difference: largest absolute difference of logits, continuous actions and hidden states; of
-            logits that a mask forbids only if the other does not. NaN if a number is.
-        n_apart: greedy actions that differ though their logits differ by more than that.
-        largest: absolute value of the logits and states.
-    """
-
-    difference: float
-    n_apart: int
-    largest: float
-
-
 # ---- Files ----
 
 
 def program(step: Step, name: str = "") -> "torch.export.ExportedProgram":
-    """Returns a step as a graph of PyTorch's operators, of any number of lanes.
-
-    Raises:
-        UserError: a core or an encoder of the user's cannot be exported.
+    """Returns a step as a graph of PyTorch's operators, of any number of lanes. Raises UserError
+    if a core or an encoder of the user's cannot be exported.
     """
     lanes = torch.export.Dim("lanes")
     dynamic = (tuple({0: lanes} for _ in step.example),)
@@ -201,10 +181,8 @@ def write_torch(step: Step, path: Path, name: str = "") -> None:
 
 
 def write_onnx(step: Step, path: Path, name: str = "") -> None:
-    """Writes an ONNX file, with its ports as the metadata `megastep`.
-
-    Raises:
-        UserError: the packages are missing; or as `program`.
+    """Writes an ONNX file, with its ports as the metadata `megastep`. Raises UserError if the
+    packages are missing, or as `program`.
     """
     require("onnx", "onnxscript")
     made, sides = program(step, name), (step.inputs, step.outputs)
@@ -247,9 +225,14 @@ def run_onnx(path: Path) -> Runner:
 
 
 @torch.no_grad()
-def compare(step: Step, run: Runner, policy: "Policy", env: Env, n_steps: int = 1000) -> Comparison:
-    """Returns how far apart a file and a policy are: both act on the same worlds, each with its own
-    hidden state, with more resets than the environment's own.
+def compare(
+    step: Step, run: Runner, policy: "Policy", env: Env, name: object, n_steps: int = 1000
+) -> float:
+    """Returns how far apart the numbers of a file and of a policy are: both act on the same worlds,
+    each with its own hidden state, with more resets than the environment's own.
+
+    Raises:
+        UserError: the file, called `name`, acts otherwise than the policy.
     """
     world, state = env.reset(), policy.initial(n_lanes(env))
     own = state.map(torch.clone) if state else state
@@ -274,17 +257,12 @@ def compare(step: Step, run: Runner, policy: "Policy", env: Env, n_steps: int = 
                 choices.append((mine != theirs, best[..., 0] - best[..., 1]))
         world = env.step(decision)
     n_apart = sum(int((is_other & (gap > 2 * difference)).sum()) for is_other, gap in choices)
-    return Comparison(difference.item(), n_apart, largest)
-
-
-def check(path: Path, comparison: Comparison) -> None:
-    """Raises UserError if a file acts otherwise than its policy."""
-    is_alike = comparison.difference <= MAX_DIFFERENCE * max(1, comparison.largest)  # also if NaN
-    if comparison.n_apart or not is_alike:
+    if n_apart or not difference <= MAX_DIFFERENCE * max(1, largest):  # also if NaN
         raise UserError(
-            f"{path} acts otherwise than its policy: logits differ by {comparison.difference:.2g}, "
-            f"and {comparison.n_apart} actions"
+            f"{name} acts otherwise than its policy: logits differ by {difference:.2g}, and "
+            f"{n_apart} actions"
         )
+    return difference.item()
 
 
 def require(*names: str) -> list:

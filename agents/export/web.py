@@ -34,8 +34,7 @@ def make(
         seed: of the first episodes.
 
     Raises:
-        UserError: the environment, the policy or the opponent cannot be exported; or the page is
-            too large.
+        UserError: the environment or a policy cannot be exported; or the page is too large.
     """
     loaded = folders.load_checkpoint(folders.find(run), False, factory.make_device("cpu"))
     trained, name = factory.config_of(loaded), folders.name_of(loaded.path)
@@ -83,7 +82,6 @@ def make(
 
 
 def _homes(found: list, numbers: Sequence[int] | None) -> list:
-    """Returns the homes of these numbers."""
     if numbers is None or not found:
         return found[:N_HOMES]
     for number in numbers:

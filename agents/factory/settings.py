@@ -349,7 +349,6 @@ class Record(Played):
     dpi: Annotated[float, Field(ge=20, le=400)] = 100.0
     speed: Annotated[float, Field(gt=0, le=100)] = 1.0
     trail: Annotated[int, Field(ge=0, le=10_000)] = 60
-    axes: bool = False
 
     def conflicts(self) -> Iterator[tuple[str, str]]:
         return conflicts.of_recording(self)

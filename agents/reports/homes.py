@@ -20,9 +20,7 @@ N_WORST, N_BEST = 36, 12
 
 
 def section(run: runs.Run) -> list[str]:
-    """Returns the part of a report that shows where the agent does badly; empty without an
-    evaluation in several homes.
-    """
+    """Returns the HTML that shows where the agent does badly; empty without several homes."""
     for table in run.evaluations:
         if "home" not in table.get("episodes", {}):
             continue
@@ -52,9 +50,7 @@ def section(run: runs.Run) -> list[str]:
 
 
 def score_by_home(episodes: Mapping[str, Sequence]) -> tuple[str, dict[int, float]]:
-    """Returns the first of `SCORES` that episodes have, and its mean in each home, of the first
-    agent of a table.
-    """
+    """Returns the first of `SCORES` that episodes have, and its mean by home, of one agent."""
     name = next(name for name in SCORES if any(v is not None for v in episodes.get(name, ())))
     agents, values = episodes["agent"], defaultdict(list)
     for agent, home, value in zip(agents, episodes["home"], episodes[name], strict=True):
@@ -64,21 +60,13 @@ def score_by_home(episodes: Mapping[str, Sequence]) -> tuple[str, dict[int, floa
 
 
 def plans_of(run: runs.Run, table: Mapping) -> list:
-    """Returns the geometries of the split that a table is about.
-
-    Raises:
-        UserError: the run needs classes that are not imported without trust.
-    """
+    """Returns the geometries of the split that a table is about."""
     loaded = folders.load_checkpoint(folders.find(str(run.folder)), False, "cpu")
     trained = factory.config_of(loaded)
-    chosen = loads(json.dumps(table["evaluation"]))
-    geometry = chosen.get("geometry")
-    if geometry is None:
-        kept = trained.geometry
-    else:
-        kind = components.kind_of("geometry", str(geometry["name"]))
-        kept = check.check(kind, geometry)
-    return factory.homes(trained.env, kept, str(chosen["split"]))
+    chosen, geometry = loads(json.dumps(table["evaluation"])), trained.geometry
+    if typed := chosen.get("geometry"):
+        geometry = check.check(components.kind_of("geometry", str(typed["name"])), typed)
+    return factory.homes(trained.env, geometry, str(chosen["split"]))
 
 
 def figure(number: int, plan: Mapping, value: float, span: tuple[float, float]) -> str:
@@ -91,12 +79,10 @@ def figure(number: int, plan: Mapping, value: float, span: tuple[float, float]) 
     )
     width, height = high - low
     fraction = (value - span[0]) / (span[1] - span[0]) if span[1] > span[0] else 1.0
+    # from a dark red to a light green: lightness differs as well
+    hue, saturation, lightness = 10 + 110 * fraction, 70 - 15 * fraction, 48 + 20 * fraction
+    colour = f"hsl({hue:.0f} {saturation:.0f}% {lightness:.0f}%)"
     box = f"-.3 -.3 {width + 0.6:.2f} {height + 0.6:.2f}"
-    floor = f'<rect width="{width:.2f}" height="{height:.2f}" fill="{colour(fraction)}"/>'
+    floor = f'<rect width="{width:.2f}" height="{height:.2f}" fill="{colour}"/>'
     drawing = f'<svg viewBox="{box}" role="img">{floor}<path d="{lines}"/></svg>'
     return f"<figure>{drawing}<figcaption>{number}: {value:.3g}</figcaption></figure>"
-
-
-def colour(fraction: float) -> str:
-    """Returns a colour between a dark red, 0, and a light green, 1: lightness differs as well."""
-    return f"hsl({10 + 110 * fraction:.0f} {70 - 15 * fraction:.0f}% {48 + 20 * fraction:.0f}%)"

@@ -21,21 +21,14 @@ OF_A_SEED = "seed", "folder", "resume", "rerun", "ranks", "device", "finish", "l
 
 
 class Run(NamedTuple):
-    """A run that has been trained, or is being trained.
-
-    Attributes:
-        folder: of the run.
-        config: its settings as nested dicts.
-        metrics, perf, provenance: the rows of its files.
-        evaluations: the contents of `evaluations/*.json`, in the order of names.
-    """
+    """A run that has been trained, or is being trained."""
 
     folder: Path
-    config: "Config"
-    metrics: "list[Row]"
+    config: "Config"  # its settings as nested dicts
+    metrics: "list[Row]"  # the rows of its files
     perf: "list[Row]"
     provenance: "list[Row]"
-    evaluations: "list[Row]"
+    evaluations: "list[Row]"  # the contents of `evaluations/*.json`, in the order of names
 
     @property
     def task(self) -> str:
@@ -88,10 +81,7 @@ def read(folder: Path) -> Run:
 
 def expanded(names: Sequence[str]) -> list[Path]:
     """Returns the run folders that names stand for: runs, `latest`, and folders of sweeps, which
-    stand for all of their jobs.
-
-    Raises:
-        UserError: a name is none of them.
+    stand for all of their jobs. Raises UserError for other names.
     """
     paths = []
     for name in names:
@@ -102,9 +92,7 @@ def expanded(names: Sequence[str]) -> list[Path]:
 
 
 def groups_of(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Returns {label: the runs that differ in their seeds alone}. Labels name what differs between
-    groups.
-    """
+    """Returns {what differs between groups: the runs that differ in their seeds alone}."""
     by_settings: dict[str, list[Run]] = {}
     for run in runs:
         by_settings.setdefault(repr(sorted(run.settings().items())), []).append(run)

@@ -28,13 +28,11 @@ def interval(
     n_resamples: int = 2000,
     seed: int = 1,
 ) -> tuple[float, float, float]:
-    """Returns a statistic and its stratified bootstrap interval: `(value, lower, upper)`.
-
-    The runs of each task are resampled by themselves.
+    """Returns a statistic of all tasks' scores and its stratified bootstrap interval:
+    `(value, lower, upper)`. The runs of each task are resampled by themselves.
 
     Args:
         scores: of each task, those of its runs.
-        statistic: of the scores of all tasks.
     """
     tasks = [np.asarray(task, float) for task in scores]
     draw = np.random.default_rng(seed)
@@ -51,9 +49,7 @@ POOLED = ["runs", "seeds", "IQM of {}", "95 % interval"]
 
 
 def pooled(scores: Mapping[str, Sequence[float]]) -> list[list[str]]:
-    """Returns the rows of a table: for each label, the number of seeds, and the interquartile mean
-    of their scores with its interval.
-    """
+    """Returns a row for each label: the number of seeds, the IQM of their scores, its interval."""
     rows = []
     for name, values in scores.items():
         middle, lower, upper = interval([values]) if len(values) else 3 * (float("nan"),)
@@ -76,15 +72,8 @@ def band(
     n_resamples: int = 500,
     seed: int = 1,
 ) -> dict[str, np.ndarray]:
-    """Returns the mean curve of several seeds, with its bootstrap interval.
-
-    Curves are interpolated linearly where all of them have points.
-
-    Args:
-        curves: `(x, y)` of each seed, in the order of x.
-
-    Returns:
-        {x, mean, lower, upper}, (n_points,) each; the bounds are the mean if there is one seed.
+    """Returns the mean curve of several seeds with its bootstrap interval: {x, mean, lower, upper},
+    (n_points,) each. Curves, `(x, y)` of each seed, are interpolated where all have points.
     """
     start = max(np.min(x) for x, _ in curves)
     end = max(start, min(np.max(x) for x, _ in curves))

@@ -117,12 +117,7 @@ def plot_trail(ax: Area | Axes, points: ArrayLike, colour: str = AGENTS[0]) -> N
 
 
 def plot_goal(ax: Area | Axes, position: ArrayLike, radius: float) -> None:
-    """Draws a goal as a disc in a ring.
-
-    Args:
-        position: (2,) in metres.
-        radius: metres within which the goal counts as reached.
-    """
+    """Draws a goal at (2,) metres as a disc in a ring; it is reached within ``radius`` metres."""
     area = _area(ax)
     area.disc(position, 1.6 * radius, GOAL, fill="#1fa94c", alpha=0.25, least=9)
     area.disc(position, radius, GOAL, fill="#1fa94c", edge="#ffffff", width=1.2, least=5)
@@ -139,10 +134,8 @@ def plot_shot(ax: Area | Axes, start: ArrayLike, end: ArrayLike, colour: str) ->
 def plot_object(
     ax: Area | Axes, shape: str, position: ArrayLike, angle: float, size: float, colour: ArrayLike
 ) -> None:
-    """Draws a disc, a crate or a door, as :class:`megastep.engine.Objects` has them.
-
-    Args:
-        colour: (3,), sRGB.
+    """Draws a disc, a crate or a door, as :class:`megastep.engine.Objects` has them; the colour
+    is (3,), sRGB.
     """
     area, position = _area(ax), np.asarray(position, float)
     fill, edge = tuple(np.asarray(colour, float)), area.style.colours.text

@@ -53,13 +53,9 @@ class Area(Artist):
     Points are data coordinates after :meth:`fit`, otherwise inches from the lower left corner.
     Things with a higher ``z`` cover those with a lower one. Methods of matplotlib's ``Axes`` work
     too, such as ``area.plot(x, y)``: they draw on axes that are put over the area, slowly.
-
-    Attributes:
-        style: the :class:`Style` that it was made in.
-        strip_label: the area beside a strip.
     """
 
-    strip_label: Area
+    strip_label: Area  # beside a strip
 
     def __init__(self, figure: Figure, left: float, bottom: float, width: float, height: float):
         super().__init__()
@@ -298,10 +294,7 @@ def panels(
     picture = Picture(figsize=(width, height), dpi=style.dpi, facecolor=style.colours.page)
     _write_head(picture, height, title)
     tall = height - head - below - MARGIN / 2
-    left, under = (0.3, 0.25) if style.axes else (0, 0)
-    plan = Area(
-        picture, MARGIN + left, below + MARGIN / 2 + under, width - 2 * MARGIN - left, tall - under
-    )
+    plan = Area(picture, MARGIN, below + MARGIN / 2, width - 2 * MARGIN, tall)
     cell = (width - 2 * MARGIN - (columns - 1) * MARGIN) / columns
     label = LABEL + DEGREES * (n_cameras > 1)
     strips = []

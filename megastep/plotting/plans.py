@@ -57,15 +57,6 @@ def plot_scenery(
     area.fit(plan.low - BORDER, plan.high + BORDER, FOOT)
     area.add(plan.draw, 0)
     _scale_bar(area, plan)
-    if area.style.axes:
-        from matplotlib.ticker import AutoLocator
-
-        overlay = area.overlay()
-        for axis in overlay.xaxis, overlay.yaxis:
-            axis.set_major_locator(AutoLocator())
-        overlay.set_xlabel("x, m", color=area.style.colours.faint, fontsize=8, labelpad=1)
-        overlay.set_ylabel("y, m", color=area.style.colours.faint, fontsize=8, labelpad=1)
-        overlay.tick_params(colors=area.style.colours.faint, labelsize=8)
     return ax
 
 

@@ -63,14 +63,12 @@ class Style:
         theme: "light" or "dark".
         dpi: pixels per inch; at 100, most pictures are 640 x 720 pixels.
         title: above the picture.
-        axes: draw axes in metres around floor plans.
         note: added to a picture's line of numbers, such as an episode's return.
     """
 
     theme: str = "light"
     dpi: float = 100
     title: str | None = None
-    axes: bool = False
     note: str = ""
 
     @property
@@ -89,11 +87,7 @@ def current() -> Style:
 
 @contextlib.contextmanager
 def styled(**settings) -> Iterator[Style]:
-    """Changes the style of pictures that are made inside the block; see :class:`Style`.
-
-    Raises:
-        ValueError: there is no such theme.
-    """
+    """Changes the style of pictures that are made inside the block; see :class:`Style`."""
     style = dataclasses.replace(current(), **settings)
     if style.theme not in THEMES:
         raise ValueError(f"theme must be light or dark, but {style.theme!r} was given")

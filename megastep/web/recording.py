@@ -78,7 +78,6 @@ class Tape(TorchDispatchMode):
         return result
 
     def observe(self, library: KernelLibrary, operation: str, packed: bytes) -> None:
-        """Notes a launch."""
         values = {}
         for word in library.words[library.cpu_operations[operation]]:
             (value,) = struct.unpack_from(word.kind, packed, word.offset)
@@ -108,7 +107,6 @@ class Recorder:
         self.scan()
 
     def refusal(self, reason: str) -> ValueError:
-        """Returns the error that says why the environment cannot be recorded."""
         return ValueError(f"{self.name} cannot be exported: {reason}")
 
     # ---- Storages ----
@@ -143,7 +141,6 @@ class Recorder:
                             self.add(one)
 
     def contents(self, start: int) -> bytes:
-        """Returns what a storage holds."""
         return ctypes.string_at(start, self.storages[start].nbytes())
 
     # ---- Buffers ----
@@ -158,8 +155,7 @@ class Recorder:
 
     def run(self, call: Callable[[], World], is_reset: bool) -> tuple[Tape, dict]:
         """Calls a function of the environment, and makes buffers for what it uses. Returns its tape
-        and the leaves of its world. Refuses what PyTorch computes where a replay would go without
-        it.
+        and the leaves of its world. Refuses what PyTorch computes between kernels.
         """
         tape = Tape(self)
         with tape, observed(tape.observe):
