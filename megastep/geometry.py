@@ -71,9 +71,7 @@ def indices(coords: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.n
 
 
 def _runs(lows, highs) -> tuple[np.ndarray, np.ndarray]:
-    """Returns (the number of the range, the integer) for each integer of the closed ranges
-    low..high, given as vectors of integers.
-    """
+    """Returns (the number of the range, the integer) for each integer of closed ranges."""
     counts = np.maximum(highs - lows + 1, 0)
     ranges = np.repeat(np.arange(len(lows)), counts)
     offsets = np.arange(len(ranges)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -81,11 +79,9 @@ def _runs(lows, highs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _touched(walls, shape) -> np.ndarray:
-    """Returns the cells that a wall touches, (H, W) bool with row 0 at the *bottom*. Walls
-    (M, 2, 2) are in units of cells.
-
-    Each wall is cut into the rows that it crosses. The piece in a row covers a run of columns; the
-    ends of the runs are counted and summed up along the row.
+    """Returns the cells that a wall touches, (H, W) bool with row 0 at the *bottom*. Walls are in
+    units of cells. Each is cut into the rows that it crosses. The piece in a row covers a run of
+    columns; the ends of the runs are counted and summed up along the row.
     """
     height, width = shape
     starts = np.take_along_axis(walls, walls[..., 1:].argsort(1), 1)  # lower end first
@@ -110,9 +106,7 @@ def _touched(walls, shape) -> np.ndarray:
 
 
 def _inside(rings, shape) -> np.ndarray:
-    """Returns the cells whose centre an odd number of rings encloses, (H, W) bool with row 0 at the
-    bottom. Rings (P, 2) are in units of cells.
-    """
+    """Returns the cells whose centre an odd number of rings encloses, as `_touched` does."""
     height, width = shape
     edges = np.concatenate([np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings])
     edges = np.take_along_axis(edges, edges[..., 1:].argsort(1), 1)
@@ -123,10 +117,8 @@ def _inside(rings, shape) -> np.ndarray:
     )
     crossing = x0[edge] + (row + 0.5 - y0[edge]) * (x1 - x0)[edge] / (y1 - y0)[edge]
     column = np.ceil(crossing - 0.5).astype(np.int64).clip(0, width)
-    flips = np.bincount(row * (width + 1) + column, minlength=height * (width + 1)).reshape(
-        height, width + 1
-    )
-    return flips.cumsum(1)[:, :width] % 2 == 1
+    flips = np.bincount(row * (width + 1) + column, minlength=height * (width + 1))
+    return flips.reshape(height, width + 1).cumsum(1)[:, :width] % 2 == 1
 
 
 def masks(walls: ArrayLike, rooms: Sequence, res: float = RES) -> np.ndarray:
@@ -155,9 +147,8 @@ def masks(walls: ArrayLike, rooms: Sequence, res: float = RES) -> np.ndarray:
     result = np.zeros((height, width), np.int16)
     for number, room in enumerate(rooms, 1):
         rings = room if isinstance(room, (list, tuple)) and np.ndim(room[0]) == 2 else [room]
-        result[_inside([np.asarray(ring, np.float64) / res for ring in rings], result.shape)] = (
-            number
-        )
+        rings = [np.asarray(ring, np.float64) / res for ring in rings]
+        result[_inside(rings, result.shape)] = number
     for start in range(0, len(walls), CHUNK):
         result[_touched(walls[start : start + CHUNK] / res, result.shape)] = -1
     return np.ascontiguousarray(result[::-1])

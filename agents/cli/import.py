@@ -148,8 +148,7 @@ def _import_database(cfg) -> None:
 
     options = imports.Options(source, cfg.per or "floor", cfg.entrances != "open")
     with user_errors(f"{imported.folder()} cannot be written: ", (OSError,)):
-        imported.folder().mkdir(parents=True, exist_ok=True)
-        imported.probe()
+        imported.prepare()
     with console.Progress() as progress, user_errors():
         plans, shown = imports.run(
             options, path, lambda n: progress.show(None, [f"{n:,} files read"])

@@ -35,10 +35,7 @@ def sample(
         n: number of geometries.
         split: "training", "test" or "all".
         seed: of the order in which geometries are drawn.
-        options: of the source: `width` of "box"; `width` and `pillar` of "column"; `outer`,
-            `density` and `clutter` of "homes"; `path` of "files"; `size`, `corridor`, `thickness`
-            and `braid` of "maze"; `size` and `cell` of "memory_maze"; `parts` of "mixed"; `parts`
-            and `plans` of "suite".
+        options: of the source; :mod:`~megastep.geometries.sources` has them.
 
     Raises:
         ValueError: for an unknown name, split or option, or a value that the source cannot use.

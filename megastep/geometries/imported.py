@@ -20,7 +20,7 @@ from megastep.atomic_files import write_atomically
 from megastep.dotdict import dotdict
 from megastep.geometries.homes import database
 
-__all__ = ["NAMES", "folder", "load", "pick", "probe", "write"]
+__all__ = ["NAMES", "folder", "load", "pick", "write"]
 
 #: The sources that can be imported.
 NAMES = ("cubicasa", "houseexpo")
@@ -33,11 +33,10 @@ def folder() -> Path:
     return Path(base) / "megastep"
 
 
-def probe() -> None:
-    """Raises OSError if the folder cannot be written, before an import begins."""
-    handle, path = tempfile.mkstemp(dir=folder(), suffix=".partial")
-    os.close(handle)
-    os.unlink(path)
+def prepare() -> None:
+    """Makes the folder. Raises OSError if it cannot be written, before an import begins."""
+    folder().mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=folder()).close()
 
 
 def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Path, str]:
@@ -56,8 +55,7 @@ def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Pa
     folder().mkdir(parents=True, exist_ok=True)
     path = folder() / f"{name}-{digest[:12]}.npz"
     write_atomically(path, content)
-    line = f"{digest}  {path.name}\n".encode()
-    write_atomically(folder() / f"{name}.sha256", line)
+    write_atomically(folder() / f"{name}.sha256", f"{digest}  {path.name}\n".encode())
     for old in folder().glob(f"{name}-*.npz"):
         if old != path:
             old.unlink(missing_ok=True)
@@ -65,11 +63,10 @@ def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Pa
 
 
 @functools.lru_cache(maxsize=2)
-def _arrays(name, listing, modified) -> tuple[dict, np.ndarray]:
-    """Returns the arrays of a database and the index at which each geometry's begin."""
-    cure = f"run megastep import source={name} path=... again"
+def _arrays(name, listing, modified) -> database.Arrays:
+    remedy = f"run megastep import source={name} path=... again"
     what = f"The imported plans of {name}"
-    return database.read(listing.parent, listing, MAX_GEOMETRIES, what, cure, ("files",))
+    return database.read(listing, MAX_GEOMETRIES, what, remedy, ("files",))
 
 
 def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
@@ -84,16 +81,17 @@ def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
             f"{name} is not imported: there is no {listing}. Download it and run megastep import "
             f"source={name} path=FILE; megastep import --help says where it is to be had"
         )
-    arrays, starts = _arrays(name, listing, listing.stat().st_mtime_ns)
-    files = np.unique(arrays["files"])
+    plans = _arrays(name, listing, listing.stat().st_mtime_ns)
+    of_plans = plans.arrays["files"]
+    files = np.unique(of_plans)
     order = np.random.RandomState(0).permutation(len(files))  # numpy never changes what it draws
     of_split = files[order[[*database.split_range(len(files), split)]]]
-    members = database.draw(np.isin(arrays["files"], of_split).nonzero()[0].tolist(), n, seed)
-    drawn = {i: database.geometry_at(arrays, starts, i, i) for i in members}
+    members = database.draw(np.isin(of_plans, of_split).nonzero()[0].tolist(), n, seed)
+    drawn = {i: plans.home(i, i) for i in members}
     return [drawn[i] for i in members]
 
 
 def load(path: Path) -> list[dotdict]:
     """Returns all geometries of a database that `write` wrote. Raises ValueError."""
-    arrays, starts = database.unpack(path.read_bytes(), MAX_GEOMETRIES, "import it again")
-    return [database.geometry_at(arrays, starts, i, i) for i in range(len(starts) - 1)]
+    plans = database.unpack(path.read_bytes(), MAX_GEOMETRIES, "import it again")
+    return [plans.home(i, i) for i in range(len(plans.starts) - 1)]

@@ -30,27 +30,22 @@ STEPS = (0, 1), (0, -1), (1, 0), (-1, 0)
 class Kind(NamedTuple):
     """What a size of mazes has."""
 
-    objects: int  # that an episode of Memory Maze has; each in a room of its own
-    steps: int  # of such an episode
+    objects: int  # of an episode of Memory Maze; each in a room of its own
     rooms: int  # at most
     widest: int  # cells of the side of a room; the shortest is 3
 
 
 #: The kinds by size.
 KINDS = {
-    9: Kind(objects=3, steps=1000, rooms=4, widest=5),
-    11: Kind(objects=4, steps=2000, rooms=6, widest=5),
-    13: Kind(objects=5, steps=3000, rooms=6, widest=5),
-    15: Kind(objects=6, steps=4000, rooms=9, widest=3),
+    9: Kind(objects=3, rooms=4, widest=5),
+    11: Kind(objects=4, rooms=6, widest=5),
+    13: Kind(objects=5, rooms=6, widest=5),
+    15: Kind(objects=6, rooms=9, widest=3),
 }
 
 
 def validate(size: int, cell: float) -> int:
-    """Returns the side of a cell in mm.
-
-    Raises:
-        ValueError: if there are no mazes of that size, or its cells are too small or too large.
-    """
+    """Returns the side of a cell in mm. Raises ValueError for a wrong size or cell."""
     if size not in KINDS:
         raise ValueError(
             f"size={size!r}: Memory Maze has mazes of {', '.join(map(str, KINDS))} cells"
@@ -79,6 +74,10 @@ def _rooms(size, generator) -> list[tuple[int, int, int, int]]:
     return rooms
 
 
+def _within(size, i, j) -> bool:
+    return 0 <= i < size and 0 <= j < size
+
+
 def _dig(size, rooms, generator) -> np.ndarray:
     """Returns the region of each cell, 0 for walls: rooms from 1, then trees of corridors."""
     regions = np.zeros((size, size), int)
@@ -97,9 +96,7 @@ def _dig(size, rooms, generator) -> np.ndarray:
             exits = [
                 (y, x)
                 for y, x in STEPS
-                if 0 <= i + 2 * y < size
-                and 0 <= j + 2 * x < size
-                and not regions[i + 2 * y, j + 2 * x]
+                if _within(size, i + 2 * y, j + 2 * x) and not regions[i + 2 * y, j + 2 * x]
             ]
             if not exits:
                 way.pop()
@@ -112,40 +109,24 @@ def _dig(size, rooms, generator) -> np.ndarray:
 
 def _join(regions, generator) -> None:
     """Opens walls between regions until all are connected, and some more."""
-    size = len(regions)
-    doors = [
-        (i, j, i + y, j + x, i - y, j - x)
-        for i in range(size)
-        for j in range(size)
-        for y, x in ((0, 1), (1, 0))
-        if not regions[i, j] and y <= i < size - y and x <= j < size - x
-        and 0 != regions[i + y, j + x] != regions[i - y, j - x] != 0
-    ]  # fmt: skip
+    walls, doors = np.pad(regions, 1), []
+    for i, j in np.argwhere(regions == 0).tolist():
+        for y, x in STEPS[0::2]:
+            a, b = walls[i + 1 + y, j + 1 + x], walls[i + 1 - y, j + 1 - x]
+            if 0 != a != b != 0:
+                doors.append((i, j, a, b))
     part = list(range(regions.max() + 1))
-    for i, j, *sides in generator.shuffled(doors):
-        a, b = (part[regions[i, j]] for i, j in (sides[:2], sides[2:]))
-        if a != b:
-            part = [a if p == b else p for p in part]
+    for i, j, a, b in generator.shuffled(doors):
+        if part[a] != part[b]:
+            part = [part[a] if p == part[b] else p for p in part]
         elif not generator.chance(LOOPS):
             continue
-        regions[i, j] = -1
-    regions[regions < 0] = regions.max() + 1
+        regions[i, j] = regions.max() + 1
 
 
 def _around(floor, i, j) -> list[tuple[int, int]]:
-    n = len(floor)
     beside = [(i + y, j + x) for y, x in STEPS]
-    return [(i, j) for i, j in beside if 0 <= i < n and 0 <= j < n and floor[i, j]]
-
-
-def _fill_dead_ends(regions) -> None:
-    is_end = True
-    while is_end:
-        is_end = False
-        for i, j in np.argwhere(regions).tolist():
-            if len(_around(regions, i, j)) < 2:
-                regions[i, j] = 0
-                is_end = True
+    return [at for at in beside if _within(len(floor), *at) and floor[at]]
 
 
 def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, int, int]]]:
@@ -158,8 +139,12 @@ def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, i
         rooms = _rooms(size, generator)
     regions = _dig(size, rooms, generator)
     _join(regions, generator)
-    _fill_dead_ends(regions)
-    return regions > 0, rooms
+    floor, ends = regions > 0, [(0, 0)]
+    while ends:
+        ends = [(i, j) for i, j in np.argwhere(floor).tolist() if len(_around(floor, i, j)) < 2]
+        for at in ends:
+            floor[at] = False
+    return floor, rooms
 
 
 def generate(seed: int, size: int = 9, cell: float = 0.6) -> dotdict:

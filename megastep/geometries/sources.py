@@ -7,9 +7,8 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
-import numpy as np
 from pydantic import Field
 
 from megastep.dotdict import dotdict
@@ -39,8 +38,7 @@ SUITE = {  # the parts of `suite`
 }
 
 
-def _draw_indices(count, n, split, seed) -> list[int]:
-    """Returns n indices into a database of `count`: a random permutation of the split, repeated."""
+def _draw(count, n, split, seed) -> list[int]:
     return database.draw(database.split_range(count, split), n, seed)
 
 
@@ -48,9 +46,7 @@ def box(n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.
     """Returns one empty square room, n times.
 
     Args:
-        n: number of geometries, all the same one.
-        split: any; the room is in every split.
-        seed: not used.
+        n, split, seed: all draw the same one, n times.
         width: width of the room, in metres.
     """
     return [toys.box(width)] * n
@@ -62,9 +58,7 @@ def column(
     """Returns one square room with a pillar in its middle, n times.
 
     Args:
-        n: number of geometries, all the same one.
-        split: any; the room is in every split.
-        seed: not used.
+        n, split, seed: all draw the same one, n times.
         width: width of the room, in metres.
         pillar: width of the pillar, in metres.
     """
@@ -81,13 +75,12 @@ def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str)
 
     Args:
         n: number of geometries; a split with fewer repeats them.
-        split: training, test or all.
-        seed: which geometries of the split are drawn, and in which order.
+        split, seed: training, test or all, and the order in which geometries of it are drawn.
         path: the file.
     """
     file = Path(path)
     database = _load(file, file.stat().st_mtime_ns if file.exists() else 0)
-    return [database[i] for i in _draw_indices(len(database), n, split, seed)]
+    return [database[i] for i in _draw(len(database), n, split, seed)]
 
 
 @checked
@@ -105,14 +98,13 @@ def homes(
 
     Args:
         n: number of geometries; a split with fewer repeats them.
-        split: training, test or all.
-        seed: which geometries of the split are drawn, and in which order.
+        split, seed: training, test or all, and the order in which geometries of it are drawn.
         outer: if False, outer walls have no outer faces, which cannot be seen from inside.
         density: 3: more rooms, narrower doors and corridors, and furniture: three times as many
             walls.
         clutter: 1: furniture leaves narrow gaps to walls, to other furniture and in doorways.
     """
-    indices = _draw_indices(database.COUNT, n, split, seed)
+    indices = _draw(database.COUNT, n, split, seed)
     if density == 1 and clutter == 0:
         return [database.home(i, outer) for i in indices]
     generated = database.generated(tuple(dict.fromkeys(indices)), density, clutter, outer)
@@ -124,8 +116,7 @@ def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdi
 
     Args:
         n: number of geometries; a split with fewer repeats them.
-        split: training, test or all.
-        seed: which geometries of the split are drawn, and in which order.
+        split, seed: training, test or all, and the order in which geometries of it are drawn.
     """
     return files(n, split, seed, path=str(BENCH))
 
@@ -135,8 +126,7 @@ def cubicasa(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[do
 
     Args:
         n: number of geometries; a split with fewer repeats them.
-        split: training, test or all. Floors of one home are in the same split.
-        seed: which geometries of the split are drawn, and in which order.
+        split, seed: as of `homes`; floors of one home are in the same split.
     """
     return imported.pick("cubicasa", n, split, seed)
 
@@ -146,8 +136,7 @@ def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[d
 
     Args:
         n: number of geometries; a split with fewer repeats them.
-        split: training, test or all.
-        seed: which geometries of the split are drawn, and in which order.
+        split, seed: training, test or all, and the order in which geometries of it are drawn.
     """
     return imported.pick("houseexpo", n, split, seed)
 
@@ -156,7 +145,7 @@ def _generated(module, n, split, seed, n_bytes, size, **options) -> list[dotdict
     """Returns mazes that a module generates, of `n_bytes` each."""
     from megastep.devices import fit  # imports PyTorch, which reading settings must not
 
-    indices = _draw_indices(module.COUNT, n, split, seed)
+    indices = _draw(module.COUNT, n, split, seed)
     unique = dict.fromkeys(indices)
     fit(len(unique), n_bytes, "cpu", f"mazes of {size} x {size} cells")
     generated = {i: module.generate(i, size, **options) for i in unique}
@@ -177,8 +166,7 @@ def maze(
 
     Args:
         n: number of geometries; a split with fewer repeats them.
-        split: training, test or all.
-        seed: which geometries of the split are drawn, and in which order.
+        split, seed: training, test or all, and the order in which geometries of it are drawn.
         size: cells per side.
         corridor: width of the corridors, in metres, at least 0.32, so that agents fit.
         thickness: thickness of the walls, in metres.
@@ -202,8 +190,7 @@ def memory_maze(
 
     Args:
         n: number of geometries; a split with fewer repeats them.
-        split: training, test or all.
-        seed: which geometries of the split are drawn, and in which order.
+        split, seed: training, test or all, and the order in which geometries of it are drawn.
         size: cells per side: 9, 11, 13 or 15.
         cell: side of a cell, in metres, at least 0.5.
     """
@@ -212,61 +199,40 @@ def memory_maze(
     return _generated(memory_mazes, n, split, seed, n_bytes, size=size, cell=cell)
 
 
-class _Part(NamedTuple):
-    """A part of `mixed`: a source, its options with `n`, and how training uses its geometries."""
-
-    source: Callable
-    options: dict[str, Any]
-    weight: int
-    mirror: bool
+@checked
+def _use(weight: Annotated[int, Field(ge=1, le=1000)] = 1, mirror: bool = False) -> tuple:
+    return weight, mirror
 
 
-def _part(name: str, part: object) -> _Part:
-    """Returns a part of `mixed`.
+def _part(name, part) -> tuple[Callable, dict, int, bool]:
+    """Returns the source of a part of `mixed`, its options, its weight and whether it is mirrored.
 
     Raises:
         ValueError: if there is no such source, or it takes other options.
     """
     options = dict(part) if isinstance(part, dict) else {"n": part}
     source = options.pop("source", name)
-    weight, mirror = options.pop("weight", 1), options.pop("mirror", False)
     known = [name for name in __all__ if name not in ("mixed", "suite")]
     if not isinstance(source, str) or source not in known and ":" not in source:
         raise ValueError(
             f"{source!r} is not a source; {closest(source, [*known, 'module:function'])}"
         )
     function = import_object(source) if ":" in source else globals()[source]
-    arguments = inspect.signature(function).parameters
-    taken = [k for k in arguments if k != "split"]
-    if missing := [k for k in ("n", "split", "seed") if k not in arguments]:
-        raise ValueError(f"{name}: {source} is not a source: it has no argument {missing[0]}")
-    if unknown := [k for k in options if k not in taken]:
+    used = {key: options.pop(key) for key in ("weight", "mirror") if key in options}
+    signature = inspect.signature(function)
+    try:
+        signature.bind(**{"n": 1, "split": "training", "seed": 1, **options})
+        weight, mirror = _use(**used)
+    except TypeError as error:
+        taken = ", ".join(signature.parameters)
         raise ValueError(
-            f"{name}: {source} has no option {unknown[0]}; {closest(unknown[0], taken)}"
-        )
-    required = [k for k in taken if arguments[k].default is inspect.Parameter.empty]
-    if absent := [k for k in required if k not in options]:
-        raise ValueError(f"{name}: {absent[0]} is missing")
-    n = options.setdefault("n", arguments["n"].default)
-    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 0 <= n <= 1_000_000:
-        raise ValueError(f"{name}: {n!r} is not a number of geometries, 0 to 1,000,000")
-    if isinstance(weight, bool) or not isinstance(weight, int) or not 1 <= weight <= 1000:
-        raise ValueError(f"{name}: weight={weight!r} is not an integer from 1 to 1,000")
-    if not isinstance(mirror, bool):
-        raise ValueError(f"{name}: mirror={mirror!r} is neither true nor false")
+            f"{name}: {source}: {error}; it takes {taken}, and a source n, split and seed"
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
     if function is files and not Path(str(options["path"])).is_file():  # before others are made
         raise ValueError(f"{name}: there is no file {str(options['path'])!r}")
-    return _Part(function, options, weight, mirror)
-
-
-def check_parts(parts: dict[str, Any]) -> None:
-    """Checks the parts of `mixed` and `suite`.
-
-    Raises:
-        ValueError: if a source does not exist or takes other options, or no part has geometries.
-    """
-    if not sum(_part(name, part).options["n"] for name, part in parts.items()):
-        raise ValueError("its counts sum to 0; give at least one geometry: {homes: 512}")
+    return function, options, weight, mirror
 
 
 @checked
@@ -287,21 +253,22 @@ def mixed(
             of its source. With {weight: 2} the training split has each of them twice, and with
             {mirror: true} the mirror image of each as well.
     """
-    check_parts(parts)
-    geometries = []
-    for name, part in parts.items():
-        source, options, weight, mirror = _part(name, part)
-        if options["n"]:
-            try:
-                drawn = checked(source)(**{"split": split, "seed": seed, **options})
-                unique = list({id(g): g for g in drawn}.values())
-                if split == "training":
-                    unique += [mirror_image(g) for g in unique] if mirror else []
-                    unique *= weight
-            except ValueError as error:
-                raise ValueError(f"{name}: {error}") from error
-            # each another object, and so a layout of its own, as layouts are drawn evenly
-            geometries += [dotdict(g, source=name) for g in unique]
+    geometries, uses = [], {name: _part(name, part) for name, part in parts.items()}
+    for name, (source, options, weight, mirror) in uses.items():
+        if options.get("n") == 0:
+            continue
+        try:
+            drawn = checked(source)(**{"split": split, "seed": seed, **options})
+            unique = list({id(g): g for g in drawn}.values())
+            if split == "training":
+                unique += [mirror_image(g) for g in unique] if mirror else []
+                unique *= weight
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+        # each another object, and so a layout of its own, as layouts are drawn evenly
+        geometries += [dotdict(g, source=name) for g in unique]
+    if not geometries:
+        raise ValueError("its counts sum to 0; give at least one geometry: {homes: 512}")
     total = len(geometries)
     n = n or total
     return [geometries[i * total // n if n < total else i % total] for i in range(n)]

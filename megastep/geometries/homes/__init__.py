@@ -25,12 +25,12 @@ def _attempt(count, generator, style) -> list[tuple]:
     """Tries to plan `count` rooms. Returns [(cost, footprint, rooms, contacts, depth, gaps)], or []
     if it fails.
     """
-    rooms = plan.programme(count, generator)
-    footprint = plan.footprint(sum(size for _, size in rooms), generator)
-    try:
-        rooms, sides = partition.partition(footprint, rooms, generator, style)
-    except partition.Failure:
+    programme = plan.programme(count, generator)
+    footprint = plan.footprint(sum(size for _, size in programme), generator)
+    result = partition.partition(footprint, programme, generator, style)
+    if not result:
         return []
+    rooms, sides = result
     depth = walls.depths(sides, THIN[generator.below(len(THIN))])
     meetings = openings.contacts(rooms)
     spans = {contact: openings.clear(contact, meetings, depth) for contact in meetings}
@@ -51,16 +51,14 @@ def _best_plan(generator, style) -> tuple:
     The number of rooms is drawn once. Plans of few rooms succeed more often, so drawing it again
     after each failure would make homes too small.
     """
-    count = plan.room_count(generator, style)
-    while True:
-        plans = []
+    count, plans = plan.room_count(generator, style), []
+    while not plans:
         for _ in range(ATTEMPTS):
             plans += _attempt(count, generator, style)
             if len(plans) >= (ENOUGH if count <= FEW else 1):
                 break
-        if plans:
-            return min(plans, key=lambda plan: plan[0])
         count -= 1
+    return min(plans, key=lambda plan: plan[0])
 
 
 def _doorways(gaps, depth, half_blocked, generator) -> tuple[list, list]:
@@ -82,25 +80,8 @@ def _doorways(gaps, depth, half_blocked, generator) -> tuple[list, list]:
     return clear, blocked
 
 
-def _furnish(
-    rooms, solids, gaps, depth, lights, triangle, style, generator
-) -> list[tuple[int, int, int, int]]:
-    """Returns the furniture of a home: rectangles, none in a room with a slanted corner."""
-    clear, blocked = _doorways(gaps, depth, style.half_blocked, generator)
-    reach = furniture.BESIDE_LIGHT
-    clear += [(x - reach, y - reach, x + reach, y + reach) for x, y in lights]
-    return [
-        piece
-        for room in rooms
-        if not walls.holds(room.region, triangle)
-        for piece in furniture.furnish(
-            room.region, solids, clear, style.furniture, generator, style.clutter, blocked
-        )
-    ]
-
-
-def _metres(segments, shift) -> np.ndarray:
-    return ((np.reshape(segments, (-1, 2, 2)) + shift) / 100).astype(np.float32)
+def _metres(points, shift) -> np.ndarray:
+    return (np.array(points) + shift) / 100
 
 
 def generate(seed: int, density: float = 1, clutter: float = 0) -> dotdict:
@@ -132,44 +113,47 @@ def generate(seed: int, density: float = 1, clutter: float = 0) -> dotdict:
         [[(x0, y0), (x1, y0), (x1, y1), (x0, y1)] for x0, y0, x1, y1 in room.region]
         for room in rooms
     ]
+    triangle = []
     if generator.chance(SLANTED):
-        inside, outside, triangle = walls.slanted(inside, outside, *grid, thickness, generator)
-        for room, ring in zip(rooms, rings):
-            ring += [triangle] if walls.holds(room.region, triangle) else []
-    else:
-        triangle = []
+        inside, outside, triangle = walls.slanted(inside, outside, grid, thickness, generator)
+    is_cut = [walls.holds(room.region, triangle) for room in rooms]
+    for ring in (ring for ring, cut in zip(rings, is_cut) if cut):
+        ring.append(triangle)
     if style.furniture:
-        lights = [
-            light
-            if walls.holds(room.region, triangle) or not generator.chance(style.off_centre)
-            else furniture.place_light(room.region, solids, generator)
-            for light, room in zip(lights, rooms)
-        ]
-        pieces = _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator)
+        for i, room in enumerate(rooms):
+            if not is_cut[i] and generator.chance(style.off_centre):
+                lights[i] = furniture.place_light(room.region, solids, generator)
+        clear, blocked = _doorways(gaps, depth, style.half_blocked, generator)
+        reach = furniture.BESIDE_LIGHT
+        clear += [(x - reach, y - reach, x + reach, y + reach) for x, y in lights]
+        pieces = []
+        for room in (room for room, cut in zip(rooms, is_cut) if not cut):
+            pieces += furniture.furnish(room.region, solids, clear, blocked, style, generator)
         grid = walls.paint(*layers, pieces)
         inside = walls.segments(*grid, walls.INDOORS)
         inside = walls.cut_off(inside, triangle) if triangle else inside
 
     shift = START - outside.min((0, 1))
-    lines = (np.concatenate([inside, outside]) + shift) / 100
-    masks = geometry.masks(
-        lines, [[(np.array(ring) + shift) / 100 for ring in room] for room in rings]
-    )
+    lines = _metres(np.concatenate([inside, outside]), shift)
+    masks = geometry.masks(lines, [[_metres(ring, shift) for ring in room] for room in rings])
     if style.furniture:  # no line marks the cells that are wholly inside it
         y, x = ((np.arange(n) + 0.5) * geometry.RES * 100 for n in masks.shape)
         masks[(masks > 0) & ~walls.are_indoors(grid, x - shift[0], y[::-1] - shift[1])] = 0
     doors, open_ = (
-        [walls.across(g) for g in gaps if g.door is has_door] for has_door in (True, False)
+        _metres(
+            np.reshape([walls.across(g) for g in gaps if g.door is has_door], (-1, 2, 2)), shift
+        )
+        for has_door in (True, False)
     )
     return dotdict(
         id=seed,
         walls=lines.astype(np.float32),
-        lights=((np.array(lights) + shift) / 100).astype(np.float32),
+        lights=_metres(lights, shift).astype(np.float32),
         masks=masks,
         res=geometry.RES,
         rooms=[room.kind for room in rooms],
         areas=walls.areas(grid, [room.region for room in rooms]),
-        doors=_metres(doors, shift),
-        openings=_metres(open_, shift),
+        doors=doors.astype(np.float32),
+        openings=open_.astype(np.float32),
         n_outer=len(outside),
     )

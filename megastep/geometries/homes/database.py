@@ -15,6 +15,7 @@ import io
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from megastep.dotdict import dotdict
 from megastep.geometries import files, homes
 
 COUNT = 5_000
-NAMES = ("walls", "lights", "doors", "masks", "widths")
+PARTS = ("walls", "lights", "masks", "doors")
 #: Bytes of a home and of the headers of arrays, at most; the homes of the package have 3.8 kB.
 MAX_EACH, MAX_HEADERS = 1 << 16, 1 << 12
 PATH = Path(__file__).parents[1] / "data" / "homes.npz"
@@ -32,16 +33,37 @@ SEEDS_EACH = 50  # homes per process at least; to start one takes as long as abo
 REMEDY = "install megastep again, or run scripts/make_homes.py"
 
 
+class Arrays(NamedTuple):
+    """A database that is read: its arrays, and the index at which each home's begin."""
+
+    arrays: dict[str, np.ndarray]
+    starts: np.ndarray
+
+    def home(self, index: int, seed: int, outer: bool = True) -> dotdict:
+        """Returns a home, with the id `seed`, and without its outer faces unless `outer`."""
+        _, n_outer, _, height, width, _ = self.arrays["widths"][index]
+        walls, lights, cells, doors = (
+            self.arrays[key][a:b]
+            for key, a, b in zip(PARTS, self.starts[index], self.starts[index + 1])
+        )
+        return dotdict(
+            id=seed,
+            walls=(walls[: len(walls) if outer else len(walls) - n_outer] / 100).astype(np.float32),
+            lights=(lights / 100).astype(np.float32),
+            masks=cells.reshape(height, width).astype(np.int16),
+            res=geometry.RES,
+            doors=(doors / 100).astype(np.float32),
+            n_outer=int(n_outer) if outer else 0,
+        )
+
+
 def split_range(count: int, split: str) -> range:
     """Returns the indices of a split, as a range into a database of `count` geometries. A single
     geometry is in every split.
     """
     training = count - max(1, round(count / 10)) if count > 1 else 1
-    return {
-        "training": range(training),
-        "test": range(training if count > 1 else 0, count),
-        "all": range(count),
-    }[split]
+    of_test = range(training if count > 1 else 0, count)
+    return {"training": range(training), "test": of_test, "all": range(count)}[split]
 
 
 def draw(members: Sequence[int], n: int, seed: int) -> list[int]:
@@ -51,52 +73,23 @@ def draw(members: Sequence[int], n: int, seed: int) -> list[int]:
     return [members[order[i % len(members)]] for i in range(n)]
 
 
-def read(
-    path: Path, listing: Path, n_homes: int, what: str, remedy: str, further: Sequence[str] = ()
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Returns what `unpack` returns of a file, or of the file in its folder that `listing` names.
-
-    Args:
-        path: the file, or its folder.
-        listing: a file of the sha256 and the name.
-        what: the database's name in errors, which end with the remedy.
-
-    Raises:
-        ValueError: if the file cannot be read or has another sha256.
-    """
-    try:
-        digest, name = listing.read_text().split()
-        content = (path / Path(name).name if path.is_dir() else path).read_bytes()
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{what} cannot be read ({error}); {remedy}") from error
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise ValueError(f"{what} are damaged (wrong sha256); {remedy}")
-    return unpack(content, n_homes, remedy, further)
-
-
-@functools.lru_cache(maxsize=1)
-def _arrays(path) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    what = f"The homes in {str(path)!r}"
-    return read(path, path.with_suffix(".sha256"), COUNT, what, REMEDY)
-
-
 def pack(
     plans: Sequence[dotdict], compression: int = zipfile.ZIP_LZMA, **further: np.ndarray
 ) -> bytes:
     """Returns the bytes of a database of homes from `homes.generate`, or of other geometries whose
     coordinates are whole centimetres. `further` are arrays with an entry per home.
     """
-    is_large = max(int(g.masks.max()) for g in plans) > 127
     arrays = {
-        "walls": np.concatenate([np.rint(g.walls * 100) for g in plans]).astype("<i2"),
-        "lights": np.concatenate([np.rint(g.lights * 100) for g in plans]).astype("<i2"),
-        "doors": np.concatenate([np.rint(g.doors * 100) for g in plans]).astype("<i2"),
-        "masks": np.concatenate([g.masks.ravel() for g in plans]).astype(
-            "i2" if is_large else "i1"
-        ),
-        "widths": np.array([_widths(g) for g in plans], "<i4"),
-        **further,
+        key: np.concatenate([np.rint(g[key] * 100) for g in plans]).astype("<i2")
+        for key in ("walls", "lights", "doors")
     }
+    masks = np.concatenate([g.masks.ravel() for g in plans])
+    arrays["masks"] = masks.astype("i2" if masks.max() > 127 else "i1")
+    widths = [
+        (len(g.walls), g.get("n_outer", 0), len(g.lights), *g.masks.shape, len(g.doors))
+        for g in plans
+    ]
+    arrays |= {"widths": np.array(widths, "<i4"), **further}
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in arrays.items():
@@ -107,16 +100,10 @@ def pack(
     return buffer.getvalue()
 
 
-def _widths(g) -> tuple[int, ...]:
-    n_outer = g.get("n_outer", 0)
-    return len(g.walls), n_outer, len(g.lights), *g.masks.shape, len(g.doors)
-
-
 def unpack(
     content: bytes, n_homes: int, remedy: str = REMEDY, further: Sequence[str] = ()
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Returns the arrays of a database, with `further` ones, and the index at which each home's
-    begin.
+) -> Arrays:
+    """Returns a database, with `further` arrays.
 
     Raises:
         ValueError: for one that is larger than `n_homes` homes can be, before it is unpacked, or
@@ -127,38 +114,41 @@ def unpack(
             n_bytes = sum(entry.file_size for entry in archive.zip.infolist())
             if n_bytes > n_homes * MAX_EACH + MAX_HEADERS:
                 raise ValueError(f"it unpacks to more than {n_homes:,} homes can have")
-            arrays = {name: archive[name] for name in (*NAMES, *further)}
+            arrays = {name: archive[name] for name in (*PARTS, "widths", *further)}
     except (*files.UNREADABLE, KeyError) as error:
         raise ValueError(f"The database of homes cannot be read ({error}); {remedy}.") from error
     widths = arrays["widths"]
     sizes = np.stack([widths[:, 0], widths[:, 2], widths[:, 3] * widths[:, 4], widths[:, 5]], 1)
-    return arrays, np.concatenate([np.zeros((1, 4), int), sizes.cumsum(0)])
+    return Arrays(arrays, np.concatenate([np.zeros((1, 4), int), sizes.cumsum(0)]))
+
+
+def read(
+    listing: Path, n_homes: int, what: str, remedy: str, further: Sequence[str] = ()
+) -> Arrays:
+    """Returns the database that `listing`, a file of its sha256 and its name, lies beside.
+
+    Raises:
+        ValueError: saying of `what` that it cannot be read or has another sha256, and the remedy.
+    """
+    try:
+        digest, name = listing.read_text().split()
+        content = listing.with_name(Path(name).name).read_bytes()
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{what} cannot be read ({error}); {remedy}") from error
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise ValueError(f"{what} are damaged (wrong sha256); {remedy}")
+    return unpack(content, n_homes, remedy, further)
+
+
+@functools.lru_cache(maxsize=1)
+def _packaged(path) -> Arrays:
+    return read(path.with_suffix(".sha256"), COUNT, f"The homes in {str(path)!r}", REMEDY)
 
 
 @functools.lru_cache(maxsize=COUNT)
 def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
-    """Returns the home of seed `index`, with `doors` and `n_outer`. `outer` is as in `generate`."""
-    return geometry_at(*_arrays(path), index, index, outer)
-
-
-def geometry_at(
-    arrays: dict[str, np.ndarray], starts: np.ndarray, index: int, seed: int, outer: bool = True
-) -> dotdict:
-    """Returns home `index` of what `unpack` returned, with the id `seed`."""
-    _, n_outer, _, height, width, _ = arrays["widths"][index]
-    parts = ("walls", "lights", "masks", "doors")
-    walls, lights, cells, doors = (
-        arrays[key][a:b] for key, a, b in zip(parts, starts[index], starts[index + 1])
-    )
-    return dotdict(
-        id=seed,
-        walls=(walls[: len(walls) if outer else len(walls) - n_outer] / 100).astype(np.float32),
-        lights=(lights / 100).astype(np.float32),
-        masks=cells.reshape(height, width).astype(np.int16),
-        res=geometry.RES,
-        doors=(doors / 100).astype(np.float32),
-        n_outer=int(n_outer) if outer else 0,
-    )
+    """Returns the home of seed `index`, with `doors` and `n_outer`."""
+    return _packaged(path).home(index, index, outer)
 
 
 @functools.lru_cache(maxsize=4)
@@ -173,11 +163,10 @@ def generated(
     content, _ = cache.fetch(name, lambda: _generate(seeds, density, clutter))
     cache.prune(PREFIX, MAX_FILES)
     database = unpack(content, len(seeds))
-    return {seed: geometry_at(*database, index, seed, outer) for index, seed in enumerate(seeds)}
+    return {seed: database.home(index, seed, outer) for index, seed in enumerate(seeds)}
 
 
 def _generate(seeds, density, clutter) -> bytes:
-    """Returns the bytes of a database of generated homes."""
     import loky
 
     make = functools.partial(homes.generate, density=density, clutter=clutter)

@@ -7,14 +7,13 @@ around clutter `TIGHT[0]`.
 """
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any
 
 from megastep.geometries.homes import regions
+from megastep.geometries.homes.plan import Style
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from megastep.geometries.homes.regions import Rectangle
 from megastep.geometries.homes.walls import CLEAR
-
-T = TypeVar("T")
 
 PASSAGE = 65  # cm; 5 more than the narrowest door
 SLIT = 20  # cm; nearer than this to a wall, a piece stands at it
@@ -30,12 +29,13 @@ OFF_WALL = 0.5  # fraction of clutter that leaves a gap behind it
 
 
 def overlap(a: Sequence[int], b: Sequence[int], apart: int = 0) -> bool:
-    """Returns True if two rectangles overlap, or are less than `apart` cm apart in x and in y."""
+    """True if two rectangles overlap, or are less than `apart` cm apart in x and in y."""
     return min(a[2], b[2]) + apart > max(a[0], b[0]) and min(a[3], b[3]) + apart > max(a[1], b[1])
 
 
-def clear(rectangle: Rectangle, solids: regions.Region) -> Rectangle:
-    """Returns a room's rectangle less the walls at its sides."""
+def _floor(region, solids) -> Rectangle:
+    """Returns a room's widest rectangle less the walls at its sides."""
+    rectangle = regions.widest(region)
     sides = [*rectangle]
     for solid in solids:
         part = [*map(max, rectangle[:2], solid[:2]), *map(min, rectangle[2:], solid[2:])]
@@ -51,15 +51,13 @@ def place_light(
     region: regions.Region, solids: regions.Region, generator: PortableGenerator
 ) -> tuple[int, int]:
     """Draws a place for a room's light, anywhere in its widest rectangle that is clear of walls."""
-    x0, y0, x1, y1 = clear(regions.widest(region), solids)
+    x0, y0, x1, y1 = _floor(region, solids)
     return generator.between(x0 + CLEAR, x1 - CLEAR), generator.between(y0 + CLEAR, y1 - CLEAR)
 
 
-def walled(region: regions.Region, rectangle: Rectangle) -> list[bool]:
-    """Returns for each side of a rectangle in a region, in its order, whether the region ends
-    there all along.
-    """
-    closed = []
+def _walled(region) -> list[bool]:
+    """Returns for each side of a room's widest rectangle whether the room ends there all along."""
+    rectangle, closed = regions.widest(region), []
     for side in range(4):
         beyond, axis, at = [*rectangle], side % 2, rectangle[side]
         beyond[axis], beyond[axis + 2] = (at - 1, at) if side < 2 else (at, at + 1)
@@ -73,13 +71,7 @@ def tight(generator: PortableGenerator) -> int:
 
 
 def _place(
-    low: int,
-    high: int,
-    size: int,
-    is_walled: Sequence[bool],
-    generator: PortableGenerator,
-    passage: int = PASSAGE,
-    off_wall: float = 0.0,
+    low, high, size, is_walled, generator, passage=PASSAGE, off_wall=0.0
 ) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """Places a piece along an axis of a room, from `low` to `high`. With the probability `off_wall`
     no wall is nearer than a passage.
@@ -90,10 +82,8 @@ def _place(
     spare = high - low - size
     if spare < 0:
         return None
-    if generator.chance(AT_WALL):
-        before = generator.below(2) * spare
-    else:
-        before = generator.between(0, spare // 5) * 5
+    at_wall = generator.chance(AT_WALL)
+    before = generator.below(2) * spare if at_wall else generator.between(0, spare, 5)
     before = 0 if before < SLIT else spare if spare - before < SLIT else before
     if off_wall and spare >= 2 * passage and generator.chance(off_wall):
         before = min(max(before, passage), spare - passage)
@@ -111,7 +101,7 @@ def _roomy(floor, is_walled, generator) -> tuple[Rectangle, Rectangle] | None:
     None if it blocks the room.
     """
     x0, y0, x1, y1 = floor
-    width, height = (generator.between(SIZES[0] // 5, SIZES[1] // 5) * 5 for _ in "xy")
+    width, height = (generator.between(*SIZES, step=5) for _ in "xy")
     across = _place(x0, x1, width, is_walled[0::2], generator)
     down = _place(y0, y1, height, is_walled[1::2], generator)
     if not (across and down):
@@ -120,9 +110,9 @@ def _roomy(floor, is_walled, generator) -> tuple[Rectangle, Rectangle] | None:
     return (a, b, c, d), (fill_a, fill_b, fill_c, fill_d)
 
 
-def _turned(sides: tuple[T, T, T, T]) -> tuple[T, T, T, T]:
+def _turned(sides) -> Any:
     """Exchanges x and y of a rectangle, or of something else in the order of its sides."""
-    return sides[1], sides[0], sides[3], sides[2]
+    return sides and (sides[1], sides[0], sides[3], sides[2])
 
 
 def _cluttered(
@@ -138,15 +128,9 @@ def _cluttered(
         turns = generator.below(2)
     if not turns:
         return _in_row(floor, is_walled, filled, keep_clear, doorway, gap, generator)
-    rectangles = _in_row(
-        _turned(floor),
-        _turned(is_walled),
-        [*map(_turned, filled)],
-        [*map(_turned, keep_clear)],
-        doorway and _turned(doorway),
-        gap,
-        generator,
-    )
+    filled, keep_clear = [*map(_turned, filled)], [*map(_turned, keep_clear)]
+    sides = _turned(floor), _turned(is_walled), filled, keep_clear, _turned(doorway)
+    rectangles = _in_row(*sides, gap, generator)
     return rectangles and (_turned(rectangles[0]), _turned(rectangles[1]))
 
 
@@ -157,7 +141,7 @@ def _in_row(
     is kept clear, less narrow gaps. At a wall at one of its ends may be none.
     """
     x0, y0, x1, y1 = floor
-    size = generator.between(DEEP[0] // 5, DEEP[1] // 5) * 5
+    size = generator.between(*DEEP, step=5)
     if doorway:
         at, above = (doorway[0] + doorway[2]) // 2, doorway[1] >= y0
         b = y1 - size if above else y0
@@ -173,16 +157,16 @@ def _in_row(
     before = generator.below(2)
     a = x0 if is_walled[0] and not before else x0 + gap
     c = x1 if is_walled[2] and before else x1 - gap
-    for others, strip, apart in (keep_clear, 0, 0), (filled, gap, gap):
+    for others, apart in (keep_clear, 0), (filled, gap):
         for x_low, y_low, x_high, y_high in others:
-            if min(fills[1], y_high) + strip > max(fills[0], y_low):
+            if min(fills[1], y_high) + apart > max(fills[0], y_low):
                 if x_low > at:
                     c = min(c, x_low - apart, x1 - TIGHT[0])
                 elif x_high < at:
                     a = max(a, x_high + apart, x0 + TIGHT[0])
                 else:
                     return None
-    length = generator.between(LONG[0] // 5, LONG[1] // 5) * 5
+    length = generator.between(*LONG, step=5)
     if c - a - length >= gap:
         at_low = at - a < c - at if doorway else before
         a, c = (a, a + length) if at_low else (c - length, c)
@@ -195,50 +179,46 @@ def furnish(
     region: regions.Region,
     solids: regions.Region,
     keep_clear: Sequence[Rectangle],
-    rate: float,
+    doorways: Sequence[Rectangle],
+    style: Style,
     generator: PortableGenerator,
-    clutter: float = 0.0,
-    doorways: Sequence[Rectangle] = (),
 ) -> regions.Region:
     """Draws the furniture of a room: disjoint rectangles, of which an L-shape has two.
 
     Args:
         solids: the walls of the home.
         keep_clear: where nothing may stand, such as in front of doors.
-        rate: pieces per m2 of the room's widest rectangle. Those that find no place are left out.
-        clutter: fraction of the pieces that leave narrow gaps.
         doorways: parts of the home's doorways, outside of rooms, that clutter blocks.
+        style: how many pieces, and which fraction of them is clutter. Those that find no place
+            are left out.
     """
-    widest = regions.widest(region)
-    is_walled, floor = walled(region, widest), clear(widest, solids)
+    is_walled, floor = _walled(region), _floor(region, solids)
     x0, y0, x1, y1 = floor
-    count = int(rate * (x1 - x0) * (y1 - y0) / 10_000 + generator.uniform())
+    count = int(style.furniture * (x1 - x0) * (y1 - y0) / 10_000 + generator.uniform())
     doorways = [doorway for doorway in doorways if overlap(doorway, floor, 1)]
     filled, pieces = [], []
     for _ in range(count):
-        is_clutter = clutter > 0 and generator.chance(clutter)
+        is_clutter = style.clutter > 0 and generator.chance(style.clutter)
         doorway = doorways.pop() if is_clutter and doorways else None
         for _ in range(TRIES):
             if is_clutter:
                 passage = tight(generator)
-                rectangles = _cluttered(
+                placed = _cluttered(
                     floor, is_walled, filled, keep_clear, doorway, passage, generator
                 )
             else:
-                passage, rectangles = PASSAGE, _roomy(floor, is_walled, generator)
-            if not rectangles:
+                passage, placed = PASSAGE, _roomy(floor, is_walled, generator)
+            if not placed:
                 continue
-            box, fills = rectangles
-            if any(overlap(fills, other, passage) for other in filled):
-                continue
-            if any(overlap(fills, other) for other in keep_clear):
-                continue
-            filled.append(fills)
-            # the corner that an L-shape lacks is away from walls, or it would be walled in
-            right = 1 if fills[0] == x0 else 0 if fills[2] == x1 else generator.below(2)
-            up = 1 if fills[1] == y0 else 0 if fills[3] == y1 else generator.below(2)
-            pieces += _shape(box, right, up, generator)
-            break
+            box, fills = placed
+            is_free = not any(overlap(fills, other, passage) for other in filled)
+            if is_free and not any(overlap(fills, other) for other in keep_clear):
+                filled.append(fills)
+                # the corner that an L-shape lacks is away from walls, or it would be walled in
+                right = 1 if fills[0] == x0 else 0 if fills[2] == x1 else generator.below(2)
+                up = 1 if fills[1] == y0 else 0 if fills[3] == y1 else generator.below(2)
+                pieces += _shape(box, right, up, generator)
+                break
     return pieces
 
 
@@ -249,7 +229,7 @@ def _shape(box, right, up, generator) -> list[Rectangle]:
     a, b, c, d = box
     if min(c - a, d - b) < 3 * NOTCH or not generator.chance(L_SHAPED):
         return [box]
-    wide, high = (generator.between(NOTCH // 5, (side - NOTCH) // 5) * 5 for side in (c - a, d - b))
+    wide, high = (generator.between(NOTCH, side - NOTCH, 5) for side in (c - a, d - b))
     x = c - wide if right else a + wide
     low, top = (b, d - high) if up else (b + high, d)
     left, end = (a, x) if right else (x, c)

@@ -2,13 +2,11 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+from megastep.geometries.homes.partition import Room
 from megastep.geometries.homes.plan import Style
 from megastep.geometries.homes.portable_generator import PortableGenerator
-
-if TYPE_CHECKING:
-    from megastep.geometries.homes.partition import Room
 
 # Probability of each width of a door.
 DOORS = {60: 0.06, 65: 0.12, 70: 0.16, 75: 0.18, 80: 0.24, 85: 0.14, 90: 0.10}
@@ -18,44 +16,47 @@ STUB = 5  # cm of wall beside a door in a corner
 IN_CORNER = 0.70  # fraction of doors in a corner; the others are anywhere
 MIN_CONTACT = 95  # cm of clear wall that a door needs
 LOOPS = 0.45  # fraction of cheap contacts outside the tree that become doors too
-# Probability that a connection has no door.
-OPEN = {
-    frozenset(pair): fraction
-    for pair, fraction in {
-        ("living", "kitchen"): 0.7,
-        ("living", "entry"): 0.6,
-        ("kitchen", "entry"): 0.6,
-        ("living", "room"): 0.6,
-        ("kitchen", "room"): 0.6,
-        ("entry", "room"): 0.4,
-        ("entry", "lobby"): 0.4,
-        ("bedroom", "closet"): 0.2,
-        ("entry", "closet"): 0.2,
-        ("bedroom", "room"): 0.2,
-    }.items()
-}
 FULL = 0.45  # fraction of connections without a door that take the whole wall
 OPENING = (100, 240)  # cm; width of the others
 REACH = 25  # cm; a wall this close to the end of another leaves less of it to open
 
+
+def _of_pairs(table) -> dict[frozenset, float]:
+    return {frozenset(pair.split()): value for pair, value in table.items()}
+
+
+# Probability that a connection of two kinds of rooms has no door.
+OPEN = _of_pairs(
+    {
+        "living kitchen": 0.7,
+        "living entry": 0.6,
+        "kitchen entry": 0.6,
+        "living room": 0.6,
+        "kitchen room": 0.6,
+        "entry room": 0.4,
+        "entry lobby": 0.4,
+        "bedroom closet": 0.2,
+        "entry closet": 0.2,
+        "bedroom room": 0.2,
+    }
+)
 # Cost of a connection in the spanning tree: cheap ones become doors.
-COSTS = {
-    frozenset(pair): cost
-    for pair, cost in {
-        ("living", "kitchen"): 0.05,
-        ("bedroom", "closet"): 0.25,
-        ("bath", "living"): 0.7,
-        ("bedroom",): 1.5,
-        ("closet",): 2.0,
-        ("closet", "storage"): 2.0,
-        ("storage",): 2.0,
-        ("closet", "bath"): 2.0,
-        ("storage", "bath"): 2.0,
-        ("bath",): 3.0,
-        ("bath", "kitchen"): 3.0,
-        ("bath", "bedroom"): 0.8,
-    }.items()
-}
+COSTS = _of_pairs(
+    {
+        "living kitchen": 0.05,
+        "bedroom closet": 0.25,
+        "bath living": 0.7,
+        "bedroom": 1.5,
+        "closet": 2.0,
+        "closet storage": 2.0,
+        "storage": 2.0,
+        "closet bath": 2.0,
+        "storage bath": 2.0,
+        "bath": 3.0,
+        "bath kitchen": 3.0,
+        "bath bedroom": 0.8,
+    }
+)
 COST_ENTRY, COST_LIVING, COST = 0.15, 0.3, 1.0
 CHEAP = 0.8  # the maximum cost of a loop
 
@@ -80,7 +81,7 @@ class Opening(NamedTuple):
     door: bool
 
 
-def contacts(rooms: Sequence["Room"]) -> list[Contact]:
+def contacts(rooms: Sequence[Room]) -> list[Contact]:
     """Returns every Contact between two of the rooms. Collinear pieces are merged."""
     pieces = []
     for (i, room), (j, other) in combinations(enumerate(rooms), 2):
@@ -93,17 +94,15 @@ def contacts(rooms: Sequence["Room"]) -> list[Contact]:
                         pieces.append((i, j, axis, at, low, high))
     merged = []
     for i, j, axis, at, low, high in sorted(pieces):
-        if merged and merged[-1][:4] == (i, j, axis, at) and merged[-1][5] == low:
-            merged[-1] = (i, j, axis, at, merged[-1][4], high)
+        if merged and merged[-1] == (axis, at, merged[-1].low, low, i, j):
+            merged[-1] = merged[-1]._replace(high=high)
         else:
-            merged.append((i, j, axis, at, low, high))
-    return [Contact(axis, at, low, high, i, j) for i, j, axis, at, low, high in merged]
+            merged.append(Contact(axis, at, low, high, i, j))
+    return merged
 
 
 def clear(contact: Contact, others: Iterable[Contact], depth: Callable) -> tuple[int, int]:
-    """Returns the part (low, high) of a contact that no other wall meets. `depth` is a result of
-    `walls.depths`.
-    """
+    """Returns the part (low, high) of a contact that no other wall meets."""
     low, high = contact.low, contact.high
     for other in others:
         if other.axis != contact.axis and other.low - REACH <= contact.at <= other.high + REACH:
@@ -115,16 +114,13 @@ def clear(contact: Contact, others: Iterable[Contact], depth: Callable) -> tuple
     return low, high
 
 
-def _cost(a, b) -> float:
-    """Returns the cost of a connection between rooms of kinds a and b."""
-    pair = frozenset((a, b))
-    return COSTS.get(
-        pair, COST_ENTRY if "entry" in pair else COST_LIVING if "living" in pair else COST
-    )
+def _cost(*kinds) -> float:
+    other = COST_ENTRY if "entry" in kinds else COST_LIVING if "living" in kinds else COST
+    return COSTS.get(frozenset(kinds), other)
 
 
 def connections(
-    rooms: Sequence["Room"], spans: dict[Contact, tuple[int, int]], generator: PortableGenerator
+    rooms: Sequence[Room], spans: dict[Contact, tuple[int, int]], generator: PortableGenerator
 ) -> tuple[float, list[Contact]] | None:
     """Chooses the contacts to open: a cheapest spanning tree of the rooms, and some loops.
 
@@ -163,25 +159,21 @@ def opening(
     generator: PortableGenerator,
     style: Style,
 ) -> Opening:
-    """Returns a random Opening within the clear span (low, high) of a contact between rooms of two
-    kinds.
-    """
+    """Draws an Opening within the clear span of a contact between rooms of two kinds."""
     low, high = span
     open_plan = generator.chance(OPEN.get(frozenset(kinds), 0.0) * style.open_plan)
     if open_plan:
         if generator.chance(FULL):
             return Opening(contact, low, high, False)
-        width = generator.between(OPENING[0] // 5, OPENING[1] // 5) * 5
+        width = generator.between(*OPENING, step=5)
     else:
-        widths = list(DOORS)
-        if any(kind in SMALL for kind in kinds):
-            widths = [width for width in widths if width <= MAX_SMALL]
+        is_small = any(kind in SMALL for kind in kinds)
+        widths = [width for width in DOORS if not is_small or width <= MAX_SMALL]
         weights = [DOORS[width] * (1 + style.narrow * (90 - width) ** 2 / 100) for width in widths]
         width = widths[generator.pick(weights)]
     spare = high - low - width - 2 * STUB
     if spare < 0:
         return Opening(contact, low, high, False)
-    offset = (
-        generator.below(2) * spare if generator.chance(IN_CORNER) else generator.between(0, spare)
-    )
+    in_corner = generator.chance(IN_CORNER)
+    offset = generator.below(2) * spare if in_corner else generator.between(0, spare)
     return Opening(contact, low + STUB + offset, low + STUB + offset + width, not open_plan)

@@ -37,10 +37,8 @@ ORDER = {
 
 
 class Room(NamedTuple):
-    """A room of a kind and its region."""
-
     kind: str
-    region: list
+    region: regions.Region
 
 
 class Cut(NamedTuple):
@@ -52,36 +50,25 @@ class Cut(NamedTuple):
     favour: float = 1.0  # relative probability among cuts of equal aspect
 
 
-class Failure(Exception):
-    """No partition was found in STEPS cuts."""
-
-
 def partition(
     region: regions.Region,
     rooms: Sequence[tuple[str, int]],
     generator: PortableGenerator,
     style: Style,
-) -> tuple[list[Room], dict]:
+) -> tuple[list[Room], dict] | None:
     """Lays out rooms, a list of (kind, area in cm2), in a region.
 
-    Returns:
-        ([Room], {(axis, at): side}): the rooms, and for the line of each cut the side of it on
-        which the wall stands.
-
-    Raises:
-        Failure: if no partition is found.
+    Returns ([Room], {(axis, at): side}): the rooms, and for the line of each cut the side of it on
+    which the wall stands; None if no partition is found in STEPS cuts.
     """
     keyed = [(ORDER[kind] + generator.normal(0.0, 0.8), i) for i, (kind, _) in enumerate(rooms)]
     ordered = [rooms[i] for _, i in sorted(keyed)]
-    result = _divide(region, ordered, generator, style.corridor, steps_left=[STEPS])
-    if result is None:
-        raise Failure
-    return result
+    return _divide(region, ordered, generator, style.corridor, steps_left=[STEPS])
 
 
 def _divide(region, rooms, generator, corridor, steps_left) -> tuple[list[Room], dict] | None:
-    """Returns the result of `partition` for rooms in this order, or None if it fails. `steps_left`
-    counts down over the whole recursion.
+    """Returns the result of `partition` for rooms in this order. `steps_left` counts down over the
+    whole recursion.
     """
     if len(rooms) == 1:
         return [Room(rooms[0][0], region)], {}
@@ -90,9 +77,8 @@ def _divide(region, rooms, generator, corridor, steps_left) -> tuple[list[Room],
         steps_left[0] -= 1
         if steps_left[0] < 0:
             return None
-        cut = cuts.pop(
-            generator.pick([c.favour * exp(-min(c.aspect, 5.0) / TEMPERATURE) for c in cuts])
-        )
+        weights = (c.favour * exp(-min(c.aspect, 5.0) / TEMPERATURE) for c in cuts)
+        cut = cuts.pop(generator.pick(weights))
         placed, sides = [], {(axis, at): side for axis, at, side in cut.lines}
         for part, rooms_inside in cut.parts:
             result = _divide(part, rooms_inside, generator, corridor, steps_left)
@@ -105,7 +91,7 @@ def _divide(region, rooms, generator, corridor, steps_left) -> tuple[list[Room],
     return None
 
 
-def _cuts(region, rooms, generator, corridor) -> list:
+def _cuts(region, rooms, generator, corridor) -> list[Cut]:
     """Returns all cuts of a region in two that suit its rooms, and cuts with a corridor."""
     widths = [KINDS[kind].width + ALLOWANCE for kind, _ in rooms]
     firsts, lasts = list(accumulate(widths, max)), list(accumulate(widths[::-1], max))[::-1]
@@ -134,64 +120,52 @@ def _cuts(region, rooms, generator, corridor) -> list:
 
 
 def _corridor(region, rooms, axis, slices, generator, widths) -> Cut | None:
-    """Returns a cut of a region into two rows of rooms with the entry as a corridor between, or
-    None.
-    """
+    """Cuts a region into two rows of rooms with the entry as a corridor between."""
     entries = [room for room in rooms if room[0] == "entry"]
     in_rows = [room for room in rooms if room[0] != "entry"]
     if not entries or len(in_rows) < 4:
         return None
-    low, high = slices[0][0], slices[-1][1]
-    width = generator.between(*widths) // regions.LATTICE * regions.LATTICE + ALLOWANCE // 2 * 2
+    lattice = regions.LATTICE
+    width = generator.between(*widths) // lattice * lattice + ALLOWANCE // 2 * 2
     k = generator.between(2, len(in_rows) - 2)
     below, total = (sum(size for _, size in part) for part in (in_rows[:k], in_rows))
-    at = (
-        regions.position(slices, regions.area(region) * below // total)
-        - width // 2 // regions.LATTICE * regions.LATTICE
-    )
-    if not low < at < at + width < high:
+    middle = regions.position(slices, regions.area(region) * below // total)
+    at = middle - width // 2 // lattice * lattice
+    if not slices[0][0] < at < at + width < slices[-1][1]:
         return None
     lower, rest = regions.cut(region, axis, at)
     strip, upper = regions.cut(rest, axis, at + width)
     if len(strip) > 1 or strip[0][3 - axis] - strip[0][1 - axis] > MAX_CORRIDOR:
         return None
-    cut = _suitable_cut(
-        [(lower, in_rows[:k]), (upper, in_rows[k:])], [(axis, at, 0), (axis, at + width, 0)]
-    )
+    pairs = [(lower, in_rows[:k]), (upper, in_rows[k:])]
+    cut = _suitable_cut(pairs, [(axis, at, 0), (axis, at + width, 0)])
     return cut and cut._replace(parts=[*cut.parts, (strip, entries)], favour=CORRIDORS)
 
 
 def _suitable_cut(pairs, lines) -> Cut | None:
     """Returns the Cut of these (region, rooms), or None if a part does not suit its rooms."""
-    worst = 1.0
+    aspects = [1.0]
     for part, rooms in pairs:
-        aspect = _leaf_aspect(part, rooms[0][0]) if len(rooms) == 1 else _aspect(part, rooms)
+        aspect = _aspect(part, [kind for kind, _ in rooms])
         if aspect is None:
             return None
-        worst = max(worst, aspect)
-    return Cut(pairs, lines, worst)
+        aspects.append(aspect)
+    return Cut(pairs, lines, max(aspects))
 
 
-def _aspect(region, rooms) -> float | None:
-    """Returns long side / short side of a region for several rooms, or None if it is too narrow for
-    one of them.
+def _aspect(region, kinds) -> float | None:
+    """Returns long side / short side of a region for rooms, or None if it does not suit them: it
+    is too narrow, or for one room too long or too jagged.
     """
-    if not region or not regions.connected(region, PORTAL):
+    is_room = len(kinds) == 1
+    if not region or not regions.connected(region, 90 if is_room else PORTAL):
         return None
     x0, y0, x1, y1 = regions.bounds(region)
     short, long = sorted((x1 - x0, y1 - y0))
-    if short < max(KINDS[kind].width for kind, _ in rooms) + ALLOWANCE:
+    clear = short
+    if is_room and (len(region) > 2 or long > KINDS[kinds[0]].aspect * short):
         return None
-    return long / short
-
-
-def _leaf_aspect(region, kind) -> float | None:
-    """Returns long side / short side of a region for one room, or None if it does not suit it."""
-    if not region or len(region) > 2 or not regions.connected(region, 90):
-        return None
-    x0, y0, x1, y1 = regions.bounds(region)
-    short, long = sorted((x1 - x0, y1 - y0))
-    if len(region) > 1:
+    if is_room and len(region) == 2:
         (_, a, p, b), (_, c, _, d) = sorted(region)
         jogs = [abs(a - c), abs(b - d), p - x0, x1 - p]
         if regions.area(region) < MIN_FILL * short * long or any(0 < jog < MIN_JOG for jog in jogs):
@@ -199,10 +173,5 @@ def _leaf_aspect(region, kind) -> float | None:
         crossings = [b - a, d - c, *(length for *_, length in regions.bands(region, 1))]
         if min(abs(a - c), abs(b - d)) > 0 or min(crossings) < 90 + ALLOWANCE:
             return None
-        x0, y0, x1, y1 = regions.widest(region)
-        clear = min(x1 - x0, y1 - y0)
-    else:
-        clear = short
-    if clear < KINDS[kind].width + ALLOWANCE or long > KINDS[kind].aspect * short:
-        return None
-    return long / short
+        clear, _ = regions.breadth(regions.widest(region))
+    return long / short if clear >= max(KINDS[k].width for k in kinds) + ALLOWANCE else None

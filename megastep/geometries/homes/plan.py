@@ -11,17 +11,6 @@ from typing import NamedTuple
 from megastep.geometries.homes import regions
 from megastep.geometries.homes.portable_generator import PortableGenerator
 
-
-class Kind(NamedTuple):
-    """A kind of room."""
-
-    median: float  # of the area, m2
-    sigma: float  # standard deviation of the area's logarithm
-    width: int  # minimum clear width, cm
-    weight: float = 0.0  # relative probability among rooms that are added
-    aspect: float = 2.6  # maximum of long side / short side
-
-
 DENSEST = 3  # density at which homes have about three times as many walls as at 1
 # Pieces tried per m2: in homes of density 1 with a clutter of 1, in the densest homes without
 # clutter, and in the densest with a clutter of 1, where fewer are refused.
@@ -29,7 +18,7 @@ SPARSE, FULL, CLUTTERED = 0.4, 0.8, 0.38
 
 
 class Style(NamedTuple):
-    """How homes of a density differ from those of density 1."""
+    """How homes of a density and a clutter differ from others."""
 
     rooms: float  # factor of the median number of rooms
     sigma: float  # factor of the standard deviation of its logarithm
@@ -44,13 +33,9 @@ class Style(NamedTuple):
 
 
 def style(density: float, clutter: float = 0.0) -> Style:
-    """Returns the style of homes of a density from 1, as real homes have, to `DENSEST`, and a
-    clutter from 0 to 1.
+    """Returns the style of a density from 1, as real homes have, to `DENSEST`, and a clutter from
+    0 to 1.
     """
-    if not 1 <= density <= DENSEST:
-        raise ValueError(f"density={density!r}: homes have a density from 1 to {DENSEST}")
-    if not 0 <= clutter <= 1:
-        raise ValueError(f"clutter={clutter!r}: homes have a clutter from 0 to 1")
     t = (density - 1) / (DENSEST - 1)
     return Style(
         rooms=1 + 0.55 * t,
@@ -64,6 +49,16 @@ def style(density: float, clutter: float = 0.0) -> Style:
         clutter=0.8 * clutter,
         half_blocked=0.25 * clutter,
     )
+
+
+class Kind(NamedTuple):
+    """A kind of room."""
+
+    median: float  # of the area, m2
+    sigma: float  # standard deviation of the area's logarithm
+    width: int  # minimum clear width, cm
+    weight: float = 0.0  # relative probability among rooms that are added
+    aspect: float = 2.6  # maximum of long side / short side
 
 
 KINDS = {
@@ -96,7 +91,6 @@ STEP = 10  # cm; the lattice of outlines
 
 
 def room_count(generator: PortableGenerator, style: Style) -> int:
-    """Draws the number of rooms of a home."""
     count = int(generator.lognormal(MEDIAN_ROOMS * style.rooms, SIGMA_ROOMS * style.sigma) + 0.5)
     return min(max(count, MIN_ROOMS), style.max_rooms)
 
@@ -107,20 +101,18 @@ def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]
     maximum = {"bedroom": 1 + count // 4, "bath": 1 + count // 6, "lobby": 1, "utility": 1}
     while len(kinds) < count:
         allowed = [kind for kind in KINDS if kinds.count(kind) < maximum.get(kind, count)]
-        kinds.append(allowed[generator.pick([KINDS[kind].weight for kind in allowed])])
+        kinds.append(allowed[generator.pick(KINDS[kind].weight for kind in allowed)])
     scale = 10_000 * generator.lognormal(SCALE, 0.15)
-    drawn = [
-        int(generator.lognormal(KINDS[kind].median, KINDS[kind].sigma) * scale) for kind in kinds
-    ]
-    return [
-        (kind, max(size, int(FIT * (KINDS[kind].width + ALLOWANCE) ** 2)))
-        for kind, size in zip(kinds, drawn)
-    ]
+    rooms = []
+    for kind in kinds:
+        size = int(generator.lognormal(KINDS[kind].median, KINDS[kind].sigma) * scale)
+        rooms.append((kind, max(size, int(FIT * (KINDS[kind].width + ALLOWANCE) ** 2))))
+    return rooms
 
 
 def _notch(width, height, fraction, at_corner, generator) -> regions.Rectangle | None:
-    """Draws a notch: a rectangle of about `fraction` of the bounding box, at a corner or in the
-    middle of a side. Returns None if it does not fit.
+    """Draws a rectangle of about `fraction` of the bounding box, at a corner or in the middle of a
+    side. Returns None if it does not fit.
     """
     ratio = generator.uniform(0.6, 1.7)
     across = int(sqrt(fraction * width * height * ratio)) // STEP * STEP
@@ -129,10 +121,10 @@ def _notch(width, height, fraction, at_corner, generator) -> regions.Rectangle |
         return None
     left, low = generator.below(2) * (width - across), generator.below(2) * (height - down)
     if not at_corner:
-        room = width - across - 2 * MIN_NECK
-        if room < 0:
+        most = width - across - MIN_NECK
+        if most < MIN_NECK:
             return None
-        left = MIN_NECK + generator.between(0, room // STEP) * STEP
+        left = generator.between(MIN_NECK, most, STEP)
     return left, low, left + across, low + down
 
 
@@ -143,7 +135,7 @@ def _apart(a, b) -> int:
 
 def footprint(total: int, generator: PortableGenerator) -> regions.Region:
     """Draws the inner outline of a home whose rooms have `total` cm2: a box less up to three
-    notches. Returns a region.
+    notches.
     """
     aspect = min(max(generator.lognormal(MEDIAN_ASPECT, SIGMA_ASPECT), 1.0), MAX_ASPECT)
     fractions = [generator.uniform(0.03, 0.15) for _ in range(generator.pick(NOTCHES))]
@@ -162,26 +154,16 @@ def footprint(total: int, generator: PortableGenerator) -> regions.Region:
             if notch and all(_apart(notch, other) >= MIN_NECK for other in notches):
                 notches.append(notch)
                 break
-    region = _without(width, height, notches)
-    return (
-        region
-        if generator.chance(0.5)
-        else _without(height, width, [(b, a, d, c) for a, b, c, d in notches])
-    )
-
-
-def _without(width, height, notches) -> list:
-    """Returns the box from (0, 0) less the notches, as a region."""
-    lines = sorted({0, width, *(x for notch in notches for x in (notch[0], notch[2]))})
-    region = []
+    if not generator.chance(0.5):
+        width, height, notches = height, width, [(b, a, d, c) for a, b, c, d in notches]
+    lines = sorted({0, width, *(x for notch in notches for x in notch[::2])})
+    region: regions.Region = []
     for x0, x1 in zip(lines, lines[1:]):
-        low = max([0, *(n[3] for n in notches if n[0] <= x0 and n[2] >= x1 and n[1] == 0)])
-        high = min(
-            [height, *(n[1] for n in notches if n[0] <= x0 and n[2] >= x1 and n[3] == height)]
-        )
-        if region and region[-1][1] == low and region[-1][3] == high:
+        beside = [n for n in notches if n[0] <= x0 and n[2] >= x1]
+        low = max([0, *(n[3] for n in beside if n[1] == 0)])
+        high = min([height, *(n[1] for n in beside if n[3] == height)])
+        if region and region[-1][1::2] == (low, high):
             region[-1] = (region[-1][0], low, x1, high)
         else:
             region.append((x0, low, x1, high))
-    assert regions.connected(region, MIN_NECK)
     return region

@@ -2,12 +2,11 @@
 
 The k-th number of a seed is a hash of (seed, k): SplitMix64 (Steele, Lea and Flood, "Fast
 splittable pseudorandom number generators", OOPSLA 2014) on Python integers. Floats are computed
-with +, -, * and / only, which IEEE 754 defines to the last bit. `exp` below replaces the C
-library's, whose last bit differs between systems. `sum` of floats is avoided, since Python 3.12
-changed its rounding.
+with +, -, * and / only, which IEEE 754 defines to the last bit: `exp` replaces the C library's, and
+`sum`, whose rounding changed in Python 3.12, is avoided.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -35,7 +34,7 @@ def mixed(value: int) -> int:
 
 
 class PortableGenerator:
-    """A counter-based random generator (SplitMix64) of one seed, any integer."""
+    """The generator of a seed, any integer."""
 
     def __init__(self, seed: int):
         self._key = mixed((seed * GOLDEN + 1) & MASK)
@@ -50,12 +49,12 @@ class PortableGenerator:
         """Returns an integer from 0 to n - 1."""
         return self.bits() * n >> 64
 
-    def between(self, low: int, high: int) -> int:
-        """Returns an integer from low to high, both included."""
-        return low + self.below(high - low + 1)
+    def between(self, low: int, high: int, step: int = 1) -> int:
+        """Returns a multiple of `step` from low to high, both included."""
+        low, high = low // step, high // step
+        return (low + self.below(high - low + 1)) * step
 
     def uniform(self, low: float = 0.0, high: float = 1.0) -> float:
-        """Returns a float from low to high."""
         return low + (high - low) * ((self.bits() >> 11) / 2**53)
 
     def chance(self, probability: float) -> bool:
@@ -74,7 +73,7 @@ class PortableGenerator:
         """Returns median * e^(sigma z), where z is nearly normal."""
         return median * exp(sigma * self.normal())
 
-    def shuffled(self, items: Sequence[T]) -> Iterator[T]:
+    def shuffled(self, items: Iterable[T]) -> Iterator[T]:
         """Yields items in a random order, each drawn when it is taken."""
         rest = [*items]
         for k in range(len(rest)):

@@ -11,14 +11,18 @@ LATTICE = 5  # centimetres; cuts are at multiples
 
 
 def area(region: Region) -> int:
-    """Returns the area in cm2."""
     return sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in region)
 
 
-def bounds(region: Region) -> tuple[int, int, int, int]:
-    """Returns the bounding box (x0, y0, x1, y1)."""
+def bounds(region: Region) -> Rectangle:
     x0, y0, x1, y1 = zip(*region)
     return min(x0), min(y0), max(x1), max(y1)
+
+
+def breadth(rectangle: Rectangle) -> tuple[int, int]:
+    """Returns the short side and the area, by which rectangles are compared."""
+    x0, y0, x1, y1 = rectangle
+    return min(x1 - x0, y1 - y0), (x1 - x0) * (y1 - y0)
 
 
 def cut(region: Region, axis: int, at: int) -> tuple[Region, Region]:
@@ -37,23 +41,16 @@ def cut(region: Region, axis: int, at: int) -> tuple[Region, Region]:
 
 
 def bands(region: Region, axis: int) -> list[tuple[int, int, int]]:
-    """Cuts the region across an axis at all its lines. Returns a list of (low, high, length
-    across).
-    """
+    """Cuts the region across an axis at all its lines into (low, high, length across)."""
     if len(region) == 1:
         r = region[0]
         return [(r[axis], r[axis + 2], r[3 - axis] - r[1 - axis])]
     lines = sorted({line for r in region for line in r[axis::2]})
-    return [
-        (
-            low,
-            high,
-            sum(
-                r[3 - axis] - r[1 - axis] for r in region if r[axis] <= low and r[axis + 2] >= high
-            ),
-        )
+    lengths = [
+        sum(r[3 - axis] - r[1 - axis] for r in region if r[axis] <= low and r[axis + 2] >= high)
         for low, high in zip(lines, lines[1:])
     ]
+    return list(zip(lines, lines[1:], lengths))
 
 
 def position(slices: list[tuple[int, int, int]], area_below: int) -> int:
@@ -72,24 +69,17 @@ def corners(region: Region, axis: int) -> dict[int, int]:
     if len(region) == 1:
         return {}
     low, high = bounds(region)[axis::2]
-    lengths = {}
+    excess: dict[int, int] = {}  # of the length that begins at a line over that which ends there
     for r in region:
-        for line, side in (r[axis], 1), (r[axis + 2], -1):
-            below, above = lengths.get(line, (0, 0))
-            length = r[3 - axis] - r[1 - axis]
-            lengths[line] = (below + length, above) if side < 0 else (below, above + length)
-    return {
-        line: 1 if above < below else -1
-        for line, (below, above) in lengths.items()
-        if low < line < high
-    }
+        length = r[3 - axis] - r[1 - axis]
+        excess[r[axis]] = excess.get(r[axis], 0) + length
+        excess[r[axis + 2]] = excess.get(r[axis + 2], 0) - length
+    return {line: 1 if more < 0 else -1 for line, more in excess.items() if low < line < high}
 
 
 def connected(region: Region, portal: int) -> bool:
-    """Returns True if contacts of at least `portal` cm connect the whole region."""
-    if len(region) == 1:
-        return True
-    reached, rest = [region[0]], list(region[1:])
+    """True if contacts of at least `portal` cm connect the whole region."""
+    reached, rest = region[:1], region[1:]
     for a in reached:
         near = [
             b
@@ -101,18 +91,13 @@ def connected(region: Region, portal: int) -> bool:
     return not rest
 
 
-def widest(region: Region) -> tuple[int, int, int, int]:
+def widest(region: Region) -> Rectangle:
     """Returns the rectangle in a region with the longest short side; of equal ones, the largest."""
-    best = max(region, key=_breadth)
+    best = max(region, key=breadth)
     ordered = sorted(region)
     for i, (x0, y0, x1, y1) in enumerate(ordered):
         for other in ordered[i + 1 :]:
             if other[0] == x1 and min(y1, other[3]) > max(y0, other[1]):
                 x1, y0, y1 = other[2], max(y0, other[1]), min(y1, other[3])
-                best = max(best, (x0, y0, x1, y1), key=_breadth)
+                best = max(best, (x0, y0, x1, y1), key=breadth)
     return best
-
-
-def _breadth(rectangle) -> tuple[int, int]:
-    x0, y0, x1, y1 = rectangle
-    return min(x1 - x0, y1 - y0), (x1 - x0) * (y1 - y0)

@@ -24,18 +24,18 @@ def depths(sides: dict, thickness: int) -> Callable:
     """Returns a function from a contact to (before, after), the cm that its wall reaches on either
     side of its line. `sides` is a result of `partition`.
     """
-    around = {
-        0: (thickness // 2, thickness - thickness // 2),
-        1: (0, thickness),
-        -1: (thickness, 0),
-    }
+    half = thickness // 2
+    around = {0: (half, thickness - half), 1: (0, thickness), -1: (thickness, 0)}
     return lambda contact: around[sides.get((contact.axis, contact.at), 0)]
 
 
-def _rectangle(axis, across, along) -> regions.Rectangle:
-    """Returns a rectangle from its extents along `axis` and along the other axis."""
-    (a, b), (c, d) = across, along
-    return (a, c, b, d) if axis == 0 else (c, a, d, b)
+def _rectangle(contact, depth, low, high) -> regions.Rectangle:
+    """Returns the rectangle of a contact's wall from low to high."""
+    before, after = depth(contact)
+    at = contact.at
+    if contact.axis == 0:
+        return at - before, low, at + after, high
+    return low, at - before, high, at + after
 
 
 def solids(meetings: Sequence[Contact], depth: Callable) -> regions.Region:
@@ -50,18 +50,13 @@ def solids(meetings: Sequence[Contact], depth: Callable) -> regions.Region:
                     low = contact.low - before
                 elif other.at == contact.high:
                     high = contact.high + after
-        before, after = depth(contact)
-        rectangles.append(
-            _rectangle(contact.axis, (contact.at - before, contact.at + after), (low, high))
-        )
+        rectangles.append(_rectangle(contact, depth, low, high))
     return rectangles
 
 
-def gap(opening: Opening, depth: Callable) -> tuple[int, int, int, int]:
+def gap(opening: Opening, depth: Callable) -> regions.Rectangle:
     """Returns the rectangle that an opening takes out of its wall."""
-    before, after = depth(opening.contact)
-    at = opening.contact.at
-    return _rectangle(opening.contact.axis, (at - before, at + after), (opening.low, opening.high))
+    return _rectangle(opening.contact, depth, opening.low, opening.high)
 
 
 def across(opening: Opening) -> list[tuple[int, int]]:
@@ -84,14 +79,11 @@ def paint(
     Returns the coordinates of the lines, xs and ys, and the states of the cells,
     (len(ys) - 1, len(xs) - 1) with row 0 at the bottom.
     """
-    layers = [
-        ((x0 - envelope, y0 - envelope, x1 + envelope, y1 + envelope), WALL)
-        for x0, y0, x1, y1 in floor
+    grown = [
+        (x0 - envelope, y0 - envelope, x1 + envelope, y1 + envelope) for x0, y0, x1, y1 in floor
     ]
-    layers += (
-        [(r, INDOORS) for r in floor] + [(r, WALL) for r in walls] + [(r, INDOORS) for r in gaps]
-    )
-    layers += [(r, WALL) for r in furniture]
+    kinds = (grown, WALL), (floor, INDOORS), (walls, WALL), (gaps, INDOORS), (furniture, WALL)
+    layers = [(r, state) for rectangles, state in kinds for r in rectangles]
     xs = sorted({x for r, _ in layers for x in r[::2]})
     ys = sorted({y for r, _ in layers for y in r[1::2]})
     column, row = ({line: k for k, line in enumerate(lines)} for lines in (xs, ys))
@@ -114,9 +106,7 @@ def _faces(lines, along, cells, beside) -> np.ndarray:
     changes = edges[:, 1:] != edges[:, :-1]
     row, start = np.nonzero(changes & (edges[:, 1:] != 0))
     _, end = np.nonzero(changes & (edges[:, :-1] != 0))
-    return np.stack(
-        [np.stack([along[start], lines[row]], -1), np.stack([along[end], lines[row]], -1)], 1
-    )
+    return np.stack([np.stack([along[at], lines[row]], -1) for at in (start, end)], 1)
 
 
 def segments(xs: np.ndarray, ys: np.ndarray, cells: np.ndarray, beside: int) -> np.ndarray:
@@ -131,10 +121,8 @@ def segments(xs: np.ndarray, ys: np.ndarray, cells: np.ndarray, beside: int) -> 
 def are_indoors(grid: Grid, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:
     """Returns whether each point of a lattice, xs (W,) and ys (H,), is indoors: (H, W) bool."""
     lines_x, lines_y, cells = grid
-    columns, rows = (
-        np.searchsorted(lines, points, "right") - 1
-        for lines, points in ((lines_x, xs), (lines_y, ys))
-    )
+    columns = np.searchsorted(lines_x, xs, "right") - 1
+    rows = np.searchsorted(lines_y, ys, "right") - 1
     return np.pad(cells, ((0, 1), (0, 1)))[rows[:, None], columns] == INDOORS
 
 
@@ -151,10 +139,8 @@ def areas(grid: Grid, parts: Sequence[regions.Region]) -> list[float]:
 
 
 def light(region: regions.Region, inside: np.ndarray) -> tuple[int, int]:
-    """Returns the place of a room's light: its centroid if that is clear of walls, else the centre
-    of its widest rectangle.
-
-    `inside` has the segments (n, 2, 2) indoors, all along an axis.
+    """Returns the place of a room's light: its centroid if that is clear of `inside`, the segments
+    (n, 2, 2) indoors, else the centre of its widest rectangle.
     """
     total = 2 * regions.area(region)
     x = sum((x1 - x0) * (y1 - y0) * (x0 + x1) for x0, y0, x1, y1 in region) // total
@@ -169,9 +155,7 @@ def light(region: regions.Region, inside: np.ndarray) -> tuple[int, int]:
 def slanted(
     inside: np.ndarray,
     outside: np.ndarray,
-    xs: np.ndarray,
-    ys: np.ndarray,
-    cells: np.ndarray,
+    grid: Grid,
     thickness: int,
     generator: PortableGenerator,
 ) -> tuple[np.ndarray, np.ndarray, list]:
@@ -182,57 +166,41 @@ def slanted(
     corner of the triangle is the old corner. The triangle is empty, and nothing is cut, if the
     walls there are too short.
     """
-    outdoors = np.pad(cells == OUTDOORS, 1, constant_values=True)
-    around = (
-        outdoors[:-1, :-1].astype(int) + outdoors[1:, :-1] + outdoors[:-1, 1:] + outdoors[1:, 1:]
+    xs, ys, cells = grid
+    outdoors = np.pad(cells == OUTDOORS, 1, constant_values=True).astype(int)
+    around = np.stack(
+        [outdoors[:-1, :-1], outdoors[:-1, 1:], outdoors[1:, :-1], outdoors[1:, 1:]], -1
     )
-    corners = [
-        (int(xs[j]), int(ys[i]))
-        + tuple(int(outdoors[i + k, j + l]) for k in (0, 1) for l in (0, 1))
-        for i, j in zip(*np.nonzero(around == 3))
-    ]
-    x, y, *quadrants = corners[generator.below(len(corners))]
-    k, l = divmod(quadrants.index(0), 2)  # the quadrant that is wall
-    right, up = 2 * l - 1, 2 * k - 1
+    corners = np.argwhere(around.sum(-1) == 3)
+    i, j = corners[generator.below(len(corners))]
+    k, l = divmod(around[i, j].argmin(), 2)  # the quadrant that is wall
+    x, y, right, up = int(xs[j]), int(ys[i]), int(2 * l - 1), int(2 * k - 1)
     inner = x + right * thickness, y + up * thickness
-    leg = min([LONGEST, *(_reach(inside, inner)[axis] // 2 for axis in (0, 1))]) // 5 * 5
+    lines = inside[(inside == inner).all(-1).any(-1)]  # those that end in the corner
+    leg = min(LONGEST, *(np.abs(lines - inner).max((0, 1)) // 2)) // 5 * 5
     if leg < SHORTEST:
         return inside, outside, []
     outer_leg = leg + thickness * 586 // 1000  # 2 - sqrt 2
     triangle = [inner, (inner[0] + right * leg, inner[1]), (inner[0], inner[1] + up * leg)]
-    return (
-        _chamfered(inside, inner, right * leg, up * leg),
-        _chamfered(outside, (x, y), right * outer_leg, up * outer_leg),
-        triangle,
-    )
-
-
-def _reach(lines, corner) -> np.ndarray:
-    """Returns the lengths along x and y of the segments that end in a corner."""
-    return np.abs(lines[(lines == corner).all(-1).any(-1)] - corner).max((0, 1))
+    outer = [(x, y), (x + right * outer_leg, y), (x, y + up * outer_leg)]
+    return cut_off(inside, triangle), cut_off(outside, outer), triangle
 
 
 def cut_off(lines: np.ndarray, triangle: list) -> np.ndarray:
-    """Cuts the triangle of a slanted corner off the segments (n, 2, 2) indoors."""
-    corner, (x, _), (_, y) = triangle
-    return _chamfered(lines, corner, x - corner[0], y - corner[1])
-
-
-def _chamfered(lines, corner, dx, dy) -> np.ndarray:
-    """Cuts back the two segments that end in a corner by (dx, dy), and adds one between their new
-    ends.
+    """Cuts back the two segments that end in the triangle's first corner, and adds one between
+    their new ends.
     """
-    x, y = corner
+    corner, (x, _), (_, y) = triangle
     lines = lines.copy()
     for line in lines:
         for end, other in ((0, 1), (1, 0)):
             if tuple(line[end]) == corner:
-                line[end] += (dx, 0) if line[other][1] == y else (0, dy)
-    return np.concatenate([lines, [[(x + dx, y), (x, y + dy)]]])
+                line[end] = (x, corner[1]) if line[other][1] == corner[1] else (corner[0], y)
+    return np.concatenate([lines, [triangle[1:]]])
 
 
 def holds(region: regions.Region, triangle: list) -> bool:
-    """Returns True if the triangle's first corner is a corner of one of the region's rectangles."""
+    """True if the triangle's first corner is a corner of one of the region's rectangles."""
     return bool(triangle) and any(
         triangle[0] in ((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for x0, y0, x1, y1 in region
     )
