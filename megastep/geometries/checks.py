@@ -43,30 +43,25 @@ def clearance(g: dotdict, cell: float = FINE) -> np.ndarray:
 
 
 def joins(labels: np.ndarray, rooms: np.ndarray) -> bool:
-    """Returns True if one component of `labels` enters all `rooms`, (H, W) integers each, both 0
-    where there is none.
-    """
+    """True if one component of `labels` enters all `rooms`; both are 0 where there is none."""
     pairs = np.unique(np.stack([rooms, labels])[:, (rooms > 0) & (labels > 0)], axis=1)
     n_entered = np.bincount(pairs[1])
     return n_entered.max(initial=0) == len(np.unique(rooms[rooms > 0]))
 
 
-def sorted_ends(walls: np.ndarray) -> np.ndarray:
-    """Returns walls (M, 2, 2) as rows (M, 4) that are equal for the same wall in either
-    direction.
-    """
-    ends = walls.astype(np.float64).reshape(-1, 4)
-    is_reversed = (ends[:, 0] > ends[:, 2]) | (ends[:, 0] == ends[:, 2]) & (ends[:, 1] > ends[:, 3])
-    ends[is_reversed] = ends[is_reversed][:, [2, 3, 0, 1]]
-    return ends
+def _sorted_ends(walls) -> np.ndarray:
+    """Returns walls as rows (M, 4), from left to right, that are equal in either direction."""
+    ends = walls.astype(np.float64)
+    (x0, y0), (x1, y1) = ends[:, 0].T, ends[:, 1].T
+    is_reversed = (x0 > x1) | (x0 == x1) & (y0 > y1)
+    ends[is_reversed] = ends[is_reversed, ::-1]
+    return ends[ends[:, 0, 0].argsort(kind="stable")].reshape(-1, 4)
 
 
-def crosses(walls: np.ndarray) -> bool:
-    """Returns True if two walls (M, 2, 2) cross at a point that is inside both, or lie on one
-    another for more than a point.
+def _crosses(ends) -> bool:
+    """True if two walls cross at a point that is inside both, or lie on one another for more than a
+    point.
     """
-    ends = sorted_ends(walls)
-    ends = ends[ends[:, 0].argsort(kind="stable")]
     starts, vectors = ends[:, :2], ends[:, 2:] - ends[:, :2]
     lengths = np.hypot(*vectors.T)
     units = vectors / lengths[:, None]
@@ -112,13 +107,13 @@ def errors(g: dotdict, fine: float = FINE) -> list[str]:
         valid = geometry.validate_geometry(dotdict(g))
     except ValueError as error:
         return [str(error)]
-    messages = []
+    messages: list[str] = []
     if len(valid.walls) < len(g["walls"]):
         messages.append("a wall has no length")
-    ends = sorted_ends(valid.walls)
+    ends = _sorted_ends(valid.walls)
     if len(np.unique(ends, axis=0)) < len(ends):
         messages.append("two walls are the same")
-    elif crosses(valid.walls):
+    elif _crosses(ends):
         messages.append("two walls cross or overlap; split them where they meet")
     labels, _ = geometry.components(np.pad(valid.masks >= 0, 1, constant_values=True))
     if (valid.masks[labels[1:-1, 1:-1] == labels[0, 0]] > 0).any():

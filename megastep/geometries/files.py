@@ -19,9 +19,8 @@ from megastep.dotdict import dotdict
 
 KEYS = ("walls", "lights", "masks", "res", "id")
 MAX_GEOMETRIES = 16_384
-# Bytes of a file, of all its arrays, and of one: the maximum of cells in the widest dtype. Masks
-# become int16, so a load takes less than 500 MB with Python itself.
-MAX_FILE, MAX_UNPACKED, MAX_ARRAY = 128 << 20, 96 << 20, 32 << 20
+# Bytes of all arrays. Masks become int16, so a load takes less than 500 MB with Python itself.
+MAX_UNPACKED = 96 << 20
 # Metres of all walls of a geometry, and of a file: 20 texels a metre, 16 bytes each.
 MAX_LENGTH, MAX_LENGTHS = 20_000, 4_000_000
 HEADER = 128  # bytes of the header that numpy writes
@@ -33,30 +32,26 @@ UNREADABLE = (
 NAME = re.compile(r"(0|[1-9][0-9]{0,5})/([A-Za-z_][A-Za-z0-9_]{0,63})\.npy")
 
 
+def _check_size(n_geometries, n_bytes) -> None:
+    if not 1 <= n_geometries <= MAX_GEOMETRIES:
+        raise ValueError(f"{n_geometries:,} geometries: allowed are 1 to {MAX_GEOMETRIES:,}")
+    if n_bytes > MAX_UNPACKED:
+        raise ValueError(f"its arrays have {n_bytes:,} bytes, but the limit is {MAX_UNPACKED:,}")
+
+
 def _keys_of(archive) -> list[list[str]]:
     """Returns the keys of each geometry. Raises ValueError unless the archive holds the indices
-    from 0 up, nothing else, and respects the limits at the head of this file.
+    from 0 up, nothing else, and respects the limits.
     """
     keys: dict[int, list[str]] = {}
     entries = archive.zip.infolist()
     for entry in entries:
         match = NAME.fullmatch(entry.filename)
         if not match:
-            raise ValueError(
-                f"holds {entry.filename[:80]!r}, but only '<number>/<name>.npy' is allowed"
-            )
+            name = entry.filename[:80]
+            raise ValueError(f"holds {name!r}, but only '<number>/<name>.npy' is allowed")
         keys.setdefault(int(match[1]), []).append(match[2])
-        if entry.file_size > MAX_ARRAY:
-            raise ValueError(
-                f"holds {entry.filename!r} of {entry.file_size:,} bytes, but the limit is "
-                f"{MAX_ARRAY:,}"
-            )
-    if not keys:
-        raise ValueError("holds no geometry")
-    if len(keys) > MAX_GEOMETRIES:
-        raise ValueError(f"holds {len(keys):,} geometries, but the limit is {MAX_GEOMETRIES:,}")
-    if (unpacked := sum(entry.file_size for entry in entries)) > MAX_UNPACKED:
-        raise ValueError(f"unpacks to {unpacked:,} bytes, but the limit is {MAX_UNPACKED:,}")
+    _check_size(len(keys), sum(entry.file_size for entry in entries))
     if missing := {*range(len(keys))} - {*keys}:
         raise ValueError(f"must number its geometries from 0 up, but {min(missing)} is missing")
     return [sorted(keys[index]) for index in range(len(keys))]
@@ -73,15 +68,19 @@ def _read_geometry(archive, index, keys) -> dict:
                 raise ValueError(f"is of dtype {g[key].dtype}, which is not a number")
         except UNREADABLE as error:
             raise ValueError(f"{key!r} cannot be read: {_clause(error)}") from error
-    return geometry.validate_geometry(g)
+    return g
 
 
-def _length(g) -> float:
-    """Returns the metres of a geometry's walls. Raises ValueError if they exceed MAX_LENGTH."""
-    length = float(np.hypot(*(g.walls[:, 1] - g.walls[:, 0]).T).sum())
-    if length > MAX_LENGTH:
-        raise ValueError(f"has {length:,.0f} m of walls, but the limit is {MAX_LENGTH:,}")
-    return length
+def _sound(g, before) -> tuple[dict, float]:
+    """Returns a validated geometry and the metres of its walls and those `before` it in a file."""
+    g = geometry.validate_geometry(g)
+    length = float(np.hypot(*(g["walls"][:, 1] - g["walls"][:, 0]).T).sum())
+    if length > MAX_LENGTH or before + length > MAX_LENGTHS:
+        raise ValueError(
+            f"has {length:,.0f} m of walls, and the file {before + length:,.0f} m up to here, but "
+            f"the limits are {MAX_LENGTH:,} and {MAX_LENGTHS:,}"
+        )
+    return g, before + length
 
 
 def _clause(error) -> str:
@@ -100,21 +99,14 @@ def load(path: str | Path) -> list[dotdict]:
     if not path.is_file():
         raise ValueError(f"There is no geometry file {str(path)!r}. Set path to an .npz file.")
     try:
-        if path.stat().st_size > MAX_FILE:
-            raise ValueError(f"is larger than {MAX_FILE:,} bytes")
         if not zipfile.is_zipfile(path):
             raise ValueError("is no zip file, or is cut short")
         with np.load(path, allow_pickle=False) as archive:
             geometries, length = [], 0.0
             for index, keys in enumerate(_keys_of(archive)):
                 place = f", geometry {index}"
-                geometries.append(_read_geometry(archive, index, keys))
-                length += _length(geometries[-1])
-                if length > MAX_LENGTHS:
-                    raise ValueError(
-                        f"up to here the file has {length:,.0f} m of walls, but the limit is "
-                        f"{MAX_LENGTHS:,}"
-                    )
+                g, length = _sound(_read_geometry(archive, index, keys), length)
+                geometries.append(g)
             return geometries
     except UNREADABLE as error:
         raise ValueError(f"Geometry file {str(path)!r}{place}: {_clause(error)}.") from error
@@ -127,26 +119,15 @@ def save(path: str | Path, geometries: Sequence[dict]) -> None:
     Raises:
         ValueError: if `load` would refuse a geometry. The message names it.
     """
-    path, arrays, lengths = Path(path), {}, []
-    if not 0 < len(geometries) <= MAX_GEOMETRIES:
-        raise ValueError(
-            f"{len(geometries):,} geometries cannot be saved: give from 1 to {MAX_GEOMETRIES:,}."
-        )
+    path, arrays, length = Path(path), {}, 0.0
     for index, g in enumerate(geometries):
         try:
-            g = geometry.validate_geometry(g)
-            lengths.append(_length(g))
+            g, length = _sound(g, length)
         except ValueError as error:
             raise ValueError(f"Geometry {index} cannot be saved: {error}.") from error
         for key, value in g.items():
             if key in KEYS or np.asarray(value).dtype.kind in "fiub":
                 arrays[f"{index}/{key}"] = np.asarray(value)
-    n_bytes = sum(values.nbytes + HEADER for values in arrays.values())
-    if n_bytes > MAX_UNPACKED or sum(lengths) > MAX_LENGTHS:
-        raise ValueError(
-            f"{len(geometries):,} geometries of {n_bytes:,} bytes and {sum(lengths):,.0f} m of "
-            f"walls are too many for a file: the limits are {MAX_UNPACKED:,} bytes and "
-            f"{MAX_LENGTHS:,} m."
-        )
+    _check_size(len(geometries), sum(values.nbytes + HEADER for values in arrays.values()))
     with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)
