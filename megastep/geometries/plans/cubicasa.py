@@ -8,40 +8,17 @@ Floorplan; floors lie side by side, all but the first hidden.
 from collections.abc import Iterator
 from xml.etree.ElementTree import Element
 
-import numpy as np
 import shapely
 from svgelements import Matrix
 
 from megastep.geometries.plans import outlines, safe
 from megastep.geometries.plans.outlines import Drawing
+from megastep.geometries.plans.svg import apply, tokens, transform
 
 SUFFIX = ".svg"
 UNITS = 100  # a metre
 TOLERANCE = outlines.GRID / 2  # metres, by which contours are simplified
 SKIPPED = ("defs", "script", "foreignObject", "use", "text", "symbol", "clipPath", "mask")
-
-
-def tokens(element: Element) -> list[str]:
-    """Returns the words of an element's class."""
-    return (element.get("class") or "").split()
-
-
-def transform(element: Element, above: Matrix) -> Matrix:
-    """Returns the transform of an element within one. Raises ValueError if it is not finite."""
-    text = element.get("transform")
-    if not text:
-        return above
-    matrix = Matrix(text) * above
-    values = [matrix.a, matrix.b, matrix.c, matrix.d, matrix.e, matrix.f]
-    if not np.isfinite(values).all():
-        raise ValueError(f"transform {text[:40]!r} is not finite")
-    return matrix
-
-
-def apply(matrix: Matrix, points: np.ndarray) -> np.ndarray:
-    """Returns points (P, 2) after a transform."""
-    linear = np.array([[matrix.a, matrix.b], [matrix.c, matrix.d]])
-    return points @ linear + (matrix.e, matrix.f)
 
 
 def read(content: bytes, per: str = "floor") -> list[Drawing]:
@@ -72,7 +49,7 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
 def _floors(element, above) -> Iterator[tuple[Element, Matrix]]:
     if safe.name_of(element) in SKIPPED or "FloorsCompose" in tokens(element):
         return
-    matrix = transform(element, above)
+    matrix = transform(element.get("transform"), above)
     if "Floorplan" in tokens(element):
         yield element, matrix
         return
@@ -85,12 +62,14 @@ def _collect(element, matrix, drawing) -> None:
     for child in element:
         if safe.name_of(child) != "g":
             continue
-        inner, words = transform(child, matrix), tokens(child)
+        inner, words = transform(child.get("transform"), matrix), tokens(child)
         if "Wall" in words:
             drawing.walls.extend(_polygons(child, inner))
             for opening in child:
                 if "Door" in tokens(opening):
-                    drawing.doors.extend(_polygons(opening, transform(opening, inner)))
+                    drawing.doors.extend(
+                        _polygons(opening, transform(opening.get("transform"), inner))
+                    )
         elif "Space" in words:
             rooms = drawing.outdoors if "Outdoor" in words else drawing.rooms
             parts = _polygons(child, inner)
@@ -105,6 +84,8 @@ def _polygons(element, matrix) -> list:
     result = []
     for child in element:
         if safe.name_of(child) == "polygon" and (child.get("points") or "").strip():
-            points = apply(transform(child, matrix), safe.points(child.get("points") or ""))
+            points = apply(
+                transform(child.get("transform"), matrix), safe.points(child.get("points") or "")
+            )
             result += outlines.ring(points / UNITS * (1, -1))
     return result

@@ -187,9 +187,9 @@ def own_svg(path: Path, scale: float, walls: str = "wall", doors: str = "door") 
     if member.content is None:
         raise ValueError(member.refusal)
     with _refused():
-        drawing = svg.read(member.content, scale, walls, doors)
+        drawing, warnings = svg.read(member.content, scale, walls, doors)
     g, notes = _home(drawing)
-    return Own(drawing, g, notes.warnings)
+    return Own(drawing, g, warnings + notes.warnings)
 
 
 def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:

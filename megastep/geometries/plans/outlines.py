@@ -60,6 +60,47 @@ def ring(points: np.ndarray) -> list[Polygon]:
     return polygons(Polygon(points)) if len(points) >= 3 else []
 
 
+MAX_MEETINGS = 2_000_000  # of the boxes around the segments of a shape
+
+
+def check_meetings(lines: Sequence[BaseGeometry]) -> None:
+    """Raises ValueError for lines that cross so often that their area would take minutes."""
+    segments = np.concatenate(
+        [np.stack([c[:-1], c[1:]], 1) for c in (shapely.get_coordinates(line) for line in lines)]
+    )
+    boxes = shapely.box(*segments.min(1).T, *segments.max(1).T)
+    tree, n = shapely.STRtree(boxes), 0
+    for start in range(0, len(boxes), 256):
+        n += tree.query(boxes[start : start + 256]).shape[1]
+        if n > MAX_MEETINGS:
+            raise ValueError("its lines cross one another too often")
+
+
+def area_of(rings: Sequence[np.ndarray], is_even_odd: bool = False) -> list[BaseGeometry]:
+    """Returns the area that rings (P, 2) enclose by one of SVG's fill rules, in a list: none for
+    nothing.
+    """
+    shapes = [Polygon(points) for points in rings]
+    if len(shapes) == 1 and shapes[0].is_valid:
+        return shapes
+    lines = [shape.exterior for shape in shapes]
+    if not lines:
+        return []
+    check_meetings(lines)
+    faces = shapely.get_parts(shapely.polygonize([shapely.union_all(lines)]))
+    points = shapely.get_coordinates(shapely.point_on_surface(faces))
+    edges = np.concatenate([np.stack([r, np.roll(r, -1, 0)], 1) for r in rings])
+    (x0, y0), (x1, y1) = edges[:, 0].T, edges[:, 1].T
+    winding = np.zeros(len(points), int)
+    for i, (x, y) in enumerate(points):
+        is_left = (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0)
+        winding[i] = (is_left & (y0 <= y) & (y < y1)).sum() - (
+            ~is_left & (y1 <= y) & (y < y0)
+        ).sum()
+    inside = winding % 2 == 1 if is_even_odd else winding != 0
+    return [shapely.union_all(faces[inside])]
+
+
 def filled(shape: BaseGeometry) -> BaseGeometry:
     """Returns a shape without its holes."""
     return shapely.union_all([Polygon(part.exterior) for part in polygons(shape)])

@@ -1,123 +1,376 @@
 """Reads a floor plan that somebody drew: an SVG whose walls, and doors if any, are marked by the
-id, class or label of an element, or of a group or layer around it.
+id, class or label of an element, or of a group or layer around it. They cover what a browser paints
+there, so hidden and transparent shapes are none. Paths and matrices are those of svgelements.
 """
 
 import re
+from collections import Counter
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
-from svgelements import Close, Line, Matrix, Move, Path
+from svgelements import Close, Color, Line, Matrix, Move, Path, Viewbox
 
 from megastep.geometries.plans import outlines, safe
-from megastep.geometries.plans.cubicasa import SKIPPED, apply, tokens, transform
 from megastep.geometries.plans.outlines import Drawing
 
-LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
-CURVE = np.linspace(0, 1, 25)  # points of a curve, which are simplified later
-MAX_PATH = 1 << 20  # characters of a path
-FILL, STROKE, WIDTH = "fill", "stroke", "stroke-width"
+LABELS = ("{http://www.inkscape.org/namespaces/inkscape}label", "data-name")
+HREFS = ("href", "{http://www.w3.org/1999/xlink}href")
+#: Elements that draw nothing where they are, or nothing that is a wall.
+SKIPPED = (
+    *("defs", "symbol", "clipPath", "mask", "marker", "pattern", "style", "script", "text"),
+    *("foreignObject", "linearGradient", "radialGradient", "metadata", "namedview"),
+)
+#: What changes a shape and is not read. Elements have it from those around them, to be counted.
+UNREAD = {"clip-path": "none", "mask": "none", "stroke-dasharray": "none", "transform-origin": ""}
+#: Properties that elements inherit, and those that they do not.
+INHERITED = {
+    **UNREAD,
+    **{"fill": "black", "fill-rule": "nonzero", "fill-opacity": "1", "color": "black"},
+    **{"stroke": "none", "stroke-width": "1", "stroke-opacity": "1", "stroke-linecap": "butt"},
+    **{"stroke-linejoin": "miter", "stroke-miterlimit": "4", "visibility": "visible"},
+}
+OWN = {
+    **{"display": "inline", "opacity": "1", "transform": "", "vector-effect": "none"},
+    "overflow": "hidden",
+}
+#: Pixels of a unit, of which 96 are an inch.
+UNITS = {"px": 1, "pt": 4 / 3, "pc": 16, "mm": 96 / 25.4, "cm": 96 / 2.54, "in": 96, "em": 16}
+LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(%|[a-z]*)", re.I)
+RULE = re.compile(r"([^{}]+)\{([^{}]*)\}")
+COMPOUND = re.compile(r"(>?)(\*|[\w-]+)?((?:[.#][\w-]+)*)")
+CURVE = np.linspace(0, 1, 49)  # points of a curve, which are simplified later
+CAPS = {"butt": "flat", "round": "round", "square": "square"}
+JOINS = {"round": "round", "bevel": "bevel"}
+MAX_PATHS = 2 << 20  # characters of all marked paths
+MAX_WORK = 3_000_000  # elements that are visited, each times the rules of style
 
 
-def read(content: bytes, scale: float, walls: str = "wall", doors: str = "door") -> Drawing:
-    """Returns the drawing of an SVG.
+class _Place(NamedTuple):
+    """Where an element is: what it gets from those around it."""
+
+    matrix: Matrix
+    style: dict[str, str]
+    opacity: float
+    kind: str  # of a marked group around it
+    size: tuple[float, float]  # of the viewport, which is 100 %
+    clip: BaseGeometry | None  # by nested viewports, in metres
+    chain: tuple  # (name, words) of the elements around it
+
+
+def read(
+    content: bytes, scale: float, walls: str = "wall", doors: str = "door"
+) -> tuple[Drawing, list[str]]:
+    """Returns the drawing of an SVG, and what of it is not read.
 
     Args:
         content: of the file.
         scale: metres per unit of the SVG, after all transforms.
-        walls: the mark of walls: an id, perhaps followed by a number, a word of the class, or
-            Inkscape's label.
+        walls: the mark of walls: an id, perhaps followed by a number, a word of the class, or a
+            label of Inkscape or Illustrator.
         doors: the mark of doors, in gaps of the walls or upon them.
 
     Raises:
         ValueError: saying what is wrong with the file.
     """
-    root = safe.svg(content)
-    marks = {"walls": walls, "doors": doors}
-    shapes: dict[str, list[BaseGeometry]] = {key: [] for key in marks}
-    _collect(root, Matrix(), {FILL: "black", STROKE: "none", WIDTH: "1"}, "", marks, shapes, scale)
-    if not shapes["walls"]:
+    reader = _Reader(safe.svg(content), scale, {"walls": walls, "doors": doors})
+    if not reader.shapes["walls"]:
         raise ValueError(
             f"no shape is marked {walls!r} by id, class or label; walls= names another mark"
         )
-    outlines.check_extent(shapes["walls"])
-    return outlines.enclosed(shapes["walls"], shapes["doors"])
+    outlines.check_extent(reader.shapes["walls"])
+    unread = [f"{n} times {name}" for name, n in reader.unread.items()]
+    warnings = [f"not read, so drawn otherwise in a browser: {', '.join(unread)}"] * bool(unread)
+    return outlines.enclosed(reader.shapes["walls"], reader.shapes["doors"]), warnings
 
 
-def is_marked(element, mark: str) -> bool:
+def tokens(element: Element) -> list[str]:
+    """Returns the words of an element's class."""
+    return (element.get("class") or "").split()
+
+
+def transform(text: str | None, above: Matrix, size: tuple[float, float] = (0, 0)) -> Matrix:
+    """Returns a transform within one. Raises ValueError if it is not finite."""
+    if not text or text == "none":
+        return above
+    matrix = Matrix(text)
+    matrix.render(ppi=96, width=size[0], height=size[1])
+    matrix = matrix * above
+    if not np.isfinite([matrix.a, matrix.b, matrix.c, matrix.d, matrix.e, matrix.f]).all():
+        raise ValueError(f"transform {text[:40]!r} is not finite")
+    return matrix
+
+
+def apply(matrix: Matrix, points: np.ndarray) -> np.ndarray:
+    """Returns points (P, 2) after a transform."""
+    linear = np.array([[matrix.a, matrix.b], [matrix.c, matrix.d]])
+    return points @ linear + (matrix.e, matrix.f)
+
+
+def length(text: str, whole: float) -> float:
+    """Returns a length in pixels, of which `whole` are 100 %. Raises ValueError."""
+    match = LENGTH.fullmatch(text.strip())
+    unit = match[2].lower() or "px" if match else ""
+    if not match or unit != "%" and unit not in UNITS:
+        raise ValueError(f"{text[:40]!r} is no length that is read")
+    return float(match[1]) * (whole / 100 if unit == "%" else UNITS[unit])
+
+
+def is_marked(element: Element, mark: str) -> bool:
     """True if an element's id, class or label is the mark, in any case."""
     mark = mark.lower()
-    words = [*tokens(element), element.get(LABEL) or ""]
+    words = [*tokens(element), *(element.get(label) or "" for label in LABELS)]
     name = (element.get("id") or "").lower()
-    is_id = re.fullmatch(rf"{re.escape(mark)}s?[-_ ]?\d*", name) is not None
+    is_id = re.fullmatch(rf"{re.escape(mark)}s?[-_ ]?\d*_?", name) is not None
     return is_id or any(word.lower() in (mark, f"{mark}s") for word in words)
 
 
-def _collect(element, above, style, kind, marks, shapes, scale) -> None:
-    """Adds the marked shapes within an element. `kind` is that of a marked group around it."""
-    if safe.name_of(element) in SKIPPED:
-        return
-    style, matrix = _styled(element, style), transform(element, above)
-    if style.pop("display", "") == "none":
-        return
-    kind = next((key for key, mark in marks.items() if is_marked(element, mark)), kind)
-    if kind and (lines := _outline(element)):
-        lines = [(apply(matrix, line) * (scale, -scale), is_closed) for line, is_closed in lines]
-        size = scale * abs(matrix.a * matrix.d - matrix.b * matrix.c) ** 0.5
-        shapes[kind] += _solid(lines, style, size)
-    for child in element:
-        _collect(child, matrix, style, kind, marks, shapes, scale)
+def declarations(text: str) -> dict[str, str]:
+    """Returns the properties of a style."""
+    pairs = (one.partition(":")[::2] for one in text.split(";"))
+    return {key.strip().lower(): value.strip() for key, value in pairs if value.strip()}
 
 
-def _styled(element, style) -> dict[str, str]:
-    """Returns the style of an element within one of another style."""
-    declared = re.findall(r"([\w-]+)\s*:\s*([^;]+)", element.get("style") or "")
-    own = {key: element.get(key) for key in (FILL, STROKE, WIDTH, "display")} | dict(declared)
-    return style | {key: value.strip() for key, value in own.items() if value}
+def is_painted(paint: str, opacity: str) -> bool:
+    """True if a fill or stroke can be seen."""
+    paint, fallback = re.sub(r"url\([^)]*\)", "", paint).strip().lower(), "url(" in paint
+    if paint in ("none", "transparent") or length(opacity, 1) <= 0:
+        return False
+    if "/" in paint:  # as in rgb(0 0 0 / 0%)
+        return length(paint.partition("/")[2].strip(" )"), 1) > 0
+    return fallback or Color(paint).alpha != 0
 
 
-def _length(element, key) -> float:
-    """Returns a length of an element in units, 0 if it has none."""
-    (value, *_) = safe.numbers(re.sub(r"[a-z%]+$", "", element.get(key) or "0")) or [0.0]
-    return value
+class _Reader:
+    """Collects the marked shapes of a document, in metres with y up."""
+
+    def __init__(self, root, scale, marks):
+        self.scale, self.marks = np.array((scale, -scale)), marks
+        self.shapes: dict[str, list[BaseGeometry]] = {key: [] for key in marks}
+        self.unread: Counter[str] = Counter()
+        self.n_characters = self.work = 0
+        self.ids, self.rules = {}, []
+        for element in root.iter():
+            self.ids.setdefault(element.get("id"), element)
+            if safe.name_of(element) == "style":
+                self._add_rules(element.text or "")
+        self.rules.sort(key=lambda rule: rule[0])
+        self._visit(root, _Place(Matrix(), INHERITED, 1.0, "", (0, 0), None, ()))
+
+    def _add_rules(self, text) -> None:
+        for selectors, body in RULE.findall(re.sub(r"/\*.*?\*/|<!--|-->|@import[^;]*;", "", text)):
+            for selector in selectors.split(","):
+                words = re.sub(r"\s*>\s*", " >", selector.strip()).split()
+                parts = [COMPOUND.fullmatch(word) for word in words]
+                if not parts or None in parts:
+                    if not selector.strip().startswith("@font-face"):
+                        self.unread[f"the style {selector.strip()[:40]!r}"] += 1
+                    continue
+                found = [(p[1], p[2], re.findall(r"[.#][\w-]+", p[3])) for p in parts if p]
+                names = [name for *_, names in found for name in names]
+                n_ids = sum(name[0] == "#" for name in names)
+                n_tags = sum(tag not in (None, "*") for _, tag, _ in found)
+                rank = n_ids, len(names) - n_ids, n_tags
+                self.rules.append((rank, found, declarations(body)))
+
+    def _declared(self, element, chain) -> dict[str, str]:
+        """Returns the attributes of an element after those of rules and of its own style."""
+        sheets = [body for _, parts, body in self.rules if _matches(parts, chain)]
+        sheets.append(declarations(element.get("style") or ""))
+        found = {**element.attrib}
+        for body in sheets:
+            found |= {k: v for k, v in body.items() if "!important" not in v}
+        for body in sheets:
+            found |= {
+                k: v.partition("!important")[0].strip()
+                for k, v in body.items()
+                if "!important" in v
+            }
+        return found
+
+    def _visit(self, element, place, box=None) -> None:
+        """Collects what is in an element. `box` is the width and height that a `use` gives it."""
+        name = safe.name_of(element)
+        if name in SKIPPED and (name != "symbol" or box is None):
+            return
+        self.work += 1 + len(self.rules)
+        if self.work > MAX_WORK or len(place.chain) > safe.MAX_DEPTH:
+            raise ValueError("its elements, each times the rules of its style, are too many")
+        ids = [f"#{element.get('id')}"] * ("id" in element.attrib)
+        chain = (*place.chain, (name, {*ids, *(f".{word}" for word in tokens(element))}))
+        own = self._declared(element, chain)
+        style = {
+            k: v if own.get(k, "inherit") == "inherit" else own[k] for k, v in place.style.items()
+        }
+        for key in ("fill", "stroke"):
+            if style[key].lower() == "currentcolor":
+                style[key] = style["color"]
+        once = {key: own.get(key, value) for key, value in OWN.items()}
+        if once["display"] == "none":
+            return
+        opacity = place.opacity * length(once["opacity"], 1)
+        kind = next(
+            (key for key, mark in self.marks.items() if is_marked(element, mark)), place.kind
+        )
+        matrix, size, clip = (
+            transform(once["transform"], place.matrix, place.size),
+            place.size,
+            place.clip,
+        )
+
+        def of(key, default: Any = 0) -> float:
+            axis = next((letter for letter in key if letter in "xywh"), "r")
+            whole = size["yh".count(axis)] if axis != "r" else np.hypot(*size) / 2**0.5
+            return length(str(own.get(key, default)), whole)
+
+        if name in ("svg", "symbol"):
+            view = own.get("viewBox")
+            numbers = safe.numbers(view) if view else []
+            if len(numbers) == 4 and min(numbers[2:]) <= 0:
+                return
+            if place.chain:  # the root's own units are the drawing's
+                own |= box or {}
+                x, y, width, height = (
+                    *(of(key) if name == "svg" else 0.0 for key in "xy"),
+                    *(of(key, "100%") for key in ("width", "height")),
+                )
+                if once["overflow"] in ("hidden", "scroll", "clip"):
+                    frame = np.array(
+                        [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
+                    )
+                    visible = shapely.Polygon(apply(matrix, frame) * self.scale)
+                    clip = visible if clip is None else clip & visible
+                moved = f"translate({x}, {y})"
+                if len(numbers) == 4:
+                    aspect = own.get("preserveAspectRatio")
+                    moved = Viewbox.viewbox_transform(x, y, width, height, *numbers, aspect)
+                matrix, size = transform(moved, matrix), (width, height)
+            elif len(numbers) != 4:
+                size = of("width", 100), of("height", 100)
+            size = (numbers[2], numbers[3]) if len(numbers) == 4 else size
+        place = _Place(matrix, style, opacity, kind, size, clip, chain)
+        if name == "use":
+            target = self.ids.get(
+                next((own[k][1:] for k in HREFS if own.get(k, "")[:1] == "#"), None)
+            )
+            if target is None:
+                self.unread["use of what is not in the file"] += bool(kind)
+                return
+            moved = transform(f"translate({of('x')}, {of('y')})", matrix)
+            box = {key: own[key] for key in ("width", "height") if key in own}
+            self._visit(target, place._replace(matrix=moved), box)
+        elif kind and style["visibility"] == "visible" and opacity > 0:
+            self._paint(name, own, of, place, once["vector-effect"] == "non-scaling-stroke")
+        if name != "use":
+            for child in element:
+                self._visit(child, place)
+
+    def _paint(self, name, own, of, place, is_fixed) -> None:
+        """Adds what a shape covers: its fill and its stroke."""
+        style, shapes = place.style, []
+        lines = self._outline(name, own, of)
+
+        def metres(points) -> np.ndarray:
+            return apply(place.matrix, points) * self.scale
+
+        area = abs(place.matrix.a * place.matrix.d - place.matrix.b * place.matrix.c)
+        if area < 1e-12 or not lines:
+            return
+        self.unread.update(key for key, value in UNREAD.items() if style[key] not in (value, "0"))
+        if is_painted(style["fill"], style["fill-opacity"]):
+            rings = [metres(line) for line, _ in lines if len(line) > 2]
+            shapes += outlines.area_of(rings, style["fill-rule"] == "evenodd")
+        width = length(style["stroke-width"], float(np.hypot(*place.size)) / 2**0.5)
+        if width > 0 and is_painted(style["stroke"], style["stroke-opacity"]):
+            size = self.scale[0] * (1 if is_fixed else area**0.5)
+            pen: dict = dict(
+                distance=max(width, outlines.GRID / size) / 2,
+                cap_style=CAPS.get(style["stroke-linecap"], "flat"),
+                join_style=JOINS.get(style["stroke-linejoin"], "mitre"),
+                mitre_limit=max(1.0, length(style["stroke-miterlimit"], 1)),
+            )
+            for line, is_closed in lines:
+                line = apply(place.matrix, line) if is_fixed else line
+                closes = is_closed and len(np.unique(line, axis=0)) > 2
+                drawn = shapely.LinearRing(line) if closes else shapely.LineString(line)
+                stroke = drawn.buffer(**pen)
+                if is_fixed:
+                    shapes.append(shapely.transform(stroke, lambda p: p * self.scale))
+                else:
+                    shapes.append(shapely.transform(stroke, metres))
+        if place.clip is not None:
+            shapes = [shape & place.clip for shape in shapes]
+        self.shapes[place.kind] += [shape for shape in shapes if not shape.is_empty]
+
+    def _outline(self, name, own, of) -> list[tuple[np.ndarray, bool]]:
+        """Returns the lines (P, 2) of a shape, and whether each is closed; none for a group."""
+        if name == "rect":
+            x, y, width, height = (of(key) for key in ("x", "y", "width", "height"))
+            if width <= 0 or height <= 0:
+                return []
+            rx, ry = own.get("rx", own.get("ry", "0")), own.get("ry", own.get("rx", "0"))
+            own |= {"rx": rx, "ry": ry}
+            rx, ry = min(of("rx"), width / 2), min(of("ry"), height / 2)
+            if rx <= 0 or ry <= 0:
+                corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
+                return [(np.array(corners), True)]
+            arc, across, down = f"a{rx} {ry} 0 0 1 ", width - 2 * rx, height - 2 * ry
+            return _path(
+                f"M{x + rx} {y}h{across}{arc}{rx} {ry}v{down}{arc}{-rx} {ry}h{-across}"
+                f"{arc}{-rx} {-ry}v{-down}{arc}{rx} {-ry}z"
+            )
+        if name in ("polygon", "polyline"):
+            points = safe.points(own.get("points", ""))
+            return [(points, name == "polygon")] if len(points) > 1 else []
+        if name == "line":
+            return [(np.array([[of("x1"), of("y1")], [of("x2"), of("y2")]]), False)]
+        if name in ("circle", "ellipse"):
+            radii = (of("r"),) * 2 if name == "circle" else (of("rx"), of("ry"))
+            angles = np.linspace(0, 2 * np.pi, 128, endpoint=False)
+            circle = np.stack([np.cos(angles), np.sin(angles)], 1)
+            return [(circle * radii + (of("cx"), of("cy")), True)] if min(radii) > 0 else []
+        if name == "image":
+            self.unread["image"] += 1
+        if name != "path" or not own.get("d"):
+            return []
+        self.n_characters += len(own["d"])
+        if self.n_characters > MAX_PATHS:
+            raise ValueError(f"its marked paths have more than {MAX_PATHS:,} characters")
+        return _path(own["d"])
 
 
-def _outline(element) -> list[tuple[np.ndarray, bool]]:
-    """Returns the lines (P, 2) of a shape, and whether each is closed; none for a group."""
-    name = safe.name_of(element)
-    x, y, width, height, r = (_length(element, key) for key in ("x", "y", "width", "height", "r"))
-    if name == "rect":
-        corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-        return [(np.array(corners), True)]
-    if name in ("polygon", "polyline"):
-        return [(safe.points(element.get("points") or ""), name == "polygon")]
-    if name == "line":
-        ends = [[_length(element, f"{axis}{i}") for axis in "xy"] for i in (1, 2)]
-        return [(np.array(ends), False)]
-    if name in ("circle", "ellipse"):
-        angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-        radii = (r, r) if name == "circle" else (_length(element, "rx"), _length(element, "ry"))
-        centre = _length(element, "cx"), _length(element, "cy")
-        return [(np.stack([np.cos(angles), np.sin(angles)], 1) * radii + centre, True)]
-    return _path(element.get("d") or "") if name == "path" else []
+def _matches(parts, chain) -> bool:
+    """True if a selector fits the last of the chain."""
+
+    def fits(part, node) -> bool:
+        return part[1] in (None, "*", node[0]) and node[1].issuperset(part[2])
+
+    if not fits(parts[-1], chain[-1]):
+        return False
+    at = len(chain) - 1
+    for part, after in zip(parts[-2::-1], parts[::-1]):
+        at -= 1
+        while at >= 0 and not fits(part, chain[at]):
+            at = -1 if after[0] else at - 1
+        if at < 0:
+            return False
+    return True
 
 
 def _path(text) -> list[tuple[np.ndarray, bool]]:
     """Returns the lines of a path with its curves flattened."""
-    if len(text) > MAX_PATH:
-        raise ValueError(f"a path has {len(text):,} characters, but the limit is {MAX_PATH:,}")
     try:
         segments = list(Path(text))
     except (ValueError, IndexError, TypeError, AttributeError, ZeroDivisionError) as error:
         raise ValueError(f"the path {text[:30]!r} cannot be read") from error
-    lines, points, is_closed = [], [], False
+    lines, points = [], []
     for segment in [*segments, Move((0, 0))]:
-        if isinstance(segment, Move):
+        if isinstance(segment, (Move, Close)):
             if len(points) > 1:
-                lines.append((np.array(points), is_closed))
-            points, is_closed = [tuple(segment.end)], False
-        elif isinstance(segment, Close):
-            is_closed = True
+                lines.append((np.array(points), isinstance(segment, Close)))
+            points = points[:1] if isinstance(segment, Close) else [tuple(segment.end)]
         elif isinstance(segment, Line):
             points.append(tuple(segment.end))
         else:
@@ -128,21 +381,3 @@ def _path(text) -> list[tuple[np.ndarray, bool]]:
         if not np.isfinite(line).all() or np.abs(line).max() > safe.MAX_COORDINATE:
             raise ValueError("a coordinate of a path is not finite, or too large")
     return lines
-
-
-def _solid(lines, style, size) -> list[BaseGeometry]:
-    """Returns the area that a shape covers: what it fills, else what its stroke covers."""
-    if style[FILL] != "none" and any(is_closed or len(line) > 2 for line, is_closed in lines):
-        area = shapely.Polygon()
-        for line, _ in lines:
-            area = area.symmetric_difference(shapely.union_all(outlines.ring(line)))
-        return [area] if not area.is_empty else []
-    if style[STROKE] == "none":
-        return []
-    width = max(outlines.GRID, size * safe.numbers(re.sub(r"[a-z%]+$", "", style[WIDTH]))[0])
-    ends = [np.concatenate([line, line[:1]]) if is_closed else line for line, is_closed in lines]
-    return [
-        shapely.LineString(line).buffer(width / 2, cap_style="square", join_style="mitre")
-        for line in ends
-        if len(line) > 1
-    ]
