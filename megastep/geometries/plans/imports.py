@@ -195,11 +195,9 @@ def own_svg(path: Path, scale: float, walls: str = "wall", doors: str = "door") 
 def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
     """Returns the floor plan of a map. Arguments are those of `maps.load`. Raises ValueError."""
     with _refused():
-        grid = maps.load(path, metres_per_pixel)
-        drawing, warnings = maps.read(grid)
-    image = np.where(grid.free, 254, np.where(grid.unknown, 205, 0)).astype(np.uint8)
+        drawing, picture, warnings = maps.read(maps.load(path, metres_per_pixel))
     g, notes = _home(drawing)
-    return Own(image, g, warnings + notes.warnings)
+    return Own(picture, g, warnings + notes.warnings)
 
 
 # ---- Statistics ----

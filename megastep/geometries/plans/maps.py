@@ -4,7 +4,7 @@ images, in which white is floor.
 
 import io
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -13,20 +13,28 @@ from contourpy import contour_generator
 from PIL import Image
 from scipy import ndimage
 from shapely import affinity
+from shapely.geometry.base import BaseGeometry
 
-from megastep import geometry
 from megastep.geometries.plans import outlines
 from megastep.geometries.plans.outlines import Drawing
 
-MAX_PIXELS = 25_000_000
+MAX_PIXELS = 16_000_000  # 200 m x 200 m of 5 cm
 MAX_YAML = 1 << 16  # bytes
 FORMATS = ("PNG", "PPM", "BMP", "JPEG", "TIFF")
 TOLERANCE = 0.02  # metres by which contours are simplified, and at least STEP of a pixel
 STEP = 0.6
 SPECKLE = 0.03  # m2; smaller objects on the floor, and smaller holes in walls, are no walls
+BUMP = 2  # cells that differ from most around them and may be a bump; more are a thin wall
+MAX_PIECES = 5_000  # of floor and walls
 MAX_ANGLE = 5.0  # degrees by which a map is straightened
 MIN_ANGLE = 0.15
 ROUGH = 0.05  # metres by which contours are simplified to find their angle
+#: Grey levels of the picture of a map, and the colours of cells that are changed.
+FREE, UNKNOWN, WALL = 254, 205, 0
+TO_FLOOR, TO_WALL = (214, 39, 40), (31, 119, 180)
+ANY = np.ones((3, 3), np.uint8)  # cells that touch, also at a corner
+CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)  # at a side
+DEFAULTS = {"occupied_thresh": "0.65", "free_thresh": "0.196", "negate": "0", "mode": "trinary"}
 
 
 class Map(NamedTuple):
@@ -35,10 +43,12 @@ class Map(NamedTuple):
     free: np.ndarray
     unknown: np.ndarray
     resolution: float  # metres per cell
+    warnings: list[str]
 
 
 def load(path: Path, metres_per_pixel: float | None = None) -> Map:
-    """Returns the map of a ROS `.yaml`, or of an image if `metres_per_pixel` is given.
+    """Returns the map of a ROS `.yaml`, as map_server reads it, or of an image if
+    `metres_per_pixel` is given.
 
     Raises:
         ValueError: saying what is wrong with the file.
@@ -46,36 +56,59 @@ def load(path: Path, metres_per_pixel: float | None = None) -> Map:
     if path.suffix.lower() not in (".yaml", ".yml"):
         if metres_per_pixel is None:
             raise ValueError("an image needs metres_per_pixel=, such as 0.02")
-        free = _image(path) >= 128
-        return Map(free, np.zeros_like(free), metres_per_pixel)
+        shade, alpha = _image(path)
+        free = shade * alpha + 1 - alpha >= 128 / 255  # what is transparent is floor
+        return Map(free, np.zeros_like(free), metres_per_pixel, [])
     if path.stat().st_size > MAX_YAML:
         raise ValueError(f"it has more than {MAX_YAML:,} bytes")
     try:
-        given = yaml.safe_load(path.read_bytes())
+        given = yaml.load(path.read_bytes(), yaml.BaseLoader)  # noqa: S506  # which makes words
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ValueError("it is no YAML") from error
     if not isinstance(given, dict) or not isinstance(given.get("image"), str):
         raise ValueError("it has no 'image'; a map of ROS has image, resolution and origin")
-    numbers = {"occupied_thresh": 0.65, "free_thresh": 0.196, "negate": 0}
-    for key in ("resolution", *numbers):
-        value = given.get(key, numbers.get(key))
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ValueError(f"its {key} is {value!r}, no number")
-        numbers[key] = value
-    image = (path.parent / given["image"]).resolve()
-    if not image.is_relative_to(path.parent.resolve()):
-        raise ValueError("its image is not in its own folder")
-    values = _image(image).astype(float) / 255
-    occupied = values if numbers["negate"] else 1 - values
-    free = occupied < numbers["free_thresh"]
-    unknown = ~free & (occupied <= numbers["occupied_thresh"])
-    return Map(free, unknown, float(metres_per_pixel or numbers["resolution"]))
+    given = DEFAULTS | given
+    negate = {"true": 1.0, "false": 0.0}.get(str(given["negate"]).lower())
+    is_negative = _number(given, "negate") != 0 if negate is None else negate != 0
+    free_below, wall_above = _number(given, "free_thresh"), _number(given, "occupied_thresh")
+    mode = str(given["mode"]).lower()
+    if mode not in ("trinary", "scale", "raw"):
+        raise ValueError(f"its mode is {mode[:20]!r}, but trinary, scale and raw are allowed")
+    places = path.parent / given["image"], path.parent / Path(given["image"]).name
+    shade, alpha = _image(next((place for place in places if place.is_file()), places[0]))
+    if mode == "trinary":  # map_server takes alpha for a channel of colour
+        n = 4 if alpha.min() < 1 else 3
+        shade = (3 * shade + (n - 3) * alpha) / n
+    occupied = shade if is_negative else 1 - shade
+    unknown = alpha < (1 if mode == "scale" else 1e-9)
+    if mode == "raw":
+        occupied = np.rint(shade * 255) / 100
+        unknown |= occupied > 1
+    else:
+        is_free, is_wall = occupied < free_below, occupied > wall_above
+        span = max(wall_above - free_below, 1e-9)
+        occupied = np.select([is_wall, is_free], [1, 0], (occupied - free_below) / span)
+        if mode == "trinary":
+            unknown |= ~is_free & ~is_wall
+            if free_below == 0.25:  # as Nav2 wrote until 2025, where 205 was unknown
+                unknown |= np.rint(shade * 255) == UNKNOWN
+    guessed = ((occupied > 0) & (occupied < 1) & ~unknown).sum()
+    text = f"{guessed:,} cells are neither free nor occupied; those from 50 % are walls"
+    resolution = float(metres_per_pixel or _number(given, "resolution"))
+    return Map((occupied < 0.5) & ~unknown, unknown, resolution, [text] * bool(guessed))
 
 
-def _image(path) -> np.ndarray:
-    """Returns an image as (H, W) grey levels."""
+def _number(given, key) -> float:
+    try:
+        return float(given.get(key, ""))
+    except (TypeError, ValueError):
+        raise ValueError(f"its {key} is {str(given.get(key))[:40]!r}, no number") from None
+
+
+def _image(path) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the shades of an image, (H, W) from 0 for black to 1 for white, and their alpha."""
     if not path.is_file():
-        raise ValueError(f"there is no image {path.name!r}")
+        raise ValueError(f"there is no image {str(path)!r}")
     try:
         with Image.open(io.BytesIO(path.read_bytes()), formats=FORMATS) as image:
             if image.width * image.height > MAX_PIXELS:
@@ -83,15 +116,18 @@ def _image(path) -> np.ndarray:
                     f"its image has {image.width * image.height:,} pixels, but the limit is "
                     f"{MAX_PIXELS:,}"
                 )
-            flat = Image.new("RGBA", image.size, "white")
-            flat.alpha_composite(image.convert("RGBA"))  # what is transparent is floor
-            return np.asarray(flat.convert("L"))
+            if image.mode.startswith("I"):  # 16 bits
+                values = np.asarray(image, np.float32) / 65_535
+                return values.clip(0, 1), np.ones_like(values)
+            values = np.asarray(image.convert("RGBA"), np.uint8)
+            return values[..., :3].mean(-1) / 255, values[..., 3] / 255
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"its image {path.name!r} cannot be read, or is cut short") from error
 
 
-def read(grid: Map) -> tuple[Drawing, list[str]]:
-    """Returns the drawing of a map, straightened and without speckles, and warnings.
+def read(grid: Map) -> tuple[Drawing, np.ndarray, list[str]]:
+    """Returns the drawing of a map, straightened and without speckles, a picture (H, W, 3) of what
+    was changed, and warnings.
 
     Raises:
         ValueError: saying what is wrong with the map.
@@ -104,56 +140,94 @@ def read(grid: Map) -> tuple[Drawing, list[str]]:
     extent = max(grid.free.shape) * resolution
     if extent > 10 * outlines.MAX_EXTENT:
         raise ValueError(f"the map is {extent:,.0f} m long; check the resolution")
-    n_cells = max(2, round(SPECKLE / resolution**2))
-    around = [
-        ndimage.convolve(c.astype(int), np.ones((3, 3)), mode="constant")
-        for c in (grid.free, ~grid.free)
-    ]
-    free = ~_without_specks(around[0] <= around[1], n_cells)
-    free = _without_specks(free, n_cells)
-    warnings = []
+    free, warnings = _cleaned(grid.free, resolution), [*grid.warnings]
+    picture = np.select([grid.free, grid.unknown], [FREE, UNKNOWN], WALL).astype(np.uint8)
+    picture = picture[..., None].repeat(3, -1)
+    changes = (free & ~grid.free, TO_FLOOR, "floor"), (~free & grid.free, TO_WALL, "wall")
+    for cells, colour, kind in changes:
+        picture[cells] = colour
+        if n := cells.sum():
+            warnings.append(f"{n:,} cells ({n * resolution**2:.2f} m2) of specks are {kind} now")
     on_border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]])
     is_drawing = bool(on_border.any()) and not grid.unknown.any()
-    floor = _area(~free if is_drawing else free, resolution)
+    floor = _area(free, resolution)
+    if is_drawing:  # its walls, which are connected where they touch at a corner
+        floor = shapely.box(*floor.bounds).difference(floor)
+        floor = floor.buffer(resolution / 50, **outlines.MITRE)
     angle = skew(floor)
     if MIN_ANGLE < abs(angle) <= MAX_ANGLE:
         floor = affinity.rotate(floor, -angle, origin=(0, 0))
         warnings.append(f"the map is turned by {-angle:.1f} degrees, so that its walls are level")
     floor = shapely.simplify(floor, max(TOLERANCE, STEP * resolution))
     if is_drawing:
-        return outlines.enclosed(outlines.polygons(floor), []), warnings
-    edge = ndimage.binary_dilation(free, np.ones((3, 3))) & grid.unknown
+        return outlines.enclosed(outlines.polygons(floor), []), picture, warnings
+    edge = ndimage.binary_dilation(free, ANY) & grid.unknown
     if (length := edge.sum() * resolution) > 0.5:
         warnings.append(f"about {length:.1f} m of the floor's edge is unknown, and is a wall now")
-    parts = [part for part in outlines.polygons(floor) if part.area >= outlines.MIN_AREA]
+    pieces = outlines.polygons(floor)
+    parts = [part for part in pieces if part.area >= outlines.MIN_AREA]
     if not parts:
         raise ValueError(f"no floor of {outlines.MIN_AREA:g} m2 is free; check the resolution")
+    if lost := len(pieces) - len(parts):
+        area = sum(part.area for part in pieces) - sum(part.area for part in parts)
+        warnings.append(f"{lost} pieces of floor ({area:.1f} m2) under 1 m2 are left out")
     outlines.check_extent(parts)
     floor = shapely.union_all(parts)
-    return Drawing([], outlines.rooms_of(floor), [], [], floor), warnings
+    return Drawing([], outlines.rooms_of(floor), [], [], floor), picture, warnings
 
 
-def _without_specks(cells, n_cells) -> np.ndarray:
-    """Returns cells (H, W) without the connected ones that are at most `n_cells`."""
-    labels, _ = geometry.components(cells)
-    is_large = np.bincount(labels.ravel()) > n_cells
-    is_large[0] = False
-    return is_large[labels]
+def _cleaned(free, resolution) -> np.ndarray:
+    """Returns the free cells without speckles, and with bumps and dents of a cell smoothed away. A
+    wall stays that is one cell thick, and so do corners.
+    """
+    same = [
+        np.where(free, n, around.sum() - n)
+        for around in (ANY, CROSS)
+        for n in [ndimage.convolve(free.astype(np.uint8), around, mode="nearest")]
+    ]
+    free = free ^ (_small(same[0] <= 4, BUMP) & (same[1] <= 2))
+    n_cells = max(2, round(SPECKLE / resolution**2))
+    free = free | _small(~free, n_cells)
+    return free & ~_small(free, n_cells, None)
 
 
-def _area(cells, resolution) -> shapely.geometry.base.BaseGeometry:
-    """Returns the area of cells (H, W) in metres, its contours smoothed by a cell."""
-    smooth = ndimage.gaussian_filter(np.pad(cells, 2).astype(float), 0.7, mode="nearest")
-    area = shapely.Polygon()
-    rings: Any = contour_generator(z=smooth).lines(0.5)
-    parts = [part for ring in rings for part in outlines.ring(ring * (1, -1))]
-    for part in sorted(parts, key=lambda part: -part.area):  # a hole after what it is in
-        inside = area.contains(part.representative_point())
-        area = area.difference(part) if inside else area.union(part)
-    return shapely.transform(area, lambda points: points * resolution)
+def _small(cells, n_cells, touching=ANY) -> np.ndarray:
+    """Returns the components of cells (H, W) that are at most `n_cells` large."""
+    labels, _ = ndimage.label(cells, touching)  # pyright: ignore[reportGeneralTypeIssues]
+    is_small = np.bincount(labels.ravel()) <= n_cells
+    is_small[0] = False
+    return is_small[labels]
 
 
-def skew(area: shapely.geometry.base.BaseGeometry) -> float:
+def _area(cells, resolution) -> BaseGeometry:
+    """Returns the area of cells (H, W) in metres. Those that touch at a corner are not connected."""
+    heights = np.pad(cells, 1).astype(np.float32)
+    rings_of, offsets_of = contour_generator(z=heights, fill_type="OuterOffset").filled(0.5, 2)
+    if len(rings_of) > MAX_PIECES:
+        raise ValueError(f"it has {len(rings_of):,} pieces, but {MAX_PIECES:,} are allowed")
+    parts = []
+    for points, offsets in zip(rings_of, offsets_of):
+        rings = [_with_corners(points[a : b - 1]) for a, b in zip(offsets, offsets[1:])]
+        rings = [(ring - 0.5) * (resolution, -resolution) for ring in rings]
+        parts += outlines.polygons(shapely.Polygon(rings[0], rings[1:]))
+    return shapely.union_all(parts)
+
+
+def _with_corners(points) -> np.ndarray:
+    """Returns a contour, of points in the middle of the sides of cells, with the corners that it
+    cuts, but for those of staircases, which are slanted walls.
+    """
+    points = np.round(points * 2) / 2
+    following = np.roll(points, -1, 0)
+    steps = following - points
+    goes_on = (steps == np.roll(steps, -1, 0)).all(1)
+    is_corner = (steps != 0).all(1) & ~goes_on & ~np.roll(goes_on, 1)
+    is_level = points[:, 1] % 1 == 0.5  # the side that a point is in the middle of
+    corners = np.where(is_level, [following[:, 0], points[:, 1]], [points[:, 0], following[:, 1]]).T
+    return np.insert(points, is_corner.nonzero()[0] + 1, corners[is_corner], axis=0)
+
+
+def skew(area: BaseGeometry) -> float:
     """Returns the degrees, from -45 to 45, by which most of an area's edges are turned."""
     rough = shapely.simplify(area, ROUGH)
     rings = [r for part in outlines.polygons(rough) for r in (part.exterior, *part.interiors)]

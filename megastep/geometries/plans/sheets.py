@@ -58,7 +58,7 @@ def write(
         pairs, axes.reshape(-1, 2)[:, 0], axes.reshape(-1, 2)[:, 1]
     ):
         if isinstance(original, np.ndarray):
-            left.imshow(original, cmap="gray", vmin=0, vmax=255)
+            left.imshow(original)
         else:
             draw(original, left)
         geometry.display(g, right)
