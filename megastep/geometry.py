@@ -121,7 +121,9 @@ def _inside(rings, shape) -> np.ndarray:
     return flips.reshape(height, width + 1).cumsum(1)[:, :width] % 2 == 1
 
 
-def masks(walls: ArrayLike, rooms: Sequence, res: float = RES) -> np.ndarray:
+def masks(
+    walls: ArrayLike, rooms: Sequence, res: float = RES, extent: ArrayLike = (0, 0)
+) -> np.ndarray:
     """Returns the masks of a geometry, (H, W) int16.
 
     A room holds the cells whose centre it contains. Walls take every cell that they touch, even at
@@ -132,12 +134,13 @@ def masks(walls: ArrayLike, rooms: Sequence, res: float = RES) -> np.ndarray:
         rooms: a polygon (P, 2) in metres per room, or a list of polygons of which all but the first
             are holes. The first room is number 1.
         res: the side of a cell in metres.
+        extent: (x, y) in metres that the masks reach at least, where no wall is.
 
     Raises:
         ValueError: if a wall reaches beyond 200 m.
     """
     walls = np.asarray(walls, np.float64).reshape(-1, 2, 2)
-    extent = walls.reshape(-1, 2).max(0) if len(walls) else np.zeros(2)
+    extent = np.concatenate([walls.reshape(-1, 2), np.reshape(extent, (1, 2))]).max(0)
     if not extent.max() <= MAX_EXTENT:
         raise ValueError(
             f"walls reach {extent.max():g} m, but the limit is {MAX_EXTENT:g} m; check the unit"

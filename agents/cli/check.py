@@ -25,9 +25,8 @@ def run(cfg: Check) -> None:
     from megastep.geometries import checks, files, imported
 
     path = Path(cfg.path)
-    is_database = path.resolve().parent == imported.folder().resolve()
     with user_errors():
-        plans = imported.load(path) if is_database else files.load(path)
+        plans = imported.load(path) if imported.is_database(path) else files.load(path)
     errors = {index: checks.errors(g) for index, g in enumerate(plans)}
     errors = {index: sentences for index, sentences in errors.items() if sentences}
     for index, sentences in list(errors.items())[:SHOWN]:

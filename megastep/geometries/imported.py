@@ -20,7 +20,7 @@ from megastep.atomic_files import write_atomically
 from megastep.dotdict import dotdict
 from megastep.geometries.homes import database
 
-__all__ = ["NAMES", "folder", "load", "pick", "write"]
+__all__ = ["NAMES", "folder", "is_database", "load", "pick", "prepare", "write"]
 
 #: The sources that can be imported.
 NAMES = ("cubicasa", "houseexpo")
@@ -89,6 +89,15 @@ def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
     members = database.draw(np.isin(of_plans, of_split).nonzero()[0].tolist(), n, seed)
     drawn = {i: plans.home(i, i) for i in members}
     return [drawn[i] for i in members]
+
+
+def is_database(path: Path) -> bool:
+    """True if a file is one that `write` wrote, wherever it lies."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return "widths.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile, NotImplementedError):
+        return False
 
 
 def load(path: Path) -> list[dotdict]:

@@ -236,18 +236,3 @@ def test_explorer_runs_in_mazes():
     n_texels = layouts.texel_starts[layouts.wall_starts.long()].diff()
     n_visible = sum((visible >> bit & 1).sum(1) for bit in range(32))
     assert (n_visible > 0.9 * n_texels).all()
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("thickness", float("nan")),
-        ("corridor", "wide"),
-        ("braid", 2.0),
-        ("size", 2.5),
-        ("seed", 1.5),
-    ],
-)
-def test_wrong_arguments_of_a_maze_are_named(name, value):
-    with pytest.raises(ValueError, match=f"^{name}={value!r}"):
-        mazes.generate(**{"seed": 1, name: value})

@@ -278,7 +278,7 @@ def drawn(tmp_path_factory):
     [
         ("curved.svg", 2, (8, 8.25), 1, ""),
         ("millimetres.svg", 3, (9.15, 7.15), 0, ""),
-        ("transformed.svg", 3, (6, 10), 0, "an opening leads outside"),
+        ("transformed.svg", 3, (6, 10), 0, "1 openings lead outside, 0.9 m wide"),
         ("scan.png", 3, (10, 6), 0, "turned by -3."),
         ("slam.yaml", 3, (9.4, 5.4), 0, ""),
         ("partly.yaml", 3, (9.4, 5.4), 0, "edge is unknown"),
@@ -332,7 +332,7 @@ def test_bad_own_plans(drawn, name, words, sentence, here, capsys):
 
 def test_bad_maps(here, capsys):
     black = np.zeros((50, 50), np.uint8)
-    cases = {"image: ../x.png\nresolution: 1": "not in its own folder", "- 1": "no 'image'"}
+    cases = {"image: ../x.png\nresolution: 1": "there is no image", "- 1": "no 'image'"}
     cases["image: a.pgm\nresolution: x"] = "no number"
     cases["image: a.pgm\nresolution: 0.05"] = "all walls"
     for text, sentence in cases.items():

@@ -1,8 +1,8 @@
 """Reads CubiCasa5k's `model.svg` (Kalervo et al. 2019): 100 units are a metre, y grows downwards.
 
-Walls are the groups of class Wall, doors and windows are groups within them, rooms are the groups
-of class Space; the direct child `polygon` of each is its outline. A floor is a group of class
-Floorplan; floors lie side by side, all but the first hidden.
+Walls are the groups of class Wall or Column, doors and windows are groups within them, rooms are
+the groups of class Space; the direct child `polygon` of each is its outline. A floor is a group of
+class Floorplan; floors lie side by side, all but the first hidden.
 """
 
 from collections.abc import Iterator
@@ -75,6 +75,8 @@ def _collect(element, matrix, drawing) -> None:
             parts = _polygons(child, inner)
             if parts:
                 rooms.append(shapely.union_all(parts))
+        elif "Column" in words:
+            drawing.walls.extend(_polygons(child, inner))
         else:
             _collect(child, inner, drawing)
 

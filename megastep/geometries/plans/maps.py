@@ -62,7 +62,7 @@ def load(path: Path, metres_per_pixel: float | None = None) -> Map:
     if path.stat().st_size > MAX_YAML:
         raise ValueError(f"it has more than {MAX_YAML:,} bytes")
     try:
-        given = yaml.load(path.read_bytes(), yaml.BaseLoader)  # noqa: S506  # which makes words
+        given = yaml.load(path.read_bytes(), yaml.BaseLoader)  # all words
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise ValueError("it is no YAML") from error
     if not isinstance(given, dict) or not isinstance(given.get("image"), str):
@@ -76,9 +76,8 @@ def load(path: Path, metres_per_pixel: float | None = None) -> Map:
         raise ValueError(f"its mode is {mode[:20]!r}, but trinary, scale and raw are allowed")
     places = path.parent / given["image"], path.parent / Path(given["image"]).name
     shade, alpha = _image(next((place for place in places if place.is_file()), places[0]))
-    if mode == "trinary":  # map_server takes alpha for a channel of colour
-        n = 4 if alpha.min() < 1 else 3
-        shade = (3 * shade + (n - 3) * alpha) / n
+    if mode == "trinary" and alpha.min() < 1:  # map_server takes alpha for a channel of colour
+        shade = (3 * shade + alpha) / 4
     occupied = shade if is_negative else 1 - shade
     unknown = alpha < (1 if mode == "scale" else 1e-9)
     if mode == "raw":
@@ -200,7 +199,7 @@ def _small(cells, n_cells, touching=ANY) -> np.ndarray:
 
 
 def _area(cells, resolution) -> BaseGeometry:
-    """Returns the area of cells (H, W) in metres. Those that touch at a corner are not connected."""
+    """Returns the area of cells (H, W) in metres. Touching at a corner does not connect them."""
     heights = np.pad(cells, 1).astype(np.float32)
     rings_of, offsets_of = contour_generator(z=heights, fill_type="OuterOffset").filled(0.5, 2)
     if len(rings_of) > MAX_PIECES:

@@ -35,7 +35,7 @@ class Drawing(NamedTuple):
     doors: list[BaseGeometry]
     outdoors: list[BaseGeometry]
     floor: BaseGeometry | None = None  # where agents walk; None: in rooms and doorways
-    leaks: bool = False  # a gap in the outer walls is closed
+    warnings: tuple[str, ...] = ()  # what was guessed
 
 
 class Notes(NamedTuple):
@@ -143,7 +143,7 @@ def geometry_of(
         raise ValueError("it has no room" + " indoors" * bool(drawing.outdoors))
     if not drawing.walls and drawing.floor is None:
         raise ValueError("it has no wall")
-    check_extent([*drawing.walls, *drawing.rooms])
+    check_extent([*drawing.walls, *rooms])
     solids = shapely.union_all(drawing.walls)
     openings, n_sealed = drawing.doors, 0
     if sealed and drawing.floor is None:
@@ -170,21 +170,21 @@ def geometry_of(
     walls = merged(shapely.union_all(edges, grid_size=GRID))
     if not 3 <= len(walls) <= MAX_WALLS:
         raise ValueError(f"it has {len(walls):,} walls, but 3 to {MAX_WALLS:,} are allowed")
-    shift = geometry.MARGIN - walls.min((0, 1))
+    inside = [polygons(room & floor if sealed else room - solids) for room in rooms]
+    corners = np.concatenate([walls.reshape(-1, 2), *map(shapely.get_coordinates, inside)])
+    shift = geometry.MARGIN - corners.min(0)
     walls = walls + shift
-    inside = [polygons(room.intersection(floor) if sealed else room) for room in rooms]
     inside = [[_moved(part, shift) for part in parts] for parts in inside if parts]
     doors = [line for door in openings if (line := _across(door, floor)) is not None]
     result = dotdict(
         id=0,
         walls=walls.astype(np.float32),
         lights=np.zeros((0, 2), np.float32),
-        masks=_masks(walls, inside),
+        masks=_masks(walls, inside, corners.max(0) + shift),
         res=geometry.RES,
         doors=(np.reshape(doors, (-1, 2, 2)) + shift).astype(np.float32),
     )
-    warnings = ["an opening leads outside; it is closed"] if drawing.leaks else []
-    return _reachable(result, inside, n_sealed, warnings)
+    return _reachable(result, inside, n_sealed, [*drawing.warnings])
 
 
 def _openings(drawing, solids, rooms) -> tuple[list[BaseGeometry], int]:
@@ -208,12 +208,12 @@ def _rings(polygon) -> list[np.ndarray]:
     return [np.array(line.coords[:-1]) for line in (polygon.exterior, *polygon.interiors)]
 
 
-def _masks(walls, rooms) -> np.ndarray:
+def _masks(walls, rooms, extent) -> np.ndarray:
     """Returns the masks of rooms, each a list of polygons. A room in pieces has them all."""
     pieces = [(number, part) for number, parts in enumerate(rooms, 1) for part in parts]
     if len(pieces) > geometry.MAX_ROOMS:
         raise ValueError(f"it has {len(pieces):,} rooms, but the limit is {geometry.MAX_ROOMS:,}")
-    cells = geometry.masks(walls, [_rings(part) for _, part in pieces])
+    cells = geometry.masks(walls, [_rings(part) for _, part in pieces], extent=extent)
     numbers = np.array([-1, 0, *(number for number, _ in pieces)], np.int16)
     return numbers[cells + 1]
 
@@ -337,16 +337,25 @@ def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Dr
     hull = filled(closed)
     bridged = closed.buffer(WIDEST / 2, **MITRE).buffer(-WIDEST / 2, **MITRE)
     wide = filled(bridged)
-    if leaks := wide.difference(hull).area > MIN_AREA:
+    warnings = []
+    if wide.difference(hull).area > MIN_AREA:
         hull = shapely.union_all([hull, wide])
+        gaps = [g for g in _lines(hull.boundary.difference(closed.buffer(GRID))) if g.length > 0.2]
+        widths = ", ".join(f"{gap.length:.1f}" for gap in gaps[:8])
+        warnings.append(f"{len(gaps)} openings lead outside, {widths} m wide; they are closed")
     inner = [door for door in doors if hull.covers(door.buffer(2 * JAMB, **MITRE))]
     gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in inner])
     floor = hull.difference(solids.difference(gaps))
-    parts = [part for part in polygons(floor) if part.area > 0.3]
+    pieces = polygons(floor)
+    parts = [part for part in pieces if part.area > 0.3]
     if not parts:
         raise ValueError(
             f"its walls enclose no floor: they leave gaps wider than {WIDEST:g} m, or fill it"
         )
     floor = shapely.union_all(parts)
     rooms = rooms_of(floor.difference(gaps))
-    return Drawing([solids.difference(gaps)], rooms, inner, [], floor, leaks)
+    if lost := len(pieces) - len(parts):
+        warnings.append(f"{lost} pieces of floor, each under 0.3 m2, are left out")
+    if outer := len(doors) - len(inner):
+        warnings.append(f"{outer} doors lead outside; they are closed")
+    return Drawing([solids.difference(gaps)], rooms, inner, [], floor, tuple(warnings))

@@ -146,7 +146,7 @@ def is_painted(paint: str, opacity: str) -> bool:
 class _Reader:
     """Collects the marked shapes of a document, in metres with y up."""
 
-    def __init__(self, root, scale, marks):
+    def __init__(self, root, scale, marks) -> None:
         self.scale, self.marks = np.array((scale, -scale)), marks
         self.shapes: dict[str, list[BaseGeometry]] = {key: [] for key in marks}
         self.unread: Counter[str] = Counter()
