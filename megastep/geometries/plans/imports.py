@@ -1,4 +1,4 @@
-"""Imports the floor plans of an archive or folder, in parallel processes."""
+"""Imports the floor plans of an archive or folder, in parallel processes, or one of one's own."""
 
 import contextlib
 import functools
@@ -55,6 +55,19 @@ def _home(drawing, sealed=True, tolerance=outlines.CURVED) -> tuple[dotdict, Not
         return g, notes
 
 
+@contextlib.contextmanager
+def _refused() -> Iterator[None]:
+    """Turns whatever a stranger's file makes libraries raise into a ValueError."""
+    try:
+        yield
+    except UNREADABLE as error:
+        raise ValueError(f"it cannot be read ({type(error).__name__}: {_line(error)})") from error
+
+
+def _line(error) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
 def first_home(options: Options, member: safe.Member) -> tuple[Drawing, dotdict]:
     """Returns the first floor of a file that is a home, and its geometry."""
     reader = READERS[options.source]
@@ -87,29 +100,6 @@ def read(options: Options, member: safe.Member) -> Plan:
     return Plan(name, [g for g, _ in made], [notes for _, notes in made])
 
 
-@contextlib.contextmanager
-def _refused() -> Iterator[None]:
-    """Turns whatever a stranger's file makes libraries raise into a ValueError."""
-    try:
-        yield
-    except UNREADABLE as error:
-        raise ValueError(f"it cannot be read ({type(error).__name__}: {_line(error)})") from error
-
-
-def _line(error) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__
-
-
-@contextlib.contextmanager
-def _killed() -> Iterator[None]:
-    """Turns the end of a process of a pool into a ValueError."""
-    try:
-        yield
-    except BrokenExecutor as error:
-        text = "a process was killed, perhaps as memory is short; nothing is imported"
-        raise ValueError(text) from error
-
-
 def _read_all(options, members) -> list[Plan]:
     return [read(options, member) for member in members]
 
@@ -130,7 +120,8 @@ def run(
         ValueError: if there is no file, it is damaged, or none of the files is a plan.
     """
     n_processes = loky.cpu_count() if processes is None else processes
-    members = safe.members(path, READERS[options.source].SUFFIX)
+    suffix = READERS[options.source].SUFFIX
+    members = safe.members(path, suffix)
     batches = iter(lambda: [*itertools.islice(members, BATCH)], [])
     plans: list[Plan] = []
     shown: list[safe.Member] = []
@@ -141,32 +132,29 @@ def run(
         shown.extend(good[: SHOWN - len(shown)])
         show(len(plans))
 
-    first = next(batches, [])
-    keep(first, _read_all(options, first))
-    if n_processes < 2:
-        for batch in batches:
-            keep(batch, _read_all(options, batch))
-    elif (second := next(batches, None)) is not None:
-        with _killed(), workers.terminal_signals_blocked(), workers.pool(n_processes) as pool:
-            submit = functools.partial(pool.submit, _read_all, options)
-            pending = [(second, submit(second))]
-            for batch in batches:
-                pending.append((batch, submit(batch)))
-                if len(pending) >= PENDING * n_processes:
-                    done, result = pending.pop(0)
+    # a small archive is read here, as processes take a while to start
+    for batch in itertools.islice(batches, 1 if n_processes > 1 else None):
+        keep(batch, _read_all(options, batch))
+    if (second := next(batches, None)) is not None:
+        try:
+            with workers.terminal_signals_blocked(), workers.pool(n_processes) as pool:
+                submit = functools.partial(pool.submit, _read_all, options)
+                pending = []
+                for batch in itertools.chain([second], batches):
+                    pending.append((batch, submit(batch)))
+                    if len(pending) >= PENDING * n_processes:
+                        done, result = pending.pop(0)
+                        keep(done, result.result())
+                for done, result in pending:
                     keep(done, result.result())
-            for done, result in pending:
-                keep(done, result.result())
-    if not plans:
-        raise ValueError(
-            f"{str(path)!r} has no floor plan: no file whose name ends in "
-            f"{READERS[options.source].SUFFIX}"
-        )
+        except BrokenExecutor as error:
+            text = "a process was killed, perhaps as memory is short; nothing is imported"
+            raise ValueError(text) from error
     if not any(plan.geometries for plan in plans):
-        raise ValueError(
-            f"{str(path)!r} has no floor plan that can be used; of {len(plans):,} files, "
-            f"{plans[0].name!r} is refused: {plans[0].refusal}"
-        )
+        reason = f"no file's name ends in {suffix}"
+        if plans:
+            reason = f"of {len(plans):,} files, {plans[0].name!r} is refused: {plans[0].refusal}"
+        raise ValueError(f"{str(path)!r} has no floor plan that can be used; {reason}")
     return sorted(plans, key=lambda plan: plan.name), shown
 
 
@@ -198,24 +186,3 @@ def own_map(path: Path, metres_per_pixel: float | None = None) -> Own:
         drawing, picture, warnings = maps.read(maps.load(path, metres_per_pixel))
     g, notes = _home(drawing)
     return Own(picture, g, warnings + notes.warnings)
-
-
-# ---- Statistics ----
-
-
-def statistics(g: dotdict) -> dict[str, float]:
-    """Returns the statistics of a geometry that reports compare."""
-    vectors = (g.walls[:, 1] - g.walls[:, 0]).astype(float)
-    lengths = np.hypot(*vectors.T)
-    is_straight = np.abs(vectors).min(1) <= np.sin(np.radians(1)) * lengths
-    distance, rooms, cell = checks.fine_rooms(g)
-    return {
-        "floor area of rooms, m²": float((rooms > 0).sum() * cell**2),
-        "rooms": int(g.masks.max()),
-        "walls": len(g.walls),
-        "length of walls, m": float(lengths.sum()),
-        "doors": len(g.get("doors", ())),
-        "longer side, m": float(np.ptp(g.walls, axis=(0, 1)).max()),
-        "straight walls, % of length": 100 * float(lengths[is_straight].sum() / lengths.sum()),
-        "floor nearer than 0.3 m to a wall, %": 100 * float((distance[rooms > 0] < 0.3).mean()),
-    }

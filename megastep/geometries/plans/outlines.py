@@ -63,11 +63,10 @@ def ring(points: np.ndarray) -> list[Polygon]:
 MAX_MEETINGS = 2_000_000  # of the boxes around the segments of a shape
 
 
-def check_meetings(lines: Sequence[BaseGeometry]) -> None:
-    """Raises ValueError for lines that cross so often that their area would take minutes."""
-    segments = np.concatenate(
-        [np.stack([c[:-1], c[1:]], 1) for c in (shapely.get_coordinates(line) for line in lines)]
-    )
+def check_meetings(shapes: Sequence[BaseGeometry]) -> None:
+    """Raises ValueError for shapes that cross so often that their area would take minutes."""
+    points, of_shape = shapely.get_coordinates(shapes, return_index=True)
+    segments = np.stack([points[:-1], points[1:]], 1)[of_shape[:-1] == of_shape[1:]]
     boxes = shapely.box(*segments.min(1).T, *segments.max(1).T)
     tree, n = shapely.STRtree(boxes), 0
     for start in range(0, len(boxes), 256):
@@ -331,6 +330,7 @@ def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Dr
     Raises:
         ValueError: if they enclose nothing.
     """
+    check_meetings([*walls, *doors])
     solids = shapely.union_all(walls)
     check_extent([solids])
     closed = shapely.union_all([solids, *(door.buffer(JAMB, **MITRE) for door in doors)])

@@ -44,21 +44,21 @@ def members(path: Path, suffix: str) -> Iterator[Member]:
         ValueError: there is no such file, or it is damaged or cut short.
     """
     if path.is_dir():
-        yield from _of_folder(path, suffix)
+        files = (file for file in sorted(path.rglob(f"*{suffix}")) if file.is_file())
+        yield from (of_file(file, file.relative_to(path).as_posix()) for file in files)
         return
     if not path.is_file():
         raise ValueError(f"there is no file or folder {str(path)!r}")
     with path.open("rb") as file:
         start = file.read(262 + 6)
-    kind = {b"PK\3\4": _of_zip, b"PK\5\6": _of_zip, b"\x1f\x8b": _of_tar}.get(start[:4])
-    kind = kind or (_of_tar if start[:2] == b"\x1f\x8b" or start[257:262] == b"ustar" else None)
-    if kind is None:
+    is_zip = start[:4] in (b"PK\3\4", b"PK\5\6")
+    if not is_zip and start[:2] != b"\x1f\x8b" and start[257:262] != b"ustar":
         if path.suffix.lower() in (".zip", ".gz", ".tgz", ".tar"):
             raise ValueError(f"{str(path)!r} is no archive, or the download is cut short")
         yield of_file(path, path.name)
         return
     try:
-        yield from kind(path, suffix)
+        yield from (_of_zip if is_zip else _of_tar)(path, suffix)
     except BROKEN as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         text = f"{str(path)!r} is damaged or cut short ({reason}); download it again"
@@ -70,67 +70,57 @@ def members(path: Path, suffix: str) -> Iterator[Member]:
 def of_file(path: Path, name: str) -> Member:
     """Returns a file as a member."""
     try:
-        if (size := path.stat().st_size) > MAX_BYTES:
-            return Member(name, None, _too_large(size))
-        return Member(name, path.read_bytes())
+        refusal = _refusal("", path.stat().st_size)
+        return Member(name, None if refusal else path.read_bytes(), refusal)
     except OSError as error:
         return Member(name, None, f"it cannot be read: {error.strerror}")
 
 
-def _of_folder(path, suffix) -> Iterator[Member]:
-    for file in sorted(path.rglob(f"*{suffix}")):
-        if file.is_file():
-            yield of_file(file, file.relative_to(path).as_posix())
-
-
-def _too_large(size) -> str:
-    return f"it has {size:,} bytes, but the limit is {MAX_BYTES:,}"
-
-
 def _refusal(name, size) -> str:
-    """Returns why an archive's file is refused, if it is."""
+    """Returns why a file is refused, if it is."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
     if ".." in parts or name.startswith(("/", "\\")) or ":" in name[:3]:
         return "its name leads out of the archive"
-    return _too_large(size) if size > MAX_BYTES else ""
+    return f"it has {size:,} bytes, but the limit is {MAX_BYTES:,}" if size > MAX_BYTES else ""
+
+
+def _check_archive(n_files, n_bytes) -> None:
+    if n_files > MAX_MEMBERS or n_bytes > MAX_TOTAL:
+        raise ValueError(f"has more than {MAX_MEMBERS:,} files or {MAX_TOTAL:,} bytes")
 
 
 def _of_zip(path, suffix) -> Iterator[Member]:
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
-        total = sum(entry.file_size for entry in entries)
-        if len(entries) > MAX_MEMBERS or total > MAX_TOTAL:
-            raise ValueError(f"has more than {MAX_MEMBERS:,} files or {MAX_TOTAL:,} bytes")
-        entries = [one for one in entries if one.filename.endswith(suffix) and not one.is_dir()]
+        _check_archive(len(entries), sum(entry.file_size for entry in entries))
         for entry in sorted(entries, key=lambda entry: entry.filename):
-            if refusal := _refusal(entry.filename, entry.file_size):
-                yield Member(entry.filename, None, refusal)
-            else:
-                try:
+            if entry.is_dir() or not entry.filename.endswith(suffix):
+                continue
+            content, refusal = None, _refusal(entry.filename, entry.file_size)
+            try:
+                if not refusal:
                     with archive.open(entry) as file:  # `read` of the archive unpacks all there is
-                        yield Member(entry.filename, file.read(entry.file_size))
-                except (*BROKEN, RuntimeError) as error:  # the last of encrypted ones
-                    yield Member(entry.filename, None, f"it is damaged or encrypted: {error}")
+                        content = file.read(entry.file_size)
+            except (*BROKEN, RuntimeError) as error:  # the last of encrypted ones
+                refusal = f"it is damaged or encrypted: {error}"
+            yield Member(entry.filename, content, refusal)
 
 
 def _of_tar(path, suffix) -> Iterator[Member]:
     total = 0
     with tarfile.open(path, "r|*") as archive:
-        for number, entry in enumerate(archive):
+        for number, entry in enumerate(archive, 1):
             total += entry.size
-            if number >= MAX_MEMBERS or total > MAX_TOTAL:
-                raise ValueError(f"has more than {MAX_MEMBERS:,} files or {MAX_TOTAL:,} bytes")
+            _check_archive(number, total)
             archive.members = []  # type: ignore[misc]  # which would keep all names
             if not entry.isfile() or not entry.name.endswith(suffix):
                 continue
-            if refusal := _refusal(entry.name, entry.size):
-                yield Member(entry.name, None, refusal)
-            else:
-                file = archive.extractfile(entry)
-                content = file.read() if file else b""
+            content, refusal = None, _refusal(entry.name, entry.size)
+            if not refusal and (file := archive.extractfile(entry)):
+                content = file.read()
                 if len(content) < entry.size:
                     raise EOFError("a file ends too early")
-                yield Member(entry.name, content)
+            yield Member(entry.name, content, refusal)
 
 
 # ---- XML ----
@@ -157,26 +147,21 @@ class _Builder(ElementTree.TreeBuilder):
         return super().end(tag)
 
 
-def xml(content: bytes) -> ElementTree.Element:
-    """Returns the root of an XML file. Raises ValueError for a DOCTYPE, an entity, or limits."""
+def svg(content: bytes) -> ElementTree.Element:
+    """Returns the root of an SVG. Raises ValueError for other files, entities, or limits."""
     if not content.strip():
         raise ValueError("it is empty")
-    parser = DefusedXMLParser(target=_Builder(), forbid_dtd=False)
+    parser = DefusedXMLParser(target=_Builder())
     try:
         parser.feed(content)
-        return parser.close()
+        root = parser.close()
     except DefusedXmlException as error:
         raise ValueError(
-            "it has a DOCTYPE or entities, which are refused; save it again as plain SVG, as "
-            "Inkscape does, if a program such as potrace wrote it"
+            "it declares entities, which are refused; open it in Inkscape and save it again as "
+            "plain SVG"
         ) from error
     except ElementTree.ParseError as error:
         raise ValueError(f"it is no XML, or cut short ({error})") from error
-
-
-def svg(content: bytes) -> ElementTree.Element:
-    """Returns the root of an SVG. Raises ValueError as `xml`, or for other XML."""
-    root = xml(content)
     if name_of(root) != "svg":
         raise ValueError(f"it is no SVG: its first element is {name_of(root)[:40]!r}")
     return root

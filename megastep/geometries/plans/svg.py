@@ -45,7 +45,9 @@ CURVE = np.linspace(0, 1, 49)  # points of a curve, which are simplified later
 CAPS = {"butt": "flat", "round": "round", "square": "square"}
 JOINS = {"round": "round", "bevel": "bevel"}
 MAX_PATHS = 2 << 20  # characters of all marked paths
-MAX_WORK = 3_000_000  # elements that are visited, each times the rules of style
+MAX_SHAPES = 20_000
+MAX_WORK = 2_000_000  # of elements, each of which costs as much as VISIT rules of style
+VISIT = 20
 
 
 class _Place(NamedTuple):
@@ -150,7 +152,7 @@ class _Reader:
         self.scale, self.marks = np.array((scale, -scale)), marks
         self.shapes: dict[str, list[BaseGeometry]] = {key: [] for key in marks}
         self.unread: Counter[str] = Counter()
-        self.n_characters = self.work = 0
+        self.n_characters = self.n_shapes = self.n_corners = self.work = 0
         self.ids, self.rules = {}, []
         for element in root.iter():
             self.ids.setdefault(element.get("id"), element)
@@ -195,7 +197,7 @@ class _Reader:
         name = safe.name_of(element)
         if name in SKIPPED and (name != "symbol" or box is None):
             return
-        self.work += 1 + len(self.rules)
+        self.work += VISIT + len(self.rules)
         if self.work > MAX_WORK or len(place.chain) > safe.MAX_DEPTH:
             raise ValueError("its elements, each times the rules of its style, are too many")
         ids = [f"#{element.get('id')}"] * ("id" in element.attrib)
@@ -295,6 +297,8 @@ class _Reader:
                 line = apply(place.matrix, line) if is_fixed else line
                 closes = is_closed and len(np.unique(line, axis=0)) > 2
                 drawn = shapely.LinearRing(line) if closes else shapely.LineString(line)
+                if len(line) > 200:
+                    outlines.check_meetings([drawn])
                 stroke = drawn.buffer(**pen)
                 if is_fixed:
                     shapes.append(shapely.transform(stroke, lambda p: p * self.scale))
@@ -303,6 +307,12 @@ class _Reader:
         if place.clip is not None:
             shapes = [shape & place.clip for shape in shapes]
         self.shapes[place.kind] += [shape for shape in shapes if not shape.is_empty]
+        self.n_shapes += 1
+        self.n_corners += int(shapely.get_num_coordinates(shapes).sum())
+        if self.n_shapes > MAX_SHAPES or self.n_corners > outlines.MAX_CORNERS:
+            raise ValueError(
+                f"it marks more than {MAX_SHAPES:,} shapes, or {outlines.MAX_CORNERS:,} corners"
+            )
 
     def _outline(self, name, own, of) -> list[tuple[np.ndarray, bool]]:
         """Returns the lines (P, 2) of a shape, and whether each is closed; none for a group."""
