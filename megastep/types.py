@@ -21,7 +21,6 @@ __all__ = [
     "Space",
     "Tree",
     "World",
-    "is_stored",
     "n_lanes",
     "optional",
     "takes_masks",
@@ -191,17 +190,3 @@ class PolicyLike(Protocol):
         the most likely.
         """
         ...
-
-
-def is_stored(tensor: torch.Tensor) -> bool:
-    """Returns whether a tensor has memory and lies inside its storage; PyTorch crashes else."""
-    import torch
-
-    if tensor.layout is not torch.strided:
-        return False
-    if tensor.is_contiguous():
-        n = tensor.numel()
-    else:
-        n = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride()))
-    n_bytes = (tensor.storage_offset() + n) * tensor.itemsize
-    return n_bytes <= tensor.untyped_storage().nbytes() or not tensor.numel()

@@ -1,6 +1,6 @@
 """Trains with the plain form of fused operations, to tell a kernel's fault from a recipe's.
 
-    python scripts/train_plain.py lstm,joint_heads experiment=deathmatch samples=1e8 seed=1
+    python scripts/train_plain.py lstm,critic experiment=deathmatch samples=1e8 seed=1
     python scripts/train_plain.py all experiment=deathmatch samples=1e8 seed=1
 
 The first word names modules of `megastep.agents` whose operations are plain, separated by commas,

@@ -19,9 +19,8 @@ class CudaGraphUpdate:
     """Calls an update function, on a GPU through a CUDA graph, or several with the communication of
     ranks between them.
 
-    The first updates run eagerly, on the stream that captures afterwards. A graph reads the memory
-    of the rollout it was captured with, so another rollout object causes another capture: pass the
-    same object every time.
+    The first updates run eagerly. A graph reads the memory of the rollout it was captured with, so
+    another rollout object causes another capture: pass the same object every time.
 
     Args:
         update: a function of a rollout that returns tensors () by name, if any, and never
@@ -29,9 +28,6 @@ class CudaGraphUpdate:
         device: device of the policy; need not be the current GPU.
         graph: whether to capture. A CPU always runs eagerly.
         generators: the generators that `update` draws from.
-
-    Attributes:
-        graph: the captured graph, None before the capture.
     """
 
     def __init__(
@@ -46,9 +42,7 @@ class CudaGraphUpdate:
         self.restart()
 
     def restart(self) -> None:
-        """Discards the graph. The next updates warm up and capture again. Call it after replacing
-        generators.
-        """
+        """Discards the graph. The next updates warm up and capture again."""
         self.graph: SegmentedGraph | None = None
         self._rollout, self._names = None, []
         self._n_warm_ups_left = _N_WARM_UPS
@@ -58,19 +52,15 @@ class CudaGraphUpdate:
         if self.stream is None:
             return self.update(rollout)
         if self.graph is None or self._rollout is not rollout:
-            return self._first(rollout)
+            with torch.cuda.device(self.device):
+                if self._n_warm_ups_left:
+                    self._n_warm_ups_left -= 1
+                    return self._warm_up(rollout)
+                generators = [generator.on(self.device) for generator in self.generators]
+                self.graph = SegmentedGraph(lambda: self._packed(rollout), self.stream, generators)
+                self._rollout = rollout
+                return self._replayed(self.graph)
         return self._replayed(self.graph)
-
-    def _first(self, rollout) -> Metrics:
-        with torch.cuda.device(self.device):
-            if self._n_warm_ups_left:
-                self._n_warm_ups_left -= 1
-                return self._warm_up(rollout)
-            assert self.stream is not None
-            generators = [generator.on(self.device) for generator in self.generators]
-            self.graph = SegmentedGraph(lambda: self._packed(rollout), self.stream, generators)
-            self._rollout = rollout
-            return self._replayed(self.graph)
 
     def _replayed(self, graph) -> Metrics:
         graph.replay()

@@ -1,14 +1,20 @@
 """The gradient steps of an update. Non-finite steps are skipped and counted."""
 
-from collections.abc import Iterable, Mapping
-from types import MappingProxyType
+import functools
+from collections.abc import Iterable
 
 import torch
 
-from megastep.agents.algorithms.adam import Adam, has_kernels, squared_norms
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
-from megastep.agents.algorithms.optimizers import make_optimizer
+from megastep.agents.algorithms.optimizers import (
+    NAMES,
+    Adam,
+    Factors,
+    Imported,
+    has_kernels,
+    squared_norms,
+)
 from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
 from megastep.agents.networks.fused import fused
 from megastep.agents.types import StateDict
@@ -16,7 +22,6 @@ from megastep.kernels.build.launch import Blocks, launch
 
 #: Bounds of a step size that follows the KL divergence, those of rsl_rl.
 ADAPTIVE_LR = 1e-5, 1e-2
-_NONE = MappingProxyType({})
 
 
 def _take_on_gpu(steps, is_enabled=True) -> torch.Tensor:
@@ -65,12 +70,9 @@ class GradientSteps:
         parameters: parameters to optimise.
         lr: step size, a number, or a tensor () on the device, which is changed in place.
         max_grad_norm: longer gradients are scaled down to this norm.
-        device: device of the parameters.
-        optimizer: its name, see `make_optimizer`.
+        optimizer: one of `optimizers.NAMES`, or the import path of a class like those of
+            `torch.optim`.
         lr_factors, weight_decays: as for `Adam`.
-
-    Attributes:
-        check: the first non-finite number, and how many updates were skipped in a row.
     """
 
     def __init__(
@@ -80,30 +82,24 @@ class GradientSteps:
         max_grad_norm: float,
         device: torch.device,
         optimizer: str = "adam",
-        lr_factors: Mapping[torch.nn.Parameter, float] = _NONE,
-        weight_decays: Mapping[torch.nn.Parameter, float] = _NONE,
+        lr_factors: Factors | None = None,
+        weight_decays: Factors | None = None,
     ):
         self.max_grad_norm = max_grad_norm
         self.lr = torch.as_tensor(lr, device=device)
-        self.optimizer = make_optimizer(optimizer, parameters, self.lr, lr_factors, weight_decays)
+        make = Adam if optimizer in NAMES else functools.partial(Imported, optimizer)
+        factors: dict = dict(lr_factors=lr_factors or {}, weight_decays=weight_decays or {})
+        self.optimizer: Adam | Imported = make(parameters, self.lr, **factors)
         self.check = NonFiniteCheck(device)
         # of the update in progress; totals are those of metrics, then steps taken and skipped
         self.is_finite: torch.Tensor | None = None
         self.totals: torch.Tensor | None = None
         self.metrics: dict[str, torch.Tensor] = {}
 
-    def set_lr(self, lr: float) -> None:
-        """Changes the step size, also for a captured update."""
-        self.lr.fill_(lr)
-
     def follow_kl(self, kl: torch.Tensor, desired: float) -> None:
-        """Changes the step size so that updates have about a desired KL divergence: where it is
-        above twice as much, the step size is divided by 1.5; below half, multiplied (rsl_rl, Rudin
-        et al. 2022). It stays between `ADAPTIVE_LR`.
-
-        Args:
-            kl: (), of a minibatch, in nats.
-            desired: the one to have.
+        """Changes the step size so that minibatches have about a desired KL divergence, in nats:
+        where it is above twice as much, the step size is divided by 1.5; below half, multiplied
+        (rsl_rl, Rudin et al. 2022). It stays between `ADAPTIVE_LR`.
         """
         least, most = ADAPTIVE_LR
         lower, higher = (self.lr / 1.5).clamp(min=least), (self.lr * 1.5).clamp(max=most)
@@ -115,15 +111,8 @@ class GradientSteps:
     def begin(
         self, floats: dict[str, torch.Tensor], *moments: Moments
     ) -> tuple[torch.Tensor, list[Moments]]:
-        """Begins an update.
-
-        Args:
-            floats: the tensors to learn from, as for `NonFiniteCheck`.
-            moments: statistics to pool over the ranks in the same operation.
-
-        Returns:
-            () bool, whether `floats` are all finite, on every rank: if not, no step of this update
-            is taken. And the moments of all ranks, as `pool_moments` returns them.
+        """Begins an update. Returns whether `floats`, the tensors to learn from, are all finite on
+        every rank, () bool: if not, no step of this update is taken. And the moments of all ranks.
         """
         self.is_finite, pooled = pool_with_condition(self.check(floats), *moments)
         self.totals = None
@@ -132,15 +121,8 @@ class GradientSteps:
     def backward(
         self, loss: torch.Tensor, metrics: dict[str, torch.Tensor], n_valid: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        """Computes the gradient of a loss ().
-
-        Args:
-            loss: () tensor, a mean over the valid transitions of a minibatch.
-            metrics: tensors () by name, which `end` averages over the steps taken.
-            n_valid: () number of those transitions.
-
-        Returns:
-            The metrics of all ranks.
+        """Computes the gradient of a loss (), a mean over the `n_valid` () valid transitions of a
+        minibatch. Returns the metrics () of all ranks, which `end` averages over the steps taken.
         """
         self.optimizer.zero_grad()
         loss.backward()
@@ -151,13 +133,8 @@ class GradientSteps:
 
     @fused(_take_on_gpu, _fits)
     def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
-        """Takes one step down the gradient. Without a valid transition, it is not taken.
-
-        Args:
-            is_enabled: () bool. A step that is not enabled is neither taken nor counted as skipped.
-
-        Returns:
-            () bool, whether the step was taken.
+        """Takes one step down the gradient, and returns whether it did, () bool. Without a valid
+        transition it is not taken; if not enabled, () bool, not counted as skipped either.
         """
         assert self.is_finite is not None
         grad_norm = self.optimizer.grad_norm()
@@ -172,10 +149,8 @@ class GradientSteps:
         return is_taken
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Ends the update. Returns the means of the metrics over the steps taken, and
-        `skipped_steps`, the number of steps skipped because they were not finite.
-
-        Without a step, the means are NaN: a trainer leaves them out of its report.
+        """Ends the update. Returns the means of the metrics over the steps taken, NaN without one,
+        and `skipped_steps`, the number of steps skipped because they were not finite.
         """
         assert self.totals is not None
         n_taken, n_skipped = self.totals[-2], self.totals[-1]

@@ -11,14 +11,12 @@ needs the attributes of `megastep.agents.types.Learner`, and is used like this:
 
 Rules:
 
-- `collect()` returns a `megastep.agents.types.RolloutLike`; `storage.rollout.Rollout` is one. The
-  collector owns the rollout and may return the same object every time. `collect.rollout` exists
-  before the first call, too.
+- `collect()` returns a `megastep.agents.types.RolloutLike`; `storage.rollout.Rollout` is one. It
+  may return the same object every time. `collect.rollout` exists before the first call, too.
 - `collect()` and `update()` do not synchronise host and device.
 - A learner with a `check`, a `nonfinite.NonFiniteCheck`, passes `rollout.floats()` to it in every
-  `update()` and skips a rollout with non-finite numbers. The trainer reads the check and stops
-  after many skipped updates in a row. Without a check, a run stops when it is about to save weights
-  that are not finite.
+  `update()` and skips a rollout with non-finite numbers. The trainer stops after many skipped
+  updates in a row. Without a check, a run stops before it saves weights that are not finite.
 - Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. An environment
   with opponents has an attribute `learners`, a bool per lane; only those lanes need to be stored.
 - `collector(env)` resets the environment before it returns: a run then gives the lanes random ages.
@@ -29,12 +27,10 @@ Rules:
   if updates should be captured as a CUDA graph.
 - A replay buffer belongs to the learner or to its collector.
 - `megastep.agents.types.LearnerOptions` and `CollectorOptions` list what is optional.
-  `bytes_per_env(env)` and, with a replay buffer, `replay_size(env)` are what a run checks its
-  memory with before it starts.
 
 Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_rollout`,
-`storage.rollout.bytes_per_step`, `storage.collector.Collector`, `gradient_steps.GradientSteps`,
-`cuda_graph.CudaGraphUpdate`, `masked_stats` and `returns`.
+`storage.collector.Collector`, `gradient_steps.GradientSteps`, `cuda_graph.CudaGraphUpdate`,
+`masked_stats` and `returns`.
 """
 
 import functools
@@ -97,10 +93,8 @@ class GradientLearner:
     """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
 
     A subclass adds its settings, `collector`, `bytes_per_env` and `_update`, and sets
-    `n_minibatches` if it splits lanes into minibatches.
-
-    A subclass of one of the learners adds a loss of its own, such as that of an auxiliary head, by
-    `extra_loss` and, for weights that acting does not need, `extra_parameters`.
+    `n_minibatches` if it splits lanes into minibatches. A subclass of one of the learners adds a
+    loss of its own by `extra_loss` and, for weights that acting does not need, `extra_parameters`.
 
     Args:
         policy: the policy to improve, in place.
@@ -109,8 +103,7 @@ class GradientLearner:
         graph: on a GPU, captures updates as a CUDA graph.
         seed: seed of the learner's own generator.
         critic_lr: step size of the critic's parameters, which falls with `lr`. None: `lr`.
-        weight_decay: weight decay, of parameters of two or more axes whose name contains
-            "weight": those of layers, but no biases and no standard deviations.
+        weight_decay: of the layers' weights, not of biases.
         optimizer: a name in `optimizers.NAMES`, or the import path of a class.
         warmup: updates over which the step size rises to `lr`.
         desired_kl: KL divergence of a minibatch that the step size follows; None: it does not.
@@ -126,7 +119,6 @@ class GradientLearner:
     Attributes:
         coefficients: the `Coefficients` of the loss, and `lr`.
         steps: the `GradientSteps` of the policy's parameters.
-        check: finds non-finite numbers in rollouts and counts skipped updates.
         generator: the `SeededGenerator` of all random numbers in an update.
     """
 
@@ -179,13 +171,8 @@ class GradientLearner:
         self.cuda_graph = CudaGraphUpdate(self._update, self.device, graph, (self.generator,))
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
-        """Learns from a rollout.
-
-        Returns metrics as tensors () on the device, averaged over the gradient steps.
-        `loss/skipped_steps` counts the steps that were skipped because of non-finite numbers.
-
-        Raises:
-            ValueError: if there are fewer lanes than minibatches.
+        """Learns from a rollout. Returns metrics as tensors () on the device, averaged over the
+        gradient steps. ValueError if there are fewer lanes than minibatches.
         """
         if rollout.n_lanes < self.n_minibatches:
             raise ValueError(
@@ -212,9 +199,8 @@ class GradientLearner:
     def extra_parameters(self) -> Iterable[torch.nn.Parameter]:
         """Returns parameters that only `extra_loss` needs, which are none here.
 
-        Called once, before the optimizer is made, with a seed that all ranks share; they are moved
-        to the policy's device. They train with the policy's, and are part of the learner's state:
-        checkpoints have them, while acting, exporting and `init` do without.
+        Called once, before the optimizer is made, with a seed that all ranks share. They train with
+        the policy's, and are part of the learner's state: acting, exporting and `init` do without.
         """
         return ()
 
@@ -224,7 +210,7 @@ class GradientLearner:
         """Returns a loss () that is added to the learner's, and metrics () by name.
 
         Here it is the error of predicting privileged observations, if the critic is asymmetric, and
-        0 else; `super().extra_loss(features, batch)` keeps it.
+        0 else.
 
         Args:
             features: (T, M, width) of the actor, from which gradients flow into it.
@@ -261,12 +247,9 @@ class GradientLearner:
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Returns `extra_loss`, checked, and its metrics without gradients.
 
-        Args:
-            features, batch: as for `extra_loss`.
-            taken: names of the learner's own metrics.
-
         Raises:
-            UserError: it fails, is not a scalar, has no gradient, or the name of another metric.
+            UserError: it fails, is not a scalar, teaches nothing, or has the name of another
+                metric, one of those `taken`.
         """
         name = f"{type(self).__name__}.extra_loss"
         try:
@@ -275,41 +258,33 @@ class GradientLearner:
             problem = f"{type(error).__name__}: {shortened(error, 300)}"
             raise UserError(f"{name} failed ({problem}); it returns (loss, metrics)") from error
         for key, value in {"loss": extra, **own}.items():
-            if not isinstance(value, torch.Tensor) or value.shape != ():
-                given = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
+            given = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
+            if given != ():
                 raise UserError(
                     f"{name} must return tensors of shape (), such as means over batch.valid, but "
                     f"{key} is {given}"
                 )
             if key in taken:
                 raise UserError(f"{name}: the learner has a metric {key} itself; use another name")
-        if self.has_extra_loss:
-            self._check_gradients(name, extra)
+        if self.has_extra_loss and not self._is_checked:
+            self._is_checked = True
+            targets = self.extra or [p for p in self.policy.parameters() if p.requires_grad]
+            options: dict = dict(retain_graph=True, allow_unused=True)
+            if not extra.requires_grad or not any(
+                gradient is not None for gradient in torch.autograd.grad(extra, targets, **options)
+            ):
+                what = "of extra_parameters()" if self.extra else "of the policy"
+                raise UserError(
+                    f"{name} touches no parameter {what}, so it teaches nothing: compute it from "
+                    "features and from your parameters, without detach() or no_grad"
+                )
         return extra, {key: value.detach() for key, value in own.items()}
 
-    def _check_gradients(self, name, extra) -> None:
-        """Checks once that a loss depends on what it is to train."""
-        if self._is_checked:
-            return
-        self._is_checked = True
-        targets = self.extra or [p for p in self.policy.parameters() if p.requires_grad]
-        gradients = (None,)
-        if extra.requires_grad:
-            gradients = torch.autograd.grad(
-                extra, targets, retain_graph=True, allow_unused=True, materialize_grads=False
-            )
-        if all(gradient is None for gradient in gradients):
-            what = "of extra_parameters()" if self.extra else "of the policy"
-            raise UserError(
-                f"{name} touches no parameter {what}, so it teaches nothing: compute it from "
-                "features and from your parameters, without detach() or no_grad"
-            )
+    # ---- State ----
 
     def state_dict(self) -> StateDict:
         """Returns optimizer, learning rate, coefficients and generators as plain tensors and
-        numbers.
-
-        Does not include the policy's weights, rollouts or what a replay buffer holds.
+        numbers, without the policy's weights, rollouts and what a replay buffer holds.
         """
         return dict(
             learner=type(self).__name__,
@@ -322,9 +297,8 @@ class GradientLearner:
         )
 
     def copy_from(self, other: "GradientLearner") -> None:
-        """Takes over what another learner of the same class and sizes has learnt: its policy's
-        weights and statistics, and the state of its optimizer. In place, so that captured updates
-        stay; generators and rollouts stay this one's.
+        """Takes over what another learner of the same class and sizes has learnt, the policy's
+        weights too, in place. Generators and rollouts stay this one's.
         """
         own, others = self.policy.state_dict(), other.policy.state_dict()
         copy_all((own[name], others[name]) for name in own)
@@ -358,15 +332,10 @@ class GradientLearner:
             )
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Continues from a `state_dict`, which may come from another device.
-
-        Raises:
-            ValueError: if the state belongs to another class of learner, or to a version of
-                megastep that normalised observations and returns otherwise.
-        """
+        """Continues from a `state_dict`, which may come from another device; see `check_state`."""
         self.check_state(state)
         self.steps.load_state_dict(state)
-        saved = state.get("coefficients", {})  # which earlier versions could not change
+        saved = state["coefficients"]
         self.coefficients.set(**{k: v for k, v in saved.items() if k in self.coefficients.values})
         with torch.no_grad():
             for parameter, saved in zip(self.extra, state.get("extra", []), strict=True):

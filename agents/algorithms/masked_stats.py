@@ -6,7 +6,7 @@
 import torch
 
 from megastep.agents.distributed.pooling import pool_moments
-from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
+from megastep.agents.networks.running_norm import masked_moments, normalise_masked
 
 
 def masked_mean(x: torch.Tensor, valid: torch.Tensor, axis: int | None = None) -> torch.Tensor:
@@ -21,9 +21,7 @@ def pooled_mean(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
 
 
 def pooled_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Returns x minus its mean over all ranks, divided by its standard deviation there; 0 where
-    invalid.
-    """
+    """Returns x minus its mean over all ranks, divided by its deviation; 0 where invalid."""
     (moments,) = pool_moments(*masked_moments(valid, x))
     return normalise_masked(x, valid, moments)
 
@@ -31,10 +29,8 @@ def pooled_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
 def explained_variance(
     value: torch.Tensor, targets: torch.Tensor, valid: torch.Tensor
 ) -> torch.Tensor:
-    """Returns the fraction of the targets' variance that a value explains.
-
-    1 is a perfect prediction up to a constant, 0 is as good as predicting the mean, negative is
-    worse than that.
+    """Returns the fraction of the targets' variance that a value explains: 1 is a perfect
+    prediction up to a constant, 0 is as good as predicting the mean, negative is worse.
     """
     error, spread = targets - value, targets - masked_mean(targets, valid)
     error = error - masked_mean(error, valid)
@@ -43,9 +39,8 @@ def explained_variance(
 
 
 def effective_sample_size(weights: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Returns the effective sample size (Kish 1965) as a fraction of the number of valid entries.
-
-    1 if all weights (>= 0) are equal, 1/n if one of n has all the weight, 0 if none is valid.
+    """Returns the effective sample size (Kish 1965) as a fraction of the number of valid entries: 1
+    if all weights (>= 0) are equal, 1/n if one of n has all the weight, 0 if none is valid.
     """
     mean, square = masked_mean(weights, valid), masked_mean(weights.square(), valid)
     return mean.square() / square.clamp(min=torch.finfo(square.dtype).tiny)

@@ -24,11 +24,7 @@ MAX_NAMED = 8
 
 class NonFiniteError(RuntimeError):
     """Training cannot continue because of a NaN or an infinity. The message names the first one and
-    the likely cure.
-
-    Args:
-        message: the error.
-        is_from_env: True if the environment produced them; the policy is intact then.
+    the likely cure. The policy is intact if it `is_from_env`.
     """
 
     def __init__(self, message: str, is_from_env: bool = False):
@@ -72,18 +68,10 @@ class NonFiniteValue:
         return self.name.split(".")[0] in ("obs", "privileged", "reward")
 
     def in_env(self, lanes: Sequence[int], n_agents: int) -> "NonFiniteValue":
-        """Returns a copy that numbers lanes as the environment does instead of as the rollout does.
-
-        Args:
-            lanes: the environment's lane for each lane of the rollout.
-            n_agents: lanes per environment.
-        """
-        return dataclasses.replace(
-            self,
-            lane=int(lanes[self.lane]),
-            others=tuple(other.in_env(lanes, n_agents) for other in self.others),
-            n_agents=n_agents,
-        )
+        """Returns a copy with the environment's lane for each lane of the rollout."""
+        others = tuple(other.in_env(lanes, n_agents) for other in self.others)
+        lane = int(lanes[self.lane])
+        return dataclasses.replace(self, lane=lane, others=others, n_agents=n_agents)
 
     def __str__(self) -> str:
         texts = [
@@ -100,9 +88,6 @@ class NonFiniteCheck:
     """Checks rollouts for non-finite numbers and counts skipped updates.
 
     Only `read` synchronises. All else works in place on fixed shapes, so CUDA graphs can record it.
-
-    Args:
-        device: device of the rollouts.
     """
 
     def __init__(self, device: torch.device):
@@ -117,13 +102,11 @@ class NonFiniteCheck:
 
     @fused(lambda *inputs: _check_on_gpu(*inputs), lambda self, floats: _are_readable(floats))
     def __call__(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Checks a rollout. Keeps the first non-finite number of each lane until `read`.
+        """Returns whether all numbers of a rollout are finite and within `LIMIT`, () bool. Keeps
+        the first other one of each lane until `read`.
 
         Args:
             floats: tensors by name, each (T, B, ...) or (T+1, B, ...), at least one of T.
-
-        Returns:
-            () bool on the device, true if all numbers are finite and within `LIMIT`.
         """
         count, first = self.record[:1], self.record[2:]
         count += 1
@@ -142,11 +125,8 @@ class NonFiniteCheck:
         return n_bad == 0
 
     def state_dict(self) -> torch.Tensor:
-        """Returns (2,) float64: rollouts checked, and updates skipped in a row.
-
-        Omits unread detections, because when they are read depends on wall-clock time.
-        """
-        return self.record[:2].clone()
+        """Returns (2,) float64: rollouts checked, and updates skipped in a row."""
+        return self.record[:2].clone()  # when the rest is read depends on wall-clock time
 
     def load_state_dict(self, counts: torch.Tensor) -> None:
         """Restores a `state_dict`."""
@@ -157,14 +137,9 @@ class NonFiniteCheck:
         self.record[1].add_(1).mul_(is_skipped)
 
     def read(self, floats: dict[str, torch.Tensor]) -> tuple[NonFiniteValue | None, int]:
-        """Reads and clears the detections since the last call. Synchronises.
-
-        Args:
-            floats: tensors of any rollout; only names and shapes are used.
-
-        Returns:
-            The first non-finite number, with those of other lanes, or None; and the number of
-            updates skipped in a row.
+        """Returns and clears the first non-finite number since the last call, with those of other
+        lanes, or None; and the number of updates skipped in a row. Synchronises. Only names and
+        shapes of `floats` are used, those of any rollout.
         """
         _, n_skipped, rollout, n_bad, *numbers = self.record.tolist()
         self.record[2:].zero_()
@@ -180,7 +155,6 @@ class NonFiniteCheck:
 
 
 def _are_readable(floats) -> bool:
-    """Returns True if kernels can check these tensors."""
     tensors = list(floats.values())
     return len(tensors) <= LIBRARY.constants["CHECKED_TENSORS"] and all(
         tensor.is_cuda
@@ -211,13 +185,12 @@ def _check_on_gpu(check, floats) -> torch.Tensor:
         )
         # one more block than full ones, for the numbers after the last whole word
         n_blocks += tensor.numel() * tensor.element_size() // block_bytes + 1
-    shared = dict(tensors=b"".join(packed), first_rows=first_rows, n_tensors=len(tensors))
-    shared |= dict(n_steps=n_steps, n_lanes=n_lanes)
+    fields = dict(tensors=b"".join(packed), first_rows=first_rows, n_tensors=len(tensors))
+    fields |= dict(n_steps=n_steps, n_lanes=n_lanes)
     blocks = Blocks(n_blocks, threads=constants["CHECKED_THREADS"])
-    launch(LIBRARY, "find_bad", device, blocks, **shared, limit=LIMIT)
-    results = dict(record=check.record, is_finite=is_finite, n_named=MAX_NAMED)
-    blocks = Blocks(1, threads=constants["RECORD_THREADS"])
-    launch(LIBRARY, "record", device, blocks, **shared, **results)
+    launch(LIBRARY, "find_bad", device, blocks, **fields, limit=LIMIT)
+    fields |= dict(record=check.record, is_finite=is_finite, n_named=MAX_NAMED)
+    launch(LIBRARY, "record", device, Blocks(1, threads=constants["RECORD_THREADS"]), **fields)
     return is_finite
 
 
@@ -258,10 +231,7 @@ def lane_name(lane: int, n_agents: int) -> str:
 
 
 def nonfinite_leaf(tree: Tree) -> str | None:
-    """Returns the dotted path of the first non-finite tensor in nested dicts and lists, or None.
-
-    Ignores plain numbers, which may well be infinite, such as an initial best loss.
-    """
+    """Returns the dotted path of the first non-finite tensor in nested dicts and lists, or None."""
     for path, leaf in tree_leaves_with_path(tree):
         if isinstance(leaf, torch.Tensor) and not leaf.isfinite().all():
             return ".".join(str(getattr(part, "key", getattr(part, "idx", part))) for part in path)

@@ -1,40 +1,59 @@
-"""Optimizers by name: Adam, plain gradient descent, and those of other packages."""
+"""Optimizers by name: Adam, and those of other packages.
 
-from collections.abc import Callable, Iterable, Mapping
+Adam is PyTorch's fused operation on a CPU, on a GPU one kernel for all parameters that also clips
+their gradients. PyTorch's takes ten times as long there for networks this small, and
+`torch.optim.Adam` imports PyTorch's compiler first, which takes more than a second.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
 
 import torch
 
-from megastep.agents.algorithms.adam import Adam
+from megastep.agents.algorithms.kernels import LIBRARY
+from megastep.agents.networks.fused import fused, is_plain_on_gpu
 from megastep.agents.types import StateDict
 from megastep.imports import import_object
+from megastep.kernels.build.launch import Blocks, launch
 
 #: Adam's weight decay is decoupled, so that with one it is AdamW.
-NAMES = ("adam", "adamw", "sgd")
-_Factors = Mapping[torch.nn.Parameter, float]
+NAMES = ("adam", "adamw")
+Factors = Mapping[torch.nn.Parameter, float]
+_MAX_ROWS = LIBRARY.constants["ADAM_ROWS"]
+_THREADS = LIBRARY.constants["ADAM_THREADS"]
+_NONE = MappingProxyType({})
 
 
-def make_optimizer(
-    name: str,
-    parameters: Iterable[torch.nn.Parameter],
-    lr: torch.Tensor,
-    lr_factors: _Factors,
-    weight_decays: _Factors,
-) -> "Adam | SGD | Imported":
-    """Returns an optimizer; arguments are those of `Adam`.
+class _Optimizer:
+    def __init__(self, parameters: Iterable[torch.nn.Parameter], lr: torch.Tensor):
+        self.parameters, self.lr = list(parameters), lr
+        self.n_steps: torch.Tensor = torch.zeros((), device=lr.device)
+
+    def grad_norm(self) -> torch.Tensor:
+        """Returns the norm () of all gradients together."""
+        gradients = [p.grad for p in self.parameters if p.grad is not None]
+        return torch.nn.utils.get_total_norm(gradients)
+
+    def zero_grad(self) -> None:
+        """Frees the gradients."""
+        for p in self.parameters:
+            p.grad = None
+
+
+class Adam(_Optimizer):
+    """Adam (Kingma and Ba 2015), with decoupled weight decay (AdamW, Loshchilov and Hutter 2019).
+
+    A step skips parameters without a gradient: frozen or unused ones. All share one count of steps.
 
     Args:
-        name: one of `NAMES`, or the import path of a class like those of `torch.optim`.
+        parameters: parameters to optimise.
+        lr: step size, a tensor () on their device that may be changed in place.
+        betas: decay of the running means of gradients and of squared gradients.
+        eps: added to the denominator.
+        lr_factors: factors of `lr` for some of the parameters; 1 for the others.
+        weight_decays: weight decays of some of the parameters, from each of which a step also
+            subtracts step size x decay x parameter; 0 for the others.
     """
-    settings = parameters, lr, lr_factors, weight_decays
-    if name == "sgd":
-        return SGD(*settings)
-    if name in NAMES:
-        return Adam(parameters, lr, lr_factors=lr_factors, weight_decays=weight_decays)
-    return Imported(*settings, import_object(name), name)
-
-
-class SGD:
-    """Gradient descent without momentum, as a few operations that a CUDA graph can repeat."""
 
     capturable = True
 
@@ -42,71 +61,94 @@ class SGD:
         self,
         parameters: Iterable[torch.nn.Parameter],
         lr: torch.Tensor,
-        lr_factors: _Factors,
-        weight_decays: _Factors,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-5,
+        lr_factors: Factors = _NONE,
+        weight_decays: Factors = _NONE,
     ):
-        self.parameters, self.lr = list(parameters), lr
-        self.lr_factors, self.weight_decays = lr_factors, weight_decays
-        self.n_steps = torch.zeros((), device=lr.device)
-
-    def grad_norm(self) -> torch.Tensor:
-        """Returns the norm () of all gradients together."""
-        return torch.nn.utils.get_total_norm(_gradients(self.parameters))
+        super().__init__(parameters, lr)
+        self.betas, self.eps = betas, eps
+        self.means = [torch.zeros_like(p) for p in self.parameters]
+        self.squares = [torch.zeros_like(p) for p in self.parameters]
+        # those of one step size and one decay are updated by one operation
+        self.groups: dict[tuple[float, float], list] = {}
+        for row in zip(self.parameters, self.means, self.squares, strict=True):
+            key = lr_factors.get(row[0], 1.0), weight_decays.get(row[0], 0.0)
+            self.groups.setdefault(key, []).append(row)
 
     @torch.no_grad()
+    @fused(lambda self: squared_norms(self).sum().sqrt(), lambda self: has_kernels(self))
+    def grad_norm(self) -> torch.Tensor:
+        """Returns the norm () of all gradients together."""
+        return super().grad_norm()
+
     def step(
         self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0
     ) -> None:
-        """Takes one step, as `Adam.step` does."""
+        """Takes one step.
+
+        Args:
+            is_taken: () bool on the device. If false, nothing changes.
+            grad_norm: (), of `grad_norm`. If given, gradients are clipped to `max_norm`.
+            max_norm: longer gradients are scaled down to this norm.
+        """
         self.n_steps += is_taken
+        self.update(is_taken, grad_norm, max_norm)
+
+    @torch.no_grad()
+    @fused(lambda *inputs: _update_on_gpu(*inputs), lambda self, *_: has_kernels(self))
+    def update(
+        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None, max_norm: float
+    ) -> None:
+        """Takes a `step` that `n_steps` counts already."""
         if grad_norm is not None:
             torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
-        for p in self.parameters:
-            if p.grad is None:
-                continue
-            change = p.grad + self.weight_decays.get(p, 0.0) * p
-            change = (self.lr * self.lr_factors.get(p, 1.0)) * change
-            p.sub_(change.masked_fill_(~is_taken, 0.0))  # its gradient may be NaN
-
-    def zero_grad(self) -> None:
-        """Frees the gradients."""
-        for p in self.parameters:
-            p.grad = None
+        for (factor, weight_decay), members in self.groups.items():
+            rows = [(p, p.grad, *moments) for p, *moments in members if p.grad is not None]
+            if rows:
+                torch._fused_adamw_(  # pyright: ignore[reportPrivateImportUsage]
+                    *map(list, zip(*rows)),
+                    max_exp_avg_sqs=[],
+                    state_steps=[self.n_steps] * len(rows),
+                    lr=self.lr if factor == 1 else self.lr * factor,
+                    beta1=self.betas[0],
+                    beta2=self.betas[1],
+                    weight_decay=weight_decay,
+                    eps=self.eps,
+                    amsgrad=False,
+                    maximize=False,
+                    found_inf=(~is_taken).float(),
+                )
 
     def state_dict(self) -> StateDict:
-        """Returns the number of steps."""
-        return dict(n_steps=self.n_steps)
+        """Returns the number of steps and both running means."""
+        return dict(n_steps=self.n_steps, means=self.means, squares=self.squares)
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`, in place."""
         self.n_steps.copy_(state["n_steps"])
+        saved = state["means"] + state["squares"]
+        for target, source in zip(self.means + self.squares, saved):
+            target.copy_(source)
 
 
-class Imported(SGD):
-    """An optimizer of another package. Its steps read conditions and the learning rate on the host,
-    so an update is not a CUDA graph.
-
-    Args:
-        make: takes groups of parameters, as dicts with `params`, `lr` and, if not 0,
-            `weight_decay`.
-        name: of it, in messages.
-
-    Raises:
-        ValueError: it cannot be made so.
+class Imported(_Optimizer):
+    """An optimizer of another package, by the import path of a class like those of `torch.optim`,
+    which takes groups of parameters. Its steps read conditions and the learning rate on the host,
+    so an update is not a CUDA graph. ValueError if it cannot be made so.
     """
 
     capturable = False
 
     def __init__(
         self,
+        name: str,
         parameters: Iterable[torch.nn.Parameter],
         lr: torch.Tensor,
-        lr_factors: _Factors,
-        weight_decays: _Factors,
-        make: Callable,
-        name: str,
+        lr_factors: Factors,
+        weight_decays: Factors,
     ):
-        super().__init__(parameters, lr, lr_factors, weight_decays)
+        super().__init__(parameters, lr)
         groups: dict[tuple[float, float], list] = {}
         for p in self.parameters:
             key = lr_factors.get(p, 1.0), weight_decays.get(p, 0.0)
@@ -117,7 +159,7 @@ class Imported(SGD):
             for (factor, decay), members in groups.items()
         ]
         try:
-            self.inner = make(settings)
+            self.inner = import_object(name)(settings)
             methods = self.inner.step, self.inner.state_dict, self.inner.load_state_dict
             assert all(map(callable, methods))
             assert len(self.inner.param_groups) == len(settings)
@@ -129,15 +171,12 @@ class Imported(SGD):
             ) from None
 
     @torch.no_grad()
-    def step(
-        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0
-    ) -> None:
-        """Takes one step, if it is taken."""
+    def step(self, is_taken: torch.Tensor, grad_norm: torch.Tensor, max_norm: float) -> None:
+        """Takes one step, as `Adam.step` does."""
         if not bool(is_taken):
             return
         self.n_steps += 1
-        if grad_norm is not None:
-            torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
+        torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
         for group, factor in zip(self.inner.param_groups, self.factors, strict=True):
             group["lr"] = float(self.lr) * factor
         with torch.enable_grad():
@@ -150,11 +189,63 @@ class Imported(SGD):
 
     def load_state_dict(self, state: StateDict) -> None:
         """Continues from a `state_dict`."""
-        super().load_state_dict(state)
+        self.n_steps.copy_(state["n_steps"])
         own = {int(key): value for key, value in state["state"].items()}
         groups = self.inner.state_dict()["param_groups"]
         self.inner.load_state_dict({"state": own, "param_groups": groups})
 
 
-def _gradients(parameters) -> list[torch.Tensor]:
-    return [p.grad for p in parameters if p.grad is not None]
+# ---- On a GPU ----
+
+
+def has_kernels(adam: Adam) -> bool:
+    """Returns whether kernels take the parameters and their present gradients."""
+    gradients = [p.grad for p in adam.parameters if p.grad is not None]
+    return bool(gradients) and is_plain_on_gpu(*adam.parameters, *gradients)
+
+
+def squared_norms(adam: Adam) -> torch.Tensor:
+    """Returns (n,) numbers that add up to the square of `grad_norm`."""
+    launches = list(_launches(adam))
+    sums, first_sum = adam.n_steps.new_empty(sum(n for _, n in launches)), 0
+    for rows, n_blocks in launches:
+        launch(
+            *(LIBRARY, "squared_norm", sums.device, Blocks(n_blocks, threads=_THREADS)),
+            **dict(rows=b"".join(rows), sums=sums, n_rows=len(rows), first_sum=first_sum),
+        )
+        first_sum += n_blocks
+    return sums
+
+
+def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
+    for rows, n_blocks in _launches(adam):
+        launch(
+            *(LIBRARY, "adam", adam.lr.device, Blocks(n_blocks, threads=_THREADS)),
+            **dict(rows=b"".join(rows), n_rows=len(rows), lr=adam.lr, n_steps=adam.n_steps),
+            **dict(grad_norm=grad_norm, is_taken=is_taken, max_norm=max_norm),
+            **dict(beta1=adam.betas[0], beta2=adam.betas[1], eps=adam.eps),
+        )
+
+
+def _launches(adam) -> Iterator[tuple[list[bytes], int]]:
+    """Yields the packed rows of a launch and its number of blocks."""
+    rows, n_blocks = [], 0
+    for (factor, weight_decay), members in adam.groups.items():
+        for p, mean, square in members:
+            if p.grad is None:
+                continue
+            if len(rows) == _MAX_ROWS:
+                yield rows, n_blocks
+                rows, n_blocks = [], 0
+            addresses = [x.data_ptr() for x in (p, p.grad, mean, square)]
+            names = "parameter", "gradient", "mean", "square"
+            rows.append(
+                LIBRARY.params.AdamRowParams(
+                    **dict(zip(names, addresses, strict=True)),
+                    **dict(n=p.numel(), first_block=n_blocks),
+                    is_aligned=int(not any(address % 16 for address in addresses)),
+                    **dict(lr_factor=factor, weight_decay=weight_decay),
+                )
+            )
+            n_blocks += max(1, -(-p.numel() // (4 * _THREADS)))
+    yield rows, n_blocks

@@ -5,7 +5,8 @@ over valid steps: those that the environment took, of lanes that learn. An updat
 synchronises: conditions are bool tensors on the device.
 """
 
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -25,8 +26,8 @@ from megastep.agents.algorithms.learner import (
 )
 from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
 from megastep.agents.networks.fused import fused
-from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
 from megastep.agents.networks.policy import Policy
+from megastep.agents.networks.running_norm import masked_moments, normalise_masked
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import (
     SEQUENCES,
@@ -41,31 +42,16 @@ from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
 _PARTS = "starts", "actions", "logprobs", "mask"  # of a rollout, that a minibatch copies
-
-
+_COEFFICIENTS = "clip", "value_coef", "entropy_coef", "auxiliary_coef"
 _METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
 
 
-class Coefficients(NamedTuple):
-    """The settings of the loss; see `PPO`. Tensors () on the device may change between replays of a
-    graph.
-    """
-
-    clip: float | torch.Tensor
-    value_clip: float | None
-    value_coef: float | torch.Tensor
-    entropy_coef: float | torch.Tensor
-    auxiliary_coef: float | torch.Tensor
-
-
 class _Loss(torch.autograd.Function):
-    """`ppo_loss` in one kernel, which leaves the gradients for the backward pass."""
-
     @staticmethod
     def forward(
         ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        numbers = coefficients._asdict()
+        numbers = dict(coefficients)
         value_clip, device = numbers.pop("value_clip"), logprobs.device
         inputs = dict(logprobs=logprobs, entropies=entropies, values=values, errors=errors)
         inputs |= dict(old_logprobs=batch.logprobs, advantages=batch.advantages)
@@ -73,8 +59,7 @@ class _Loss(torch.autograd.Function):
         inputs["old_values"] = None if value_clip is None else batch.old_value
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
-        n_rows = logprobs.numel()
-        blocks = Blocks(-(-n_rows // BLOCK))
+        n_rows, blocks = logprobs.numel(), Blocks(-(-logprobs.numel() // BLOCK))
         sums = logprobs.new_empty(blocks.x, LIBRARY.constants["N_SUMS"])
         launch(
             *(LIBRARY, "ppo_loss", device, blocks),
@@ -116,7 +101,7 @@ def ppo_loss(
     errors: torch.Tensor | None,
     batch: arrdict,
     value_scale: torch.Tensor,
-    coefficients: Coefficients,
+    coefficients: Mapping,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Returns the loss, a mean over the valid steps, and its metrics, tensors ().
 
@@ -128,9 +113,10 @@ def ppo_loss(
         batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each, and `n_valid` (),
             the number of valid steps; with a `value_clip` also `old_value` (T, M).
         value_scale: (), the value's own scale.
-        coefficients: the settings.
+        coefficients: `PPO`'s clip, value_clip, value_coef, entropy_coef and auxiliary_coef, numbers
+            or tensors () on the device, which may change between replays of a graph.
     """
-    clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
+    clip, value_clip = coefficients["clip"], coefficients["value_clip"]
     valid = batch.valid
     log_ratio = logprobs - batch.logprobs
     log_ratio = log_ratio.masked_fill(~valid, 0.0)  # its exp may overflow, and 0 * inf is NaN
@@ -148,11 +134,11 @@ def ppo_loss(
         # this estimate of the KL divergence is never negative, unlike the mean log ratio
         kl = masked_mean(ratio - 1 - log_ratio, valid)
         clip_fraction = masked_mean((ratio != clipped).float(), valid)
-    loss = policy + value_coef * value - entropy_coef * entropy
+    loss = policy + coefficients["value_coef"] * value - coefficients["entropy_coef"] * entropy
     metrics = dict(policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction)
     if errors is not None:
         metrics["auxiliary"] = masked_mean(errors, valid)
-        loss = loss + auxiliary_coef * metrics["auxiliary"]
+        loss = loss + coefficients["auxiliary_coef"] * metrics["auxiliary"]
     return loss, metrics
 
 
@@ -180,8 +166,8 @@ class PPO(GradientLearner):
         max_grad_norm: longer gradients are scaled down to this norm.
         n_epochs: passes over a rollout.
         n_minibatches: minibatches per pass; lanes are divided among them.
-        optimizer: `adam` or `adamw`, one kernel on a GPU; `sgd`; or the import path of a class like
-            those of `torch.optim`.
+        optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
+            of `torch.optim`.
         warmup: updates over which the step size rises linearly to `lr`.
         desired_kl: changes the step size after each minibatch so that its KL divergence stays near
             this many nats (as in rsl_rl). None: it does not.
@@ -247,15 +233,9 @@ class PPO(GradientLearner):
         self.policy.clear_stats()
         return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps))
 
-    @property
-    def gamma(self) -> float | torch.Tensor:
-        """The present discount; on a GPU a tensor () that a graph may read."""
-        return self.coefficients["gamma"]
-
-    @property
-    def lambda_(self) -> float | torch.Tensor:
-        """The present lambda of GAE, likewise."""
-        return self.coefficients["lambda_"]
+    # On a GPU tensors (), which a graph may read; the curriculum estimates advantages with them.
+    gamma = property(lambda self: self.coefficients["gamma"])
+    lambda_ = property(lambda self: self.coefficients["lambda_"])
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""
@@ -268,7 +248,7 @@ class PPO(GradientLearner):
 
     def _update(self, rollout) -> "dict[str, torch.Tensor]":
         transitions = rollout.transitions()
-        numbers = dict(gamma=self.coefficients["gamma"], lambda_=self.coefficients["lambda_"])
+        numbers = dict(gamma=self.gamma, lambda_=self.lambda_)
         estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **numbers)
         advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
         moments = masked_moments(valid, targets, advantages)
@@ -306,27 +286,21 @@ class PPO(GradientLearner):
         return {**self.steps.end(), "explained_variance": explained}
 
     def _losses(self, rollout, lanes, batch) -> "tuple[torch.Tensor, dict[str, torch.Tensor]]":
-        """Returns the loss of a minibatch and its metrics, tensors ().
-
-        Args:
-            rollout: the rollout, whose observations are selected as they are normalised.
-            lanes: (M,), lanes of the minibatch.
-            batch: the other parts of its steps, (T, M) each.
+        """Returns the loss of a minibatch and its metrics, tensors (). Observations of its lanes
+        are selected as they are normalised; `batch` has the other parts of its steps.
         """
         policy, privileged = self.policy, without_last(rollout.privileged)
         starts = without_last(batch.starts)
         sequence = without_last(rollout.obs), starts, batch.state, batch.actions
         options = dict(has_errors=not self.has_extra_loss, mask=without_last(batch.get("mask")))
         terms = policy.terms(*sequence, privileged, lanes, **options)
-        features, numbers = terms.pop("features"), self.coefficients
-        names = "value_coef", "entropy_coef", "auxiliary_coef"
+        features = terms.pop("features")
+        numbers = {name: self.coefficients[name] for name in _COEFFICIENTS}
         loss, metrics = ppo_loss(
             **terms,
             batch=batch,
             value_scale=self.critic.output.scale,
-            coefficients=Coefficients(
-                numbers["clip"], self.value_clip, *map(numbers.__getitem__, names)
-            ),
+            coefficients=numbers | {"value_clip": self.value_clip},
         )
         if self.has_extra_loss:  # which has that of the privileged observations, too
             with policy.compute_dtype():

@@ -4,11 +4,14 @@ T steps of a rollout, B lanes, L steps of a sequence, M sequences of a minibatch
 valid steps: those that the environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from pydantic import Field
+from torch.autograd.function import once_differentiable
 
+from megastep.agents.algorithms import returns
+from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.learner import (
     Coefficient,
     Fraction,
@@ -19,17 +22,21 @@ from megastep.agents.algorithms.learner import (
     ScheduledPositive,
     Warmup,
 )
-from megastep.agents.algorithms.td_loss import Result, Settings, td_loss
-from megastep.agents.networks.masked_moments import masked_moments
+from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
+from megastep.agents.networks.fused import fused
+from megastep.agents.networks.outputs import Output
 from megastep.agents.networks.policy import Policy
+from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings, defaults_from
-from megastep.agents.storage.rollout import bytes_per_step, make_rollout
+from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
+from megastep.coefficients import on_device
 from megastep.dotdict import mapping
+from megastep.kernels.build.launch import Blocks, launch
 from megastep.settings import MAX_ENVS, checked
 from megastep.types import Env, Tree, World, optional
 
@@ -39,15 +46,124 @@ REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
 _USUAL = 1e-2, 1e2
 #: Parts of a minibatch with a time axis that the loss needs.
 _STEPS = "actions", "reward", "terminal", "truncated", "starts", "learns"
+_METRICS = "td", "td_error", "q", "staleness", "effective_samples"
+_ENDS = "reward", "terminal", "truncated"
+_EPS = 1e-3  # of `returns.rescale`
+_THREADS = LIBRARY.constants["TD_THREADS"]
+_SEQUENCES = LIBRARY.constants["TD_SEQUENCES"]
+_N_SUMS, _N_METRICS = (LIBRARY.constants[f"N_TD_{name}"] for name in ("SUMS", "METRICS"))
+
+
+class Result(NamedTuple):
+    """What a minibatch gives."""
+
+    loss: torch.Tensor  # (), the mean of the weighted squared errors over the valid steps
+    metrics: dict[str, torch.Tensor]  # () by name
+    priorities: torch.Tensor  # (M,)
+    n_valid: torch.Tensor  # (), the number of valid steps
+
+
+class _Loss(torch.autograd.Function):
+    """The gradient of the sum over valid steps is left for the backward pass."""
+
+    @staticmethod
+    def forward(
+        ctx, q, target_q, batch, gamma, return_steps, eta
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        n_rows, n_sequences, n_agents, n_choices = q.shape
+        n_blocks = -(-n_sequences // _SEQUENCES)
+        d_q = torch.empty_like(q, memory_format=torch.contiguous_format)
+        values = q.new_empty(n_rows, n_sequences)
+        priorities = q.new_empty(n_sequences)
+        sums, metrics = q.new_empty(n_blocks, _N_SUMS), q.new_empty(_N_METRICS)
+        names = *_ENDS, "actions", "starts", "learns", "weight", "age"
+        tensors = {name: batch[name].contiguous() for name in names}
+        launch(
+            *(LIBRARY, "td_loss", q.device, Blocks(n_blocks, threads=_THREADS)),
+            **dict(q=q.contiguous(), target_q=target_q.contiguous(), **tensors),
+            **dict(values=values, d_q=d_q, priorities=priorities, sums=sums),
+            **dict(n_steps=n_rows - 1, n_sequences=n_sequences),
+            **dict(n_agents=n_agents, n_choices=n_choices),
+            **dict(gamma=on_device(gamma, q.device), eta=eta, eps=_EPS),
+            n_return_steps=return_steps,
+        )
+        launch(
+            *(LIBRARY, "td_metrics", q.device, Blocks(1, threads=_THREADS)),
+            **dict(sums=sums, metrics=metrics, n_blocks=n_blocks, n_sequences=n_sequences),
+        )
+        ctx.save_for_backward(d_q, metrics)
+        ctx.mark_non_differentiable(metrics, priorities)
+        return metrics[0].clone(), metrics, priorities
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_loss, d_metrics, d_priorities) -> tuple[torch.Tensor | None, ...]:
+        d_q, metrics = ctx.saved_tensors
+        return d_q * (d_loss * metrics[-1]), *[None] * 5
+
+
+def _loss_on_gpu(q, target_q, batch, output, *, gamma, return_steps, eta) -> Result:
+    loss, metrics, priorities = _Loss.apply(q, target_q, batch, gamma, return_steps, eta)
+    *values, n_valid, _ = metrics.unbind()
+    return Result(loss, dict(zip(_METRICS, values, strict=True)), priorities, n_valid)
+
+
+@fused(
+    _loss_on_gpu,
+    lambda q, *_, **__: isinstance(q, torch.Tensor) and q.is_cuda and q.dtype == torch.float32,
+)
+def td_loss(
+    q: Tree,
+    target_q: Tree,
+    batch: arrdict,
+    output: Output,
+    *,
+    gamma: float | torch.Tensor,
+    return_steps: int,
+    eta: float,
+) -> Result:
+    """Computes the error of action values from n-step returns of a target network (Kapturowski et
+    al. 2019, section 2.3), with the priorities that follow from it.
+
+    Args:
+        q: (T+1, M, A, n) of the online network, or a tree of these.
+        target_q: those of the target network, without a gradient.
+        batch: has `actions`, `reward`, `terminal` and `truncated`, (T, M, ...) each, `starts` and
+            `learns` (T+1, M), `weight` and `age` (M,).
+        output: the policy's output.
+        gamma, return_steps, eta: see `R2D2`.
+    """
+    reset = batch.starts[1:]
+    valid = ~reset & batch.learns[:-1]
+    with torch.no_grad():
+        value = returns.inverse_rescale(output.action_value(target_q, output.greedy(q)), _EPS)
+        targets = returns.n_step_returns(
+            **{name: batch[name] for name in _ENDS},
+            value=value[:-1],
+            last_value=value[-1],
+            reset=reset,
+            gamma=gamma,
+            n=return_steps,
+        )
+    q_taken = output.action_value(without_last(q), batch.actions)
+    error = (returns.rescale(targets, _EPS) - q_taken).masked_fill(~valid, 0.0)
+    loss = masked_mean(batch.weight * error.square(), valid)
+    with torch.no_grad():
+        size = error.abs()
+        priorities = eta * size.amax(0) + (1 - eta) * masked_mean(size, valid, 0)
+        all_sequences = torch.ones_like(batch.weight, dtype=torch.bool)
+        metrics = dict(
+            td=loss,
+            td_error=masked_mean(size, valid),
+            q=masked_mean(returns.inverse_rescale(q_taken, _EPS), valid),
+            staleness=batch.age.float().mean(),
+            effective_samples=effective_sample_size(batch.weight, all_sequences),
+        )
+    return Result(loss, metrics, priorities, valid.sum())
 
 
 class EpsilonGreedy:
-    """A policy of action values that takes random actions with a probability per lane.
-
-    Args:
-        policy: a policy with a duelling output.
-        epsilon: (B,), the probability of a random action.
-    """
+    """A policy of action values that takes random actions with a probability per lane, (B,)."""
 
     def __init__(self, policy: Policy, epsilon: torch.Tensor):
         self.policy, self.epsilon = policy, epsilon
@@ -95,8 +211,8 @@ class R2D2(GradientLearner):
         epsilon_spread: lane i of B uses epsilon ** (1 + epsilon_spread i / (B - 1)).
         eta: weight of the largest error in a sequence's priority; the mean error has 1 - eta.
         max_grad_norm: longer gradients are scaled down to this norm.
-        optimizer: `adam` or `adamw`, one kernel on a GPU; `sgd`; or the import path of a class like
-            those of `torch.optim`.
+        optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
+            of `torch.optim`.
         warmup: updates over which the step size rises linearly to `lr`.
         gradient_steps: gradient steps per rollout. Together they draw `replay.ratio` x B sequences.
         replay: settings of the replay buffer.
@@ -232,7 +348,6 @@ class R2D2(GradientLearner):
         }
 
     def _losses(self, batch) -> Result:
-        """Returns the `td_loss.Result` of a minibatch."""
         burn_in = self.replay_settings.burn_in
         sequence = batch.obs, batch.starts, batch.state
         if self._beside is not None:
@@ -248,8 +363,9 @@ class R2D2(GradientLearner):
         scale = self.reward_scale.masked_fill(self.reward_scale == 0, 1.0)
         steps["reward"] = steps.reward / scale
         learned = arrdict({**steps, "weight": batch.weight, "age": batch.age})
-        settings = Settings(self.coefficients["gamma"], self.return_steps, self.eta)
-        result = td_loss(q, target_q, learned, self.policy.output, settings)
+        settings = dict(gamma=self.coefficients["gamma"])
+        settings |= dict(return_steps=self.return_steps, eta=self.eta)
+        result = td_loss(q, target_q, learned, self.policy.output, **settings)
         result.metrics["q"] = result.metrics["q"] * scale
         if self.has_extra_loss:
             learned["obs"] = mapping(lambda leaf: leaf[burn_in:])(batch.obs)
@@ -269,18 +385,12 @@ class R2D2(GradientLearner):
         self.reward_scale.copy_(other.reward_scale)
 
     def state_dict(self) -> StateDict:
-        """Returns the base's state, the target network, the number of gradient steps taken and the
-        scale of rewards.
-        """
+        """Returns the base's state, the target network and what an update counts."""
         own = dict(n_taken=self.n_taken.clone(), reward_scale=self.reward_scale.clone())
         return dict(super().state_dict(), target=self.target.state_dict(), **own)
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Continues from a `state_dict`, which may come from another device.
-
-        Raises:
-            ValueError: if the state belongs to another class of learner.
-        """
+        """Continues from a `state_dict`, which may come from another device."""
         super().load_state_dict(state)
         self.target.load_state_dict(state["target"])
         self.n_taken.copy_(state["n_taken"])

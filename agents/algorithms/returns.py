@@ -31,7 +31,6 @@ def _are_floats_on_gpu(*tensors) -> bool:
 def _gae_on_gpu(
     reward, value, last_value, reset, terminal, truncated, learns=None, *, gamma, lambda_
 ) -> arrdict.arrdict:
-    """Goes from the last step to the first, a thread per lane."""
     (n_steps, n_lanes), device = reward.shape, value.device
     advantages, targets = reward.new_empty(2, n_steps, n_lanes)
     valid = torch.empty_like(advantages, dtype=torch.bool)
@@ -66,12 +65,9 @@ def gae(
         delta_t = r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t
         A_t     = delta_t + gamma lambda (1 - done_{t+1}) A_{t+1},   done = terminal or truncated
 
-    Args:
-        learns: (T, B) bool, transitions to learn from; the others are not valid. None: all.
-
-    Returns:
-        arrdict(advantages, targets, valid), each (T, B). Targets are the lambda returns A + V,
-        which the value should fit. A is 0 where the environment ignored the action.
+    Returns arrdict(advantages, targets, valid), each (T, B). Targets are the lambda returns A + V,
+    which the value should fit. A is 0 where the environment ignored the action. Transitions without
+    `learns`, (T, B) bool, are not valid. None: all.
     """
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
@@ -120,21 +116,17 @@ def vtrace(
     c_clip: float | torch.Tensor = 1.0,
 ) -> arrdict.arrdict:
     """Computes V-trace returns and advantages of a policy pi from actions of another policy, mu
-    (IMPALA, Espeholt et al. 2018, section 4.1).
-
-    With rho_t = min(rho_clip, pi/mu) and c_t = lambda min(c_clip, pi/mu):
+    (IMPALA, Espeholt et al. 2018, section 4.1). With rho_t = min(rho_clip, pi/mu) and
+    c_t = lambda min(c_clip, pi/mu):
 
         delta_t   = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t)
         v_t - V_t = delta_t + gamma c_t (1 - done_{t+1}) (v_{t+1} - V_{t+1}),      v_T = V_T
         A_t       = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) v'_{t+1} - V_t),   v' = V at a
                                                                              truncation, else v
 
-    Args:
-        log_ratio: log pi(a_t) - log mu(a_t).
-
-    Returns:
-        arrdict(advantages, targets, valid), each (T, B). The value should fit the targets v; the
-        policy's gradient is weighted by A. Where the action was not valid, v = V and A = 0.
+    Returns arrdict(advantages, targets, valid), each (T, B), from log_ratio = log pi(a_t) -
+    log mu(a_t). The value should fit the targets v; the policy's gradient is weighted by A. Where
+    the action was not valid, v = V and A = 0.
     """
     following = _following(value, last_value)
     ratio = log_ratio.exp()
@@ -191,9 +183,8 @@ def rescale(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
 
 
 def inverse_rescale(y: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
-    """Returns the inverse of `rescale`.
-
-    This form is exact for large values. Near 0 its error is the rounding error of a float32 near 1.
+    """Returns the inverse of `rescale`, exact for large values. Near 0 its error is the rounding
+    error of a float32 near 1.
     """
     size = y.abs()
     root = 2 * (size + 1 + eps) / ((1 + 4 * eps * (size + 1 + eps)).sqrt() + 1)

@@ -30,13 +30,13 @@ from megastep.agents.algorithms.masked_stats import (
     pooled_mean,
 )
 from megastep.agents.distributed.pooling import pool_moments
-from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.policy import Policy
+from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings
-from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
+from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.arrdict import arrdict, cat
 from megastep.dotdict import mapping
 from megastep.settings import MAX_ENVS, AtMost, checked
@@ -79,8 +79,8 @@ class VTrace(GradientLearner):
         max_grad_norm: longer gradients are scaled down to this norm.
         n_epochs: passes over a rollout.
         n_minibatches: minibatches per pass; lanes are divided among them.
-        optimizer: `adam` or `adamw`, one kernel on a GPU; `sgd`; or the import path of a class like
-            those of `torch.optim`.
+        optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
+            of `torch.optim`.
         warmup: updates over which the step size rises linearly to `lr`.
         desired_kl: changes the step size after each minibatch so that its KL divergence stays near
             this many nats (as in rsl_rl). None: it does not.
@@ -235,18 +235,17 @@ class VTrace(GradientLearner):
         return self.steps.end()
 
     def _batch(self, rollout, lanes) -> arrdict:
-        batch = fresh_batch(rollout, lanes)
-        if self.replay_buffer is None or self.replay_settings is None:
+        batch = rollout.sequences(lanes)
+        batch = arrdict(batch, weight=torch.ones_like(batch.reward[0]), age=torch.zeros_like(lanes))
+        if self.replay_buffer is None:
             return batch
-        n_replayed = max(1, round(self.replay_settings.ratio * len(lanes)))
+        n_replayed = max(1, round(self.replay_buffer.settings.ratio * len(lanes)))
         generator = self.generator.on(self.device)
         return with_replayed(batch, self.replay_buffer, self.policy, n_replayed, generator)
 
     def _losses(self, batch, n_fresh) -> tuple[torch.Tensor, dict[str, torch.Tensor], arrdict]:
-        """Returns the loss of a minibatch, its metrics, tensors (), and V-trace's estimates.
-
-        Args:
-            n_fresh: number of lanes from the rollout; the others are replayed.
+        """Returns the loss of a minibatch, its metrics, tensors (), and V-trace's estimates. The
+        first `n_fresh` lanes are from the rollout; the others are replayed.
         """
         policy, privileged, numbers = self.policy, batch.get("privileged"), self.coefficients
         reset, weight = batch.starts[1:], batch.weight
@@ -298,7 +297,7 @@ class VTrace(GradientLearner):
         return loss, metrics, estimates
 
     def _ratio_metrics(self, log_ratio, valid) -> dict[str, torch.Tensor]:
-        """Returns how far the current policy is from the one that acted, by several measures."""
+        """Returns measures of how far the current policy is from the one that acted."""
         log_ratio = log_ratio.clamp(max=_MAX_LOG_RATIO)
         ratio, rho_clip = log_ratio.exp(), self.coefficients["rho_clip"]
         return dict(
@@ -318,12 +317,6 @@ _IN_TIME = (
 )
 
 
-def fresh_batch(rollout: Rollout, lanes: torch.Tensor) -> arrdict:
-    """Returns `Rollout.sequences` of some lanes (M,), with `weight` 1 and `age` 0, both (M,)."""
-    batch = rollout.sequences(lanes)
-    return arrdict(batch, weight=torch.ones_like(batch.reward[0]), age=torch.zeros_like(lanes))
-
-
 def with_replayed(
     batch: arrdict, replay: ReplayBuffer, policy: Policy, n: int, generator: torch.Generator
 ) -> arrdict:
@@ -332,17 +325,13 @@ def with_replayed(
     Burn-in steps warm up the hidden state and are then removed. Until the buffer is ready, replayed
     sequences have `learns` false. `index` (n,) is for `ReplayBuffer.set_priorities`.
     """
-    replayed = _burn_in(replay.sample(n, generator), policy, replay.settings.burn_in)
+    replayed, n_burnt = replay.sample(n, generator), replay.settings.burn_in
+    if n_burnt:
+        first = mapping(lambda leaf: leaf[:n_burnt])
+        state = policy.warm_up(first(replayed.obs), first(replayed.starts), replayed.state)
+        rest = mapping(lambda leaf: leaf[n_burnt:])
+        parts = {key: rest(x) if key in _IN_TIME else x for key, x in replayed.items()}
+        replayed = arrdict(parts, state=state)
     replayed["learns"] = replayed.learns & replay.is_ready
     joined = {key: cat([batch[key], replayed[key]], int(key in _IN_TIME)) for key in batch}
     return arrdict(joined, index=replayed.index)
-
-
-def _burn_in(batch, policy, n_steps) -> arrdict:
-    """Returns a batch without its first steps, with the hidden state after them."""
-    if not n_steps:
-        return batch
-    first, rest = mapping(lambda leaf: leaf[:n_steps]), mapping(lambda leaf: leaf[n_steps:])
-    state = policy.warm_up(first(batch.obs), first(batch.starts), batch.state)
-    parts = {key: rest(part) if key in _IN_TIME else part for key, part in batch.items()}
-    return arrdict(parts, state=state)

@@ -23,13 +23,7 @@ _N_NODES = 16
 
 
 class _BoundedOutput(Output):
-    """Base: two parameters per number, from a linear layer that starts near 0.
-
-    Args:
-        space: action space.
-        width: number of features.
-        n_parameters: outputs of the linear layer per number.
-    """
+    """Base: a linear layer that starts near 0, with `n_parameters` per number."""
 
     low: torch.Tensor  # (D,)
     high: torch.Tensor
@@ -49,12 +43,11 @@ class _BoundedOutput(Output):
         return out.unflatten(-1, (self.shape[0], -1))
 
     def _scaled(self, actions) -> torch.Tensor:
-        """Returns actions as numbers from -1 to 1."""
+        """Returns actions within the bounds as numbers from -1 to 1."""
         x = 2 * (actions.float() - self.low) / (self.high - self.low) - 1
         return x.clamp(-_MAX_X, _MAX_X)
 
     def _actions(self, x) -> torch.Tensor:
-        """Returns numbers from -1 to 1 as actions within the bounds."""
         actions = self.low + (self.high - self.low) * (x + 1) / 2
         return actions.clamp(self.low, self.high)
 
@@ -66,10 +59,6 @@ class GaussianOutput(_BoundedOutput):
     Logits are (..., A, 2 D): means, then logarithms of standard deviations, before the tanh.
     Actions are (..., A, D) float32 within the bounds. `logprob` and `entropy` (...,) belong to the
     lane's joint action: they are summed over agents and numbers.
-
-    Args:
-        space: action space.
-        width: number of features.
     """
 
     # tanh(5) is 0.9999, and the gradient of a log-probability is inverse to the standard deviation
@@ -125,10 +114,6 @@ class BetaOutput(_BoundedOutput):
     Logits are (..., A, 2 D): alphas, then betas. Actions are (..., A, D) float32 within the bounds.
     `logprob` and `entropy` (...,) belong to the lane's joint action: they are summed over agents
     and numbers.
-
-    Args:
-        space: action space.
-        width: number of features.
     """
 
     def __init__(self, space: spaces.MultiContinuous, width: int):

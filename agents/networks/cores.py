@@ -76,11 +76,8 @@ class GRU(nn.Module):
 
 
 class Feedforward(nn.Module):
-    """A hidden layer instead of a recurrent core: only the current observation counts.
-
-    Args:
-        width: W.
-        activation: a name in `intakes.ACTIVATIONS`.
+    """A hidden layer instead of a recurrent core: only the current observation counts. The
+    activation is a name in `intakes.ACTIVATIONS`.
     """
 
     def __init__(self, width: int, activation: str = "relu"):
@@ -107,8 +104,8 @@ CORES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}
 class Stack(nn.ModuleList):
     """Several cores with residual connections (He et al. 2016), which together are a core.
 
-    The input of each is x plus the outputs of those below. The output is the sum of all outputs,
-    with `is_residual` x plus that sum. The hidden state holds theirs under "0", "1", ...
+    The input of each is x plus the outputs of those below, and the output is the sum of all
+    outputs. The hidden state holds theirs under "0", "1", ...
     """
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
@@ -147,16 +144,9 @@ def with_residual(
 
 
 def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") -> RecurrentCore:
-    """Returns a recurrent core.
-
-    Args:
-        name: a name in `CORES`, or an import path.
-        width: W.
-        layers: number of cores; more than one make a `Stack`.
-        activation: of the core "none"; the others have their own.
-
-    Raises:
-        ValueError: if there is no such core, or it breaks the contract at the head of this file.
+    """Returns a recurrent core, a name in `CORES` or an import path; several layers make a `Stack`.
+    The activation is that of the core "none". ValueError if there is no such core, or it breaks the
+    contract at the head of this file.
     """
     kind = resolve(name, CORES, nn.Module)
     options = {"activation": activation} if kind is Feedforward else {}
@@ -169,11 +159,16 @@ def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") 
 @torch.no_grad()
 def _check(name, core, width, n_steps=3, n_lanes=2) -> None:
     """Runs a core on two inputs that differ only before a reset."""
-    _require(name, hasattr(core, "initial"), "it needs a method initial(B, device)")
+
+    def require(condition, clause) -> None:
+        if not condition:
+            raise ValueError(f"{name} breaks the contract of recurrent cores: {clause}")
+
+    require(hasattr(core, "initial"), "it needs a method initial(B, device)")
     state = core.initial(n_lanes, "cpu")
-    _require(name, isinstance(state, arrdict), "the hidden state must be an arrdict of tensors")
+    require(isinstance(state, arrdict), "the hidden state must be an arrdict of tensors")
     has_lanes = all(len(leaf) == n_lanes for leaf in leaves(state))
-    _require(name, has_lanes, "the hidden state must have a row per lane")
+    require(has_lanes, "the hidden state must have a row per lane")
     generator = torch.Generator().manual_seed(1)
     x, other = torch.randn(2, n_steps, n_lanes, width, generator=generator)
     other[1:] = x[1:]
@@ -181,20 +176,8 @@ def _check(name, core, width, n_steps=3, n_lanes=2) -> None:
     reset[1] = True
     (outputs, after), (other_outputs, _) = core(x, reset, state), core(other, reset, state)
     shape, expected = tuple(outputs.shape), (n_steps, n_lanes, width)
-    _require(
-        name, shape == expected, f"outputs must be (T, B, width), here {expected}, not {shape}"
-    )
-    _require(
-        name, _shapes(after) == _shapes(state), "the hidden state must keep its keys and shapes"
-    )
+    require(shape == expected, f"outputs must be (T, B, width), here {expected}, not {shape}")
+    shapes = [{key: leaf.shape for key, leaf in spaces.leaves(s).items()} for s in (state, after)]
+    require(shapes[0] == shapes[1], "the hidden state must keep its keys and shapes")
     is_cleared = torch.equal(outputs[1:], other_outputs[1:])
-    _require(name, is_cleared, "a reset must clear the hidden state")
-
-
-def _shapes(state) -> dict[str, tuple[int, ...]]:
-    return {path: tuple(leaf.shape) for path, leaf in spaces.leaves(state).items()}
-
-
-def _require(name, condition, clause) -> None:
-    if not condition:
-        raise ValueError(f"{name} breaks the contract of recurrent cores: {clause}")
+    require(is_cleared, "a reset must clear the hidden state")

@@ -1,34 +1,48 @@
 """The critic: predicts the return from the actor's features and from privileged observations, in
-numbers normalised by running statistics of returns (PopArt).
+numbers normalised by running statistics of returns (PopArt). And the heads of an update together:
+actions, value and auxiliary prediction from the same features, on a GPU in bfloat16 one product,
+one kernel, and one sum of gradients.
 
-`...` any leading axes, such as (B,) lanes or (T, B) time and lanes.
+N rows, `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; W width, A agents that
+one lane controls, n choices, F predicted features. A row of the product has the prediction, the
+actions' scores, and the critic's hidden layer before its ReLU, each padded to a multiple of 8.
 """
 
 from typing import NamedTuple
 
 import torch
 from torch import nn
+from torch.autograd.function import once_differentiable
 
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.fused import LIBRARY, aligned, fused, is_plain_on_gpu
 from megastep.agents.networks.intakes import ConcatIntake
-from megastep.agents.networks.linear import linear
-from megastep.agents.networks.masked_moments import masked_moments
-from megastep.agents.networks.precision import compute_dtype
-from megastep.agents.networks.running_norm import RESOLUTION, mix_moments, store_if
+from megastep.agents.networks.linear import (
+    gradient_of_inputs,
+    gradient_of_weights,
+    linear,
+    product,
+    sum_rows,
+)
+from megastep.agents.networks.outputs import MultiDiscreteOutput, Output
+from megastep.agents.networks.precision import cast, compute_dtype
+from megastep.agents.networks.running_norm import (
+    RESOLUTION,
+    masked_moments,
+    mix_moments,
+    store_if,
+)
 from megastep.agents.types import Moments
-from megastep.kernels.build.launch import Blocks, launch
+from megastep.kernels.build.launch import WARP, Blocks, launch
 from megastep.types import Space, Tree
 
-#: Rows that a block of the heads' kernels adds up, and its threads.
-STRIP, STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_THREADS"]
-#: Of which widths are multiples where a kernel computes values.
-MULTIPLE = 8
+Terms = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor]
+# Rows that a block of the heads' kernels adds up, and its threads.
+_STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_THREADS"]
+_MULTIPLE = 8  # of which widths are multiples where a kernel computes values
 _THREADS = LIBRARY.constants["MASKED_THREADS"]
-#: Smallest weight of a rollout's returns in their statistics.
-_MIN_RATE = 0.05
-#: Smallest standard deviation, far below that of returns in any units, and not 0.
-_MIN_SCALE = 1e-15
+_MIN_RATE = 0.05  # smallest weight of a rollout's returns in their statistics
+_MIN_SCALE = 1e-15  # far below the standard deviation of returns in any units, and not 0
 
 
 def _add_on_gpu(output, moments, is_counted=None) -> None:
@@ -48,9 +62,6 @@ class ValueOutput(nn.Module):
     The linear layer predicts returns normalised by their running mean and standard deviation, so
     its error is about 1 whatever the size of rewards. `update_stats` moves both statistics and
     corrects the layer so that no prediction changes (PopArt, van Hasselt et al. 2016).
-
-    Args:
-        width: number of features.
     """
 
     mean: torch.Tensor  # ()
@@ -67,8 +78,8 @@ class ValueOutput(nn.Module):
 
     @torch.no_grad()
     def clear(self) -> None:
-        """Makes predictions 0, unless there are statistics of returns: whatever a new network
-        predicts may be many times the size of returns, and PopArt would keep it.
+        """Makes predictions 0, unless there are statistics of returns: those of a new network may
+        be many times the size of returns, and PopArt would keep them.
         """
         for parameter in self.linear.parameters():
             parameter.masked_fill_(self.count == 0, 0.0)
@@ -83,12 +94,7 @@ class ValueOutput(nn.Module):
         return normalised * self.scale + self.mean
 
     def update_stats(self, targets: torch.Tensor, valid: torch.Tensor) -> None:
-        """Adds returns to the statistics, those of all ranks together; see `add`.
-
-        Args:
-            targets: (...,), returns.
-            valid: (...,) bool.
-        """
+        """Adds valid returns (...,) to the statistics, those of all ranks together; see `add`."""
         (moments,) = pool_moments(*masked_moments(valid, targets))
         self.add(moments)
 
@@ -97,17 +103,13 @@ class ValueOutput(nn.Module):
     def add(self, moments: Moments, is_counted: torch.Tensor | None = None) -> None:
         """Adds moments of returns to the statistics, the n-th call with weight max(0.05, 1/n).
 
-        Changes nothing if there is no return, if mean or variance is not finite, or if all returns
-        have been 0, which tells nothing about their size.
-
-        Args:
-            moments: number of returns, their mean and variance.
-            is_counted: () bool; if false, nothing changes. None: true.
+        Changes nothing if there is no return, if mean or variance is not finite, if all returns
+        have been 0, which tells nothing about their size, or if `is_counted`, () bool, is false.
         """
         n_valid, mean, variance = moments
         count = self.count + 1
         rate = (1 / count).clamp(min=_MIN_RATE, max=1.0)
-        mean, scale = mix_moments(self, mean, variance, rate)
+        mean, scale = mix_moments(self.mean, self.scale, mean, variance, rate)
         is_nothing = (self.count == 0) & (scale == 0) & (mean == 0)
         scale = torch.maximum(scale, (RESOLUTION * mean.abs()).clamp(min=_MIN_SCALE))
         weight = self.linear.weight * (self.scale / scale)
@@ -119,10 +121,11 @@ class ValueOutput(nn.Module):
         store_if(is_stored, zip(old, (weight, bias, mean, scale, count), strict=True))
 
 
+# ---- Values, and heads together, by kernels ----
+
+
 class HeadSizes(NamedTuple):
-    """The columns of the product of an update's heads, see `joint_heads`. Values alone have only
-    those of the critic's hidden layer.
-    """
+    """The columns of the product of heads. Values alone have only those of the hidden layer."""
 
     n_predicted: int = 0  # F
     n_agents: int = 0
@@ -132,29 +135,27 @@ class HeadSizes(NamedTuple):
     @property
     def first_score(self) -> int:
         """Index of the first column of scores."""
-        return _padded(self.n_predicted)
+        return self.n_predicted + -self.n_predicted % _MULTIPLE
 
     @property
     def first_hidden(self) -> int:
         """Index of the first column of the critic's hidden layer."""
-        return self.first_score + _padded(self.n_agents * self.n_choices)
+        n_scores = self.n_agents * self.n_choices
+        return self.first_score + n_scores + -n_scores % _MULTIPLE
 
 
 def launch_heads(
-    product: torch.Tensor, value: dict[str, torch.Tensor], sizes: HeadSizes, **fields
+    columns: torch.Tensor, value: dict[str, torch.Tensor], sizes: HeadSizes, **fields
 ) -> None:
-    """Computes what follows from a product (N, columns) bfloat16.
-
-    Args:
-        value: of `value_parameters`.
-        fields: `values` (N,) float32 to write, and others of the kernel.
+    """Computes what follows from a product (N, columns) bfloat16: `values` (N,) float32 and others
+    of the kernel's fields.
     """
     names = "target", "actions", "logprobs", "entropies", "errors"
     launch(
-        *(LIBRARY, "heads_forward", product.device),
-        Blocks(-(-len(product) // STRIP), threads=STRIP_THREADS),
+        *(LIBRARY, "heads_forward", columns.device),
+        Blocks(-(-len(columns) // _STRIP), threads=_STRIP_THREADS),
         **{**dict.fromkeys(names), **fields, **value},
-        **dict(product=product, n_rows=len(product), **sizes._asdict()),
+        **dict(product=columns, n_rows=len(columns), **sizes._asdict()),
     )
 
 
@@ -168,7 +169,7 @@ def value_parameters(output: ValueOutput) -> dict[str, torch.Tensor]:
 def are_few_words(x: torch.Tensor) -> bool:
     """Returns whether the heads' kernels take so many rows (..., W) of such a width."""
     n_rows = x.numel() // max(x.shape[-1], 1)
-    return 0 < n_rows <= 2**31 - STRIP and not x.shape[-1] % MULTIPLE
+    return 0 < n_rows <= 2**31 - _STRIP and not x.shape[-1] % _MULTIPLE
 
 
 def _value_on_gpu(critic, joined) -> torch.Tensor:
@@ -187,22 +188,12 @@ def _fits_value(critic, joined) -> bool:
     return is_known and are_few_words(features)
 
 
-@fused(_value_on_gpu, _fits_value)
-def asymmetric_value(critic: "Critic", joined: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
-    """Returns the value (...,) from features and projected privileged observations, (..., W)."""
-    return critic.output(linear(joined, critic.hidden, torch.relu))
-
-
 class Critic(nn.Module):
     """Predicts the return: features (..., width) -> (...,) float32, in units of reward.
 
     With a `privileged_space` the critic is asymmetric (Pinto et al. 2018): it encodes the
     privileged observation into `width` more features, and a hidden layer joins both. The actor
     never sees them.
-
-    Args:
-        width: number of features.
-        privileged_space: space of what only the critic sees, or None.
     """
 
     def __init__(self, width: int, privileged_space: Space | None = None):
@@ -221,30 +212,143 @@ class Critic(nn.Module):
         privileged: Tree | None = None,
         lanes: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Returns the value.
-
-        Args:
-            features: (..., width).
-            privileged: (..., *shape) or a dict of them; unused by a plain critic.
-            lanes: (M,) int64, lanes to select from privileged observations (T, B, ...). None: all.
+        """Returns the value of features (..., width) and privileged observations (..., *shape), of
+        which `lanes` (M,) int64 selects some lanes (T, B, ...). None: all.
         """
-        encoded = self.encode(privileged, lanes) if self.is_asymmetric else None
+        encoded = self.intake.encode(privileged, lanes) if self.is_asymmetric else None
         return self.from_encoded(features, encoded)
-
-    def encode(self, privileged: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
-        """Returns the privileged observations, normalised and encoded, of an asymmetric critic."""
-        return self.intake.encode(privileged, lanes)
 
     def from_encoded(
         self, features: torch.Tensor, encoded: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Returns the value from features (..., width) and what `encode` returned."""
+        """Returns the value from features (..., width) and what the intake's `encode` returned."""
         if not self.is_asymmetric:
             return self.output(features)
         assert encoded is not None
-        joined = features, self.intake.projected(encoded)
-        return asymmetric_value(self, joined)
+        return self._value((features, self.intake.projected(encoded)))
+
+    @fused(_value_on_gpu, _fits_value)
+    def _value(self, joined) -> torch.Tensor:
+        """Returns the value (...,) from features and projected privileged observations."""
+        return self.output(linear(joined, self.hidden, torch.relu))
 
 
-def _padded(n) -> int:
-    return n + -n % MULTIPLE
+class _JointHeads(torch.autograd.Function):
+    """Weights of what reads the features, one above the other, make one product (rows, columns).
+    Its gradient is one tensor, too, so that those of the features need no sum.
+    """
+
+    @staticmethod
+    def forward(
+        ctx, sizes, value, target, actions, features, privileged, *parameters
+    ) -> tuple[torch.Tensor, ...]:
+        lead, dtype = features.shape[:-1], features.dtype
+        features, privileged, target = (
+            aligned(leaf.flatten(0, -2)) for leaf in (features, privileged, target)
+        )
+        actions = aligned(actions.flatten(0, -2).long())
+        weights = [cast(weight, dtype, _MULTIPLE) for weight in parameters[:6:2]]
+        biases = [cast(bias, dtype, _MULTIPLE) for bias in parameters[1:6:2]]
+        of_features, of_privileged = weights[2].split(sizes.width, 1)
+        weight = torch.cat([*weights[:2], of_features])
+        columns = product(features, weight, torch.cat(biases))
+        product(privileged, of_privileged, None, onto=columns[:, sizes.first_hidden :])
+        results = columns.new_empty(4, len(columns), dtype=torch.float32).unbind()
+        names = "logprobs", "entropies", "errors", "values"
+        inputs = dict(target=target, actions=actions)
+        launch_heads(columns, value, sizes, **inputs, **dict(zip(names, results, strict=True)))
+        ctx.sizes = sizes
+        ctx.save_for_backward(
+            *(features, privileged, weight, of_privileged),
+            *(columns, target, actions, value["value_weight"], value["value_scale"]),
+        )
+        return tuple(each.view(lead) for each in results)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *gradients) -> tuple[torch.Tensor | None, ...]:
+        features, privileged, weight, of_privileged, *saved = ctx.saved_tensors
+        columns, target, actions, value_weight, value_scale = saved
+        sizes, lead, (n_rows, n_columns) = ctx.sizes, gradients[0].shape, columns.shape
+        n_strips = -(-n_rows // _STRIP)
+        n_parts = 1 + -(-sizes.width // (_MULTIPLE * WARP))
+        d = torch.empty_like(columns)
+        sum_sizes = n_columns, sizes.width, _MULTIPLE
+        sums = columns.new_empty(n_strips, sum(sum_sizes), dtype=torch.float32)
+        names = "d_logprobs", "d_entropies", "d_errors", "d_values"
+        launch(
+            *(LIBRARY, "heads_backward", columns.device),
+            Blocks(n_strips * n_parts, threads=_STRIP_THREADS),
+            **dict(product=columns, target=target, actions=actions),
+            **dict(value_weight=value_weight, value_scale=value_scale),
+            **dict(zip(names, (each.contiguous() for each in gradients), strict=True)),
+            **dict(d_product=d, sums=sums, n_rows=n_rows, **sizes._asdict()),
+        )
+        d_biases, d_value_weight, d_value_bias = sum_rows(sums).split(sum_sizes)
+        first_hidden = sizes.first_hidden
+        d_hidden, d_weight = d[:, first_hidden:], gradient_of_weights(d, features)
+        d_of_privileged = gradient_of_weights(d_hidden, privileged)
+        n_scores = sizes.n_agents * sizes.n_choices
+        scores = slice(sizes.first_score, sizes.first_score + n_scores)
+        return (
+            *(None, None, None, None),
+            gradient_of_inputs(d, weight).unflatten(0, lead),
+            gradient_of_inputs(d_hidden, of_privileged).unflatten(0, lead),
+            *(d_weight[: sizes.n_predicted], d_biases[: sizes.n_predicted]),
+            *(d_weight[scores], d_biases[scores]),
+            *(torch.cat([d_weight[first_hidden:], d_of_privileged], 1), d_biases[first_hidden:]),
+            *(d_value_weight[None], d_value_bias[:1]),
+        )
+
+
+def _terms_on_gpu(output, critic, prediction, features, encoded, actions, mask=None) -> Terms:
+    sizes = HeadSizes(len(prediction.weight), output.shape[0], output.shape[1], features.shape[-1])
+    inputs = features, critic.intake.projected(encoded)
+    layers = prediction, output.linear, critic.hidden, critic.output.linear
+    parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
+    value = value_parameters(critic.output)
+    return _JointHeads.apply(sizes, value, encoded.detach(), actions, *inputs, *parameters)
+
+
+def _fits_joint(output, critic, prediction, features, encoded, actions, mask=None) -> bool:
+    if prediction is None or mask is not None or type(output) is not MultiDiscreteOutput:
+        return False
+    is_bf16 = features.is_cuda and features.dtype == encoded.dtype == torch.bfloat16
+    is_float32 = critic.output.linear.weight.dtype == torch.float32
+    return is_bf16 and is_float32 and are_few_words(features)
+
+
+@fused(_terms_on_gpu, _fits_joint)
+def head_terms(
+    output: Output,
+    critic: Critic,
+    prediction: nn.Linear | None,
+    features: torch.Tensor,
+    encoded: torch.Tensor | None,
+    actions: Tree,
+    mask: Tree = None,
+) -> Terms:
+    """Returns log-probabilities of actions (..., A), entropies, squared errors of the prediction
+    and values from features (..., W), (...,) float32 each.
+
+    Args:
+        prediction: predicts `encoded` from features. None: the errors are None.
+        encoded: (..., columns), of the critic's intake; None for a plain critic.
+        mask: (..., A, n) bool, allowed actions. None: all.
+    """
+    errors = None
+    if prediction is not None:
+        assert encoded is not None
+        errors = prediction_error(prediction, features, encoded)
+    logits = output(features)
+    logits = logits if mask is None else output.masked(logits, mask)
+    logprobs, entropies = output.terms(logits, actions)
+    return logprobs, entropies, errors, critic.from_encoded(features, encoded)
+
+
+def prediction_error(
+    prediction: nn.Linear, features: torch.Tensor, encoded: torch.Tensor
+) -> torch.Tensor:
+    """Returns the mean squared error (...,) of predicting the first columns of `encoded`."""
+    target = encoded[..., : len(prediction.weight)].detach()
+    return (linear(features, prediction).float() - target).square().mean(-1)

@@ -35,9 +35,7 @@ def _fits(output, x) -> bool:
 
 
 def _launch_values(operation, hidden, parameters, shape, **fields) -> torch.Tensor:
-    """Computes action values (N, A, n) float32 from the hidden layer (N, 2 W) after its ReLU, and
-    from weights and biases of the value and of the advantages.
-    """
+    """Computes action values (N, A, n) float32 from the hidden layer (N, 2 W) after its ReLU."""
     n_rows, n_features = hidden.shape
     values = torch.empty(n_rows, *shape, device=hidden.device)
     names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"
@@ -55,7 +53,6 @@ def _launch_values(operation, hidden, parameters, shape, **fields) -> torch.Tens
 def _act_on_gpu(
     output, x, sample=True, generator=None, mask=None, epsilon=None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Acts in one kernel after the hidden layer's."""
     hidden, (n_lanes, device) = linear(x, output.hidden, torch.relu), (len(x), x.device)
     noise = output.noise((n_lanes, output.shape[0]), generator, device) if sample else None
     actions = torch.empty(n_lanes, output.shape[0], dtype=torch.int64, device=device)
@@ -77,9 +74,7 @@ def _values_on_gpu(output, x) -> torch.Tensor:
 
 
 class _Values(torch.autograd.Function):
-    """`DuellingOutput.forward`: one product and one kernel forward, two products and one kernel
-    backward. The values and the weights' gradients are float32 sums.
-    """
+    """The values and the weights' gradients are float32 sums."""
 
     @staticmethod
     def forward(ctx, x, hidden_weight, hidden_bias, *parameters_and_shape) -> torch.Tensor:
@@ -126,10 +121,6 @@ class DuellingOutput(Output):
     Action values replace `logits`. `sample` is epsilon-greedy: a policy that is
     always greedy can stand before a wall forever. `action_value` (...,) belongs to the lane's joint
     action, the sum over its agents (VDN, Sunehag et al. 2018).
-
-    Args:
-        space: action space.
-        width: number of features.
     """
 
     epsilon = 0.05
@@ -166,7 +157,6 @@ class DuellingOutput(Output):
         mask: torch.Tensor | None = None,
         epsilon: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Does the same as `Output.act`."""
         options: dict = {} if epsilon is None else dict(epsilon=epsilon)
         if mask is not None:
             options["is_masked"] = True
@@ -192,10 +182,8 @@ class DuellingOutput(Output):
         epsilon: torch.Tensor | None = None,
         is_masked: bool = False,
     ) -> torch.Tensor:
-        """Returns the best actions, or random ones with probability epsilon (...,) per lane.
-
-        Args:
-            is_masked: some of the logits are those that `masked` forbids.
+        """Returns the best actions, or random ones with probability epsilon (...,) per lane; if
+        `is_masked`, not those that `masked` forbids.
         """
         limit = self.epsilon if epsilon is None else epsilon[..., None]
         best, n = self.greedy(logits), logits.shape[-1]

@@ -78,34 +78,22 @@ class Cnn(Encoder):
 ENCODERS = {"linear": Flat, "conv": Conv, "cnn": Cnn}
 
 
-@torch.no_grad()
-def _check_encoder(name, encoder, space) -> None:
-    for lead in (3,), (3, 2):
-        shape = tuple(encoder(torch.zeros(*lead, *space.shape)).shape)
-        expected = *lead, getattr(encoder, "n_features", "n_features")
-        if shape != expected:
-            raise ValueError(
-                f"{name} breaks the contract of encoders: images {(*lead, *space.shape)} must give "
-                f"features {expected}, not {shape}"
-            )
-
-
 def make_encoder(space: Space, image_encoder: str, path: str) -> Encoder:
-    """Returns the encoder of one leaf of an observation space.
-
-    Args:
-        space: the leaf.
-        image_encoder: encoder of images, a name in `ENCODERS` or an import path.
-        path: dotted path of the leaf, for the message.
-
-    Raises:
-        ValueError: if the space is of an unknown kind, there is no such encoder, or its features
-            have the wrong shape.
+    """Returns the encoder of one leaf of an observation space, whose path messages name. Images
+    have one of `ENCODERS`, or one of an import path. ValueError if the space is of an unknown kind,
+    there is no such encoder, or its features have the wrong shape.
     """
     if isinstance(space, spaces.MultiImage):
         encoder = resolve(image_encoder, ENCODERS, nn.Module)(space)
-        if ":" in image_encoder:
-            _check_encoder(image_encoder, encoder, space)
+        for lead in ((3,), (3, 2)) if ":" in image_encoder else ():
+            with torch.no_grad():
+                shape = tuple(encoder(torch.zeros(*lead, *space.shape)).shape)
+            expected = *lead, getattr(encoder, "n_features", "n_features")
+            if shape != expected:
+                raise ValueError(
+                    f"{image_encoder} breaks the contract of encoders: images "
+                    f"{(*lead, *space.shape)} must give features {expected}, not {shape}"
+                )
         return encoder
     if isinstance(space, spaces.MultiVector):
         return Flat(space)

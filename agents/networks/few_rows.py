@@ -55,56 +55,31 @@ def layer(
     has_relu: bool = False,
     onto: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns the outputs (N, M) of a linear layer.
-
-    Args:
-        x: (N, K).
-        weight: (M, K).
-        bias: (M,), contiguous.
-        has_relu: applies a ReLU.
-        onto: (N, M), to which the product is added, in place; None: to nothing.
-    """
+    """Does what `linear.product` does."""
     result = x.new_empty(len(x), len(weight)) if onto is None else onto
-    _multiply("product_of_layer", x, weight, result, x.shape[1], bias, onto, has_relu)
-    return result
+    return _multiply("product_of_layer", x, weight, result, bias, onto, has_relu)
 
 
 def of_inputs(
     d: torch.Tensor, weight: torch.Tensor, addend: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Returns the gradient (N, K) of a layer's inputs.
-
-    Args:
-        d: (N, M), that of its outputs.
-        weight: (M, K).
-        addend: (N, K), contiguous, is added.
-    """
+    """Does what `linear.gradient_of_inputs` does."""
     result = d.new_empty(len(d), weight.shape[1])
-    _multiply("product_of_inputs", d, weight, result, d.shape[1], addend=addend)
-    return result
+    return _multiply("product_of_inputs", d, weight, result, None, addend)
 
 
-def _multiply(
-    operation, left, right, result, n_inner, bias=None, addend=None, has_relu=False
-) -> None:
-    n_rows, n_columns = result.shape
+def _multiply(operation, left, right, result, bias, addend, has_relu=False) -> torch.Tensor:
+    (n_rows, n_columns), n_inner = result.shape, left.shape[1]
     n_tiles = -(-n_columns // _TILE), -(-n_rows // _TILE)
-    blocks = Blocks(*n_tiles, _SIZES["TILE_THREADS"], _SIZES["TILE_BYTES"])
     launch(
-        *(LIBRARY, operation, left.device, blocks),
-        left=left,
-        right=right,
-        bias=bias,
-        addend=addend,
-        result=result,
-        n_rows=n_rows,
-        n_columns=n_columns,
-        n_inner=n_inner,
-        left_stride=left.stride(0),
-        right_stride=right.stride(0),
+        *(LIBRARY, operation, left.device),
+        Blocks(*n_tiles, _SIZES["TILE_THREADS"], _SIZES["TILE_BYTES"]),
+        **dict(left=left, right=right, bias=bias, addend=addend, result=result),
+        **dict(n_rows=n_rows, n_columns=n_columns, n_inner=n_inner, has_relu=int(has_relu)),
+        **dict(left_stride=left.stride(0), right_stride=right.stride(0)),
         result_stride=result.stride(0),
-        has_relu=int(has_relu),
     )
+    return result
 
 
 def lstm_step(
@@ -115,35 +90,24 @@ def lstm_step(
     state: arrdict,
     is_residual: bool,
 ) -> tuple[torch.Tensor, arrdict]:
-    """Computes a step without what its gradient needs. Gates are float32.
+    """Returns output (B, W) and state after a step, without what its gradient needs. Gates are
+    float32.
 
     Args:
-        x: (B, W), W in `WIDTHS`.
+        x: (B, W), W in `WIDTHS`; added to the output if `is_residual`.
         weight: (4 W, 2 W): of x, then of the last output.
         bias: (4 W,).
         reset: (B,) bool; clears a lane's state before the step.
-        state: arrdict(output, cell), (B, W) each, before the step.
-        is_residual: adds x to the output.
-
-    Returns:
-        output (B, W) bfloat16, and the state after the step.
+        state: arrdict(output, cell), (B, W) float32 each, before the step.
     """
-    last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
     x, output, width = aligned(x), torch.empty_like(x), x.shape[1]
-    after = arrdict(output=torch.empty_like(last_output), cell=torch.empty_like(last_cell))
+    after = state.map(torch.empty_like)
     n_blocks = -(-len(x) // _SIZES["STEP_LANES"]) * width // _SIZES["STEP_UNITS"]
     launch(
         *(LIBRARY, f"lstm_step_{width}", x.device, Blocks(n_blocks, 1, _SIZES["STEP_THREADS"])),
-        x=x,
-        weight=weight,
-        bias=bias,
-        reset=reset,
-        last_output=last_output,
-        last_cell=last_cell,
-        output=output,
-        next_output=after.output,
-        next_cell=after.cell,
-        n_lanes=len(x),
-        is_residual=int(is_residual),
+        **dict(x=x, weight=weight, bias=bias, reset=reset, output=output),
+        **dict(last_output=state["output"], last_cell=state["cell"]),
+        **dict(next_output=after["output"], next_cell=after["cell"]),
+        **dict(n_lanes=len(x), is_residual=int(is_residual)),
     )
     return output, after

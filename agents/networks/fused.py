@@ -1,13 +1,8 @@
 """Operations with a fused form: a kernel that computes what takes PyTorch several operations.
 
-An operation is written in PyTorch first, which runs everywhere. Kernels come before it, and the
-first one that takes the arguments computes it:
-
-    @fused(_gae_on_gpu, lambda reward, value, *_, **__: value.is_cuda)
-    def gae(reward, value, ...):
-
-Which form runs depends on the tensors alone. `plain_operations` asks for PyTorch's, for exporters
-and to tell a kernel's fault from a recipe's.
+An operation is written in PyTorch first, which runs everywhere. The first kernel before it that
+takes the arguments computes it. `plain_operations` asks for PyTorch's form, for exporters and to
+tell a kernel's fault from a recipe's.
 """
 
 import contextlib
@@ -43,11 +38,8 @@ Operation = Callable[..., Any]
 
 
 def fused(kernel: Operation, fits: Callable[..., bool]) -> Callable[[Operation], Any]:
-    """Decorates an operation in PyTorch.
-
-    Args:
-        kernel: computes the same, from the same arguments.
-        fits: returns whether the kernel takes these arguments.
+    """Decorates an operation in PyTorch: `kernel` computes the same from the same arguments, if
+    `fits` returns that it takes them.
     """
 
     def decorate(operation: Operation) -> Operation:
@@ -67,11 +59,7 @@ def fused(kernel: Operation, fits: Callable[..., bool]) -> Callable[[Operation],
 
 @contextlib.contextmanager
 def plain_operations(*names: str) -> Iterator[None]:
-    """Computes operations in their plain form for the duration of the context.
-
-    Args:
-        names: some of `OPERATIONS`. Default: all.
-    """
+    """Computes operations in their plain form inside the context: some of `OPERATIONS`, or all."""
     global _plain
     before, _plain = _plain, frozenset(names or OPERATIONS)
     try:
@@ -95,33 +83,20 @@ def is_plain_on_gpu(*tensors: torch.Tensor) -> bool:
 
 
 def has_hopper(device: torch.device, n_bytes: int) -> bool:
-    """Returns whether a GPU is a Hopper or later, with so many bytes of shared memory per block:
-    consumer GPUs of the same generations have less.
-    """
+    """Returns whether a GPU is a Hopper or later, with so many bytes of shared memory per block."""
     gpu = torch.cuda.get_device_properties(device)
     return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= n_bytes
 
 
 def launch_units(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> None:
     """Launches a kernel of a recurrent core: a thread has one or four neighbouring units of a lane.
-
-    All tensors are contiguous, and start at a multiple of 16 bytes if the width is one of 4.
-
-    Args:
-        operation: such as "lstm_start".
-        dtype: of `DTYPES`, of products, gates and outputs.
-        state: (B, W).
-        fields: the others of its struct.
+    Tensors are contiguous, and start at a multiple of 16 bytes if the width is one of 4.
     """
     n_lanes, width = state.shape
     n_units = 1 if width % 4 else 4
-    launch(
-        *(LIBRARY, f"{operation}_{DTYPES[dtype]}", state.device, state.numel() // n_units),
-        **fields,
-        n_lanes=n_lanes,
-        width=width,
-        n_units=n_units,
-    )
+    fields |= dict(n_lanes=n_lanes, width=width, n_units=n_units)
+    n_threads = state.numel() // n_units
+    launch(LIBRARY, f"{operation}_{DTYPES[dtype]}", state.device, n_threads, **fields)
 
 
 def aligned(tensor: torch.Tensor) -> torch.Tensor:
@@ -132,9 +107,7 @@ def aligned(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def aligned_rows(matrix: torch.Tensor) -> torch.Tensor:
-    """Returns the matrix, or `aligned` of it if a row does not start at a multiple of 16 bytes, or
-    is not contiguous.
-    """
+    """Returns the matrix, or a copy if rows are not contiguous or start at odd addresses."""
     n_rows, n_columns = matrix.shape
     n_bytes = matrix.stride(0) * matrix.element_size()
     is_apart = n_rows > 1 and matrix.stride(0) >= n_columns and not n_bytes % 16
@@ -144,23 +117,15 @@ def aligned_rows(matrix: torch.Tensor) -> torch.Tensor:
 
 
 def check_shapes(x: torch.Tensor, reset: torch.Tensor, state: arrdict) -> None:
-    """Checks the inputs of a recurrent core, since kernels would read out of bounds.
-
-    Args:
-        x: (T, B, W), T at least 1.
-        reset: (T, B), on the device of `x`.
-        state: of (B, W), on the device of `x`.
-
-    Raises:
-        ValueError: naming the tensor that does not fit `x`.
+    """Raises ValueError unless x is (T, B, W), T > 0, and reset (T, B) and the state's leaves
+    (B, W) are on its device: kernels would read out of bounds.
     """
     if _plain == OPERATIONS:  # such as for an exporter, which does not know the number of lanes
         return
     if not len(x):
         raise ValueError(f"x is {tuple(x.shape)}, but a sequence has at least one step")
-    tensors = {"reset": (reset, x.shape[:2])}
-    tensors |= {f"state.{name}": (leaf, x.shape[1:]) for name, leaf in state.items()}
-    for name, (tensor, shape) in tensors.items():
+    states = [(f"state.{name}", leaf, x.shape[1:]) for name, leaf in state.items()]
+    for name, tensor, shape in [("reset", reset, x.shape[:2]), *states]:
         if tensor.shape != shape or tensor.device != x.device:
             raise ValueError(
                 f"{name} is {tuple(tensor.shape)} on {tensor.device}, but x asks for "

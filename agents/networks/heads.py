@@ -19,18 +19,9 @@ from megastep.types import Space
 def intake(
     space: Space, width: int, encoder: str = "linear", activation: str = "relu"
 ) -> ConcatIntake:
-    """Returns a module from observations to vectors (..., width).
-
-    Observations may have any dtype; features are cast to the compute dtype.
-
-    Args:
-        space: observation space, a leaf or nested dicts.
-        width: number of output features.
-        encoder: encoder of images: "linear", "conv" or an import path.
-        activation: "relu" or "tanh".
-
-    Raises:
-        ValueError: if a space is of an unknown kind.
+    """Returns a module from observations of a space, a leaf or nested dicts, to vectors
+    (..., width). Images have an encoder, "linear", "conv", "cnn" or an import path. The activation
+    is "relu" or "tanh". ValueError if a space is of an unknown kind.
     """
     return ConcatIntake(space, width, encoder, activation)
 
@@ -51,8 +42,7 @@ def output(space: Space, width: int, kind: str = "softmax", continuous: str = "g
         ValueError: if a space is of an unknown kind, or actions that need values are continuous.
     """
     if isinstance(space, dict) and space:
-        outputs = {key: output(child, width, kind, continuous) for key, child in space.items()}
-        return DictOutput(outputs)
+        return DictOutput({key: output(s, width, kind, continuous) for key, s in space.items()})
     if isinstance(space, spaces.MultiDiscrete):
         if kind == "softmax":
             return MultiDiscreteOutput(space, width)

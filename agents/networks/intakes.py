@@ -42,9 +42,9 @@ def _fits(intake, obs, lanes=None) -> bool:
 
 def _encode_on_gpu(intake, obs, lanes=None) -> torch.Tensor:
     """Selects lanes, normalises and concatenates leaves in one kernel."""
-    leaves, norms = intake.leaves(obs), intake.running_norms
-    flat = [leaves[i].flatten(-norms[i].mean.dim()) for i in intake.order]
-    lead, norms = flat[0].shape[:-1], [norms[i] for i in intake.order]
+    leaves, norms = intake.leaves(obs), [intake.norms[i] for i in intake.order]
+    flat = [leaves[i].flatten(-intake.norms[i].mean.dim()) for i in intake.order]
+    lead = flat[0].shape[:-1]
     if lanes is None:
         flat = [leaf.reshape(1, -1, leaf.shape[-1]) for leaf in flat]
     n_steps, n_lanes = flat[0].shape[:2]
@@ -70,17 +70,8 @@ class ConcatIntake(nn.Module):
     Initially every leaf has the same weight, however many numbers it has: weights have variance
     2 / (leaves x features of the leaf), which preserves the size of the inputs (He et al. 2015).
 
-    Args:
-        space: observation space, a leaf or nested dicts.
-        width: number of output features.
-        encoder: encoder of images, a name in `encoders.ENCODERS` or an import path.
-        activation: a name in `ACTIVATIONS`.
-
-    Attributes:
-        n_features: features of all leaves together, before the projection.
-
-    Raises:
-        ValueError: if a space is of an unknown kind, or nothing is observed.
+    Arguments are those of `heads.intake`. `n_features` counts those of all leaves together, before
+    the projection. ValueError if a space is of an unknown kind, or nothing is observed.
     """
 
     def __init__(self, space: Space, width: int, encoder: str = "linear", activation: str = "relu"):
@@ -116,8 +107,8 @@ class ConcatIntake(nn.Module):
         self._lay_out(list(leaves.values()))
 
     def _lay_out(self, leaves) -> None:
-        """Decides how `normalised` puts leaves side by side: images first, so that their rows
-        start at multiples of 16 bytes. After the leaves come at least `n_padding` zeros.
+        """Puts leaves side by side: images first, so that their rows start at multiples of 16
+        bytes, at last at least `n_padding` zeros.
 
         Sets `order` of leaves, `n_columns`, and `runs` of columns in the order of the features:
         (encoder, shape, start, end). Flat neighbours are one run, the padding too, with None.
@@ -141,13 +132,10 @@ class ConcatIntake(nn.Module):
         self.n_columns = -8 * (-(sum(sizes) + self.n_padding) // 8)
 
     def forward(self, obs: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
-        """Returns the projected features (..., width).
-
-        Args:
-            obs: (..., *shape) per leaf.
-            lanes: (M,) int64, lanes to select from leaves (T, B, ...). None: all.
+        """Returns the projected features (..., width) of leaves (..., *shape), or of some `lanes`,
+        (M,) int64, of leaves (T, B, ...).
         """
-        return linear(self.encode(obs, lanes), self.project, self.activation)
+        return self.projected(self.encode(obs, lanes))
 
     def projected(self, encoded: torch.Tensor) -> torch.Tensor:
         """Returns the features (..., width) of what `encode` returned."""
@@ -180,11 +168,8 @@ class ConcatIntake(nn.Module):
         features = []
         for i, shape, start, end in self.runs:
             part = columns[..., start:end]
-            # a few columns; `cat` is several times faster if all its inputs are contiguous
-            encoded = (
-                part.contiguous() if i is None else self.encoders[i](part.unflatten(-1, shape))
-            )
-            features.append(encoded)
+            part = part if i is None else self.encoders[i](part.unflatten(-1, shape))
+            features.append(part.contiguous())  # so that `cat` is several times faster
         return torch.cat(features, -1)
 
     def _parts(self) -> list[Part]:

@@ -1,8 +1,8 @@
 """Linear layers, and the matrix products of layers and of their gradients.
 
-In bfloat16 on a GPU, a layer's bias and ReLU are part of the product, and one kernel masks the
-gradient and adds up its rows. Its weights' gradients are float32 sums that are never rounded to
-bfloat16. On a CPU a kernel divides large float32 products among the engine's threads.
+In bfloat16 on a GPU, a layer's bias and ReLU are part of the product, one kernel masks the gradient
+and adds up its rows, and weights' gradients are float32 sums that are never rounded. On a CPU a
+kernel divides large float32 products among the engine's threads.
 
 N rows, K inputs, M outputs; `...` any leading axes, such as (T, B) time and lanes.
 """
@@ -25,54 +25,39 @@ _MIN_OUTPUTS = 16  # PyTorch takes less time on a CPU for fewer, such as actions
 _STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_THREADS"]
 
 
-def linear(
-    x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
-    layer: nn.Linear,
-    activation: Activation | None = None,
-) -> torch.Tensor:
-    """Applies a linear layer and an activation in the compute dtype: (..., K) -> (..., M).
-
-    Args:
-        x: the input, or two parts of it, as if concatenated.
-        layer: the layer.
-        activation: such as `torch.relu`.
-    """
-    return affine(x, layer.weight, layer.bias, activation)
-
-
-def _fits(x, weight, bias, activation=None) -> bool:
-    dtype, parts = compute_dtype(weight), x if isinstance(x, tuple) else (x,)
+def _fits(x, layer, activation=None) -> bool:
+    weight, parts = layer.weight, x if isinstance(x, tuple) else (x,)
     if activation not in (None, torch.relu):
         return False
+    dtype = compute_dtype(weight)
     if parts[0].is_cuda:
         return dtype == torch.bfloat16 and not any(part.shape[-1] % 8 for part in parts)
     are_floats = weight.device.type == "cpu" and dtype == weight.dtype == torch.float32
     return are_floats and len(weight) >= _MIN_OUTPUTS and is_built_for_cpu()
 
 
-def _by_kernel(x, weight, bias, activation=None) -> torch.Tensor:
-    parts = x if isinstance(x, tuple) else (x,)
-    parts = [part.to(compute_dtype(weight)) for part in parts]
-    return _Layer.apply(weight, bias, activation, *parts)
+def _by_kernel(x, layer, activation=None) -> torch.Tensor:
+    parts, dtype = x if isinstance(x, tuple) else (x,), compute_dtype(layer.weight)
+    parts = [part.to(dtype) for part in parts]
+    return _Layer.apply(layer.weight, layer.bias, activation, *parts)
 
 
 @fused(_by_kernel, _fits)
-def affine(
+def linear(
     x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
-    weight: torch.Tensor,
-    bias: torch.Tensor,
+    layer: nn.Linear,
     activation: Activation | None = None,
 ) -> torch.Tensor:
-    """Does what `linear` does, for a weight (M, K) and a bias (M,)."""
+    """Applies a linear layer and an activation, such as `torch.relu`, in the compute dtype:
+    (..., K) -> (..., M). The input may be two parts, as if concatenated.
+    """
     x = torch.cat(x, -1) if isinstance(x, tuple) else x
-    y = nn.functional.linear(x.to(compute_dtype(weight)), weight, bias)
+    y = nn.functional.linear(x.to(compute_dtype(layer.weight)), layer.weight, layer.bias)
     return y if activation is None else activation(y)
 
 
 class _Layer(torch.autograd.Function):
-    """A layer whose weights' gradient is that of each part of the input. On a GPU, odd numbers of
-    outputs are padded to a multiple of 8, as tensor cores want.
-    """
+    """On a GPU, odd numbers of outputs are padded to a multiple of 8, as tensor cores want."""
 
     @staticmethod
     def forward(ctx, weight, bias, activation, *parts) -> torch.Tensor:
@@ -139,11 +124,8 @@ def _bias_gradient_on_gpu(d, activated=None) -> tuple[torch.Tensor, torch.Tensor
 def bias_gradient(
     d: torch.Tensor, activated: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the gradient before a ReLU (N, M), and its sum over rows (M,) float32.
-
-    Args:
-        d: (N, M), the gradient after the ReLU; on a GPU, M is a multiple of 8.
-        activated: the ReLU's outputs. None: there is no ReLU, and d is returned.
+    """Returns the gradient before a ReLU (N, M), and its sum over rows (M,) float32, from that
+    after it and the ReLU's outputs. None: there is no ReLU.
     """
     if activated is not None:
         d = torch.ops.aten.threshold_backward(d, activated, 0)
@@ -159,10 +141,10 @@ def sum_rows(rows: torch.Tensor) -> torch.Tensor:
     return sums
 
 
-# ---- Matrix products on a GPU ----
+# ---- Matrix products ----
 #
-# Those of few rows are by kernels of our own, and others by PyTorch. Gradients of weights are
-# always by PyTorch, which splits the rows that they add up. All matrices have one dtype.
+# On a GPU those of few rows are by kernels of our own. Gradients of weights are always by PyTorch,
+# which splits the rows that they add up. All matrices have one dtype.
 
 
 def product(
@@ -172,13 +154,12 @@ def product(
     has_relu: bool = False,
     onto: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns the outputs (..., M) of a linear layer.
+    """Returns the outputs (..., M) of a linear layer, with a ReLU if `has_relu`.
 
     Args:
         x: (..., K).
         weight: (M, K).
         bias: (M,); None with `onto`.
-        has_relu: applies a ReLU.
         onto: (N, M), to which the product of x (N, K) is added, in place.
     """
     rows = x.flatten(0, -2)
@@ -201,12 +182,8 @@ def product(
 def gradient_of_inputs(
     d: torch.Tensor, weight: torch.Tensor, addend: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Returns the gradient (..., K) of a layer's inputs, plus an addend of that shape.
-
-    Args:
-        d: (..., M), that of its outputs.
-        weight: (M, K).
-        addend: (..., K), contiguous; None: nothing.
+    """Returns the gradient (..., K) of a layer's inputs from that of its outputs (..., M) and its
+    weight (M, K), plus a contiguous addend (..., K).
     """
     rows = d.flatten(0, -2)
     flat = None if addend is None else addend.flatten(0, -2)
@@ -219,19 +196,12 @@ def gradient_of_inputs(
 
 
 def gradient_of_weights(d: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-    """Returns the gradient (M, K) float32 of a layer's weights. A GPU does not round it to the
-    matrices' dtype.
-
-    Args:
-        d: (N, M), that of its outputs.
-        x: (N, K), its inputs.
+    """Returns the gradient (M, K) float32 of a layer's weights from that of its outputs (N, M) and
+    its inputs (N, K). A GPU does not round it to the matrices' dtype.
     """
     if d.is_cuda and d.dtype != torch.float32:
         return torch.mm(d.T, x, out_dtype=torch.float32)
     return (d.T @ x).float()
-
-
-# ---- Matrix products on a CPU ----
 
 
 def matmul(
@@ -242,15 +212,11 @@ def matmul(
     adds: bool = False,
     has_relu: bool = False,
 ) -> torch.Tensor:
-    """Returns the product of (rows, depth) and (depth, columns), of any strides, without a
-    gradient.
+    """Returns the product of (rows, depth) and (depth, columns) float32 on the CPU, of any strides,
+    plus a bias (columns,), with a ReLU if `has_relu`. Without a gradient.
 
     Args:
-        a, b: the matrices, float32 on the CPU.
-        out: where to write it, (rows, columns) with contiguous rows. None: a new tensor.
-        bias: (columns,) to add.
-        adds: adds to what `out` holds.
-        has_relu: applies a ReLU at the end.
+        out: where to write it, contiguous rows; added to what is there if `adds`. None: a new one.
     """
     if out is None:
         out = torch.empty(len(a), b.shape[1])

@@ -58,42 +58,24 @@ _MAX_STEPS, _THREADS, _LANES, _BLOCK_UNITS = (
 )
 
 
-class Unrolled(NamedTuple):
-    """What a form of the recurrence computes of a sequence.
+class Form(NamedTuple):
+    """A form of the recurrence with an explicit gradient.
 
     Attributes:
-        outputs: (T, B, W).
-        hiddens: (T, B, W), each step's recurrent input: the last output, 0 after a reset.
-        last_output: (B, W) float32, without a residual.
-        last_cell: (B, W) float32.
-        saved: what its backward pass needs.
+        forward: returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output
+            without a residual and the last cell, (B, W) float32, and what `backward` needs.
+        backward: returns the gradients of the gates (T, B, 4 W), of the bias (4 W,), of the output
+            and the cell before the sequence, (B, W), and of the inputs, None if left to the caller.
     """
 
-    outputs: torch.Tensor
-    hiddens: torch.Tensor
-    last_output: torch.Tensor
-    last_cell: torch.Tensor
-    saved: tuple
-
-
-class Gradients(NamedTuple):
-    """The gradients of the gates (T, B, 4 W), of the bias (4 W,), and of the output and the cell
-    before the sequence, (B, W); and of the inputs (T, B, W), or None if it is left to the caller.
-    """
-
-    gates: torch.Tensor
-    bias: torch.Tensor
-    output: torch.Tensor
-    cell: torch.Tensor
-    x: torch.Tensor | None = None
+    forward: Callable[..., tuple]
+    backward: Callable[..., tuple]
 
 
 # ---- On a GPU, step by step ----
 
 
-def _forward_in_steps(
-    x, input_weight, bias, weight, reset, output, cell, saves, residual
-) -> Unrolled:
+def _forward_in_steps(x, input_weight, bias, weight, reset, output, cell, saves, residual) -> tuple:
     gates = F.linear(x, input_weight, bias)
     outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
     cells = [torch.empty_like(cell)]
@@ -113,10 +95,10 @@ def _forward_in_steps(
         )
     last = outputs[-1].float()
     outputs = outputs if residual is None else outputs + residual
-    return Unrolled(outputs, hiddens, last, cells[-1], (gates, *cells[:-1]))
+    return outputs, hiddens, last, cells[-1], (gates, *cells[:-1])
 
 
-def _backward_in_steps(input_weight, weight, reset, saved, d_outputs, d_cell) -> Gradients:
+def _backward_in_steps(input_weight, weight, reset, saved, d_outputs, d_cell) -> tuple:
     gates, *cells = saved
     d_gates = torch.empty_like(gates)
     d_cell = torch.zeros_like(cells[0]) if d_cell is None else d_cell
@@ -133,24 +115,10 @@ def _backward_in_steps(input_weight, weight, reset, saved, d_outputs, d_cell) ->
     assert d_hidden is not None
     is_reset = reset[0, :, None]
     d_states = d_hidden.float().masked_fill_(is_reset, 0.0), d_cell.masked_fill_(is_reset, 0.0)
-    return Gradients(d_gates, d_gates.flatten(0, 1).sum(0), *d_states)
+    return d_gates, d_gates.flatten(0, 1).sum(0), *d_states, None
 
 
 # ---- On a GPU with clusters of blocks: the recurrent weights stay on the chip ----
-
-
-def _fits_clusters(x, *_) -> bool:
-    return (
-        x.is_cuda
-        and x.dtype == torch.bfloat16
-        and x.shape[-1] in WIDTHS
-        and 2 <= len(x) <= _MAX_STEPS  # for one step, loading the weights takes too long
-        and x.numel() > 0
-        and has_hopper(x.device, max(_memory(name, x.shape[-1]) for name in _DIRECTIONS))
-    )
-
-
-_DIRECTIONS = "forward", "backward"
 
 
 def _memory(direction, width) -> int:
@@ -158,21 +126,26 @@ def _memory(direction, width) -> int:
     return CLUSTERS.constants[f"{direction.upper()}_MEMORY_{width}"]
 
 
+def _fits_clusters(x, *_) -> bool:
+    n_steps, n_lanes, width = x.shape
+    if not x.is_cuda or x.dtype != torch.bfloat16 or width not in WIDTHS or not n_lanes:
+        return False
+    # for one step, loading the weights takes too long
+    n_bytes = max(_memory(direction, width) for direction in ("forward", "backward"))
+    return 2 <= n_steps <= _MAX_STEPS and has_hopper(x.device, n_bytes)
+
+
 def _launch_clusters(direction, width, device, n_lanes, **fields) -> None:
     n_clusters = -(-n_lanes // _LANES)
     n_blocks, shared = width // _BLOCK_UNITS * n_clusters, _memory(direction, width)
-    launch(
-        *(CLUSTERS, f"lstm_sequence_{direction}_{width}", device),
-        Blocks(n_blocks, threads=_THREADS, shared=shared),
-        **fields,
-        n_lanes=n_lanes,
-        n_clusters=n_clusters,
-    )
+    blocks = Blocks(n_blocks, threads=_THREADS, shared=shared)
+    fields |= dict(n_lanes=n_lanes, n_clusters=n_clusters)
+    launch(CLUSTERS, f"lstm_sequence_{direction}_{width}", device, blocks, **fields)
 
 
 def _forward_on_clusters(
     x, input_weight, bias, weight, reset, output, cell, saves, residual
-) -> Unrolled:
+) -> tuple:
     gates, (n_steps, n_lanes, width) = product(x, input_weight, bias), x.shape
     outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
     last_output, last_cell, saved = torch.empty_like(output), torch.empty_like(cell), (None, None)
@@ -186,10 +159,10 @@ def _forward_on_clusters(
         **dict(outputs=outputs, hiddens=hiddens, saved_gates=saved[0], saved_cells=saved[1]),
         n_steps=n_steps,
     )
-    return Unrolled(outputs, hiddens, last_output, last_cell, saved)
+    return outputs, hiddens, last_output, last_cell, saved
 
 
-def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell) -> Gradients:
+def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell) -> tuple:
     n_steps, n_lanes, width = d_outputs.shape
     d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * width)
     d_bias = saved[1].new_empty(-(-n_lanes // _LANES), 4 * width)
@@ -202,7 +175,7 @@ def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell)
         **dict(d_last_output=d_last_output, d_last_cell=d_last_cell),
         n_steps=n_steps,
     )
-    return Gradients(d_gates, sum_rows(d_bias), d_last_output, d_last_cell)
+    return d_gates, sum_rows(d_bias), d_last_output, d_last_cell, None
 
 
 # ---- On a CPU ----
@@ -210,19 +183,11 @@ def _backward_on_clusters(input_weight, weight, reset, saved, d_outputs, d_cell)
 
 def _launch_on_cpu(direction, like, **fields) -> None:
     n_steps, n_lanes, width = like.shape
-    launch(
-        *(LIBRARY, f"lstm_sequence_{direction}", like.device, 0),
-        **fields,
-        n_steps=n_steps,
-        n_lanes=n_lanes,
-        width=width,
-        n_threads=threads(),
-    )
+    fields |= dict(n_steps=n_steps, n_lanes=n_lanes, width=width, n_threads=threads())
+    launch(LIBRARY, f"lstm_sequence_{direction}", like.device, 0, **fields)
 
 
-def _forward_on_cpu(
-    x, input_weight, bias, weight, reset, output, cell, saves, residual
-) -> Unrolled:
+def _forward_on_cpu(x, input_weight, bias, weight, reset, output, cell, saves, residual) -> tuple:
     gates = x.new_empty((*x.shape[:2], 4 * x.shape[2]))
     hiddens, cells, outputs = (torch.empty_like(x) for _ in range(3))
     last_cell = torch.empty_like(cell)
@@ -233,10 +198,10 @@ def _forward_on_cpu(
         **dict(outputs=outputs, last_cell=last_cell),
     )
     summed = outputs if residual is None else outputs + residual
-    return Unrolled(summed, hiddens, outputs[-1].clone(), last_cell, (gates, cells))
+    return summed, hiddens, outputs[-1].clone(), last_cell, (gates, cells)
 
 
-def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> Gradients:
+def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> tuple:
     gates, cells = saved
     d_gates, d_x, d_last = torch.empty_like(gates), torch.empty_like(d_outputs), cells[0]
     d_cell = torch.zeros_like(d_last) if d_cell is None else d_cell
@@ -247,26 +212,19 @@ def _backward_on_cpu(input_weight, weight, reset, saved, d_outputs, d_cell) -> G
         **dict(d_outputs=d_outputs, d_last_cell=d_cell, d_gates=d_gates, d_x=d_x),
         **dict(d_output=d_first_output, d_cell=d_first_cell),
     )
-    return Gradients(d_gates, d_gates.flatten(0, 1).sum(0), d_first_output, d_first_cell, d_x)
+    return d_gates, d_gates.flatten(0, 1).sum(0), d_first_output, d_first_cell, d_x
 
 
 # ---- The recurrence with an explicit gradient ----
 
 
-class _Form(NamedTuple):
-    forward: Callable[..., Unrolled]
-    backward: Callable[..., Gradients]
-
-
-IN_STEPS = _Form(_forward_in_steps, _backward_in_steps)
-ON_CLUSTERS = _Form(_forward_on_clusters, _backward_on_clusters)
-ON_CPU = _Form(_forward_on_cpu, _backward_on_cpu)
+IN_STEPS = Form(_forward_in_steps, _backward_in_steps)
+ON_CLUSTERS = Form(_forward_on_clusters, _backward_on_clusters)
+ON_CPU = Form(_forward_on_cpu, _backward_on_cpu)
 
 
 class _Sequence(torch.autograd.Function):
-    """The recurrence by one of the forms. Autograd would accumulate the weights' gradients step by
-    step. Here each is one matrix product over all steps.
-    """
+    """Autograd would accumulate the weights' gradients step by step. Here each is one product."""
 
     @staticmethod
     def forward(
@@ -279,51 +237,47 @@ class _Sequence(torch.autograd.Function):
             cast(w, x.dtype).contiguous() for w in (input_weight, bias, weight)
         )
         saves = has_grad and any(ctx.needs_input_grad)
-        result = form.forward(
-            *(x, input_weight, bias, weight, reset, output, cell),
-            *(saves, x if is_residual else None),
+        states, residual = (output, cell), x if is_residual else None
+        outputs, hiddens, last_output, last_cell, saved = form.forward(
+            x, input_weight, bias, weight, reset, *states, saves, residual
         )
-        ctx.save_for_backward(x, input_weight, weight, reset, result.hiddens, *result.saved)
-        return result.outputs, result.last_output, result.last_cell
+        ctx.save_for_backward(x, input_weight, weight, reset, hiddens, *saved)
+        return outputs, last_output, last_cell
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_outputs, d_last_output, d_cell) -> tuple[torch.Tensor | None, ...]:
         x, input_weight, weight, reset, hiddens, *saved = ctx.saved_tensors
-        d_sum = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
-        d_outputs = d_sum
+        d_sum = d_outputs = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
         if d_last_output is not None:
             d_outputs = d_sum.clone()
             d_outputs[-1] += d_last_output
         d_cell = None if d_cell is None else aligned(d_cell)
-        d = ctx.form.backward(input_weight, weight, reset, saved, d_outputs, d_cell)
-        flat, residual, d_x = d.gates.flatten(0, 1), d_sum if ctx.is_residual else None, d.x
+        d_gates, d_bias, d_output, d_cell, d_x = ctx.form.backward(
+            input_weight, weight, reset, saved, d_outputs, d_cell
+        )
+        residual = d_sum if ctx.is_residual else None
         if d_x is None:
-            d_x = gradient_of_inputs(d.gates, input_weight, residual)
+            d_x = gradient_of_inputs(d_gates, input_weight, residual)
         elif residual is not None:
             d_x += residual
-        rows = [rows.flatten(0, 1) for rows in (x, hiddens)]
-        if ctx.form is ON_CPU:
-            d_weights = [matmul(flat.T, each) for each in rows]
-        else:
-            d_weights = [gradient_of_weights(flat, each) for each in rows]
-        gradients = d_x, d_weights[0], d.bias.float(), d_weights[1], None, d.output, d.cell, None
-        return None, None, *gradients
+        flat, by_kernel = d_gates.flatten(0, 1), (lambda d, rows: matmul(d.T, rows))
+        of_weights = by_kernel if ctx.form is ON_CPU else gradient_of_weights
+        d_input, d_weight = (of_weights(flat, rows.flatten(0, 1)) for rows in (x, hiddens))
+        d_states = None, d_output, d_cell, None
+        return None, None, d_x, d_input, d_bias.float(), d_weight, *d_states
 
 
 def _by(form) -> Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     return lambda *inputs: _Sequence.apply(form, torch.is_grad_enabled(), *inputs)
 
 
-@fused(
-    _by(ON_CPU),
-    lambda x, *_: (
-        x.device.type == "cpu"
-        and x.dtype == torch.float32
-        and x.shape[-1] % 16 == 0
-        and is_built_for_cpu()
-    ),
-)
+def _fits_cpu(x, *_) -> bool:
+    is_float = x.device.type == "cpu" and x.dtype == torch.float32
+    return is_float and x.shape[-1] % 16 == 0 and is_built_for_cpu()
+
+
+@fused(_by(ON_CPU), _fits_cpu)
 @fused(_by(ON_CLUSTERS), _fits_clusters)
 @fused(_by(IN_STEPS), lambda x, *_: x.is_cuda and x.dtype in DTYPES)
 def lstm_sequence(
@@ -339,14 +293,11 @@ def lstm_sequence(
     """Unrolls the recurrence. Nothing is done in place, as exporters want it.
 
     Args:
-        x: (T, B, W) in the compute dtype.
-        input_weight: (4 W, W).
-        bias: (4 W,).
+        x: (T, B, W) in the compute dtype; added to the outputs if `is_residual`.
+        input_weight, bias: (4 W, W), (4 W,).
         weight: (4 W, W), of the recurrent product.
         reset: (T, B) bool.
-        output: (B, W) float32, last output before the sequence.
-        cell: (B, W) float32, last cell before the sequence.
-        is_residual: adds x to the outputs.
+        output, cell: (B, W) float32, before the sequence.
 
     Returns:
         outputs (T, B, W) in the compute dtype, the last output without x and the last cell, (B, W)
@@ -363,48 +314,36 @@ def lstm_sequence(
     return torch.stack(outputs), output, cell
 
 
-def _act_on_gpu(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+def _act_on_gpu(core, x, reset, state, is_residual=False) -> tuple[torch.Tensor, arrdict]:
     """Computes one step with one product of inputs and last outputs."""
+    check_shapes(x, reset, state)
     dtype = compute_dtype(core.recurrent.weight)
     weight = cast_joined((core.input.weight, core.recurrent.weight), dtype)
     bias = cast(core.input.bias, dtype)
     x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
+    last = arrdict({key: aligned(state[key].float()) for key in ("output", "cell")})
     if few_rows.fits_step(x, weight):
-        output, after = few_rows.lstm_step(x, weight, bias, reset, state, is_residual)
+        output, after = few_rows.lstm_step(x, weight, bias, reset, last, is_residual)
         return output[None], after
-    last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
     output, joined = torch.empty_like(x), x.new_empty(len(x), 2 * core.width)
-    after = arrdict(output=torch.empty_like(last_output), cell=torch.empty_like(last_cell))
+    after = last.map(torch.empty_like)
     launch_units(
-        *("lstm_join", dtype, last_output),
-        **dict(reset=reset, x=x, last_output=last_output, joined=joined),
+        *("lstm_join", dtype, last.output),
+        **dict(reset=reset, x=x, last_output=last.output, joined=joined),
     )
     with torch.autocast(x.device.type, enabled=False):
         gates = F.linear(joined, weight, bias)
     launch_units(
-        *("lstm_act", dtype, last_cell),
-        **dict(gates=gates, reset=reset, last_cell=last_cell, residual=x if is_residual else None),
+        *("lstm_act", dtype, last.cell),
+        **dict(gates=gates, reset=reset, last_cell=last.cell, residual=x if is_residual else None),
         **dict(output=output, next_output=after.output, next_cell=after.cell),
     )
     return output[None], after
 
 
-@fused(
-    _act_on_gpu,
-    lambda core, x, *_: (
-        len(x) == 1
-        and x.is_cuda
-        and not torch.is_grad_enabled()
-        and compute_dtype(core.recurrent.weight) in DTYPES
-    ),
-)
-def lstm(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
-    """Does `LSTM.forward`."""
-    x = x.to(compute_dtype(core.recurrent.weight) if x.is_cuda else torch.float32)
-    weights = core.input.weight, core.input.bias, core.recurrent.weight
-    states = state["output"].float(), state["cell"].float()
-    outputs, output, cell = lstm_sequence(x, *weights, reset.bool(), *states, is_residual)
-    return outputs, arrdict(output=output, cell=cell)
+def _acts_on_gpu(core, x, *_, **__) -> bool:
+    is_step = x.is_cuda and len(x) == 1 and not torch.is_grad_enabled()
+    return is_step and compute_dtype(core.recurrent.weight) in DTYPES
 
 
 class LSTM(nn.Module):
@@ -428,6 +367,7 @@ class LSTM(nn.Module):
             {key: torch.zeros(n_lanes, self.width, device=device) for key in ("output", "cell")}
         )
 
+    @fused(_act_on_gpu, _acts_on_gpu)
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
@@ -435,4 +375,8 @@ class LSTM(nn.Module):
         compute dtype on a GPU and float32 on a CPU. ValueError if shapes or devices do not fit.
         """
         check_shapes(x, reset, state)
-        return lstm(self, x, reset, state, is_residual)
+        x = x.to(compute_dtype(self.recurrent.weight) if x.is_cuda else torch.float32)
+        weights = self.input.weight, self.input.bias, self.recurrent.weight
+        states = state["output"].float(), state["cell"].float()
+        outputs, output, cell = lstm_sequence(x, *weights, reset.bool(), *states, is_residual)
+        return outputs, arrdict(output=output, cell=cell)

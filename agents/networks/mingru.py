@@ -14,29 +14,37 @@ T time, B lanes, W width. Gates are laid out (..., 2 W): update gate before its 
 Matrix products run in the compute dtype (autocast's). The recurrence is float32: over hundreds of
 steps a bfloat16 state would round small additions away.
 
-The recurrence over a sequence is written here for the CPU, with its gradient; a GPU has a kernel
-for each. When acting, one kernel does product and recurrence (`mingru_step`). `mingru` is the plain
-form of all of it.
+A GPU has a kernel for the recurrence over a sequence, and one for its gradient. When acting, one
+kernel does product and recurrence on a GPU with much shared memory (Hopper and later).
 """
+
+from pathlib import Path
 
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks import mingru_step
 from megastep.agents.networks.fused import (
     DTYPES,
     LIBRARY,
     aligned,
     check_shapes,
     fused,
+    has_hopper,
     launch_units,
 )
 from megastep.agents.networks.linear import gradient_of_weights, product, sum_rows
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.arrdict import arrdict
+from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 
+ACTING = KernelLibrary(Path(__file__).parent / "kernels" / "acting", FAST_CUDA_FLAGS)
+_LANES, _UNITS, _PARTS, _THREADS = (
+    ACTING.constants[f"STEP_{name}"] for name in "LANES UNITS PARTS THREADS".split()
+)
+#: Widths that one step's kernel has.
+WIDTHS = tuple(range(_UNITS, (_PARTS + 1) * _UNITS, _UNITS))
 _LARGEST_BLOCK = 256  # threads, of the backward kernel
 _MANY_BLOCKS = 128  # about one per multiprocessor
 
@@ -54,10 +62,8 @@ def linear_scan(
     that factor is cut off. Nothing is divided by a product, so factors of 0 are exact.
 
     Args:
-        terms: (T, ...).
-        factors: (T, ...).
-        reset: bool, of a shape that broadcasts to theirs. Where true, y_t = terms_t, and nothing
-            passes, not even a NaN.
+        terms, factors: (T, ...).
+        reset: bool, broadcasts to them. Where true, y_t = terms_t: not even a NaN passes.
         reverse: runs from the end instead, y_t = terms_t + factors_t y_{t+1}, y_T = 0.
     """
     if reverse:
@@ -91,12 +97,10 @@ def _forward_on_gpu(gates, reset, start, residual, states, outputs, last) -> Non
 
 @fused(_forward_on_gpu, lambda gates, *_: gates.is_cuda)
 def recurrence(gates, reset, start, residual, states, outputs, last) -> None:
-    """Computes the last three from the gates and the first state.
+    """Computes the last three from gates (T, B, 2 W), resets (T, B) bool and the first state (B, W)
+    float32.
 
     Args:
-        gates: (T, B, 2 W).
-        reset: (T, B) bool.
-        start: (B, W) float32.
         residual: (T, B, W), added to the outputs. None: nothing is.
         states: (T, B, W), the outputs without the residual. None: not wanted.
         outputs: (T, B, W).
@@ -138,15 +142,8 @@ def _backward_on_gpu(
 def recurrence_backward(
     gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
 ) -> torch.Tensor:
-    """Computes the gradients of `recurrence`'s gates and first state from those of its outputs.
-
-    Args:
-        d_last: None: zeros.
-        d_start: None: not wanted.
-        d_residual: (T, B, W), a copy of `d_outputs`. None: not wanted.
-
-    Returns:
-        the gates' gradient summed over steps and lanes, (2 W,) float32.
+    """Computes the last three, gradients of `recurrence`, from those of its outputs and last state,
+    None where not wanted. Returns the gates' gradient summed over steps and lanes, (2 W,) float32.
     """
     (z, candidate), reset = _split(gates), reset[..., None]
     factors, before = 1 - z, torch.cat([start[None], states[:-1]]).masked_fill(reset, 0.0)
@@ -165,38 +162,63 @@ def recurrence_backward(
     return d_gates.flatten(0, 1).sum(0).float()
 
 
-class _Sequence(torch.autograd.Function):
-    """The product of all steps and the recurrence over time, with an explicit gradient.
+# ---- One step in one kernel ----
 
-    Saves only its input, the gates and the states. If they are bfloat16, the gradient sees states
-    rounded to bfloat16.
+
+@fused(lambda x: True, lambda x: _fits_step(x))
+def fits_step(x: torch.Tensor) -> bool:
+    """Returns whether `step` takes inputs x (T, B, W) of this dtype on their device."""
+    return False
+
+
+def _fits_step(x) -> bool:
+    width = x.shape[-1]
+    is_step = x.is_cuda and x.dtype == torch.bfloat16 and len(x) == 1 and width in WIDTHS
+    return is_step and has_hopper(x.device, step_blocks(0, width).shared)
+
+
+def step_blocks(n_lanes: int, width: int) -> Blocks:
+    """Returns the blocks that step all lanes."""
+    n_bytes, n_parts = ACTING.constants, width // _UNITS
+    of_state = _LANES * n_bytes["STATE_BYTES"] + n_bytes["BIAS_BYTES"]
+    n_blocks = -(-n_lanes // _LANES) * width // _UNITS
+    return Blocks(n_blocks, 1, _THREADS, n_parts * n_bytes["PART_BYTES"] + of_state)
+
+
+def step(x, weight, bias, reset, start, is_residual) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns outputs (1, B, W) bfloat16 and state (B, W) float32 after a step, without what its
+    gradient needs. Gates are float32 sums, rounded to bfloat16 after the bias.
+    """
+    x, start = aligned(x), aligned(start)
+    outputs, last, (n_lanes, width) = torch.empty_like(x), torch.empty_like(start), start.shape
+    launch(
+        *(ACTING, f"mingru_step_{width}", x.device, step_blocks(n_lanes, width)),
+        **dict(x=x, weight=aligned(weight), bias=aligned(bias), reset=reset.contiguous()),
+        **dict(start=start, outputs=outputs, last=last),
+        **dict(n_lanes=n_lanes, is_residual=int(is_residual)),
+    )
+    return outputs, last
+
+
+# ---- Product and recurrence ----
+
+
+class _Sequence(torch.autograd.Function):
+    """Saves only its input, the gates and the states. If they are bfloat16, the gradient sees
+    states rounded to bfloat16.
     """
 
     @staticmethod
     def forward(
         ctx, x, weight, bias, reset, start, is_residual, has_grad
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Unrolls the recurrence.
-
-        Args:
-            x: (T, B, W) in the compute dtype.
-            weight: (2 W, W).
-            bias: (2 W,).
-            reset: (T, B) bool.
-            start: (B, W) float32, state before the sequence.
-            is_residual: adds x to the outputs.
-            has_grad: whether autograd is on; it never is in here.
-
-        Returns:
-            outputs (T, B, W) in the compute dtype, and the last state (B, W) float32.
-        """
         ctx.set_materialize_grads(False)
         ctx.is_residual = is_residual
         x, reset, start = aligned(x), reset.contiguous(), aligned(start)
         weight, bias = cast(weight, x.dtype), cast(bias, x.dtype)
         needs_backward = has_grad and any(ctx.needs_input_grad)
-        if not needs_backward and mingru_step.fits(x):
-            return mingru_step.forward(x, weight, bias, reset, start, is_residual)
+        if not needs_backward and fits_step(x):
+            return step(x, weight, bias, reset, start, is_residual)
         gates = product(x, weight, bias)
         outputs, last = torch.empty_like(x), torch.empty_like(start)
         states = torch.empty_like(x) if is_residual and needs_backward else None
@@ -230,24 +252,14 @@ class _Sequence(torch.autograd.Function):
         return d_x, gradient_of_weights(flat, x.flatten(0, 1)), d_bias, None, d_start, None, None
 
 
-def _sequence(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
+def _sequence(core, x, reset, state, is_residual=False) -> tuple[torch.Tensor, arrdict]:
+    check_shapes(x, reset, state)
     x, start = x.to(compute_dtype(core.input.weight)), state["output"].float()
     sequence = x, core.input.weight, core.input.bias, reset.bool(), start, is_residual
     # autocast would choose its own dtypes inside
     with torch.autocast(x.device.type, enabled=False):
         outputs, last = _Sequence.apply(*sequence, torch.is_grad_enabled())
     return outputs, arrdict(output=last)
-
-
-@fused(_sequence, lambda core, *_: compute_dtype(core.input.weight) in DTYPES)
-def mingru(core, x, reset, state, is_residual) -> tuple[torch.Tensor, arrdict]:
-    """Does `MinGRU.forward` step by step. Nothing is done in place, as exporters want it."""
-    output, outputs = state["output"], []
-    for t in range(len(x)):
-        z, candidate = _split(core.input(x[t]))
-        output = (1 - z) * output.masked_fill(reset[t, :, None], 0.0) + z * candidate
-        outputs.append(output.to(x.dtype) + x[t] if is_residual else output.to(x.dtype))
-    return torch.stack(outputs), arrdict(output=output)
 
 
 class MinGRU(nn.Module):
@@ -269,6 +281,7 @@ class MinGRU(nn.Module):
         """Returns the hidden state of B lanes at the start of an episode."""
         return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
 
+    @fused(_sequence, lambda core, *_, **__: compute_dtype(core.input.weight) in DTYPES)
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict, is_residual: bool = False
     ) -> tuple[torch.Tensor, arrdict]:
@@ -276,4 +289,9 @@ class MinGRU(nn.Module):
         compute dtype. ValueError if shapes or devices do not fit.
         """
         check_shapes(x, reset, state)
-        return mingru(self, x, reset, state, is_residual)
+        output, outputs = state["output"], []
+        for t in range(len(x)):  # nothing is done in place, as exporters want it
+            z, candidate = _split(self.input(x[t]))
+            output = (1 - z) * output.masked_fill(reset[t, :, None], 0.0) + z * candidate
+            outputs.append(output.to(x.dtype) + x[t] if is_residual else output.to(x.dtype))
+        return torch.stack(outputs), arrdict(output=output)

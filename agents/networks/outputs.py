@@ -48,10 +48,9 @@ class Output(nn.Module):
         mask: Tree = None,
         **options: torch.Tensor,
     ) -> tuple[Tree, Tree, torch.Tensor]:
-        """Returns logits, actions and the actions' log-probability (B,).
+        """Returns logits, actions and the actions' log-probability (B,) of features (B, width).
 
         Args:
-            x: features (B, width).
             sample: samples; if false, takes the most likely or best actions.
             generator: generator of the samples.
             mask: allowed actions, as for `masked`. None: all.
@@ -62,12 +61,8 @@ class Output(nn.Module):
         return logits, actions, self.logprob(logits, actions)
 
     def masked(self, logits: Tree, mask: Tree = None) -> Tree:
-        """Returns logits with which only allowed actions are chosen.
-
-        Args:
-            logits: of `forward`.
-            mask: (..., A, n) bool, true for the allowed actions; ignored if actions are continuous.
-                None: all are.
+        """Returns logits with which only actions that a mask (..., A, n) bool allows are chosen;
+        all, if it is None or actions are continuous.
         """
         return logits
 
@@ -106,8 +101,6 @@ def _acts_on_gpu(output, x, sample=True, generator=None, mask=None) -> bool:
 
 
 class _Terms(torch.autograd.Function):
-    """`MultiDiscreteOutput.terms` in one kernel each way."""
-
     @staticmethod
     def forward(ctx, logits, actions) -> tuple[torch.Tensor, ...]:
         lead = logits.shape[:-2]
@@ -139,10 +132,6 @@ class MultiDiscreteOutput(Output):
 
     Logits are log-probabilities (..., A, n), actions (..., A) int64. `logprob` and `entropy` (...,)
     belong to the lane's joint action: they are summed over its agents.
-
-    Args:
-        space: action space.
-        width: number of features.
     """
 
     def __init__(self, space: spaces.MultiDiscrete, width: int):
@@ -170,7 +159,6 @@ class MultiDiscreteOutput(Output):
         generator: torch.Generator | None = None,
         mask: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Does the same as `Output.act`."""
         return super().act(x, sample, generator, mask)
 
     @fused(
@@ -207,9 +195,6 @@ class DictOutput(Output):
     """Independent outputs by key. Logits and actions are arrdicts with the same keys; `logprob`,
     `entropy` and `action_value` (...,) are summed over the keys.
 
-    Args:
-        outputs: an output per key of the action space.
-
     Raises:
         ValueError: if a key is the name of an attribute that every ``nn.ModuleDict`` has.
     """
@@ -225,7 +210,7 @@ class DictOutput(Output):
         self.outputs = nn.ModuleDict(outputs)
 
     def forward(self, x: torch.Tensor) -> arrdict:
-        return arrdict({key: output(x) for key, output in self.outputs.items()})
+        return self._each(lambda output, key: output(x))
 
     def act(
         self,
@@ -236,11 +221,10 @@ class DictOutput(Output):
         **options: torch.Tensor,
     ) -> tuple[arrdict, arrdict, torch.Tensor]:
         """Acts key by key. Keys that a mask has not are not masked."""
-        mask = {} if mask is None else mask
-        parts = {
-            key: output.act(x, sample, generator, mask.get(key), **options)
-            for key, output in self._outputs()
-        }
+        masks = {} if mask is None else mask
+        parts = self._each(
+            lambda output, key: output.act(x, sample, generator, masks.get(key), **options)
+        )
         logits, actions, logprobs = zip(*parts.values())
         return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), _total(logprobs)
 
@@ -248,48 +232,40 @@ class DictOutput(Output):
         """Masks key by key."""
         if mask is None:
             return logits
-        return arrdict(
-            {key: one.masked(logits[key], mask.get(key)) for key, one in self._outputs()}
-        )
+        return self._each(lambda output, key: output.masked(logits[key], mask.get(key)))
 
     def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """Sums the outputs' terms."""
-        logprobs, entropies = zip(*self._map("terms", logits, actions).values())
+        terms = self._each(lambda output, key: output.terms(logits[key], actions[key]))
+        logprobs, entropies = zip(*terms.values())
         return _total(logprobs), _total(entropies)
 
     def sample(
         self, logits: Tree, generator: torch.Generator | None = None, **options: torch.Tensor
     ) -> arrdict:
         """Samples actions, key by key."""
-        return self._map("sample", logits, generator=generator, **options)
+        return self._each(lambda output, key: output.sample(logits[key], generator, **options))
 
     def greedy(self, logits: Tree) -> arrdict:
         """Returns the most likely or best actions."""
-        return self._map("greedy", logits)
+        return self._each(lambda output, key: output.greedy(logits[key]))
 
     def logprob(self, logits: Tree, actions: Tree) -> torch.Tensor:
         """Returns the log-probability (...,) of actions."""
-        return _total(self._map("logprob", logits, actions).values())
+        each = self._each(lambda output, key: output.logprob(logits[key], actions[key]))
+        return _total(each.values())
 
     def entropy(self, logits: Tree) -> torch.Tensor:
         """Returns the entropy (...,) in nats."""
-        return _total(self._map("entropy", logits).values())
+        return _total(self._each(lambda output, key: output.entropy(logits[key])).values())
 
     def action_value(self, logits: Tree, actions: Tree) -> torch.Tensor:
         """Returns the value (...,) of actions."""
-        return _total(self._map("action_value", logits, actions).values())
+        each = self._each(lambda output, key: output.action_value(logits[key], actions[key]))
+        return _total(each.values())
 
-    def _map(self, method, *trees, **options) -> arrdict:
-        """Calls a method of each output with its part of the trees."""
-        return arrdict(
-            {
-                key: getattr(output, method)(*(tree[key] for tree in trees), **options)
-                for key, output in self.outputs.items()
-            }
-        )
-
-    def _outputs(self) -> Iterable[tuple[str, Output]]:
-        return typing.cast("Iterable[tuple[str, Output]]", self.outputs.items())
+    def _each(self, function) -> arrdict:
+        return arrdict({key: function(output, key) for key, output in self.outputs.items()})
 
 
 def _total(parts: Iterable[torch.Tensor]) -> torch.Tensor:

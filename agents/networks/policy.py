@@ -39,8 +39,8 @@ class Policy(nn.Module):
     """Acts on worlds: `decision, state = policy(world, state)`, starting from `policy.initial(B)`.
 
     A world is the dict that an environment's `step` returns, a decision the dict that it takes.
-    Privileged observations never influence the actions directly: only the critic sees them, and
-    `prediction_error` can teach the core to infer them.
+    Only the critic sees privileged observations, and `prediction_error` can teach the core to infer
+    them.
 
     Args:
         obs_space: the environment's observation space; or the environment, whose spaces it takes,
@@ -70,8 +70,7 @@ class Policy(nn.Module):
         ValueError: if an argument is out of range, or a space is of an unknown kind.
     """
 
-    #: Hidden state that `act` carries.
-    _carried: arrdict | None = None
+    _carried: arrdict | None = None  # hidden state, by `act`
 
     @checked
     def __init__(
@@ -125,14 +124,12 @@ class Policy(nn.Module):
 
     @property
     def _critic(self) -> "Critic":
-        assert self.critic is not None
-        return self.critic
+        return cast("Critic", self.critic)
 
     @property
     def activation_bytes(self) -> int:
-        """About how many bytes of activations learning needs per step of one lane: some 24 float32
-        per unit, and 8 for each layer above the first.
-        """
+        """About how many bytes of activations learning needs per step of one lane."""
+        # some 24 float32 per unit, and 8 for each layer above the first
         return 4 * (24 + 8 * (self.layers - 1)) * self.width
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
@@ -159,17 +156,12 @@ class Policy(nn.Module):
 
         Returns:
             arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.
-
-        Raises:
-            ValueError: if `obs`, `reset` and `state` are not of equally many lanes.
         """
         n_lanes = len(world["reset"])
         for name, tree in (("world.obs", world["obs"]), ("state", state)):
-            for leaf in leaves(tree):
-                if len(leaf) != n_lanes:
-                    raise ValueError(
-                        f"{name} is of {len(leaf)} lanes, but world.reset is of {n_lanes}"
-                    )
+            if any(n != n_lanes for n in map(len, leaves(tree))):
+                n = len(leaves(tree)[0])
+                raise ValueError(f"{name} is of {n} lanes, but world.reset is of {n_lanes}")
         obs, reset = mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None]
         if sample and generator is None:
             generator = self.generator.on(self.device)
@@ -184,14 +176,8 @@ class Policy(nn.Module):
     @torch.no_grad()
     def act(self, world: arrdict, greedy: bool = False) -> arrdict:
         """Returns the decision for the world that follows the last one, whose hidden state the
-        policy carries: `world = env.step(policy.act(world))`.
-
-        Where `world.reset` is true, as in all that an environment's `reset` returns, a lane's
-        hidden state is cleared. For several environments at once use `forward`.
-
-        Args:
-            world: as for `forward`.
-            greedy: takes the most likely or best actions instead of sampling.
+        policy carries: `world = env.step(policy.act(world))`. For several environments at once use
+        `forward`. Takes the most likely or best actions if `greedy`.
         """
         if self._carried is None or len(leaves(self._carried)[0]) != len(world["reset"]):
             self._carried = self.initial(len(world["reset"]))
@@ -207,7 +193,8 @@ class Policy(nn.Module):
         burn_in: int = 0,
         mask: Tree = None,
     ) -> arrdict:
-        """Runs over a sequence without acting.
+        """Runs over a sequence without acting. Returns arrdict(logits (T, B, ...), features
+        (T, B, width) that they were computed from, state after the sequence).
 
         Args:
             obs: (T, B, ...) per leaf.
@@ -217,10 +204,6 @@ class Policy(nn.Module):
             burn_in: steps at the start, fewer than T, that only warm up the hidden state. They have
                 no gradients, and the result leaves them out.
             mask: (T, M, A, n) bool per discrete action space, allowed actions. None: all.
-
-        Returns:
-            arrdict(logits (T, B, ...), features (T, B, width) that they were computed from, state
-            after the sequence).
         """
         with self.compute_dtype():
             n_apart = burn_in if torch.is_grad_enabled() else 0  # without gradients, one pass does
@@ -255,12 +238,8 @@ class Policy(nn.Module):
         privileged: Tree | None = None,
         lanes: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Returns the critic's value (...,) float32.
-
-        Args:
-            features: (..., width), of `unroll`.
-            privileged: the world's privileged observations, for an asymmetric critic.
-            lanes: (M,) int64, the lanes of `privileged` that `features` belong to. None: all.
+        """Returns the critic's value (...,) float32 of features (..., width) and, if it is
+        asymmetric, of privileged observations, or of their `lanes` (M,) int64.
         """
         with self.compute_dtype():
             return self._critic(features, privileged, lanes)
@@ -269,20 +248,15 @@ class Policy(nn.Module):
         self, features: torch.Tensor, privileged: Tree, lanes: torch.Tensor | None = None
     ) -> torch.Tensor:
         """Returns the error (T, B) of predicting the encoded privileged observations from features:
-        a mean squared error in standard deviations.
+        a mean squared error in standard deviations. Arguments are those of `value`.
 
         An auxiliary loss that trains the core and not the critic (Mirowski et al. 2017; with
         privileged information: Lambrechts et al. 2024).
-
-        Args:
-            features: (T, B, width), of `unroll`.
-            privileged: the world's privileged observations.
-            lanes: as for `value`.
         """
-        from megastep.agents.networks.joint_heads import prediction_error
+        from megastep.agents.networks.critic import prediction_error
 
         with self.compute_dtype():
-            encoded = self._critic.encode(privileged, lanes)
+            encoded = self._critic.intake.encode(privileged, lanes)
             return prediction_error(self.prediction, features, encoded)
 
     def terms(
@@ -298,23 +272,21 @@ class Policy(nn.Module):
     ) -> arrdict:
         """Returns what a loss needs of a sequence, (T, B) float32 each: `logprobs` of the actions,
         `entropies` of the policy, `values`, and without a `privileged_space` None, with one the
-        `errors` of `prediction_error`; and `features` (T, B, width). On a GPU the heads are
-        computed together, if they can.
+        `errors` of `prediction_error`; and `features` (T, B, width).
 
         Args:
-            obs: as for `unroll`, as `reset`, `state` and `lanes`.
+            obs, reset, state, lanes, mask: as for `unroll`.
             actions: (T, B, ...); (T, M, ...) with `lanes`.
             privileged: as for `value`.
             has_errors: false leaves the errors out, None.
-            mask: (T, M, A, n) bool per discrete action space, allowed actions. None: all.
         """
-        from megastep.agents.networks.joint_heads import head_terms
+        from megastep.agents.networks.critic import head_terms
 
         with self.compute_dtype():
             features, _ = self._features(obs, reset, state, lanes)
             encoded = prediction = None
             if self.privileged_space:
-                encoded = self._critic.encode(privileged, lanes)
+                encoded = self._critic.intake.encode(privileged, lanes)
                 prediction = self.prediction if has_errors else None
             heads_of = self.output, self._critic, prediction
             terms = head_terms(*heads_of, features, encoded, actions, mask)
@@ -322,9 +294,7 @@ class Policy(nn.Module):
         return arrdict(zip(names, (*terms, features), strict=True))
 
     def compute_dtype(self) -> ComputeDtype:
-        """Returns the autocast context of matrix products. Inside one context, each weight is cast
-        only once.
-        """
+        """Returns the autocast context of matrix products, in which each weight is cast once."""
         return ComputeDtype(
             self.device.type,
             torch.bfloat16,
@@ -343,13 +313,8 @@ class Policy(nn.Module):
     def update_stats(
         self, obs: Tree, privileged: Tree | None = None, is_counted: torch.Tensor | bool = True
     ) -> None:
-        """Adds observations to the running statistics of the actor's and the critic's intake, those
-        of all ranks together.
-
-        Args:
-            obs: (B, ...) per leaf.
-            privileged: (B, ...) per leaf, for an asymmetric critic.
-            is_counted: () or (B,) bool, lanes to count.
+        """Adds observations (B, ...) of the lanes that count, () or (B,) bool, to the running
+        statistics of the actor's and the critic's intake, those of all ranks together.
         """
         from megastep.agents.distributed.pooling import pool_moments  # who acts has no ranks
 
@@ -358,11 +323,7 @@ class Policy(nn.Module):
     def moments(
         self, obs: Tree, privileged: Tree | None = None, is_counted: torch.Tensor | bool = True
     ) -> "list[Moments]":
-        """Returns the moments of this rank's observations, for `pool_moments` and `add_moments`.
-
-        Args:
-            obs, privileged, is_counted: as for `update_stats`.
-        """
+        """Returns the moments of this rank's observations, for `pool_moments` and `add_moments`."""
         observations = self.intake.normalised_leaves(obs)
         if self.privileged_space:
             observations += self._critic.intake.normalised_leaves(privileged)
@@ -371,18 +332,14 @@ class Policy(nn.Module):
     def add_moments(
         self, moments: "Sequence[Moments]", is_counted: torch.Tensor | None = None
     ) -> None:
-        """Adds the observations of all ranks to the running statistics.
-
-        Args:
-            moments: those of `moments`, pooled over the ranks.
-            is_counted: () bool; if false, nothing changes. None: true.
+        """Adds `moments`, pooled over the ranks, to the running statistics, unless `is_counted`, ()
+        bool, is false.
         """
         running_norm.add_moments(self._norms(), moments, is_counted)
 
     def clear_stats(self) -> None:
-        """Makes observations and values 0 until there are statistics of them, which begin with the
-        first rollout, so that learning does not depend on their units. Leaves statistics that there
-        are as they are. Learners call it before they collect.
+        """Makes observations and values 0 until there are statistics of them, so that learning does
+        not depend on their units. Learners call it before they collect.
         """
         for norm in self._norms():
             norm.clear()

@@ -1,7 +1,7 @@
 """The dtype that layers compute in."""
 
 import threading
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import torch
@@ -30,13 +30,8 @@ _MAX_ROWS, _THREADS = LIBRARY.constants["CAST_ROWS"], LIBRARY.constants["CAST_TH
 
 
 class ComputeDtype(torch.autocast):
-    """Autocast that also remembers what `cast` and `once` returned: until the outermost context
-    ends, each weight is cast only once. Weights must not change inside it.
-
-    Args:
-        device_type, dtype, enabled: autocast's arguments.
-        weights: returns weights that are cast together, on a GPU, once one of them is needed. In
-            contexts inside each other, those of the innermost.
+    """Autocast that casts each weight only once until the outermost context ends. Weights must not
+    change inside it. Those that `weights` returns are cast together on a GPU.
     """
 
     def __init__(
@@ -64,12 +59,8 @@ class ComputeDtype(torch.autocast):
 
 
 def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.Tensor:
-    """Returns a weight in another dtype, for use without autograd.
-
-    Args:
-        weight: (N, ...).
-        dtype: of the result.
-        multiple: rows of zeros are added until there are a multiple of this.
+    """Returns a weight (N, ...) in another dtype, without autograd. Rows of zeros are added until
+    there are a multiple of `multiple`.
     """
     n_padding = -len(weight) % multiple
     if weight.dtype == dtype and not n_padding:
@@ -89,37 +80,18 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
 
 def cast_joined(weights: tuple[torch.Tensor, ...], dtype: torch.dtype) -> torch.Tensor:
     """Returns weights (N, n) each, cast as by `cast` and joined along columns: (N, sum of n)."""
-
-    def join() -> torch.Tensor:
-        return torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
-
-    return once(weights, dtype, join)
-
-
-def once(
-    weights: tuple[torch.Tensor, ...], name: Hashable, make: Callable[[], torch.Tensor]
-) -> torch.Tensor:
-    """Returns `make()`, which follows from weights and has no gradient: once per context.
-
-    Args:
-        weights: what `make` reads.
-        name: tells apart what is made of the same weights.
-        make: makes the tensor.
-    """
-    key = tuple(id(weight) for weight in weights), name
-    if key not in _CASTS.by_weight:
-        result = make()
-        if not _CASTS.depth:
-            return result
+    key = *(id(weight) for weight in weights), dtype
+    if key in _CASTS.by_weight:
+        return _CASTS.by_weight[key][1]
+    result = torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
+    if _CASTS.depth:
         _CASTS.by_weight[key] = weights, result
-    return _CASTS.by_weight[key][1]
+    return result
 
 
 @torch.no_grad()
 def _cast_together(weight) -> None:
-    """Rounds all weights of the context to bfloat16, if this is one of them: in one kernel instead
-    of one or two for each.
-    """
+    """Rounds all weights of the context to bfloat16 in one kernel, if this is one of them."""
     weights = [w for w in _CASTS.weights() if w.dim() and is_plain_on_gpu(w)]
     if not any(w is weight for w in weights):
         return
@@ -129,8 +101,8 @@ def _cast_together(weight) -> None:
 
 
 def rounded(weights: list[torch.Tensor]) -> list[torch.Tensor]:
-    """Returns weights (N, ...) float32, contiguous on a GPU, in bfloat16. Rows of zeros are added
-    until there are a multiple of 8.
+    """Returns weights (N, ...) float32, contiguous on a GPU, in bfloat16, with rows of zeros up to
+    a multiple of 8.
     """
     shapes = [(len(weight) + -len(weight) % _MULTIPLE, *weight.shape[1:]) for weight in weights]
     sizes = [torch.Size(shape).numel() for shape in shapes]

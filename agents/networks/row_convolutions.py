@@ -1,13 +1,13 @@
 """The encoder `Conv`: convolutions of images of one or a few rows of pixels.
 
 On a GPU whose tensor cores take bfloat16 and that copies in bulk (Hopper and later), both
-convolutions and their ReLUs are one kernel, and all their gradients another. On other GPUs each is
-a product with a banded matrix.
+convolutions and their ReLUs are one kernel, and all their gradients another.
 
 N rows of C channels and W columns; W' columns of features; `...` any leading axes, A agents that
 one lane controls.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,15 +19,15 @@ from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.fused import aligned, aligned_rows, fused, has_hopper
-from megastep.agents.networks.linear import Activation, affine, sum_rows
-from megastep.agents.networks.precision import cast, compute_dtype, once
+from megastep.agents.networks.linear import sum_rows
+from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 
 # Lambdas with type parameters are device code only if everything is.
 _FLAGS = *FAST_CUDA_FLAGS, "--device-as-default-execution-space"
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels" / "convolutions", _FLAGS)
-_MAX_CHANNELS = LIBRARY.constants["CONV_INPUTS"]
+_MAX_CHANNELS, MAX_COLUMNS = LIBRARY.constants["CONV_INPUTS"], 256
 _CHANNELS, _ROWS, _THREADS, _BLOCKS = (
     LIBRARY.constants[f"CONV_{name}"] for name in "CHANNELS ROWS THREADS BLOCKS".split()
 )
@@ -42,109 +42,29 @@ class Encoder(nn.Module):
     n_features: int
 
 
-class BandedConv1d(nn.Conv1d):
-    """A convolution of rows of fixed length, (N, C, W) -> (N, C', W').
-
-    On a GPU, rows of at most `MAX_BANDED` columns are multiplied by a banded matrix that holds the
-    weights of every column. That takes many times the arithmetic, but on tensor cores it is several
-    times faster than cuDNN, whose gradients are slow for few channels.
-
-    Args:
-        in_channels: C.
-        n_columns: W.
-        out_channels: C'.
-        kernel_size: columns of the kernel, K.
-        stride: columns between two outputs.
-        padding: columns of zeros at each end.
-    """
-
-    MAX_BANDED = 256
-    band: torch.Tensor  # (K, W', W)
-    bias: torch.Tensor  # (C',)
-
-    def __init__(
-        self,
-        in_channels: int,
-        n_columns: int,
-        out_channels: int,
-        kernel_size: int,
-        stride: int,
-        padding: int,
-    ):
-        super().__init__(in_channels, out_channels, kernel_size, stride=stride, padding=padding)
-        self.n_columns = n_columns
-        self.n_outputs = (n_columns + 2 * padding - kernel_size) // stride + 1
-        offset = torch.arange(n_columns) - stride * torch.arange(self.n_outputs)[:, None] + padding
-        # (K, W', W): 1 where kernel column k connects input column w to output column w'
-        band = (offset == torch.arange(kernel_size)[:, None, None]).float()
-        self.register_buffer("band", band, persistent=False)
-
-    def matrix(self) -> torch.Tensor:
-        """Returns (C' W', C W) float32, the convolution of a flattened row without the bias."""
-        with torch.autocast(self.weight.device.type, enabled=False):
-            spread = self.weight.flatten(0, 1) @ self.band.flatten(1)
-        spread = spread.view(*self.weight.shape[:2], *self.band.shape[1:])
-        return spread.transpose(1, 2).flatten(2).flatten(0, 1)
-
-    def column_bias(self) -> torch.Tensor:
-        """Returns (C' W',), the bias of each row of `matrix`."""
-        return self.bias[:, None].expand(-1, self.n_outputs).flatten()
-
-    def forward(self, rows: torch.Tensor, activation: Activation | None = None) -> torch.Tensor:
-        """Returns the convolution of rows (N, C, W), with an activation: (N, C', W')."""
-        if rows.is_cuda and self.band.shape[-1] <= self.MAX_BANDED:
-            return self.as_product(rows, activation)
-        outputs = super().forward(rows)
-        return outputs if activation is None else activation(outputs)
-
-    def as_product(self, rows: torch.Tensor, activation: Activation | None = None) -> torch.Tensor:
-        """Does what `forward` does with the banded matrix."""
-        if torch.is_grad_enabled():
-            matrix, bias = self.matrix(), self.column_bias()
-        else:
-            matrix = once((self.weight,), "matrix", self.matrix)
-            bias = once((self.bias,), "column_bias", self.column_bias)
-        outputs = affine(rows.flatten(1), matrix, bias, activation)
-        return outputs.unflatten(1, (-1, self.n_outputs))
-
-
 class Conv(Encoder):
     """Two convolutions along the rows of an image: (..., A, C, H, W) -> (..., n_features).
 
     The H rows count as channels, since images are one or a few pixels high. Agents share weights.
-    In bfloat16 on GPUs from Hopper on, one kernel does both.
     """
 
-    def __init__(self, space: spaces.MultiImage, channels: int = 32):
+    def __init__(self, space: spaces.MultiImage):
         super().__init__()
-        self.row_shape = shape = space.C * space.H, space.W
-        self.first = BandedConv1d(*shape, channels, kernel_size=8, stride=4, padding=4)
-        shape = channels, self.first.n_outputs
-        self.second = BandedConv1d(*shape, channels, kernel_size=4, stride=2, padding=2)
-        self.n_row_features = channels * self.second.n_outputs  # of one agent
+        self.row_shape = space.C * space.H, space.W
+        self.first = nn.Conv1d(self.row_shape[0], _CHANNELS, 8, stride=4, padding=4)
+        self.second = nn.Conv1d(_CHANNELS, _CHANNELS, 4, stride=2, padding=2)
+        self.n_row_features = _CHANNELS * n_outputs(space.W)  # of one agent
         self.n_features = space.n_agents * self.n_row_features
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        rows = obs.reshape(-1, *self.row_shape).to(compute_dtype(self.first.weight))
-        part = Part(self, slice(0, math.prod(self.row_shape)), slice(0, self.n_row_features))
-        return encode(rows.flatten(1), [part]).reshape(*obs.shape[:-4], self.n_features)
-
-    def convolved(self, rows: torch.Tensor) -> torch.Tensor:
-        """Returns the features (N, n_row_features) of rows (N, C H, W), layer by layer."""
-        return self.second(self.first(rows, torch.relu), torch.relu).flatten(1)
-
-    def parameters_in_order(self) -> tuple[torch.Tensor, ...]:
-        """Returns weight and bias of the first, then of the second convolution."""
-        return self.first.weight, self.first.bias, self.second.weight, self.second.bias
+        rows = obs.reshape(-1, math.prod(self.row_shape)).to(compute_dtype(self.first.weight))
+        part = Part(self, slice(0, rows.shape[1]), slice(0, self.n_row_features))
+        return encode(rows, [part]).reshape(*obs.shape[:-4], self.n_features)
 
 
 class Part(NamedTuple):
-    """Columns of normalised observations that become columns of features.
-
-    Attributes:
-        encoder: of one image. None: the columns are copied.
-        source: columns of the observations.
-        target: columns of the features.
+    """Columns of normalised observations (`source`) that become columns of features (`target`) by
+    the encoder of one image. None: they are copied.
     """
 
     encoder: Conv | None
@@ -156,26 +76,16 @@ class Part(NamedTuple):
         assert self.encoder is not None
         return columns[:, self.source].unflatten(1, self.encoder.row_shape)
 
-    def is_known(self, columns: torch.Tensor) -> bool:
-        """Returns whether the kernels take the encoder's rows."""
-        assert self.encoder is not None
-        first = self.encoder.first
-        is_size_right = (
-            first.out_channels == _CHANNELS
-            and first.n_columns <= first.MAX_BANDED
-            and self.target.start % _ALIGNMENT == 0
-        )
-        return is_size_right and takes(self.rows(columns))
-
 
 def _can_encode(columns, parts) -> bool:
     if columns.requires_grad or parts[-1].target.stop % _ALIGNMENT:
         return False
-    return all(part.encoder is None or part.is_known(columns) for part in parts)
+    images = [part for part in parts if part.encoder]
+    return all(p.target.start % _ALIGNMENT == 0 and takes(p.rows(columns)) for p in images)
 
 
 class _Encode(torch.autograd.Function):
-    """What `encode` does. Each part's encoder has four parameters, in the order of the parts."""
+    """Each part's encoder has four parameters, in the order of the parts."""
 
     @staticmethod
     def forward(ctx, columns, parts, *parameters) -> torch.Tensor:
@@ -187,9 +97,7 @@ class _Encode(torch.autograd.Function):
             if part.encoder is None:
                 target.copy_(columns[:, part.source])
             else:
-                first = next(of_encoders), next(of_encoders)
-                second = next(of_encoders), next(of_encoders)
-                conv_forward(part.rows(columns), *first, *second, target)
+                conv_forward(part.rows(columns), *itertools.islice(of_encoders, 4), features=target)
         ctx.parts = parts
         ctx.save_for_backward(columns, features, *weights)
         return features
@@ -202,7 +110,7 @@ class _Encode(torch.autograd.Function):
         for part in ctx.parts:
             if part.encoder is None:
                 continue
-            *of_part, _ = (next(of_encoders) for _ in range(4))
+            *of_part, _ = itertools.islice(of_encoders, 4)
             is_needed = ctx.needs_input_grad[len(gradients) : len(gradients) + 4]
             found = [None] * 4
             if any(is_needed):
@@ -213,26 +121,23 @@ class _Encode(torch.autograd.Function):
 
 
 def _encode_on_gpu(columns, parts) -> torch.Tensor:
-    encoders = [part.encoder for part in parts if part.encoder]
-    parameters = [leaf for encoder in encoders for leaf in encoder.parameters_in_order()]
+    parameters = [leaf for part in parts if part.encoder for leaf in part.encoder.parameters()]
     return _Encode.apply(columns, parts, *parameters)
 
 
 @fused(_encode_on_gpu, _can_encode)
 def encode(columns: torch.Tensor, parts: Sequence[Part]) -> torch.Tensor:
-    """Returns features (N, n) of parts of observations side by side; in bfloat16 on GPUs with its
-    kernels, one for each part.
-
-    Args:
-        columns: (N, n_columns), each row contiguous.
-        parts: whose targets follow each other.
+    """Returns features (N, n) of parts, whose targets follow each other, of observations side by
+    side (N, n_columns).
     """
     features = []
     for part in parts:
-        if part.encoder is None:
+        encoder = part.encoder
+        if encoder is None:
             features.append(columns[:, part.source].contiguous())
         else:
-            features.append(part.encoder.convolved(part.rows(columns)))
+            hidden = torch.relu(encoder.first(part.rows(columns)))
+            features.append(torch.relu(encoder.second(hidden)).flatten(1))
     return torch.cat(features, 1) if len(features) > 1 else features[0]
 
 
@@ -241,16 +146,14 @@ def encode(columns: torch.Tensor, parts: Sequence[Part]) -> torch.Tensor:
 
 def n_outputs(n_columns: int) -> int:
     """Returns W' of rows of W columns."""
-    n_hidden = n_columns // 4 + 1
-    return n_hidden // 2 + 1
+    return (n_columns // 4 + 1) // 2 + 1
 
 
 def takes(rows: torch.Tensor) -> bool:
-    """Returns whether the kernels take rows (N, C, W) of this dtype on their device. The backward
-    one needs more memory.
-    """
+    """Returns whether the kernels take rows (N, C, W) of this dtype on their device."""
     _, n_channels, n_columns = rows.shape
-    if not rows.is_cuda or rows.dtype != torch.bfloat16 or n_channels > _MAX_CHANNELS:
+    is_bf16 = rows.is_cuda and rows.dtype == torch.bfloat16
+    if not is_bf16 or n_channels > _MAX_CHANNELS or n_columns > MAX_COLUMNS:
         return False
     return has_hopper(rows.device, _backward_sizes(n_channels, n_columns)[1])
 
@@ -263,22 +166,14 @@ def conv_forward(
     second_bias: torch.Tensor,
     features: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Convolves rows twice, with a ReLU after each convolution.
-
-    Hidden activations and features are float32 sums, rounded to bfloat16 after bias and ReLU.
+    """Convolves rows twice, with a ReLU after each convolution. Hidden activations and features are
+    float32 sums, rounded to bfloat16 after bias and ReLU.
 
     Args:
-        rows: (N, C, W), each row contiguous; may be columns of a wider tensor. Faster if they
-            start at multiples of 16 bytes and W is a multiple of 8.
-        first_weight: (32, C, 8).
-        first_bias: (32,).
-        second_weight: (32, 32, 4).
-        second_bias: (32,).
-        features: (N, 32 W'), where to write; may be columns of a wider tensor, if its rows start at
-            multiples of 16 bytes. None: a new tensor.
-
-    Returns:
-        features (N, 32 W'), by channel, then by column.
+        rows: (N, C, W) for which `takes`; may be columns of a wider tensor.
+        first_weight, first_bias, second_weight, second_bias: (32, C, 8), (32,), (32, 32, 4), (32,).
+        features: (N, 32 W'), by channel, then by column: where to write, rows at multiples of 16
+            bytes. None: a new tensor.
     """
     n_rows, n_channels, n_columns = rows.shape
     if rows.stride()[1:] != (n_columns, 1):
@@ -325,24 +220,10 @@ def conv_backward(
     first_bias: torch.Tensor,
     second_weight: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Computes the gradients of `conv_forward`'s weights and biases.
+    """Returns the gradients of `conv_forward`'s weights and biases, float32 sums in a fixed order.
 
-    Hidden activations are computed again, and rounded to bfloat16 like their gradients. Sums are
-    float32 and have a fixed order on a model of GPUs.
-
-    Args:
-        d_features: (N, 32 W').
-        features: (N, 32 W'), of `conv_forward`. The gradient passes where they are above 0 or NaN.
-            Both may be columns of a wider tensor, and are copied if their rows do not start at
-            multiples of 16 bytes.
-        rows: (N, C, W) for which `is_supported`; may be columns of a wider tensor. Faster if they
-            start at multiples of 8 bytes and W is a multiple of 4.
-        first_weight: (32, C, 8).
-        first_bias: (32,).
-        second_weight: (32, 32, 4).
-
-    Returns:
-        The gradients of the first weight and bias, then of the second, float32.
+    Hidden activations are computed again, and rounded to bfloat16 like their gradients. Gradients
+    pass where features (N, 32 W') are above 0 or NaN.
     """
     n_rows, n_channels, n_columns = rows.shape
     if rows.stride()[1:] != (n_columns, 1):

@@ -1,11 +1,13 @@
-"""Normalisation by running means and standard deviations, in whatever units the numbers are.
-Ignores non-finite numbers.
+"""Normalisation by running means and standard deviations, in whatever units the numbers are, which
+ignores non-finite numbers; and by those of numbers of which some are valid.
 
 B lanes; `...` any further axes.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -27,11 +29,10 @@ RESOLUTION = LIBRARY.constants["RESOLUTION"]
 #: Leaves of an observation that a kernel handles.
 MAX_LEAVES = LIBRARY.constants["MAX_LEAVES"]
 _THREADS = LIBRARY.constants["MOMENTS_THREADS"]
-
-
-class _Statistics(Protocol):
-    mean: torch.Tensor
-    scale: torch.Tensor
+_MAX_ARRAYS, _MASKED_THREADS, _NUMBERS = (
+    LIBRARY.constants[f"MASKED_{name}"] for name in ("ARRAYS", "THREADS", "NUMBERS")
+)
+_TINY = 1e-30  # so that equal numbers are not divided by 0
 
 
 class RunningNorm(nn.Module):
@@ -40,12 +41,8 @@ class RunningNorm(nn.Module):
     to divide when it does.
 
     Needed also for images from 0 to 1: if pixels are .87 plus or minus .1, a new network would
-    mostly see the .87.
-
-    Before the first moments, observations stay as they are, or are 0 after `clear`.
-
-    Args:
-        space: leaf space of an image or a vector.
+    mostly see the .87. Before the first moments, observations stay as they are, or are 0 after
+    `clear`.
     """
 
     mean: torch.Tensor
@@ -65,9 +62,7 @@ class RunningNorm(nn.Module):
         return (obs - self.mean) / self.scale
 
     def clear(self) -> None:
-        """Makes observations 0 until the first moments, unless it has some: in their own units they
-        could be of any size.
-        """
+        """Makes observations, which may be of any size, 0 until the first moments."""
         self.scale.masked_fill_(self.count == 0, UNKNOWN_SCALE)
 
 
@@ -92,7 +87,7 @@ def _parts(n) -> Iterator[slice]:
     return (slice(start, start + MAX_LEAVES) for start in range(0, n, MAX_LEAVES))
 
 
-def _moments_on_gpu(norms, leaves, is_counted=True) -> "list[Moments]":
+def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
     device, n_lanes = leaves[0].device, len(leaves[0])
     is_counted = torch.as_tensor(is_counted, device=device).expand(n_lanes).contiguous()
     moments: list[Moments] = []
@@ -124,13 +119,9 @@ def moments_of(
     norms: Sequence[RunningNorm],
     leaves: Sequence[torch.Tensor],
     is_counted: torch.Tensor | bool = True,
-) -> "list[Moments]":
-    """Returns of each norm the number of lanes that count, and the mean and variance of their
-    observations.
-
-    Args:
-        leaves: the observations (B, ...) of each norm.
-        is_counted: () or (B,) bool, lanes to count.
+) -> list[Moments]:
+    """Returns of each norm and its observations (B, ...) the number of lanes that count, () or (B,)
+    bool, and mean and variance of these.
     """
     moments: list[Moments] = []
     for norm, obs in zip(norms, leaves, strict=True):
@@ -167,40 +158,97 @@ def _add_on_gpu(norms, moments, is_counted=None) -> None:
 @fused(_add_on_gpu, lambda norms, *_: is_plain_on_gpu(*(norm.mean for norm in norms)))
 def add_moments(
     norms: Sequence[RunningNorm],
-    moments: "Sequence[Moments]",
+    moments: Sequence[Moments],
     is_counted: torch.Tensor | None = None,
 ) -> None:
     """Adds moments to the statistics of each norm, the n-th call with weight 1/n. Changes nothing
-    if no lane was counted, or if a mean or variance is not finite.
-
-    Args:
-        moments: of each norm.
-        is_counted: () bool; if false, nothing changes. None: true.
+    if no lane was counted, a mean or variance is not finite, or `is_counted`, () bool, is false.
     """
     for norm, (n_lanes, mean, variance) in zip(norms, moments, strict=True):
         n_lanes = n_lanes if is_counted is None else n_lanes * is_counted
         count = norm.count + 1
-        mean, scale = mix_moments(norm, mean, variance, 1 / count)
+        mean, scale = mix_moments(norm.mean, norm.scale, mean, variance, 1 / count)
         scale = scale.masked_fill(scale <= RESOLUTION * mean.abs(), UNKNOWN_SCALE)
         is_stored = (n_lanes > 0) & (mean + scale).isfinite().all()
         store_if(is_stored, [(norm.mean, mean), (norm.scale, scale), (norm.count, count)])
 
 
 def mix_moments(
-    norm: _Statistics, mean: torch.Tensor, variance: torch.Tensor, rate: torch.Tensor
+    old_mean: torch.Tensor,
+    old_scale: torch.Tensor,
+    mean: torch.Tensor,
+    variance: torch.Tensor,
+    rate: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns mean and standard deviation of a mixture: the norm's moments with weight 1 - rate,
-    `mean` and `variance` with weight rate.
-    """
-    old_variance = norm.scale.masked_fill(norm.scale >= UNKNOWN_SCALE, 0.0).square()
-    spread = rate * (1 - rate) * (mean - norm.mean).square()
+    """Returns mean and standard deviation of old moments with weight 1 - rate, and others."""
+    old_variance = old_scale.masked_fill(old_scale >= UNKNOWN_SCALE, 0.0).square()
+    spread = rate * (1 - rate) * (mean - old_mean).square()
     variance = old_variance.lerp(variance, rate) + spread
-    return norm.mean.lerp(mean, rate), variance.sqrt()
+    return old_mean.lerp(mean, rate), variance.sqrt()
 
 
 def store_if(condition: torch.Tensor, pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:
-    """Copies the second tensor of each pair into the first if `condition`, a bool (); otherwise
-    changes no bit. Never synchronises.
-    """
+    """Copies the second tensor of each pair into the first if `condition`, () bool."""
     for target, source in pairs:
         target.copy_(torch.where(condition, source, target))
+
+
+# ---- Numbers of which some are valid; those that are not may be anything ----
+
+
+def _are_masked_readable(valid, *arrays) -> bool:
+    is_small = all(x.numel() < 2**31 and x.shape == valid.shape for x in arrays)
+    return is_small and is_plain_on_gpu(*arrays) and valid.is_contiguous()
+
+
+def _masked_on_gpu(valid, *arrays) -> list[Moments]:
+    n, tensor = arrays[0].numel(), arrays[0]
+    n_parts = max(1, -(-n // (_MASKED_THREADS * _NUMBERS)))
+    parts = tensor.new_empty(len(arrays), n_parts, 3)
+    moments = tensor.new_empty(len(arrays), 2)
+    n_valid = torch.empty((), dtype=torch.int64, device=tensor.device)
+    rows = b"".join(LIBRARY.params.MaskedArrayParams(values=array) for array in arrays)
+    blocks = Blocks(n_parts, len(arrays), _MASKED_THREADS)
+    fields = dict(arrays=rows, valid=valid, parts=parts, n=n)
+    launch(LIBRARY, "masked_parts", tensor.device, blocks, **fields)
+    fields = dict(parts=parts, moments=moments, n_valid=n_valid, n_parts=n_parts)
+    launch(LIBRARY, "masked_moments", tensor.device, blocks._replace(x=1), **fields)
+    return [(n_valid, *pair.unbind()) for pair in moments]
+
+
+@torch.no_grad()
+@fused(
+    _masked_on_gpu,
+    lambda valid, *arrays: len(arrays) <= _MAX_ARRAYS and _are_masked_readable(valid, *arrays),
+)
+def masked_moments(valid: torch.Tensor, *arrays: torch.Tensor) -> list[Moments]:
+    """Returns the number of valid entries, bool, and their mean and variance in each array of their
+    shape, 0 if none is valid.
+    """
+    n_valid = valid.sum()
+    n = n_valid.clamp(min=1)
+    moments = []
+    for x in arrays:
+        mean = x.masked_fill(~valid, 0.0).sum() / n
+        variance = (x - mean).square().masked_fill(~valid, 0.0).sum() / n
+        moments.append((n_valid, mean, variance))
+    return moments
+
+
+def _normalise_on_gpu(x, valid, moments) -> torch.Tensor:
+    _, mean, variance = moments
+    normalised = torch.empty_like(x)
+    launch(
+        *(LIBRARY, "normalise_masked", x.device, x.numel()),
+        **dict(values=x, valid=valid, mean=mean, variance=variance),
+        **dict(normalised=normalised, n=x.numel()),
+    )
+    return normalised
+
+
+@torch.no_grad()
+@fused(_normalise_on_gpu, lambda x, valid, moments: _are_masked_readable(valid, x))
+def normalise_masked(x: torch.Tensor, valid: torch.Tensor, moments: Moments) -> torch.Tensor:
+    """Returns x minus the mean, divided by the standard deviation; 0 where invalid."""
+    _, mean, variance = moments
+    return (x - mean).masked_fill(~valid, 0.0) / (variance.sqrt() + _TINY)

@@ -22,9 +22,7 @@ from megastep.types import Env
 
 
 class _Slot:
-    """One of the `lag` rollouts in progress, with its weights, CUDA graph and end event. All slots
-    share the actor state.
-    """
+    """One of the `lag` rollouts in progress, with its weights, CUDA graph and end event."""
 
     def __init__(self, env: Env, policy: Policy, rollout: Rollout, actor_state: arrdict):
         # autocast caches casts only of weights that require a gradient
@@ -42,19 +40,8 @@ class _Slot:
 
 
 class AsyncCollector:
-    """Collects `lag` rollouts in advance. Each call copies the next one into `rollout`, returns it,
-    and starts another.
-
-    Rollouts do not store values: learners with a lag compute them with their latest weights.
-
-    Args:
-        env: environment without opponents.
-        policy: the policy that the learner updates.
-        rollout: filled and returned by each call.
-        lag: age of the acting weights, in updates.
-
-    Raises:
-        ValueError: if the environment has opponents, whose weights change with the updates.
+    """Collects `lag` rollouts in advance. Each call copies the next one into `rollout`, which has
+    no values, returns it, and starts another. ValueError if the environment has opponents.
     """
 
     def __init__(self, env: Env, policy: Policy, rollout: Rollout, lag: int):
@@ -86,7 +73,7 @@ class AsyncCollector:
         self.n_returned += 1
         if slot.end is not None:
             torch.cuda.current_stream(self.rollout.reward.device).wait_event(slot.end)
-        self.rollout.copy_(slot.rollout)
+        self.rollout.load_state_dict(slot.rollout.state_dict())
         self._launch(slot)
         return self.rollout
 

@@ -24,11 +24,9 @@ _STORED = "obs", "reset", "learns", "privileged", "mask"  # what `Rollout.store_
 
 
 def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
-    """Resets an environment and allocates the rollout's metrics and mask.
-
-    Returns:
-        The actor state for `collect`: arrdict(world, state), with a copy of the parts of the
-        current world that rollouts store, and the policy's initial hidden state.
+    """Resets an environment and allocates the rollout's metrics and mask. Returns the actor state
+    for `collect`: arrdict(world, state), with a copy of the parts of the current world that
+    rollouts store, and the policy's initial hidden state.
     """
     first = rollout.select_lanes(env.reset())
     rollout.allocate_optional(first)
@@ -44,10 +42,8 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
         env: environment whose current world is in `actor_state`.
         policy: acts; its values are stored if the rollout has `values`.
         rollout: overwritten.
-        actor_state: from `initial_actor_state` or the previous `collect`; updated in place.
-
-    Returns:
-        `actor_state`.
+        actor_state: from `initial_actor_state` or the previous `collect`; updated in place, and
+            returned.
     """
     world, state = actor_state["world"], actor_state["state"]
     copy_all(zip(leaves(rollout.state), leaves(state), strict=True))
@@ -90,18 +86,12 @@ def capture_with(
     roots: tuple = (),
     warmup: int = 3,
 ) -> Callable:
-    """Records a function that steps an environment as a CUDA graph, by `capture`.
+    """Records a function that steps an environment, with a policy or several, as a CUDA graph, by
+    `capture`. `roots` are other objects with tensors that the function changes.
 
-    Args:
-        env: the environment.
-        policies: a policy or a tuple of policies.
-        function, args, warmup: as for `capture`.
-        roots: other objects with tensors that the function changes.
-
-    Returns:
-        The graph; or `function` itself, with a warning, if it cannot be recorded, for example
-        because it changes attributes of a user's environment or policy that are not tensors. Such
-        attributes are restored, so results do not depend on when a graph is recorded.
+    Returns the graph; or the function itself, with a warning, if it cannot be recorded, for example
+    because it changes attributes of a user's environment or policy that are not tensors. Such
+    attributes are restored, so results do not depend on when a graph is recorded.
     """
     state = HostState(env, policies)
     captured = capture(function, args, (env, policies, *roots), warmup, state.changed)
@@ -115,14 +105,8 @@ class Collector:
     The first call runs eagerly, so that libraries are initialised before anything is recorded.
     Later calls on a GPU replay a CUDA graph, unless the environment steps on the host.
 
-    Args:
-        env: environment.
-        policy: the acting policy.
-        rollout: the rollout to fill.
-        actor_state: actor state to continue from; None resets the environment.
-
-    Attributes:
-        graph: the CUDA graph; None before the second call and without graphs.
+    Continues from an actor state; None resets the environment. `graph` is the CUDA graph, None
+    before the second call and without graphs.
     """
 
     def __init__(

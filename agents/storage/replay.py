@@ -17,8 +17,7 @@ from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 from megastep import spaces
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.copies import LIBRARY, require_stored
-from megastep.agents.storage.replay_columns import Column, stored_dtype
+from megastep.agents.storage.copies import LIBRARY
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.storage.sum_tree import SET_THREADS, SumTree, has_kernels, packed
@@ -33,8 +32,6 @@ _FLAGS = "starts", "learns", "terminal", "truncated"
 _WITH_LAST = "obs", "privileged", "starts", "learns", "mask"
 #: Smallest priority before it is raised to alpha, so that sequences of zero error can be drawn.
 _MIN_PRIORITY = 1e-6
-
-
 _MAX_TENSORS = LIBRARY.constants["MAX_SELECTED"]
 _READ_THREADS = LIBRARY.constants["READ_THREADS"]
 _MAX_ENTRIES = 2**31  # kernels count lanes, rows and words in 32 bits
@@ -48,6 +45,60 @@ _CONVERSIONS = {
     (torch.uint8, torch.float32): LIBRARY.constants["BYTE_TO_FLOAT"],
     (torch.float16, torch.float32): LIBRARY.constants["HALF_TO_FLOAT"],
 }
+
+
+class Column:
+    """Rows (R, ...) of one tensor of the experience, stored in another dtype than that which `read`
+    returns, unless `stored` is None.
+    """
+
+    def __init__(
+        self,
+        n_rows: int,
+        shape: tuple[int, ...],
+        dtype: torch.dtype,
+        stored: torch.dtype | None,
+        device: torch.device,
+    ):
+        self.dtype = dtype
+        self.rows = torch.zeros(n_rows, *shape, dtype=stored or dtype, device=device)
+
+    def write(self, index: torch.Tensor, values: torch.Tensor) -> None:
+        """Stores the first m of values (>= m, ...) at rows index (m,)."""
+        values = cast(values[: len(index)], self.rows.dtype)
+        self.rows.index_copy_(0, index, values)
+
+    def read(self, index: torch.Tensor) -> torch.Tensor:
+        """Returns entries (..., *) of rows (R, B, *). Entry r B + b is lane b of row r."""
+        rows = self.rows.flatten(0, 1).index_select(0, index.flatten())
+        return cast(rows, self.dtype).unflatten(0, index.shape)
+
+
+def stored_dtype(space: Space, images: str) -> torch.dtype | None:
+    """Returns the dtype in which values of a leaf space are stored; None if it does not change.
+    Integers are stored in the smallest dtype that holds them.
+    """
+    if isinstance(space, spaces.MultiDiscrete):
+        dtypes = torch.uint8, torch.int16, torch.int32
+        return next(dtype for dtype in dtypes if space.n_actions - 1 <= torch.iinfo(dtype).max)
+    if isinstance(space, spaces.MultiImage) and images == "uint8":
+        return torch.uint8
+    return None
+
+
+def cast(values: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """Returns values in another dtype. Fractions from 0 to 1 become integers from 0 to 255 and
+    back; float16 is clipped to its range.
+    """
+    source = values.dtype
+    if source.is_floating_point and dtype == torch.uint8:
+        return (values * 255).round_().clamp_(0, 255).to(dtype)
+    if source == torch.uint8 and dtype.is_floating_point:
+        return values.to(dtype) / 255
+    if dtype == torch.float16 and source != dtype:
+        largest = torch.finfo(dtype).max
+        return values.clamp(-largest, largest).to(dtype)
+    return values.to(dtype)
 
 
 # ---- On a GPU ----
@@ -79,7 +130,6 @@ def _can_read(replay, index, probability) -> bool:
 
 
 def _read_on_gpu(replay, index, probability) -> arrdict:
-    """Reads sequences, weights and ages in one kernel."""
     columns, n_rows, spec = _parts(replay)
     n_sequences, n_steps, device, packed_rows = len(index), replay.length, index.device, []
     results, n_blocks = [], 1 + -(-(n_steps + 1) * n_sequences // _READ_THREADS)
@@ -141,9 +191,7 @@ class ReplayBuffer:
 
     Args:
         rollout: an example of the rollouts to store; only its shapes, dtypes and device are used.
-            With the device "meta", the buffer has its sizes but takes no memory.
-        obs_space: the environment's observation space.
-        action_space: the environment's action space.
+        obs_space, action_space: the environment's.
         settings: capacity, sequence length, priorities.
         logprobs: whether to store log-probabilities.
 
@@ -165,26 +213,24 @@ class ReplayBuffer:
         device = rollout.reward.device
         n_rows = self.n_rollouts * self.n_steps
 
-        def column(leaf, stored=None) -> Column:  # for a leaf (T, B, ...) of the rollout
+        def column(leaf, space=None) -> Column:  # for a leaf (T, B, ...) of the rollout
+            stored = None if space is None else stored_dtype(space, settings.images)
             return Column(n_rows, leaf.shape[1:], leaf.dtype, stored, device)
-
-        def column_of_space(space, leaf) -> Column:
-            return column(leaf, stored_dtype(space, settings.images))
 
         def column_of_state(leaf) -> Column:
             return Column(self.n_rollouts, leaf.shape, leaf.dtype, torch.float16, device)
 
         self.columns = arrdict(
-            obs=spaces.map(column_of_space, obs_space, rollout.obs),
-            actions=spaces.map(column_of_space, action_space, rollout.actions),
+            obs=spaces.map(column, rollout.obs, obs_space),
+            actions=spaces.map(column, rollout.actions, action_space),
             reward=column(rollout.reward),
         )
+        parts = dict(privileged=rollout.privileged, mask=rollout.mask)
         if logprobs:
-            self.columns["logprobs"] = column(rollout.logprobs)
-        if rollout.privileged is not None:
-            self.columns["privileged"] = mapping(column)(rollout.privileged)
-        if rollout.mask is not None:
-            self.columns["mask"] = mapping(column)(rollout.mask)
+            parts = dict(logprobs=rollout.logprobs) | parts
+        for name, part in parts.items():
+            if part is not None:
+                self.columns[name] = mapping(column)(part)
         self.flags = Column(n_rows, (self.n_lanes,), torch.uint8, None, device)
         self.state = mapping(column_of_state)(rollout.state)
         self.tree = SumTree(self.n_rollouts * self.n_lanes, device)
@@ -203,12 +249,9 @@ class ReplayBuffer:
     def bytes(self) -> int:
         """Size in bytes."""
         columns = [*leaves(self.columns), *leaves(self.state), self.flags]
-        tensors = self.is_finite, self.n_added, self.n_available, self.new_priority
-        return (
-            sum(column.rows.nbytes for column in columns)
-            + sum(tensor.nbytes for tensor in tensors)
-            + self.tree.bytes
-        )
+        tensors = [self.is_finite, self.n_added, self.n_available, self.new_priority]
+        tensors += [column.rows for column in columns] + self.tree.levels
+        return sum(tensor.nbytes for tensor in tensors)
 
     @property
     def is_ready(self) -> torch.Tensor:
@@ -218,34 +261,22 @@ class ReplayBuffer:
 
     @torch.no_grad()
     def add(self, rollout: Rollout, is_finite: torch.Tensor | bool = True) -> None:
-        """Stores a rollout, in place of the oldest if the buffer is full.
-
-        Args:
-            rollout: the rollout collected right after the one added last.
-            is_finite: () bool. If false, no sequence that contains part of this rollout is ever
-                drawn. Its rows are stored as zeros, because `sample` returns arbitrary rows while
-                no sequence can be drawn.
-
-        Raises:
-            ValueError: if the rollout differs from the buffer's in number of steps or lanes.
+        """Stores the rollout collected right after the one added last, in place of the oldest if
+        the buffer is full. If it is not finite, () bool, no sequence that contains part of it is
+        ever drawn, and its rows are stored as zeros: `sample` returns arbitrary rows while no
+        sequence can be drawn.
         """
-        if (rollout.n_steps, rollout.n_lanes) != (self.n_steps, self.n_lanes):
-            raise ValueError(
-                f"rollout must have {self.n_steps} steps of {self.n_lanes} lanes as the buffer's, "
-                f"but it has {rollout.n_steps} of {rollout.n_lanes}"
-            )
         is_finite = torch.ones_like(self.is_finite[:1]) & is_finite
         steps = torch.arange(self.n_steps, device=self.n_added.device)
         lanes = torch.arange(self.n_lanes, device=self.n_added.device)
         slot = self.n_added % self.n_rollouts
         rows = slot * self.n_steps + steps
+
+        def write(column, leaf) -> None:
+            column.write(rows, torch.where(is_finite, leaf, leaf.new_zeros(())))
+
         for name, columns in self.columns.items():
-            spaces.map(
-                lambda column, leaf: column.write(
-                    rows, torch.where(is_finite, leaf, leaf.new_zeros(()))
-                ),
-                *(columns, getattr(rollout, name)),
-            )
+            spaces.map(write, columns, getattr(rollout, name))
         bits = [getattr(rollout, name)[: self.n_steps].byte() << i for i, name in enumerate(_FLAGS)]
         self.flags.write(rows, torch.as_tensor(sum(bits)))
         spaces.map(lambda column, leaf: column.write(slot, leaf[None]), self.state, rollout.state)
@@ -267,14 +298,10 @@ class ReplayBuffer:
     def sample(self, n: int, generator: torch.Generator | None = None) -> arrdict:
         """Draws M = n sequences. While `n_available` is 0, all numbers are finite but meaningless.
 
-        Returns:
-            An arrdict as from `Rollout.sequences`, with leaves (L+1, M, ...) or (L, M, ...), and
-            per sequence, (M,):
-
-            index: int64, for `set_priorities`
-            probability: float64, priority divided by the sum of all priorities
-            weight: float32 importance weight for the loss, at most 1 (Schaul et al. 2016, sec. 3.4)
-            age: int64, number of rollouts added since the one in which it starts
+        Returns an arrdict as from `Rollout.sequences`, with leaves (L+1, M, ...) or (L, M, ...),
+        and per sequence, (M,): `index` for `set_priorities`; `probability` float64, priority
+        divided by the sum of all; `weight`, importance weight for the loss, at most 1 (Schaul et
+        al. 2016, sec. 3.4); and `age`, number of rollouts added since the one in which it starts.
         """
         index, probability = self.tree.draw(n, generator)
         batch = self._read(index, probability)
@@ -304,16 +331,8 @@ class ReplayBuffer:
     @torch.no_grad()
     def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
         """Sets the priorities of the last sample's sequences to `values`, (M,), to the power alpha.
-
-        Skips non-finite values. Does nothing if alpha is 0, or before `is_ready`, because learners
-        do not use samples drawn before that.
+        Skips non-finite values. Does nothing if alpha is 0, or before `is_ready`.
         """
-        if index.shape != values.shape:
-            raise ValueError(
-                f"values must have one priority for each index, so shape {tuple(index.shape)}, but "
-                f"it is {tuple(values.shape)}"
-            )
-        require_stored(index=index, values=values)
         if self.settings.alpha:
             self._store_priorities(index, values)
 

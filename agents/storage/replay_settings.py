@@ -1,7 +1,6 @@
 """Settings of the replay buffer."""
 
 import dataclasses
-import functools
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
@@ -80,8 +79,8 @@ def defaults_from(settings: ReplaySettings) -> BeforeValidator:
     """Returns a validator for annotations: a dict of some settings takes the others from `settings`
     instead of from the class.
     """
-    return BeforeValidator(functools.partial(_complete, settings))
 
+    def complete(value) -> object:
+        return dataclasses.asdict(settings) | value if isinstance(value, dict) else value
 
-def _complete(settings, value) -> object:
-    return {**dataclasses.asdict(settings), **value} if isinstance(value, dict) else value
+    return BeforeValidator(complete)

@@ -13,12 +13,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.copies import (
-    copy_all,
-    require_stored,
-    select_lanes,
-    select_tree,
-)
+from megastep.agents.storage.copies import copy_all, select_lanes, select_tree
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
@@ -34,8 +29,7 @@ class Rollout:
     Args:
         n_steps: T.
         n_lanes: B.
-        obs_space: space of the observations.
-        action_space: space of the actions.
+        obs_space, action_space: the environment's.
         state: the policy's hidden state of B lanes, such as `policy.initial(B)`; copied.
         device: device of all tensors.
         privileged_space: space of privileged observations, which only the critic sees, or None.
@@ -63,9 +57,6 @@ class Rollout:
         layouts: (T, B) int32, the floor plan that the action led through, for a curriculum and for
             statistics by source; None without `allocate_layouts`.
         state: (B, ...), the policy's hidden state before row 0.
-
-    Raises:
-        ValueError: if there are no steps or no lanes.
     """
 
     def __init__(
@@ -81,25 +72,19 @@ class Rollout:
         learners: torch.Tensor | None = None,
         values: bool = True,
     ):
-        if n_steps < 1 or n_lanes < 1:
-            raise ValueError(
-                f"a rollout needs at least one step and one lane, not {n_steps} and {n_lanes}"
-            )
         self.n_steps, self.n_lanes, self.learners = n_steps, n_lanes, learners
         self.lane_indices = None if learners is None else learners.nonzero()[:, 0]
-        rows, rows_and_last = (n_steps, n_lanes), (n_steps + 1, n_lanes)
-        self.obs = _zeros(obs_space, rows_and_last, device, obs_dtype)
+        rows, with_last = (n_steps, n_lanes), (n_steps + 1, n_lanes)
+        self.obs = _zeros(obs_space, with_last, device, obs_dtype)
         self.privileged = None
         if privileged_space is not None:
-            self.privileged = _zeros(privileged_space, rows_and_last, device, torch.float32)
+            self.privileged = _zeros(privileged_space, with_last, device)
         self.actions = _zeros(action_space, rows, device)
-        self.starts = torch.zeros(rows_and_last, dtype=torch.bool, device=device)
-        self.learns = torch.ones(rows_and_last, dtype=torch.bool, device=device)
-        self.terminal = torch.zeros(rows, dtype=torch.bool, device=device)
-        self.truncated = torch.zeros(rows, dtype=torch.bool, device=device)
-        self.values = torch.zeros(rows_and_last, device=device) if values else None
-        self.logprobs = torch.zeros(rows, device=device)
-        self.reward = torch.zeros(rows, device=device)
+        flags: dict = dict(dtype=torch.bool, device=device)
+        self.starts, self.learns = torch.zeros(with_last, **flags), torch.ones(with_last, **flags)
+        self.terminal, self.truncated = (torch.zeros(rows, **flags) for _ in range(2))
+        self.values = torch.zeros(with_last, device=device) if values else None
+        self.logprobs, self.reward = (torch.zeros(rows, device=device) for _ in range(2))
         self.metrics = arrdict()
         self.mask: Tree = None
         self.layouts: torch.Tensor | None = None
@@ -145,7 +130,10 @@ class Rollout:
             layout: (N,) integers, the environments' layouts in that world, if they are stored.
             decision: is stored with it, as `store_decision` does.
         """
-        pairs = [*self._of_transition(t, world), *self._of_world(t + 1, world)]
+        names = "reward", "terminal", "truncated"
+        pairs = [(getattr(self, name)[t], world[name]) for name in names]
+        pairs += [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
+        pairs += self._of_world(t + 1, world)
         if decision is not None:
             pairs += self._of_decision(t, decision)
         if layout is not None:
@@ -173,16 +161,6 @@ class Rollout:
         if self.mask is not None:
             pairs += _pairs(self.mask, t, world["mask"])
         return pairs
-
-    def _of_transition(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Returns (target, source) pairs for row t, from the world after its action."""
-        names = "reward", "terminal", "truncated"
-        metrics = [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
-        return [*((getattr(self, name)[t], world[name]) for name in names), *metrics]
-
-    def copy_(self, other: "Rollout") -> None:
-        """Copies every tensor of another rollout of the same shape."""
-        self.load_state_dict(other.state_dict())
 
     def state_dict(self) -> dict[str, Tree]:
         """Returns every tensor: trees by name."""
@@ -283,9 +261,8 @@ class Rollout:
 
 
 def make_rollout(env: Env, policy: Policy, n_steps: int, values: bool = True) -> Rollout:
-    """Allocates a rollout of T steps for an environment and a policy.
-
-    It holds all lanes, or only those that learn if the environment has `learners` (opponents).
+    """Allocates a rollout of T steps of all lanes of an environment, or of those that learn if it
+    has `learners` (opponents).
     """
     learners = optional(env, "learners")
     n_stored = n_lanes(env) if learners is None else int(learners.sum())
@@ -304,21 +281,17 @@ def make_rollout(env: Env, policy: Policy, n_steps: int, values: bool = True) ->
 
 def bytes_per_step(env: Env, policy: Policy) -> int:
     """Returns the approximate size of a rollout in bytes per step and lane."""
-    obs = _bytes(env.obs_space, default_itemsize=2)
-    privileged = 0
-    if policy.privileged_space:
-        privileged = _bytes(policy.privileged_space, default_itemsize=4)
-    return obs + privileged + _BYTES_OF_THE_REST
+    n_bytes = _BYTES_OF_THE_REST
+    for space, itemsize in (env.obs_space, 2), (policy.privileged_space or {}, 4):
+        for leaf in spaces.leaves(space).values():
+            dtype = getattr(leaf, "dtype", None)
+            n_bytes += math.prod(leaf.shape) * (dtype.itemsize if dtype else itemsize)
+    return n_bytes
 
 
 def copy_tree(target: Tree, source: Tree) -> None:
-    """Copies the tensors of a tree into those of another with the same keys, on any device.
-
-    Raises:
-        ValueError: if one has no memory.
-    """
+    """Copies the tensors of a tree into those of another with the same keys, on any device."""
     if isinstance(target, torch.Tensor):
-        require_stored(target=target, source=source)
         target.copy_(source)
         return
     for key, part in target.items():
@@ -347,12 +320,3 @@ def _zeros(space, lead, device, dtype=torch.float32) -> Tree:
         return torch.zeros(*lead, *leaf.shape, dtype=leaf_dtype, device=device)
 
     return spaces.map(zeros, space)
-
-
-def _bytes(space, default_itemsize) -> int:
-    """Returns the bytes of one value of a space, whose leaves may name a dtype."""
-    n_bytes = 0
-    for leaf in spaces.leaves(space).values():
-        dtype = getattr(leaf, "dtype", None)
-        n_bytes += math.prod(leaf.shape) * (dtype.itemsize if dtype else default_itemsize)
-    return n_bytes

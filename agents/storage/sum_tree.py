@@ -11,7 +11,7 @@ import itertools
 import torch
 
 from megastep.agents.networks.fused import fused
-from megastep.agents.storage.copies import LIBRARY, require_stored
+from megastep.agents.storage.copies import LIBRARY
 from megastep.kernels.build.launch import WARP, Blocks, launch
 
 #: Indices that a launch sets, and its threads.
@@ -52,23 +52,11 @@ def _store_on_gpu(tree, index, values) -> None:
 
 class SumTree:
     """Holds N priorities, initially 0. Nothing synchronises and shapes are fixed, so CUDA graphs
-    can record all methods.
-
-    Args:
-        n: N, number of priorities.
-        device: device of the tree.
-        fan_out: F, children per node. A GPU reads a block of 32 as fast as one number, and a
-            million priorities then take only four levels.
-
-    Raises:
-        ValueError: if n < 1 or fan_out < 2.
+    can record all methods. A GPU reads a block of 32 children as fast as one number, and a million
+    priorities then take only four levels.
     """
 
     def __init__(self, n: int, device: torch.device | str | None = None, fan_out: int = 32):
-        if n < 1 or fan_out < 2:
-            raise ValueError(
-                f"a sum tree needs n >= 1 priorities and fan_out >= 2, not {n} and {fan_out}"
-            )
         self.n, self.fan_out = n, fan_out
         self.levels = []  # (blocks, F) each
         while not self.levels or n > 1:
@@ -85,27 +73,10 @@ class SumTree:
         """(), the sum of all priorities."""
         return self.levels[-1].sum()
 
-    @property
-    def bytes(self) -> int:
-        """Size in bytes."""
-        return sum(level.nbytes for level in self.levels)
-
     def set(self, index: torch.Tensor, values: torch.Tensor) -> None:
-        """Sets priorities.
-
-        Args:
-            index: (M,) int64. If an index occurs several times, its largest value is stored.
-            values: (M,), finite and at least 0.
-
-        Raises:
-            ValueError: if index and values do not both have shape (M,), or lack storage.
+        """Sets the priorities of an index (M,) int64 to values (M,), finite and at least 0. If an
+        index occurs several times, its largest value is stored.
         """
-        if index.ndim != 1 or index.shape != values.shape:
-            raise ValueError(
-                f"index and values must have one shape (M,), but index is {tuple(index.shape)} and "
-                f"values is {tuple(values.shape)}"
-            )
-        require_stored(index=index, values=values)
         self._store(index, values.to(torch.float64))
 
     @fused(_store_on_gpu, lambda self, index, values: has_kernels(self, len(index)))
@@ -128,8 +99,6 @@ class SumTree:
         Sampling is stratified: one index is drawn from each of n equal parts of the total. Indices
         of priority 0 are never drawn, unless all priorities are 0; then each result is index 0.
         """
-        if n < 1:
-            raise ValueError(f"n must be at least 1 index to draw, but {n} was given")
         device = self.levels[-1].device
         # the position of each sample within its part, from 0 to 1
         return self._at(torch.rand(n, generator=generator, dtype=torch.float64, device=device))
@@ -155,6 +124,5 @@ class SumTree:
 
     def probability(self, index: torch.Tensor) -> torch.Tensor:
         """Returns the probability (M,) float64 of each index; 0 while all priorities are 0."""
-        require_stored(index=index)
         tiny = torch.finfo(torch.float64).tiny
         return self.priorities.index_select(0, index) / self.total.clamp(min=tiny)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from megastep.agents.algorithms.adam import Adam, has_kernels
+from megastep.agents.algorithms.optimizers import Adam, has_kernels
 
 YES, NO = torch.tensor(True), torch.tensor(False)
 

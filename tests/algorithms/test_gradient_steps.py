@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from megastep.agents.algorithms.adam import has_kernels
 from megastep.agents.algorithms.gradient_steps import GradientSteps
+from megastep.agents.algorithms.optimizers import has_kernels
 
 
 def updates(to=torch.Tensor.cpu):

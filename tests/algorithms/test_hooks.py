@@ -223,7 +223,7 @@ def test_a_schedule_needs_a_budget_and_the_learning_rate_one_master(here, capsys
 # ---- Optimizers ----
 
 
-@pytest.mark.parametrize("name", ["adam", "adamw", "sgd", "torch.optim:RMSprop"])
+@pytest.mark.parametrize("name", ["adam", "adamw", "torch.optim:RMSprop"])
 def test_optimizers_learn_and_resume_bit_for_bit(name):
     settings = dict(optimizer=name, weight_decay=0.01, desired_kl=0.01)
     policy, learner, collect = make(**settings)
@@ -243,15 +243,6 @@ def test_optimizers_learn_and_resume_bit_for_bit(name):
     learner.update(rollout)
     resumed.update(rollout)
     assert torch.equal(weights(policy), weights(other)) and learner.read_lr() == resumed.read_lr()
-
-
-def test_sgd_subtracts_the_gradient_times_the_step_size():
-    policy, learner, collect = make(optimizer="sgd", n_minibatches=1, lr=0.5, max_grad_norm=1e6)
-    before = {name: p.detach().clone() for name, p in policy.named_parameters()}
-    learner.update(collect())
-    for name, p in policy.named_parameters():
-        if not name.startswith("critic.output"):  # which PopArt rescales afterwards
-            torch.testing.assert_close(p.detach(), before[name] - 0.5 * p.grad)
 
 
 def test_the_step_size_follows_the_kl_divergence():

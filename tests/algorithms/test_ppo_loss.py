@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.ppo import Coefficients, ppo_loss
+from megastep.agents.algorithms.ppo import ppo_loss
 from megastep.arrdict import arrdict
 
 T, M = 7, 133
@@ -27,7 +27,8 @@ def case(to, value_clip, auxiliary):
     leaves = [draw(0.3) - 1, draw() + 2, draw(3.0), draw() if auxiliary else None]
     leaves[0][~batch.valid] = torch.nan  # whatever is invalid does not count
     leaves = [None if leaf is None else leaf.requires_grad_() for leaf in leaves]
-    settings = Coefficients(0.2, value_clip, 0.5, 0.01, 0.7)
+    settings = dict(clip=0.2, value_clip=value_clip, value_coef=0.5)
+    settings |= dict(entropy_coef=0.01, auxiliary_coef=0.7)
     return leaves, batch, to(torch.tensor(2.5)), settings
 
 

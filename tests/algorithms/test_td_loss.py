@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.algorithms.td_loss import Settings, td_loss
+from megastep.agents.algorithms.r2d2 import td_loss
 from megastep.agents.networks import heads
 from megastep.arrdict import arrdict
 
-SETTINGS = Settings(gamma=0.97, return_steps=10, eta=0.7)
+SETTINGS = dict(gamma=0.97, return_steps=10, eta=0.7)
 
 
 def case(n_steps, n_sequences, n_agents, n_choices, to):
@@ -47,7 +47,7 @@ def test_fused_loss_matches_plain(sizes, to_gpu):
     results = []
     for to in (to_gpu, torch.Tensor.cpu):
         q, *rest = case(*sizes, to)
-        loss, metrics, priorities, n_valid = td_loss(q, *rest, SETTINGS)
+        loss, metrics, priorities, n_valid = td_loss(q, *rest, **SETTINGS)
         (gradient,) = torch.autograd.grad(3 * loss, q)
         rest = dict(loss=loss, priorities=priorities, n_valid=n_valid, gradient=gradient)
         results.append(metrics | rest)
@@ -60,7 +60,7 @@ def test_fused_loss_matches_plain(sizes, to_gpu):
 
 def test_same_bits_each_time(to_gpu):
     q, *rest = case(32, 100, 1, 7, to_gpu)
-    runs = [td_loss(q, *rest, SETTINGS) for _ in range(2)]
+    runs = [td_loss(q, *rest, **SETTINGS) for _ in range(2)]
     gradients = [torch.autograd.grad(run.loss, q)[0] for run in runs]
     assert torch.equal(*gradients) and torch.equal(runs[0].priorities, runs[1].priorities)
 
@@ -69,7 +69,7 @@ def test_nan_reaches_loss_and_its_own_priority_only(to_gpu):
     q, *rest = case(12, 20, 1, 3, to_gpu)
     rest[1]["reward"][4, 7] = torch.nan
     rest[1]["starts"][5, 7], rest[1]["learns"][4, 7] = False, True
-    result = td_loss(q, *rest, SETTINGS)
+    result = td_loss(q, *rest, **SETTINGS)
     is_nan = result.priorities.isnan()
     assert result.loss.isnan() and is_nan[7] and is_nan.sum() == 1
 
@@ -77,6 +77,6 @@ def test_nan_reaches_loss_and_its_own_priority_only(to_gpu):
 def test_without_valid_steps_nothing_is_learned(to_gpu):
     q, *rest = case(5, 6, 1, 3, to_gpu)
     rest[1]["learns"][:] = False
-    result = td_loss(q, *rest, SETTINGS)
+    result = td_loss(q, *rest, **SETTINGS)
     assert not result.loss and not result.n_valid and not result.priorities.any()
     assert not torch.autograd.grad(result.loss, q)[0].any()

@@ -10,7 +10,7 @@ from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.distributed import pooling, process_group
 from megastep.agents.distributed.ranks import world
-from megastep.agents.networks.masked_moments import masked_moments
+from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.rollout import Rollout
 from tests.helpers import ranks
 from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, T, made_up, weights

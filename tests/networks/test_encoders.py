@@ -1,6 +1,4 @@
-"""Convolutions as banded matrices and as one kernel. test_heads.py tests encoders as part of
-intakes.
-"""
+"""Convolutions by PyTorch and as one kernel. test_intakes.py tests encoders as part of intakes."""
 
 from types import SimpleNamespace
 
@@ -20,25 +18,6 @@ BF16 = torch.bfloat16
 ROUNDING = dict(rtol=2**-7, atol=1e-2)
 
 
-@pytest.mark.parametrize("shape", [(3, 128), (1, 64), (6, 37), (1, 5)])
-def test_banded_matrix_matches_convolution(shape):
-    channels, n_columns = shape
-    conv = encoders.Conv(spaces.MultiImage(1, channels, 1, n_columns))
-    rows = torch.rand(6, channels, n_columns, generator=torch.Generator().manual_seed(1))
-    for layer in conv.first, conv.second:
-        expected, product = layer(rows), layer.as_product(rows)
-        torch.testing.assert_close(product, expected)
-        weights = torch.rand(expected.shape, generator=torch.Generator().manual_seed(2))
-        parameters = layer.weight, layer.bias
-        torch.testing.assert_close(
-            torch.autograd.grad((product * weights).sum(), parameters),
-            torch.autograd.grad((expected * weights).sum(), parameters),
-            rtol=1e-4,
-            atol=1e-4,
-        )
-        rows = expected.detach()
-
-
 @pytest.mark.parametrize("side, n_features", [(84, 64 * 7 * 7), (36, 64), (35, 64 * 9 * 9)])
 def test_cnn_sees_every_pixel(side, n_features):
     """For 84 x 84 pixels the features of Mnih et al. 2015, 7 x 7 of 64 channels."""
@@ -54,7 +33,7 @@ def test_cnn_sees_every_pixel(side, n_features):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("n_columns", [128, 2 * kernels.BandedConv1d.MAX_BANDED])
+@pytest.mark.parametrize("n_columns", [128, 2 * kernels.MAX_COLUMNS])
 def test_gpu_matches_cpu(n_columns):
     conv = encoders.Conv(spaces.MultiImage(1, 3, 1, n_columns))
     image = torch.rand(7, 1, 3, 1, n_columns, generator=torch.Generator().manual_seed(1))
@@ -101,9 +80,9 @@ def test_an_intake_writes_features_side_by_side(space, n_calls, monkeypatch):
     columns[..., intake.n_columns - 8 :] = 0
     calls, results = [], []
 
-    def conv_forward(rows, *arguments):
+    def conv_forward(rows, *weights, features):
         calls.append(rows.shape)
-        return convolve(rows, *arguments)
+        return convolve(rows, *weights, features)
 
     monkeypatch.setattr(kernels, "conv_forward", conv_forward)
     monkeypatch.setattr(kernels, "conv_backward", torch.enable_grad()(gradients))
@@ -136,7 +115,7 @@ def test_frozen_parameters_get_no_gradient(monkeypatch):
         assert (leaf.grad is None) == any(leaf is other for other in frozen)
 
 
-def test_observations_that_need_gradients_and_odd_columns_are_left_to_other_forms(monkeypatch):
+def test_observations_that_need_gradients_and_odd_columns_are_left_to_pytorch(monkeypatch):
     monkeypatch.setattr(kernels, "takes", lambda rows: True)
     columns = torch.zeros(5, 48, dtype=BF16)
     encoder = encoders.Conv(IMAGE)
@@ -148,23 +127,14 @@ def test_observations_that_need_gradients_and_odd_columns_are_left_to_other_form
     last = kernels.Part(None, slice(0, 5), slice(99, 104))
     assert not kernels._can_encode(columns, [part(encoder, 3), last])
     assert not kernels._can_encode(columns, [part(encoder, 0), last._replace(target=slice(96, 99))])
-    assert not kernels._can_encode(columns, [part(encoders.Conv(IMAGE, channels=16), 0)])
-    wide = encoders.Conv(spaces.MultiImage(1, 1, 1, 2 * kernels.BandedConv1d.MAX_BANDED))
-    assert not kernels._can_encode(columns, [part(wide, 0)])
     assert not kernels._can_encode(columns.requires_grad_(), [part(encoder, 0)])
-
-
-@pytest.mark.parametrize("n_columns", [1, 5, 16, 37, 128, 256])
-def test_features_have_the_columns_of_the_second_convolution(n_columns):
-    conv = encoders.Conv(spaces.MultiImage(1, 3, 1, n_columns))
-    assert kernels.n_outputs(n_columns) == conv.second.n_outputs
 
 
 def weights_of(conv, device="cuda"):
     """The weights, with biases that matter, in bfloat16."""
     for layer in conv.first, conv.second:
         layer.bias.data.normal_()
-    return [leaf.detach().to(device, BF16) for leaf in conv.parameters_in_order()]
+    return [leaf.detach().to(device, BF16) for leaf in conv.parameters()]
 
 
 @pytest.mark.parametrize("shape", [(3, 128), (6, 37), (1, 5)])
@@ -199,10 +169,7 @@ def test_kernel_matches_convolutions(shape, n_rows):
     assert features[:, :8].isnan().all() and features[:, -8:].isnan().all()
     assert torch.equal(kernels.conv_forward(rows, *weights), ours)  # same bits twice
     with torch.autocast("cuda", BF16), torch.no_grad():
-        banded = conv.cuda().convolved(rows)
-        assert torch.equal(conv(rows[:, None, :, None]), ours)
-    error = (ours.float() - banded.float()).norm() / banded.float().norm()
-    assert error < 0.02, error  # sums of the product may be rounded to 8 bits, too
+        assert torch.equal(conv.cuda()(rows[:, None, :, None]), ours)
 
 
 @pytest.mark.cuda
@@ -225,7 +192,7 @@ def test_gradients_through_the_kernel(shape, monkeypatch):
     torch.manual_seed(1)
     calls, conv_forward = [], kernels.conv_forward
     monkeypatch.setattr(
-        kernels, "conv_forward", lambda *args: calls.append(args) or conv_forward(*args)
+        kernels, "conv_forward", lambda *args, **at: calls.append(args) or conv_forward(*args, **at)
     )
     conv = encoders.Conv(spaces.MultiImage(*shape)).cuda()
     images = torch.randn(300, *shape, device="cuda")
@@ -234,7 +201,7 @@ def test_gradients_through_the_kernel(shape, monkeypatch):
         with ComputeDtype("cuda", BF16, enabled=is_enabled):
             features = conv(images)
         loss = features.float().square().sum()
-        results.append([features, *torch.autograd.grad(loss, conv.parameters_in_order())])
+        results.append([features, *torch.autograd.grad(loss, conv.parameters())])
     assert len(calls) == 1
     for ours, plain in zip(*results, strict=True):
         error = (ours.float() - plain).norm() / plain.norm()

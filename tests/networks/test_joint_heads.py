@@ -9,7 +9,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.networks import critic as critic_module
-from megastep.agents.networks import heads, joint_heads
+from megastep.agents.networks import heads
 from megastep.agents.networks import linear as linear_module
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.fused import plain_operations
@@ -53,7 +53,7 @@ def products(monkeypatch):
     """A CPU has neither products of few rows, nor those of bfloat16 with results in float32."""
     monkeypatch.setattr(linear_module.few_rows, "fits", lambda *matrices: False)
     if not torch.cuda.is_available():
-        for module in (linear_module, joint_heads):
+        for module in (linear_module, critic_module):
             monkeypatch.setattr(module, "gradient_of_weights", lambda d, x: d.float().T @ x.float())
 
 
@@ -74,11 +74,11 @@ def test_terms_and_gradients_match_pytorch(
             x, *others = (to_gpu(leaf) for leaf in (features, encoded, actions))
             x.requires_grad_()
             with torch.autocast(x.device.type, BF16):
-                terms = joint_heads._terms_on_gpu(*of, x, *others)
+                terms = critic_module._terms_on_gpu(*of, x, *others)
         else:
             of, x = plain, features.float().requires_grad_()
             with plain_operations():
-                terms = joint_heads.head_terms(*of, x, encoded.float(), actions)
+                terms = critic_module.head_terms(*of, x, encoded.float(), actions)
         loss = sum((w.to(term.device) * term).sum() for w, term in zip(weights, terms))
         leaves = [x, *(leaf for module in of for leaf in module.parameters())]
         d = torch.autograd.grad(loss, leaves, allow_unused=True)
@@ -133,9 +133,9 @@ def test_other_heads_are_not_fused():
     features, encoded = torch.randn(2, 3, 64).cuda().to(BF16), torch.randn(2, 3, 8).cuda().to(BF16)
     policy = Policy(spaces.MultiVector(1, 4), moves, privileged, width=64).cuda()
     of = policy.output, policy.critic, policy.prediction
-    assert joint_heads._fits(*of, features, encoded, None)
-    assert not joint_heads._fits(*of, features.float(), encoded, None)
-    assert not joint_heads._fits(*of[:2], None, features, encoded, None)
+    assert critic_module._fits_joint(*of, features, encoded, None)
+    assert not critic_module._fits_joint(*of, features.float(), encoded, None)
+    assert not critic_module._fits_joint(*of[:2], None, features, encoded, None)
     for space in (spaces.MultiContinuous(1, 2), arrdict(one=moves)):
         output = heads.output(space, 64).cuda()
-        assert not joint_heads._fits(output, *of[1:], features, encoded, None)
+        assert not critic_module._fits_joint(output, *of[1:], features, encoded, None)

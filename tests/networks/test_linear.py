@@ -2,6 +2,8 @@
 CPU's own. Also what is remembered of weights.
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch import nn
@@ -9,8 +11,7 @@ from torch import nn
 from megastep import engine
 from megastep.agents.networks import linear
 from megastep.agents.networks.fused import aligned_rows
-from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined, once, rounded
-from megastep.agents.networks.row_convolutions import BandedConv1d
+from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined, rounded
 
 BF16 = dict(rtol=0, atol=2e-2)  # times the largest number: 8 bits, and sums of them
 
@@ -45,23 +46,6 @@ def test_weights_are_joined_once_per_context():
         joined = cast_joined(weights, torch.bfloat16)
         assert cast_joined(weights, torch.bfloat16) is joined
     assert torch.equal(joined, expected.bfloat16()) and not joined.requires_grad
-
-
-def test_what_follows_from_weights_is_made_once_per_context():
-    conv = BandedConv1d(3, 16, 2, kernel_size=4, stride=2, padding=1)
-    rows = torch.randn(5, 3, 16)
-    with ComputeDtype("cpu", torch.bfloat16, enabled=False), torch.no_grad():
-        with ComputeDtype("cpu", torch.bfloat16, enabled=False):
-            torch.testing.assert_close(conv.as_product(rows), conv(rows))
-        matrix = once((conv.weight,), "matrix", conv.matrix)
-        assert once((conv.weight,), "matrix", conv.matrix) is matrix
-        with torch.enable_grad():
-            gradient = torch.autograd.grad(conv.as_product(rows).sum(), conv.weight)[0]
-    assert gradient.any()
-    with torch.no_grad():
-        conv.weight.mul_(2.0)
-        with ComputeDtype("cpu", torch.bfloat16, enabled=False):
-            torch.testing.assert_close(conv.as_product(rows), conv(rows))
 
 
 def test_weights_are_rounded_as_by_pytorch(to_gpu):
@@ -181,7 +165,8 @@ def sum_of_parts(parts, weight, bias, has_relu):
 
 
 def by_kernel(parts, weight, bias, has_relu):
-    return linear.affine(tuple(parts), weight, bias, torch.relu if has_relu else None)
+    layer = SimpleNamespace(weight=weight, bias=bias)
+    return linear.linear(tuple(parts), layer, torch.relu if has_relu else None)
 
 
 def with_gradients(function, lead, sizes, n_outputs, has_relu):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
+from megastep.agents.networks.running_norm import masked_moments, normalise_masked
 
 
 def test_only_valid_numbers_count():

@@ -8,7 +8,6 @@ import torch
 from torch.nn import functional
 
 from megastep.agents.networks import mingru as mingru_module
-from megastep.agents.networks import mingru_step
 from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.mingru import MinGRU, linear_scan
 from megastep.arrdict import arrdict
@@ -346,7 +345,7 @@ def test_captured_unroll_matches_steps(bf16):
 
 
 def plain_step(x, weight, bias, reset, start, is_residual):
-    """The twin of `mingru_step.forward`: float64, but for the roundings to bfloat16."""
+    """The twin of `mingru_module.step`: float64, but for the roundings to bfloat16."""
     inputs = (leaf.double() for leaf in (x[0], weight, bias))
     gates = functional.linear(*inputs).bfloat16().double()
     before = start.double().masked_fill(reset[0, :, None], 0.0)
@@ -365,8 +364,8 @@ def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
         calls.append(args)
         return plain_step(*args)
 
-    monkeypatch.setattr(mingru_step, "fits", lambda x: len(x) == 1)
-    monkeypatch.setattr(mingru_step, "forward", step)
+    monkeypatch.setattr(mingru_module, "fits_step", lambda x: len(x) == 1)
+    monkeypatch.setattr(mingru_module, "step", step)
     results = []
     for grad in (True, False):
         with torch.set_grad_enabled(grad):
@@ -424,10 +423,10 @@ def test_step_has_the_bits_of_two_kernels(n_lanes, width, is_residual):
     """Where sums are exact in any order."""
     inputs = [leaf.cuda() for leaf in step_inputs(n_lanes, width, is_exact=True)]
     x, weight, bias, reset, start = inputs
-    assert mingru_step.fits(x)
+    assert mingru_module.fits_step(x)
     gates = functional.linear(*(leaf.double() for leaf in (x, weight, bias))).bfloat16()
     expected = two_kernels(gates, reset, start, x if is_residual else None)
-    results = mingru_step.forward(*inputs, is_residual)
+    results = mingru_module.step(*inputs, is_residual)
     for name, result, expected_tensor in zip(("outputs", "last"), results, expected, strict=True):
         assert result.isfinite().all() and torch.equal(result, expected_tensor), name
 
@@ -440,7 +439,7 @@ def test_step_matches_the_plain_form_in_every_order(
     inputs = step_inputs(n_lanes, width)
     expected = plain_step(*inputs, is_residual)
     cuda_on_cpu.install(monkeypatch)
-    results = cuda_on_cpu.in_every_order(lambda: mingru_step.forward(*inputs, is_residual))
+    results = cuda_on_cpu.in_every_order(lambda: mingru_module.step(*inputs, is_residual))
     assert_close(("outputs", "last"), results, expected, SLACK[torch.bfloat16])
     assert cuda_on_cpu.launched == {f"mingru_step_{width}"}
 
@@ -450,8 +449,8 @@ def test_step_matches_the_plain_form_in_every_order(
 @STEPS
 def test_step_matches_the_plain_form_and_is_repeatable(n_lanes, width, is_residual):
     x, weight, bias, reset, start = inputs = [leaf.cuda() for leaf in step_inputs(n_lanes, width)]
-    names, results = ("outputs", "last"), mingru_step.forward(*inputs, is_residual)
-    again = mingru_step.forward(*inputs, is_residual)
+    names, results = ("outputs", "last"), mingru_module.step(*inputs, is_residual)
+    again = mingru_module.step(*inputs, is_residual)
     assert all(map(torch.equal, results, again))
     slack = SLACK[torch.bfloat16]  # sums in another order round some gates to the next number
     assert_close(names, results, plain_step(*inputs, is_residual), slack)

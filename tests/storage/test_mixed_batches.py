@@ -9,6 +9,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.replay import ReplayBuffer
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout
+from megastep.arrdict import arrdict
 
 T, B = 4, 3
 OBS, MOVES = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 60)
@@ -38,7 +39,8 @@ def batch_of(n_rollouts, n=5, burn_in=0, **settings):
             replay = ReplayBuffer(rollout, OBS, MOVES, settings)
         replay.add(rollout)
     generator = torch.Generator().manual_seed(1)
-    batch = vtrace.fresh_batch(rollout, LANES)
+    batch = rollout.sequences(LANES)
+    batch = arrdict(batch, weight=torch.ones(2), age=torch.zeros_like(LANES))
     return policy, replay, rollout, vtrace.with_replayed(batch, replay, policy, n, generator)
 
 

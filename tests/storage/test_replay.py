@@ -244,10 +244,6 @@ def test_sequences_that_cannot_be_drawn_get_no_priority():
     for _ in range(4):
         replay.add(world.next())
     replay.set_priorities(torch.arange(9), torch.full((9,), 3.0))
-    values = torch.ones(9)
-    values.untyped_storage().resize_(0)
-    with pytest.raises(ValueError, match="values has shape .9,., but its storage has only 0 bytes"):
-        replay.set_priorities(torch.arange(9), values)
     assert replay.tree.priorities.tolist() == [0, 0, 0, 3, 3, 3, 0, 0, 0]
 
 
@@ -451,12 +447,3 @@ def test_kernels_match_pytorch(n_steps, length, n, images, to_gpu):
     for ours, theirs in zip(fused.tree.levels, plain.tree.levels, strict=True):
         testing.assert_close(ours.cpu(), theirs, rtol=1e-8, atol=0)
     testing.assert_close(fused.new_priority.cpu(), plain.new_priority, rtol=1e-8, atol=0)
-
-
-def test_wrong_shapes_are_named():
-    replay = buffer_of(World(4), 3, length=4)
-    with pytest.raises(ValueError, match="^rollout must have 4 steps of 3 lanes .* it has 5 of 3"):
-        replay.add(World(5).rollout)
-    with pytest.raises(ValueError, match=r"^values must have one .*\(6,\), but it is \(1,\)"):
-        replay.set_priorities(torch.arange(6), torch.ones(1))
-    assert replay.n_added == 0 and not replay.tree.total

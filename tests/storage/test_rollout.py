@@ -283,8 +283,3 @@ def test_lanes_that_are_not_stored_act_with_0():
     actions = rollout.scatter_actions(arrdict(flat=flat, nested=nested))
     assert actions.flat.tolist() == [5, 0, 7, 0] and actions.flat.dtype == torch.int64
     assert actions.nested.tolist() == [[1.5, 2.5], [0, 0], [3.5, 4.5], [0, 0]]
-
-
-def test_empty_rollout_raises():
-    with pytest.raises(ValueError, match="not 0 and 6"):
-        Rollout(0, B, LabelledEnv.obs_space, LabelledEnv.action_space, arrdict())

@@ -5,7 +5,6 @@ import pytest
 import torch
 from torch import testing
 
-from megastep.agents.storage.rollout import copy_tree
 from megastep.agents.storage.sum_tree import SumTree
 from megastep.capture import Graph
 
@@ -101,12 +100,6 @@ def test_sums_do_not_drift(n):
         assert torch.equal(upper.view(-1)[: len(lower)], lower.sum(-1))
 
 
-@pytest.mark.parametrize("n, fan_out", [(0, 32), (5, 1)])
-def test_bad_arguments_raise(n, fan_out):
-    with pytest.raises(ValueError, match="fan_out >= 2"):
-        SumTree(n, fan_out=fan_out)
-
-
 @pytest.mark.parametrize("n", [1, 40, 70_000])
 def test_kernels_match_pytorch(n, to_gpu):
     values = 10 ** (9 * torch.rand(n, generator=torch.Generator().manual_seed(0)).double())
@@ -153,29 +146,3 @@ def test_captured_tree_matches_eager():
         results.append((out.cpu(), tree.priorities.cpu()))
     for eager, captured in zip(*results):
         assert torch.equal(eager, captured)
-
-
-@pytest.mark.parametrize("values", [torch.ones(2), torch.ones(5), torch.ones(1), torch.ones(1, 3)])
-def test_values_of_another_shape_are_named(values):
-    tree = filled(np.ones(9))
-    with pytest.raises(ValueError, match=r"^index and values .*\(3,\) and values is"):
-        tree.set(torch.arange(3), values)
-    with pytest.raises(ValueError, match="^n must be at least 1 .* 0 was given"):
-        tree.draw(0)[0]
-    assert tree.priorities.tolist() == 9 * [1.0]
-
-
-def test_tensors_without_memory_are_refused():
-    """PyTorch's own operations crash on them."""
-    tree, index, values = filled([1.0, 2.0]), torch.tensor([0, 1]), torch.tensor([3.0, 4.0])
-    for name, tensor in (("index", index), ("values", values)):
-        empty = tensor.clone()
-        empty.untyped_storage().resize_(0)
-        with pytest.raises(
-            ValueError, match=f"{name} has shape .2,., but its storage has only 0 b"
-        ):
-            tree.set(**{"index": index, "values": values, name: empty})
-    with pytest.raises(ValueError, match="target has shape"):
-        copy_tree({"index": empty}, {"index": values})
-    with pytest.raises(ValueError, match="source has shape"):
-        copy_tree({"index": values}, {"index": empty})
