@@ -1,7 +1,5 @@
 """R2D2's update. test_learners.py tests what all learners have in common."""
 
-import io
-
 import pytest
 import torch
 from torch import testing
@@ -106,21 +104,6 @@ def test_learning_waits_for_replay_start():
     assert taken == [0, 0, 0, 4, 8]
 
 
-def test_metrics_of_update():
-    learner, collect = make()
-    losses = update(learner, collect, 4)
-    assert set(losses) == {
-        f"loss/{name}"
-        for name in (
-            *("td", "td_error", "q", "staleness", "effective_samples", "grad_norm"),
-            *("skipped_steps", "priority_max", "priority_mean"),
-        )
-    }
-    assert all(value.isfinite() for value in losses.values())
-    assert 1 <= losses["loss/staleness"] <= 3 and 0 < losses["loss/effective_samples"] <= 1
-    assert losses["loss/priority_mean"] <= losses["loss/priority_max"]
-
-
 def by_hand(learner, batch, m, gamma, n, eta):
     """Computes step by step, for sequence m: the errors after the burn-in, whether they are valid,
     and the priority.
@@ -211,71 +194,6 @@ def test_collector_uses_epsilon_per_lane():
     actions = torch.cat([collect().actions[..., 0].clone() for _ in range(12)])
     random = (actions != 1).float().mean(0)
     assert 0.15 < random[0] < 0.5 and not random[1:].any()
-
-
-@pytest.mark.parametrize("name", ["obs", "reward"])
-def test_nonfinite_rollout_is_never_drawn(name):
-    learner, collect = make(lr=1e-2)
-    update(learner, collect, 3)
-    learner.update(collect())
-    before = {key: value.clone() for key, value in learner.policy.state_dict().items()}
-    target = {key: value.clone() for key, value in learner.target.state_dict().items()}
-    rollout = collect()
-    good = rollout.floats()[name][2, 3].clone()
-    rollout.floats()[name][2, 3] = torch.nan
-    losses = learner.update(rollout)
-    assert losses["loss/skipped_steps"].item() == 4
-    assert all(
-        torch.equal(value, before[key]) for key, value in learner.policy.state_dict().items()
-    )
-    assert all(
-        torch.equal(value, target[key]) for key, value in learner.target.state_dict().items()
-    )
-    bad, n_skipped = learner.check.read(rollout.floats())
-    assert (bad.name, bad.lane, n_skipped) == (name, 3, 1)
-    rollout.floats()[name][2, 3] = good
-    skipped = [update(learner, collect, 1)["loss/skipped_steps"].item() for _ in range(12)]
-    assert not any(skipped) and weights(learner.policy).isfinite().all()
-    assert not torch.equal(
-        weights(learner.policy), torch.cat([v.flatten() for v in before.values()])
-    )
-
-
-def test_state_dict_has_all_but_replay_buffer():
-    learner, collect = make(lr=1e-2)
-    update(learner, collect, 5)
-    file = io.BytesIO()
-    torch.save(dict(policy=learner.policy.state_dict(), learner=learner.state_dict()), file)
-    file.seek(0)
-    saved = torch.load(file, weights_only=True)
-    other, other_collect = make(seed=7)
-    other.policy.load_state_dict(saved["policy"])
-    other.load_state_dict(saved["learner"])
-    for part in ("policy", "target"):
-        weights, loaded = (getattr(x, part).state_dict() for x in (learner, other))
-        assert all(torch.equal(weights[name], loaded[name]) for name in weights)
-    assert other.n_taken == learner.n_taken == 16
-    update(other, other_collect, 1)
-    assert other.n_taken == 16, "the replay buffer is empty"
-    update(other, other_collect, 1)
-    assert other.n_taken == 20
-
-
-@pytest.mark.parametrize(
-    "settings, cure",
-    [
-        (dict(output="softmax"), "agent.output=duelling"),
-        (dict(replay=ReplaySettings(burn_in=9, length=9)), "burn_in=9 .* replay.length"),
-        (dict(replay=ReplaySettings(capacity=50)), "replay.capacity=50 .* at least"),
-        (dict(epsilon=0.0), "epsilon"),
-    ],
-)
-def test_bad_settings_raise(settings, cure):
-    env, settings = Noise(), {**SETTINGS, **settings}
-    output = settings.pop("output", "duelling")
-    policy = Policy(env.obs_space, env.action_space, width=WIDTH, output=output)
-    with pytest.raises(ValueError, match=cure):
-        r2d2.R2D2(policy, **settings).collector(env)
 
 
 @pytest.mark.cuda

@@ -266,22 +266,6 @@ def test_gates_saturate_and_nan_propagates(where, width):
         )
 
 
-def test_kernels_round_to_bfloat16_like_torch(where):
-    """Uses `lstm_start`, which only rounds: ties, infinities, the largest float and NaN."""
-    inf, nan = torch.inf, torch.nan
-    values = torch.tensor([0.0, -0.0, 1 + 2**-8, 1 + 3 * 2**-8, -1 - 2**-8, 3.3e38, inf, -inf, nan])
-    bits = torch.tensor([0x3F80_7FFF, 0x3F80_8001, 0x7F7F_FFFF, 0x7FFF_FFFF], dtype=torch.int32)
-    values = torch.cat([values, bits.view(torch.float32), torch.randn(1011)]).view(-1, 4).to(where)
-    reset = torch.zeros(len(values), dtype=torch.bool, device=where)
-    hidden, cell = torch.empty_like(values, dtype=torch.bfloat16), torch.empty_like(values)
-    launch_units(
-        *("lstm_start", torch.bfloat16, cell),
-        **dict(reset=reset, last_output=values, last_cell=values, hidden=hidden, cell=cell),
-    )
-    torch.testing.assert_close(hidden, values.bfloat16(), rtol=0, atol=0, equal_nan=True)
-    torch.testing.assert_close(cell, values, rtol=0, atol=0, equal_nan=True)
-
-
 @pytest.mark.cuda
 @pytest.mark.parametrize("bf16", [False, True])
 def test_captured_unroll_matches_steps(bf16):

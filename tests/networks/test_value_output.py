@@ -72,14 +72,6 @@ def test_nonfinite_returns_change_nothing(bad):
     assert all(torch.equal(value.state_dict()[name], before[name]) for name in before)
 
 
-def test_moments_that_do_not_count_change_nothing():
-    value, moments = ValueOutput(WIDTH), tuple(map(torch.tensor, (4, 3.0, 4.0)))
-    value.add(moments, torch.tensor(False))
-    assert value.mean.item() == 0 and value.count.item() == 0
-    value.add(moments, torch.tensor(True))
-    assert value.mean.item() == 3 and value.scale.item() == 2 and value.count.item() == 1
-
-
 def moved(output, to_gpu):
     """Returns a copy whose weights and statistics are on a GPU."""
     output = copy.deepcopy(output)

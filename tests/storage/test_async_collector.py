@@ -9,10 +9,9 @@ import torch
 
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import make_rollout
-from tests.helpers.made_up import B, Numbers
+from tests.helpers.made_up import Numbers
 from tests.helpers.synchronisation import no_synchronisation
 
 T = 5
@@ -75,34 +74,6 @@ def test_matches_loop_with_stored_weights(lag):
     assert torch.equal(flat(policy), flat(expected))
 
 
-def test_lags_differ():
-    first, second, third = (train(lag, 6)[0] for lag in (0, 1, 2))
-    assert not torch.equal(flat(first), flat(second))
-    assert not torch.equal(flat(second), flat(third))
-
-
-def test_first_rollouts_use_initial_weights():
-    _, rollouts, _ = train(2, 5)
-    env = Numbers()
-    policy = policy_of(env)
-    collect = Collector(env, policy, make_rollout(env, policy, T, values=False))
-    is_same = [all(map(torch.equal, rollout, acted(collect()))) for rollout in rollouts]
-    assert is_same == [True, True, True, False, False]
-
-
-def test_every_tensor_is_copied():
-    env = Numbers()
-    policy = policy_of(env)
-    collect = AsyncCollector(env, policy, make_rollout(env, policy, T, values=False), 1)
-    collect.slots[0].rollout.learns[2, 3] = False
-    rollout = collect()
-    assert not rollout.learns[2, 3] and rollout.learns.sum() == (T + 1) * B - 1
-    assert torch.equal(rollout.metrics.age[:, 0], torch.arange(1.0, T + 1))
-    assert rollout.truncated.sum() == 0 and rollout.starts[0].all()
-    state = rollout.state.cell.clone()
-    assert not state.any() and collect().state.cell.any()
-
-
 def test_weights_loaded_after_construction_are_used():
     """A resumed trainer makes its collector first and loads weights later."""
     env, other = Numbers(), policy_of(Numbers())
@@ -115,19 +86,6 @@ def test_weights_loaded_after_construction_are_used():
     logits = other.unroll(rollout.obs, rollout.starts, rollout.state).logits[:-1]
     expected = other.output.logprob(logits, rollout.actions)
     torch.testing.assert_close(rollout.logprobs, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_opponents_raise():
-    env = Numbers()
-    env.learners = torch.ones(B, dtype=torch.bool)
-    with pytest.raises(ValueError, match="lag=0 or no opponents"):
-        VTrace(policy_of(env), lag=1, **SETTINGS).collector(env)
-
-
-def test_bytes_per_env_counts_rollouts_in_progress():
-    env = Numbers()
-    n_bytes = [VTrace(policy_of(env), lag=lag, **SETTINGS).bytes_per_env(env) for lag in (0, 1, 2)]
-    assert n_bytes[2] - n_bytes[1] == n_bytes[1] - n_bytes[0] > 0
 
 
 @pytest.mark.cuda
@@ -144,16 +102,6 @@ def test_gpu_matches_loop_with_stored_weights(lag):
     torch.testing.assert_close(flat(policy), flat(expected), rtol=1e-3, atol=1e-3)
     other = train(lag - 1, 8, "cuda")[0]
     assert (flat(policy) - flat(other)).abs().max() > 1e-2
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("lag", [1, 2])
-def test_gpu_is_deterministic(lag):
-    runs = [train(lag, 12, "cuda", graph=True) for _ in range(2)]
-    (policy, rollouts, _), (other_policy, other_rollouts, _) = runs
-    for rollout, other in zip(rollouts, other_rollouts, strict=True):
-        assert all(map(torch.equal, rollout, other))
-    assert torch.equal(flat(policy), flat(other_policy))
 
 
 @pytest.mark.cuda

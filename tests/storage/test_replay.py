@@ -275,32 +275,6 @@ def test_uint8_images_round_and_clip(device):
     assert torch.equal(batch.obs.raw[:4], raw), "uint8 spaces are stored exactly"
 
 
-def test_integers_use_smallest_dtype():
-    replay = buffer_of(World(4), 2, length=4)
-    dtypes = {path: leaf_of(replay.columns, path).rows.dtype for path in paths(replay.columns)}
-    assert dtypes == {
-        ("obs", "eye"): torch.float16,
-        ("obs", "raw"): torch.uint8,
-        ("obs", "rest", "imu"): torch.float16,
-        ("obs", "rest", "bag"): torch.int16,
-        ("actions", "move"): torch.uint8,
-        ("actions", "aim"): torch.int16,
-        ("reward",): torch.float32,
-        ("logprobs",): torch.float32,
-        ("privileged", "goal"): torch.float32,
-    }
-    assert replay.sample(2).actions.move.dtype == torch.int64
-
-
-def test_large_hidden_state_is_clipped_to_float16():
-    world = World(4)
-    replay = buffer_of(world, 2, length=4)
-    world.rollout.state.cell[:] = 1e6
-    replay.add(world.rollout)
-    replay.add(world.rollout)
-    assert replay.sample(2).state.cell.eq(65504).all()
-
-
 def buffer_of_64_pixels(n_steps, width, n_rollouts=2, device="meta", **settings):
     """Returns a buffer for images of 64 pixels and 3 colours and an LSTM."""
     obs_space, action_space = spaces.MultiImage(1, 3, 1, 64), spaces.MultiDiscrete(1, 7)
@@ -328,19 +302,6 @@ def test_bytes_match_allocated_bytes():
     search(replay)
     assert replay.bytes == sum(tensor.untyped_storage().nbytes() for tensor in tensors)
     assert replay.bytes == buffer_of_64_pixels(16, 32).bytes, "also on the device meta"
-
-
-@pytest.mark.parametrize(
-    "settings, error",
-    [
-        (dict(burn_in=8, length=8), "replay.burn_in=8 .* 8 steps .* replay.length"),
-        (dict(length=3), "replay.length=3 .* n_steps=4"),
-        (dict(capacity=35, burn_in=4), "replay.capacity=35 .* 8 steps .* at least 36"),
-    ],
-)
-def test_bad_settings_raise(settings, error):
-    with pytest.raises(ValueError, match=error):
-        ReplayBuffer(World(4).rollout, OBS, ACTIONS, ReplaySettings(**settings))
 
 
 def test_is_ready_after_start():

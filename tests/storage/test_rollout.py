@@ -101,14 +101,6 @@ def test_rows_line_up_with_env(n_rollouts):
         assert torch.equal(rollout.actions.fire[row], env.actions[time].fire)
 
 
-def test_rollout_starts_where_previous_ended():
-    env, policy, rollout, actor_state = collected()
-    last, state = rollout.obs.eye[-1].clone(), actor_state.state.map(torch.clone)
-    collect(env, policy, rollout, actor_state)
-    assert torch.equal(rollout.obs.eye[0], last)
-    assert torch.equal(rollout.state.cell, state.cell) and state.cell.any()
-
-
 def test_actor_state_is_updated_in_place():
     env, policy, rollout, actor_state = collected()
     addresses = [leaf.data_ptr() for leaf in leaves(actor_state)]
@@ -239,16 +231,6 @@ def test_policy_without_critic_or_logprobs():
         stored.append(rollout)
     assert torch.equal(stored[0].actions.move, stored[1].actions.move)
     assert stored[0].logprobs.all() and not stored[1].logprobs.any()
-
-
-def test_dtypes_named_by_spaces():
-    space = arrdict(
-        sky=spaces.MultiImage(1, 3, 1, 4, dtype=torch.uint8),
-        gauge=spaces.MultiVector(1, 2, dtype=torch.float32),
-    )
-    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
-    assert rollout.obs.sky.dtype == torch.uint8 and rollout.obs.gauge.dtype == torch.float32
-    assert rollout.floats().keys() == {"obs.gauge", "reward", "value", "logprob"}
 
 
 class MetricsEnv(LabelledEnv):
