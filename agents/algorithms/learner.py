@@ -98,16 +98,23 @@ class GradientLearner:
 
     Args:
         policy: the policy to improve, in place.
-        lr: step size.
+        lr: step size. Like `gamma`, `lambda_`, the clips and the coefficients of the loss it is a
+            number or a schedule.
         max_grad_norm: longer gradients are scaled down to this norm.
-        graph: on a GPU, captures updates as a CUDA graph.
-        seed: seed of the learner's own generator.
-        critic_lr: step size of the critic's parameters, which falls with `lr`. None: `lr`.
-        weight_decay: of the layers' weights, not of biases.
-        optimizer: a name in `optimizers.NAMES`, or the import path of a class.
-        warmup: updates over which the step size rises to `lr`.
-        desired_kl: KL divergence of a minibatch that the step size follows; None: it does not.
+        graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
+        seed: seed of the minibatch order and of replay sampling.
+        critic_lr: step size of the critic's own parameters, those under "critic."; it falls
+            with `lr`. None: `lr`.
+        weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
+        optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
+            of `torch.optim`.
+        warmup: updates over which the step size rises linearly to `lr`.
+        desired_kl: changes the step size after each minibatch so that its KL divergence stays near
+            this many nats (as in rsl_rl). None: it does not.
         coefficients: numbers and schedules that the loss uses, by name.
+
+    A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
+    statistic.
 
     Metrics:
         loss/grad_norm: norm of the gradient before it is clipped.
@@ -343,3 +350,39 @@ class GradientLearner:
         self.generator.load_state_dict(state["generator"], self.device)
         self.policy.generator.load_state_dict(state["policy_generator"], self.device)
         self.cuda_graph.restart()
+
+
+class ActorCritic(GradientLearner):
+    """Base of PPO and V-trace.
+
+    Args:
+        policy: a policy with a critic.
+        n_steps: steps of a rollout, T.
+        gamma: discount per step.
+        entropy_coef: weight of the entropy bonus, relative to the advantages.
+        value_coef: weight of the value's squared error, measured in the value's own scale.
+        auxiliary_coef: weight of the policy's `prediction_error`, with an asymmetric critic.
+        n_epochs: passes over a rollout.
+        n_minibatches: minibatches per pass; lanes are divided among them.
+        settings: those of `GradientLearner`.
+
+    Metrics:
+        loss/policy: policy loss.
+        loss/value: value loss, in units of the return's variance.
+        loss/entropy: entropy of the policy; of continuous actions the differential entropy, which
+            may be negative.
+        loss/auxiliary: auxiliary loss of predicting the privileged observation.
+        loss/kl: KL divergence from the acting policy, in nats.
+        loss/explained_variance: fraction of the returns' variance that the value explains.
+
+    Raises:
+        ValueError: the policy has no critic.
+    """
+
+    def __init__(self, policy: Policy, n_steps: int, n_epochs: int, n_minibatches: int, **settings):
+        if policy.critic is None:
+            name = type(self).__name__
+            raise ValueError(f"{name} needs a policy with a critic: use agent.output=softmax")
+        super().__init__(policy, **settings)
+        self.critic, self.n_steps = policy.critic, n_steps
+        self.n_epochs, self.n_minibatches = n_epochs, n_minibatches

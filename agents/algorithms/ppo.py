@@ -12,18 +12,8 @@ import torch
 from pydantic import Field
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.algorithms import returns
+from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.kernels import LIBRARY
-from megastep.agents.algorithms.learner import (
-    Coefficient,
-    GradientLearner,
-    OptimizerName,
-    Positive,
-    ScheduledCoefficient,
-    ScheduledFraction,
-    ScheduledPositive,
-    Warmup,
-)
 from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalise
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.policy import Policy
@@ -142,52 +132,23 @@ def ppo_loss(
     return loss, metrics
 
 
-class PPO(GradientLearner):
+class PPO(learner.ActorCritic):
     """Improves a policy, in place, from rollouts that it collected.
 
     Args:
-        policy: a policy with a critic.
-        n_steps: steps of a rollout, T.
-        lr: step size. Like `gamma`, `lambda_`, `clip` and the coefficients of the loss it is a
-            number or a schedule.
-        critic_lr: step size of the critic's own parameters, those under "critic."; it falls
-            with `lr`. None: `lr`.
-        weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
-        gamma: discount per step.
         lambda_: lambda of GAE.
         clip: how far the probability ratio of an action may move from 1 before its gradient stops.
         value_clip: how far the value may move from that at the time of acting before its gradient
             stops, in the value's own scale (as in OpenAI Baselines). None: any distance.
         normalise_advantage: over what advantages get mean 0 and standard deviation 1: "rollout",
             "minibatch", or "none", which leaves them in units of reward.
-        entropy_coef: weight of the entropy bonus, relative to the advantages.
-        value_coef: weight of the value's squared error, measured in the value's own scale.
-        auxiliary_coef: weight of the policy's `prediction_error`, with an asymmetric critic.
-        max_grad_norm: longer gradients are scaled down to this norm.
-        n_epochs: passes over a rollout.
-        n_minibatches: minibatches per pass; lanes are divided among them.
-        optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
-            of `torch.optim`.
-        warmup: updates over which the step size rises linearly to `lr`.
-        desired_kl: changes the step size after each minibatch so that its KL divergence stays near
-            this many nats (as in rsl_rl). None: it does not.
         target_kl: ends an update early, once the KL divergence of a minibatch from the acting
             policy exceeds this many nats. None: never.
-        graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
-        seed: seed of the minibatch order.
 
     Metrics:
-        loss/policy: policy loss.
-        loss/value: value loss, in units of the return's variance.
-        loss/entropy: entropy of the policy; of continuous actions the differential entropy, which
-            may be negative.
-        loss/auxiliary: auxiliary loss of predicting the privileged observation.
-        loss/kl: KL divergence from the acting policy, in nats.
         loss/clip_fraction: fraction of ratios beyond `clip`.
-        loss/explained_variance: fraction of the returns' variance that the value explains.
 
-    A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
-    statistic. `check` names the number and counts the updates skipped in a row.
+    Other arguments and metrics are those of `ActorCritic` and `GradientLearner`.
     """
 
     @checked
@@ -196,46 +157,48 @@ class PPO(GradientLearner):
         policy: Policy,
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: ScheduledPositive = 1e-3,
-        critic_lr: Positive | None = None,
-        weight_decay: Coefficient = 0.0,
-        gamma: ScheduledFraction = 0.995,
-        lambda_: ScheduledFraction = 0.95,
-        clip: ScheduledPositive = 0.2,
-        value_clip: Positive | None = None,
+        lr: learner.ScheduledPositive = 1e-3,
+        critic_lr: learner.Positive | None = None,
+        weight_decay: learner.Coefficient = 0.0,
+        gamma: learner.ScheduledFraction = 0.995,
+        lambda_: learner.ScheduledFraction = 0.95,
+        clip: learner.ScheduledPositive = 0.2,
+        value_clip: learner.Positive | None = None,
         normalise_advantage: Literal["rollout", "minibatch", "none"] = "rollout",
-        entropy_coef: ScheduledCoefficient = 0.01,
-        value_coef: ScheduledCoefficient = 0.5,
-        auxiliary_coef: ScheduledCoefficient = 0.5,
-        max_grad_norm: Positive = 0.5,
+        entropy_coef: learner.ScheduledCoefficient = 0.01,
+        value_coef: learner.ScheduledCoefficient = 0.5,
+        auxiliary_coef: learner.ScheduledCoefficient = 0.5,
+        max_grad_norm: learner.Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
         n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
-        target_kl: Positive | None = None,
-        optimizer: OptimizerName = "adam",
-        warmup: Warmup = 0,
-        desired_kl: Positive | None = None,
+        target_kl: learner.Positive | None = None,
+        optimizer: learner.OptimizerName = "adam",
+        warmup: learner.Warmup = 0,
+        desired_kl: learner.Positive | None = None,
         graph: bool = False,
         seed: int = 1,
     ):
-        if policy.critic is None:
-            raise ValueError("PPO needs a policy with a critic: use agent.output=softmax")
         coefficients = dict(gamma=gamma, lambda_=lambda_, clip=clip, value_coef=value_coef)
         coefficients |= dict(entropy_coef=entropy_coef, auxiliary_coef=auxiliary_coef)
-        settings = critic_lr, weight_decay, optimizer, warmup, desired_kl, coefficients
-        super().__init__(policy, lr, max_grad_norm, graph, seed, *settings)
-        self.critic, self.value_clip, self.n_steps = policy.critic, value_clip, n_steps
+        settings = dict(lr=lr, critic_lr=critic_lr, max_grad_norm=max_grad_norm, warmup=warmup)
+        settings |= dict(weight_decay=weight_decay, optimizer=optimizer, desired_kl=desired_kl)
+        settings |= dict(graph=graph, seed=seed, coefficients=coefficients)
+        super().__init__(policy, n_steps, n_epochs, n_minibatches, **settings)
+        self.value_clip, self.target_kl = value_clip, target_kl
         self.normalise_advantage = normalise_advantage
-        self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
-        self.target_kl = target_kl
 
     def collector(self, env: Env) -> Collector:
         """Returns a collector of rollouts of `n_steps` steps."""
         self.policy.clear_stats()
         return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps))
 
-    # On a GPU tensors (), which a graph may read; the curriculum estimates advantages with them.
-    gamma = property(lambda self: self.coefficients["gamma"])
-    lambda_ = property(lambda self: self.coefficients["lambda_"])
+    gamma = property(
+        lambda self: self.coefficients["gamma"],
+        doc="The present discount; on a GPU a tensor () that a graph may read.",
+    )
+    lambda_ = property(
+        lambda self: self.coefficients["lambda_"], doc="The present lambda of GAE, likewise."
+    )
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""

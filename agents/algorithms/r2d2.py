@@ -10,18 +10,8 @@ import torch
 from pydantic import Field
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.algorithms import returns
+from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.kernels import LIBRARY
-from megastep.agents.algorithms.learner import (
-    Coefficient,
-    Fraction,
-    GradientLearner,
-    OptimizerName,
-    Positive,
-    ScheduledFraction,
-    ScheduledPositive,
-    Warmup,
-)
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.outputs import Output
@@ -187,7 +177,7 @@ def epsilons(n_lanes: int, epsilon: float, spread: float) -> torch.Tensor:
     return epsilon ** (1 + spread * torch.linspace(0, 1, n_lanes))
 
 
-class R2D2(GradientLearner):
+class R2D2(learner.GradientLearner):
     """Improves a policy of action values (`agent.output=duelling`), in place, from replayed
     sequences of rollouts that it collected.
 
@@ -202,22 +192,14 @@ class R2D2(GradientLearner):
     Args:
         policy: a policy with `output="duelling"`.
         n_steps: steps of a rollout, T.
-        lr: step size. Like `gamma` it is a number or a schedule.
-        weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
         gamma: discount per step.
         return_steps: n of the n-step returns, the rewards summed before bootstrapping.
         target_period: gradient steps between two copies of the weights to the target network.
         epsilon: probability of a random action in lane 0.
         epsilon_spread: lane i of B uses epsilon ** (1 + epsilon_spread i / (B - 1)).
         eta: weight of the largest error in a sequence's priority; the mean error has 1 - eta.
-        max_grad_norm: longer gradients are scaled down to this norm.
-        optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
-            of `torch.optim`.
-        warmup: updates over which the step size rises linearly to `lr`.
         gradient_steps: gradient steps per rollout. Together they draw `replay.ratio` x B sequences.
         replay: settings of the replay buffer.
-        graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
-        seed: seed of replay sampling.
 
     Metrics:
         loss/td: squared TD error, in rescaled values.
@@ -239,17 +221,17 @@ class R2D2(GradientLearner):
         policy: Policy,
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: ScheduledPositive = 1e-3,
-        weight_decay: Coefficient = 0.0,
-        gamma: ScheduledFraction = 0.995,
+        lr: learner.ScheduledPositive = 1e-3,
+        weight_decay: learner.Coefficient = 0.0,
+        gamma: learner.ScheduledFraction = 0.995,
         return_steps: Annotated[int, Field(ge=1, le=1000)] = 10,
         target_period: Annotated[int, Field(ge=1, le=10**6)] = 200,
         epsilon: Annotated[float, Field(gt=0, le=1)] = 0.4,
         epsilon_spread: Annotated[float, Field(ge=0, le=100)] = 3.0,
-        eta: Fraction = 0.9,
-        max_grad_norm: Positive = 10.0,
-        optimizer: OptimizerName = "adam",
-        warmup: Warmup = 0,
+        eta: learner.Fraction = 0.9,
+        max_grad_norm: learner.Positive = 10.0,
+        optimizer: learner.OptimizerName = "adam",
+        warmup: learner.Warmup = 0,
         gradient_steps: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 16,
         replay: Annotated[ReplaySettings, defaults_from(REPLAY)] = REPLAY,
         graph: bool = False,
@@ -375,7 +357,7 @@ class R2D2(GradientLearner):
             result = result._replace(loss=result.loss + extra, metrics=result.metrics | own)
         return result
 
-    def copy_from(self, other: GradientLearner) -> None:
+    def copy_from(self, other: learner.GradientLearner) -> None:
         """Takes over what another learner has learnt, its target network too. In place."""
         super().copy_from(other)
         assert isinstance(other, R2D2)

@@ -12,17 +12,7 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field
 
-from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.learner import (
-    Coefficient,
-    GradientLearner,
-    OptimizerName,
-    Positive,
-    ScheduledCoefficient,
-    ScheduledFraction,
-    ScheduledPositive,
-    Warmup,
-)
+from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.masked_stats import (
     effective_sample_size,
     explained_variance,
@@ -50,7 +40,7 @@ _TRACES = "gamma", "lambda_", "rho_clip", "c_clip"
 _METRICS = "policy", "value", "entropy", "kl", "rho", "advantage", "clip_fraction"
 
 
-class VTrace(GradientLearner):
+class VTrace(learner.ActorCritic):
     """Improves a policy, in place, from rollouts that it or an older version of it collected.
 
     Each minibatch is evaluated anew by the current policy, and V-trace corrects with truncated
@@ -59,48 +49,20 @@ class VTrace(GradientLearner):
     all actions are about equally good.
 
     Args:
-        policy: a policy with a critic.
-        n_steps: steps of a rollout, T.
-        lr: step size. Like `gamma`, `lambda_`, the clips and the coefficients of the loss it is a
-            number or a schedule.
-        critic_lr: step size of the critic's own parameters, those under "critic."; it falls
-            with `lr`. None: `lr`.
-        weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
-        gamma: discount per step.
         lambda_: decay of the traces.
         rho_clip: truncation of the ratios in the policy's gradient and the value's error. At 1,
             actions that became more likely have weight 1.
         c_clip: truncation of the ratios in the traces.
         advantage_floor: smallest divisor of advantages, in standard deviations of the return. Use
             about 0.3 for small batches.
-        entropy_coef: weight of the entropy bonus.
-        value_coef: weight of the value's squared error, measured in the value's own scale.
-        auxiliary_coef: weight of the policy's `prediction_error`, with an asymmetric critic.
-        max_grad_norm: longer gradients are scaled down to this norm.
-        n_epochs: passes over a rollout.
-        n_minibatches: minibatches per pass; lanes are divided among them.
-        optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
-            of `torch.optim`.
-        warmup: updates over which the step size rises linearly to `lr`.
-        desired_kl: changes the step size after each minibatch so that its KL divergence stays near
-            this many nats (as in rsl_rl). None: it does not.
         lag: how many updates old the acting weights are. With 1 or 2, a GPU collects on a second
             stream while the learner updates (`storage.async_collector`).
         buffer: "rollout" learns from each rollout once; "replay" adds sequences of a replay buffer
             to each minibatch.
         replay: settings of the replay buffer.
-        graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
-        seed: seed of the minibatch order and of replay sampling.
 
     Metrics:
-        loss/policy: policy loss.
-        loss/value: value loss, in units of the return's variance.
-        loss/entropy: entropy of the policy; of continuous actions the differential entropy, which
-            may be negative.
-        loss/auxiliary: auxiliary loss of predicting the privileged observation.
-        loss/kl: KL divergence from the acting policy, in nats.
         loss/clip_fraction: fraction of ratios beyond `rho_clip`.
-        loss/explained_variance: fraction of the returns' variance that the value explains.
         loss/advantage: root mean square of the advantages, in standard deviations of the return.
         loss/rho: mean clipped ratio.
         loss/effective_samples: effective sample size as a fraction: near 1, samples are as good as
@@ -108,11 +70,7 @@ class VTrace(GradientLearner):
         loss/replayed_NAME: kl, rho, clip_fraction and effective_samples of replayed sequences.
         loss/staleness: with replay, mean age of the replayed sequences, in updates.
 
-    A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
-    statistic. `check` names the number and counts the updates skipped in a row.
-
-    Raises:
-        ValueError: if the policy has no critic, or the replay settings do not fit together.
+    Other arguments and metrics are those of `ActorCritic` and `GradientLearner`.
     """
 
     @checked
@@ -121,31 +79,29 @@ class VTrace(GradientLearner):
         policy: Policy,
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: ScheduledPositive = 1e-3,
-        critic_lr: Positive | None = None,
-        weight_decay: Coefficient = 0.0,
-        gamma: ScheduledFraction = 0.995,
-        lambda_: ScheduledFraction = 0.95,
-        rho_clip: ScheduledPositive = 1.0,
-        c_clip: ScheduledPositive = 1.0,
-        advantage_floor: Positive = 0.1,
-        entropy_coef: ScheduledCoefficient = 0.01,
-        value_coef: ScheduledCoefficient = 0.5,
-        auxiliary_coef: ScheduledCoefficient = 0.5,
-        max_grad_norm: Positive = 0.5,
+        lr: learner.ScheduledPositive = 1e-3,
+        critic_lr: learner.Positive | None = None,
+        weight_decay: learner.Coefficient = 0.0,
+        gamma: learner.ScheduledFraction = 0.995,
+        lambda_: learner.ScheduledFraction = 0.95,
+        rho_clip: learner.ScheduledPositive = 1.0,
+        c_clip: learner.ScheduledPositive = 1.0,
+        advantage_floor: learner.Positive = 0.1,
+        entropy_coef: learner.ScheduledCoefficient = 0.01,
+        value_coef: learner.ScheduledCoefficient = 0.5,
+        auxiliary_coef: learner.ScheduledCoefficient = 0.5,
+        max_grad_norm: learner.Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
         n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
-        optimizer: OptimizerName = "adam",
-        warmup: Warmup = 0,
-        desired_kl: Positive | None = None,
+        optimizer: learner.OptimizerName = "adam",
+        warmup: learner.Warmup = 0,
+        desired_kl: learner.Positive | None = None,
         lag: Annotated[int, Field(ge=0, le=2)] = 0,
         buffer: Literal["rollout", "replay"] = "rollout",
         replay: ReplaySettings = _REPLAY,
         graph: bool = False,
         seed: int = 1,
     ):
-        if policy.critic is None:
-            raise ValueError("V-trace needs a policy with a critic: use agent.output=softmax")
         if buffer == "rollout" and replay != _REPLAY:
             raise ValueError("replay settings need buffer=replay, but buffer=rollout")
         if replay.sequence_steps(n_steps) != n_steps + replay.burn_in:
@@ -157,11 +113,11 @@ class VTrace(GradientLearner):
         coefficients = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
         coefficients |= dict(entropy_coef=entropy_coef, value_coef=value_coef)
         coefficients["auxiliary_coef"] = auxiliary_coef
-        settings = critic_lr, weight_decay, optimizer, warmup, desired_kl, coefficients
-        super().__init__(policy, lr, max_grad_norm, graph, seed, *settings)
-        self.critic, self.n_steps, self.lag = policy.critic, n_steps, lag
-        self.advantage_floor = advantage_floor
-        self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
+        settings = dict(lr=lr, critic_lr=critic_lr, max_grad_norm=max_grad_norm, warmup=warmup)
+        settings |= dict(weight_decay=weight_decay, optimizer=optimizer, desired_kl=desired_kl)
+        settings |= dict(graph=graph, seed=seed, coefficients=coefficients)
+        super().__init__(policy, n_steps, n_epochs, n_minibatches, **settings)
+        self.advantage_floor, self.lag = advantage_floor, lag
         self.replay_settings = replay if buffer == "replay" else None
         self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
 

@@ -15,15 +15,7 @@ from megastep.agents.networks.intakes import ConcatIntake
 from megastep.agents.networks.outputs import DictOutput, MultiDiscreteOutput, Output
 from megastep.types import Space
 
-
-def intake(
-    space: Space, width: int, encoder: str = "linear", activation: str = "relu"
-) -> ConcatIntake:
-    """Returns a module from observations of a space, a leaf or nested dicts, to vectors
-    (..., width). Images have an encoder, "linear", "conv", "cnn" or an import path. The activation
-    is "relu" or "tanh". ValueError if a space is of an unknown kind.
-    """
-    return ConcatIntake(space, width, encoder, activation)
+intake = ConcatIntake
 
 
 def output(space: Space, width: int, kind: str = "softmax", continuous: str = "gaussian") -> Output:

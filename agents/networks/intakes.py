@@ -70,8 +70,9 @@ class ConcatIntake(nn.Module):
     Initially every leaf has the same weight, however many numbers it has: weights have variance
     2 / (leaves x features of the leaf), which preserves the size of the inputs (He et al. 2015).
 
-    Arguments are those of `heads.intake`. `n_features` counts those of all leaves together, before
-    the projection. ValueError if a space is of an unknown kind, or nothing is observed.
+    Images have an encoder, "linear", "conv", "cnn" or an import path. The activation is "relu" or
+    "tanh". `n_features` counts those of all leaves together, before the projection. ValueError if a
+    space is of an unknown kind, or nothing is observed.
     """
 
     def __init__(self, space: Space, width: int, encoder: str = "linear", activation: str = "relu"):

@@ -92,7 +92,7 @@ struct TdLossParams {
 
 struct TdMetricsParams {
     const float* sums;  // (n_blocks, 7)
-    float* metrics;     // (7): those of `td_loss.METRICS`, valid steps, 1 / max(valid steps, 1)
+    float* metrics;     // (7): those of `r2d2._METRICS`, valid steps, 1 / max(valid steps, 1)
     int n_blocks;
     int n_sequences;
 };
