@@ -16,6 +16,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import megastep
+
 #: Megastep's own machinery, which nobody needs to import; and `cuda`, another name of `engine`.
 INTERNAL = re.compile(
     r"megastep\.(__main__|adapters\.(?!vector_env)\w+|atomic_files|cache|compat|cuda|colour|demo|global_generators|hosting|imports|kernels|host_state|moments"
@@ -174,9 +176,9 @@ def markdown(text: str | None) -> str:
 @functools.cache
 def comment_on(module: str, name: str) -> str:
     """Returns the comment at a constant, above it or behind it, in its module or another."""
-    own = Path(importlib.import_module(module).__file__)
+    own, root = Path(importlib.import_module(module).__file__), Path(megastep.__file__).parent
     definition = re.compile(rf"((?:^#.*\n)*)^{name}(?::.*)? = .*?(?:  # (.*))?$", re.M)
-    for path in (own, *sorted(own.parents[1].rglob("*.py"))):
+    for path in (own, *sorted(root.rglob("*.py")), *sorted((root / "agents").rglob("*.py"))):
         found = definition.search(path.read_text(errors="replace"))
         if found and (text := found[2] or re.sub(r"^#:? ?", "", found[1], flags=re.M)):
             return text
