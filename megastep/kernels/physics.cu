@@ -3,22 +3,7 @@
 // are many.
 #include "physics_cuda.h"
 
-KERNEL BOUNDS(24) physics(PhysicsParams p) {
-    wait_for_previous();
-    move_agents<0>(p);
-}
-
-KERNEL BOUNDS(24) physics_objects(PhysicsParams p) {
-    wait_for_previous();
-    move_agents<1>(p);
-}
-
-KERNEL BOUNDS(18) physics_unspilled(PhysicsParams p) {
-    wait_for_previous();
-    move_agents<0>(p);
-}
-
-KERNEL BOUNDS(18) physics_objects_unspilled(PhysicsParams p) {
-    wait_for_previous();
-    move_agents<1>(p);
-}
+INSTANCE(BOUNDS(24) physics, PhysicsParams, move_agents<0>)
+INSTANCE(BOUNDS(24) physics_objects, PhysicsParams, move_agents<1>)
+INSTANCE(BOUNDS(18) physics_unspilled, PhysicsParams, move_agents<0>)
+INSTANCE(BOUNDS(18) physics_objects_unspilled, PhysicsParams, move_agents<1>)

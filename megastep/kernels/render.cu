@@ -22,32 +22,9 @@ DEVICE void render_halves(const RenderParams& p) {
                                          newly_seen_by_warp);
 }
 
-KERNEL BOUNDS(24) render(RenderParams p) {
-    wait_for_previous();
-    render_by_warps<1>(p);
-}
-
-KERNEL BOUNDS(24) render_objects(RenderParams p) {
-    wait_for_previous();
-    render_by_warps<1, 1>(p);
-}
-
-KERNEL BOUNDS(18) render_unspilled(RenderParams p) {
-    wait_for_previous();
-    render_by_warps<0>(p);
-}
-
-KERNEL BOUNDS(18) render_objects_unspilled(RenderParams p) {
-    wait_for_previous();
-    render_by_warps<0, 1>(p);
-}
-
-KERNEL BOUNDS(18) render_split(RenderParams p) {
-    wait_for_previous();
-    render_halves<0>(p);
-}
-
-KERNEL BOUNDS(18) render_objects_split(RenderParams p) {
-    wait_for_previous();
-    render_halves<OBJECTS>(p);
-}
+INSTANCE(BOUNDS(24) render, RenderParams, render_by_warps<1>)
+INSTANCE(BOUNDS(24) render_objects, RenderParams, render_by_warps<1, 1>)
+INSTANCE(BOUNDS(18) render_unspilled, RenderParams, render_by_warps<0>)
+INSTANCE(BOUNDS(18) render_objects_unspilled, RenderParams, render_by_warps<0, 1>)
+INSTANCE(BOUNDS(18) render_split, RenderParams, render_halves<0>)
+INSTANCE(BOUNDS(18) render_objects_split, RenderParams, render_halves<OBJECTS>)

@@ -14,22 +14,7 @@ DEVICE void spawn_in(const SpawnParams& p) {
         spawn_env<0, with_objects>(p, SingleThread{0}, env);
 }
 
-KERNEL spawn(SpawnParams p) {
-    wait_for_previous();
-    spawn_in<0, 0>(p);
-}
-
-KERNEL spawn_objects(SpawnParams p) {
-    wait_for_previous();
-    spawn_in<0, 1>(p);
-}
-
-KERNEL spawn_hidden(SpawnParams p) {
-    wait_for_previous();
-    spawn_in<1, 0>(p);
-}
-
-KERNEL spawn_hidden_objects(SpawnParams p) {
-    wait_for_previous();
-    spawn_in<1, 1>(p);
-}
+INSTANCE(spawn, SpawnParams, spawn_in<0, 0>)
+INSTANCE(spawn_objects, SpawnParams, spawn_in<0, 1>)
+INSTANCE(spawn_hidden, SpawnParams, spawn_in<1, 0>)
+INSTANCE(spawn_hidden_objects, SpawnParams, spawn_in<1, 1>)

@@ -67,7 +67,7 @@ def _precompiled():
 def _cluster(library, operation):
     """Returns how many blocks are a cluster: the argument of BOUNDS, where that sets clusters."""
     for text in library.sources(".cu").values():
-        found = re.search(rf"KERNEL BOUNDS\((\d+)\) {operation}\(", text)
+        found = re.search(rf"BOUNDS\((\d+)\) {operation}[(,]", text)
         if found and "__cluster_dims__(n_blocks," in text:
             return int(found[1])
     return 1

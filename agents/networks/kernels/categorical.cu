@@ -86,15 +86,8 @@ DEVICE void act(const CategoricalActParams& p) {
         p.logprobs[row] = logprob;
 }
 
-KERNEL BOUNDS(64) categorical_act_float32(CategoricalActParams p) {
-    wait_for_previous();
-    act<float>(p);
-}
-KERNEL BOUNDS(64) categorical_act_bfloat16(CategoricalActParams p) {
-    wait_for_previous();
-    act<Bfloat16>(p);
-}
-
+INSTANCE(BOUNDS(64) categorical_act_float32, CategoricalActParams, act<float>)
+INSTANCE(BOUNDS(64) categorical_act_bfloat16, CategoricalActParams, act<Bfloat16>)
 KERNEL BOUNDS(64) categorical_terms(CategoricalTermsParams p) {
     wait_for_previous();
     int row = blockIdx.x * blockDim.x + threadIdx.x;

@@ -155,43 +155,13 @@ struct LstmBackward {
     }
 };
 
-KERNEL BOUNDS(64) lstm_start_float32(LstmStartParams p) {
-    wait_for_previous();
-    run<LstmStart, float>(p);
-}
-KERNEL BOUNDS(64) lstm_start_bfloat16(LstmStartParams p) {
-    wait_for_previous();
-    run<LstmStart, Bfloat16>(p);
-}
-KERNEL BOUNDS(64) lstm_join_float32(LstmJoinParams p) {
-    wait_for_previous();
-    run<LstmJoin, float>(p);
-}
-KERNEL BOUNDS(64) lstm_join_bfloat16(LstmJoinParams p) {
-    wait_for_previous();
-    run<LstmJoin, Bfloat16>(p);
-}
-KERNEL BOUNDS(64) lstm_act_float32(LstmActParams p) {
-    wait_for_previous();
-    run<LstmAct, float>(p);
-}
-KERNEL BOUNDS(64) lstm_act_bfloat16(LstmActParams p) {
-    wait_for_previous();
-    run<LstmAct, Bfloat16>(p);
-}
-KERNEL BOUNDS(64) lstm_forward_float32(LstmForwardParams p) {
-    wait_for_previous();
-    run<LstmForward, float>(p);
-}
-KERNEL BOUNDS(64) lstm_forward_bfloat16(LstmForwardParams p) {
-    wait_for_previous();
-    run<LstmForward, Bfloat16>(p);
-}
-KERNEL BOUNDS(64) lstm_backward_float32(LstmBackwardParams p) {
-    wait_for_previous();
-    run<LstmBackward, float>(p);
-}
-KERNEL BOUNDS(64) lstm_backward_bfloat16(LstmBackwardParams p) {
-    wait_for_previous();
-    run<LstmBackward, Bfloat16>(p);
-}
+INSTANCE(BOUNDS(64) lstm_start_float32, LstmStartParams, run<LstmStart, float>)
+INSTANCE(BOUNDS(64) lstm_start_bfloat16, LstmStartParams, run<LstmStart, Bfloat16>)
+INSTANCE(BOUNDS(64) lstm_join_float32, LstmJoinParams, run<LstmJoin, float>)
+INSTANCE(BOUNDS(64) lstm_join_bfloat16, LstmJoinParams, run<LstmJoin, Bfloat16>)
+INSTANCE(BOUNDS(64) lstm_act_float32, LstmActParams, run<LstmAct, float>)
+INSTANCE(BOUNDS(64) lstm_act_bfloat16, LstmActParams, run<LstmAct, Bfloat16>)
+INSTANCE(BOUNDS(64) lstm_forward_float32, LstmForwardParams, run<LstmForward, float>)
+INSTANCE(BOUNDS(64) lstm_forward_bfloat16, LstmForwardParams, run<LstmForward, Bfloat16>)
+INSTANCE(BOUNDS(64) lstm_backward_float32, LstmBackwardParams, run<LstmBackward, float>)
+INSTANCE(BOUNDS(64) lstm_backward_bfloat16, LstmBackwardParams, run<LstmBackward, Bfloat16>)

@@ -239,11 +239,5 @@ KERNEL BOUNDS(64) mingru_forward_bfloat16(MingruForwardParams p) {
     wait_for_previous();
     run<MingruForward<false>, Bfloat16>(p);
 }
-KERNEL BOUNDS(256) mingru_backward_float32(MingruBackwardParams p) {
-    wait_for_previous();
-    backward<float>(p);
-}
-KERNEL BOUNDS(256) mingru_backward_bfloat16(MingruBackwardParams p) {
-    wait_for_previous();
-    backward<Bfloat16>(p);
-}
+INSTANCE(BOUNDS(256) mingru_backward_float32, MingruBackwardParams, backward<float>)
+INSTANCE(BOUNDS(256) mingru_backward_bfloat16, MingruBackwardParams, backward<Bfloat16>)

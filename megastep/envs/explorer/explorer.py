@@ -99,7 +99,6 @@ class Explorer(FirstPerson):
         core, is_wanted = self.core, self.privileged_space is not None
         critic = dict(episode=N_EPISODE * is_wanted, unseen=N_BINS * is_wanted)
         outputs, n_lanes = step_outputs(self, int(self.has_metrics), {}, critic), len(self.ended)
-        out = {("coverage" if name == "metrics" else name): x for name, x in outputs.items()}
         launch(
             *(LIBRARY, "explorer_step", self.device, n_lanes * WARP if is_wanted else n_lanes),
             **world_params(core.scenery, core.agents, "positions", "angles"),
@@ -109,7 +108,7 @@ class Explorer(FirstPerson):
             ages=self.ages,
             limits=self.limits,
             ended=self.ended,
-            **out,
+            **outputs,
             n_words=self.seen.shape[-1],
             patience=self.patience,
             texels_per_point=TEXELS_PER_POINT,

@@ -129,12 +129,11 @@ class Pong(DisplayedEnv):
     def _world(self, actions) -> arrdict:
         sizes = dict(features=0 if self.pixels is not None else FEATURES), {}
         outputs = step_outputs(self, 1, *sizes)
-        out = {("points_won" if name == "metrics" else name): x for name, x in outputs.items()}
         launch(
             *(LIBRARY, "pong_step", self.device, self.n_envs),
             games=self.games,
             actions=actions.contiguous(),
-            **out,
+            **outputs,
             pixels=self.pixels,
             error_flag=self.error_flag,
             **seed_params(self.seed),

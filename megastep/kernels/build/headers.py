@@ -6,8 +6,8 @@ Three kinds of declarations are recognised:
 * structs whose names end in ``Params``, one field per line: ``const float* positions;``, or an
   array of such structs: ``LeafParams leaves[4];``
 * constants in files called ``constants.h``, one per line: ``constexpr int MAX_RES = 1024;``
-* operations: ``KERNEL render(RenderParams p)`` in a source, or in a header, for CPU and GPU,
-  ``EACH(uniform, UniformParams, ...)``
+* operations: ``KERNEL render(RenderParams p)`` or, for a GPU, ``INSTANCE(spawn, SpawnParams, ...)``
+  in a source; in a header, for CPU and GPU, ``EACH(uniform, UniformParams, ...)``
 """
 
 import re
@@ -27,6 +27,7 @@ OPERATION = re.compile(
     r"KERNEL\s+(?:BOUNDS\(\d+\)\s+)?(\w+)\((?:const\s+)?(\w+Params)\s*&?\s*\w+\)"
 )
 EACH = re.compile(r"EACH\((\w+), (\w+Params),")
+INSTANCE = re.compile(r"INSTANCE\((?:BOUNDS\(\d+\) )?(\w+), (\w+Params),")
 WAITS = re.compile(r"\s*\{\s*wait_for_previous\(\)\s*;")  # what follows an OPERATION
 STRUCT = re.compile(r"^struct (\w+Params) \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)(?:\[(\d+)\])?")
@@ -166,24 +167,26 @@ def operations(sources: Mapping[str, str]) -> dict[str, str]:
 
 def early_operations(sources: Mapping[str, str]) -> frozenset[str]:
     """Returns the operations whose first statement, in each definition behind ``#if``, is
-    ``wait_for_previous();``, as that of EACH is.
+    ``wait_for_previous();``, as that of EACH and INSTANCE is.
     """
     waits = [
-        (match[1], match.re is EACH or bool(WAITS.match(match.string, match.end())))
+        (match[1], match.re is not OPERATION or bool(WAITS.match(match.string, match.end())))
         for match in _kernels(sources)
     ]
     return frozenset(name for name, _ in waits) - {name for name, does in waits if not does}
 
 
 def _kernels(sources) -> Iterator[re.Match[str]]:
-    """Yields a match of OPERATION, in a text without comments, for every line with KERNEL, and of
-    EACH for every such line in a header.
+    """Yields a match of OPERATION or INSTANCE, in a text without comments, for every line of a
+    source with either, and of EACH for every such line in a header.
     """
     for source, text in sources.items():
         text = _without_comments(text)
-        word, pattern = ("EACH", EACH) if source.endswith(".h") else ("KERNEL", OPERATION)
-        for line in re.finditer(rf"^(?!#).*\b{word}\b.*", text, re.M):
-            match = pattern.match(text, line.start())
+        words = (
+            dict(EACH=EACH) if source.endswith(".h") else dict(KERNEL=OPERATION, INSTANCE=INSTANCE)
+        )
+        for line in re.finditer(rf"^(?!#).*\b({'|'.join(words)})\b.*", text, re.M):
+            match = words[line[1]].match(text, line.start())
             if not match:
                 number = text.count("\n", 0, line.start()) + 1
                 raise ValueError(

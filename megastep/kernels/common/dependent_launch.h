@@ -24,3 +24,10 @@ DEVICE void wait_for_previous() {
     asm volatile("griddepcontrol.wait;\n\tgriddepcontrol.launch_dependents;" ::: "memory");
 #endif
 }
+
+// A kernel that does what one function does, such as an instance of a template.
+#define INSTANCE(operation, Params, ...) \
+    KERNEL operation(Params p) {         \
+        wait_for_previous();             \
+        __VA_ARGS__(p);                  \
+    }

@@ -290,19 +290,7 @@ DEVICE void mingru_step(const MingruStepParams& p) {
     write_results<W>(part, states, lanes, units, block, p);
 }
 
-KERNEL BOUNDS(2) mingru_step_64(MingruStepParams p) {
-    wait_for_previous();
-    mingru_step<64>(p);
-}
-KERNEL BOUNDS(2) mingru_step_128(MingruStepParams p) {
-    wait_for_previous();
-    mingru_step<128>(p);
-}
-KERNEL BOUNDS(1) mingru_step_192(MingruStepParams p) {
-    wait_for_previous();
-    mingru_step<192>(p);
-}
-KERNEL BOUNDS(1) mingru_step_256(MingruStepParams p) {
-    wait_for_previous();
-    mingru_step<256>(p);
-}
+INSTANCE(BOUNDS(2) mingru_step_64, MingruStepParams, mingru_step<64>)
+INSTANCE(BOUNDS(2) mingru_step_128, MingruStepParams, mingru_step<128>)
+INSTANCE(BOUNDS(1) mingru_step_192, MingruStepParams, mingru_step<192>)
+INSTANCE(BOUNDS(1) mingru_step_256, MingruStepParams, mingru_step<256>)

@@ -565,19 +565,7 @@ static_assert(sizeof(BackwardMemory<128>) == BACKWARD_MEMORY_128);
 static_assert(sizeof(ForwardMemory<256>) == FORWARD_MEMORY_256);
 static_assert(sizeof(BackwardMemory<256>) == BACKWARD_MEMORY_256);
 
-KERNEL BOUNDS(2) lstm_sequence_forward_128(LstmSequenceForwardParams p) {
-    wait_for_previous();
-    lstm_forward<128>(p);
-}
-KERNEL BOUNDS(2) lstm_sequence_backward_128(LstmSequenceBackwardParams p) {
-    wait_for_previous();
-    lstm_backward<128>(p);
-}
-KERNEL BOUNDS(4) lstm_sequence_forward_256(LstmSequenceForwardParams p) {
-    wait_for_previous();
-    lstm_forward<256>(p);
-}
-KERNEL BOUNDS(4) lstm_sequence_backward_256(LstmSequenceBackwardParams p) {
-    wait_for_previous();
-    lstm_backward<256>(p);
-}
+INSTANCE(BOUNDS(2) lstm_sequence_forward_128, LstmSequenceForwardParams, lstm_forward<128>)
+INSTANCE(BOUNDS(2) lstm_sequence_backward_128, LstmSequenceBackwardParams, lstm_backward<128>)
+INSTANCE(BOUNDS(4) lstm_sequence_forward_256, LstmSequenceForwardParams, lstm_forward<256>)
+INSTANCE(BOUNDS(4) lstm_sequence_backward_256, LstmSequenceBackwardParams, lstm_backward<256>)

@@ -465,19 +465,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
     write(sums, p.sums + block * n_sums, p.n_channels, me);
 }
 
-KERNEL BOUNDS(2) conv_backward_2(ConvBackwardParams p) {
-    wait_for_previous();
-    conv_backward<1>(p);
-}
-KERNEL BOUNDS(2) conv_backward_4(ConvBackwardParams p) {
-    wait_for_previous();
-    conv_backward<2>(p);
-}
-KERNEL BOUNDS(2) conv_backward_6(ConvBackwardParams p) {
-    wait_for_previous();
-    conv_backward<3>(p);
-}
-KERNEL BOUNDS(2) conv_backward_8(ConvBackwardParams p) {
-    wait_for_previous();
-    conv_backward<4>(p);
-}
+INSTANCE(BOUNDS(2) conv_backward_2, ConvBackwardParams, conv_backward<1>)
+INSTANCE(BOUNDS(2) conv_backward_4, ConvBackwardParams, conv_backward<2>)
+INSTANCE(BOUNDS(2) conv_backward_6, ConvBackwardParams, conv_backward<3>)
+INSTANCE(BOUNDS(2) conv_backward_8, ConvBackwardParams, conv_backward<4>)

@@ -243,11 +243,5 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
     }
 }
 
-KERNEL BOUNDS(2) conv_forward_4(ConvForwardParams p) {
-    wait_for_previous();
-    conv_forward<4>(p);
-}
-KERNEL BOUNDS(2) conv_forward_8(ConvForwardParams p) {
-    wait_for_previous();
-    conv_forward<8>(p);
-}
+INSTANCE(BOUNDS(2) conv_forward_4, ConvForwardParams, conv_forward<4>)
+INSTANCE(BOUNDS(2) conv_forward_8, ConvForwardParams, conv_forward<8>)

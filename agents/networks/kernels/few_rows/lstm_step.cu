@@ -114,11 +114,5 @@ DEVICE void lstm_step(const LstmStepParams& p) {
         }
 }
 
-KERNEL BOUNDS(128) lstm_step_128(LstmStepParams p) {
-    wait_for_previous();
-    lstm_step<128>(p);
-}
-KERNEL BOUNDS(128) lstm_step_256(LstmStepParams p) {
-    wait_for_previous();
-    lstm_step<256>(p);
-}
+INSTANCE(BOUNDS(128) lstm_step_128, LstmStepParams, lstm_step<128>)
+INSTANCE(BOUNDS(128) lstm_step_256, LstmStepParams, lstm_step<256>)

@@ -137,12 +137,6 @@ DEVICE void multiply(const ProductParams& p) {
 }
 
 // Of a layer: inputs, and weights (N, K).
-KERNEL BOUNDS(128) product_of_layer(ProductParams p) {
-    wait_for_previous();
-    multiply<false>(p);
-}
+INSTANCE(BOUNDS(128) product_of_layer, ProductParams, multiply<false>)
 // Of the inputs' gradient: that of the outputs, and weights (K, N).
-KERNEL BOUNDS(128) product_of_inputs(ProductParams p) {
-    wait_for_previous();
-    multiply<true>(p);
-}
+INSTANCE(BOUNDS(128) product_of_inputs, ProductParams, multiply<true>)

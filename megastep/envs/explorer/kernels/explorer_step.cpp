@@ -32,16 +32,16 @@ static void step_agent(const ExplorerStepParams& p, int agent) {
     int env = agent / p.scenery.n_agents;
     Episode episode = next(p, read_episode(p, agent));
     write_episode(p, episode, agent);
-    if (p.coverage)
-        p.coverage[agent] = 0.f;
-    if (!p.unseen && !(p.coverage && is_over(episode)))
+    if (p.metrics)
+        p.metrics[agent] = 0.f;
+    if (!p.unseen && !(p.metrics && is_over(episode)))
         return;
     int layout = layout_of(p.scenery, env, p.error_flag), bins[BINS] = {0};
     Pose pose = {0.f, 0.f, 0.f, 1.f};
     if (p.unseen)
         pose = pose_of(p, agent, env);
     int n_left = count_left(p, agent, runs_of(p, layout), pose, p.unseen ? bins : 0);
-    if (p.coverage)
+    if (p.metrics)
         write_coverage(p, episode, agent, layout, n_left);
     if (!p.unseen)
         return;

@@ -52,7 +52,7 @@ DEVICE void step_privileged(const ExplorerStepParams& p, int agent, int warp_lan
     if (warp_lane)
         return;
     write_episode(p, episode, agent);
-    if (p.coverage)
+    if (p.metrics)
         write_coverage(p, episode, agent, layout, n_left);
 }
 
@@ -63,10 +63,10 @@ DEVICE void step_plain(const ExplorerStepParams& p, int agent, int warp_lane) {
     if (exists) {
         episode = next(p, read_episode(p, agent));
         write_episode(p, episode, agent);
-        if (p.coverage)
-            p.coverage[agent] = 0.f;
+        if (p.metrics)
+            p.metrics[agent] = 0.f;
     }
-    if (!p.coverage)
+    if (!p.metrics)
         return;
     unsigned int over = __ballot_sync(FULL_WARP, exists && is_over(episode));
     for (; over; over &= over - 1) {

@@ -26,7 +26,7 @@ struct ExplorerStepParams {
     unsigned char* reset;      // (N, A)
     unsigned char* terminal;   // (N, A)
     unsigned char* truncated;  // (N, A)
-    float* coverage;           // (N, A) 0 where no episode ends; null: none
+    float* metrics;            // (N, A) 0 where no episode ends; null: none
     float* episode;            // (N, A, N_EPISODE) steps left and taken, texels seen and left
     float* unseen;             // (N, A, BINS) null: none, and no episode
     int n_words;
@@ -93,7 +93,7 @@ HD void write_episode(const ExplorerStepParams& p, const Episode& episode, int a
 HD void write_coverage(const ExplorerStepParams& p, const Episode& episode, int agent, int layout,
                        int n_left) {
     int n = p.n_visible[layout];
-    p.coverage[agent] = is_over(episode) ? (float)(n - n_left) / (float)maxi(n, 1) : 0.f;
+    p.metrics[agent] = is_over(episode) ? (float)(n - n_left) / (float)maxi(n, 1) : 0.f;
 }
 
 // Number k of what a critic sees of an episode, scaled to about 1.

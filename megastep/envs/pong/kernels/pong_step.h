@@ -14,7 +14,7 @@ struct PongStepParams {
     unsigned char* reset;      // (B)
     unsigned char* terminal;   // (B)
     unsigned char* truncated;  // (B)
-    float* points_won;         // (B) fraction of a game's points where it ends; 0 elsewhere
+    float* metrics;            // (B) fraction of a game's points where it ends; 0 elsewhere
     unsigned short* features;  // (B, N_FEATURES) fp16
     unsigned char* pixels;     // (B, ROWS, COLUMNS)
     int* error_flag;           // (1) out: see common/errors.h
@@ -131,10 +131,10 @@ HD void write_outcome(const PongStepParams& p, const Game& g, int env, int reset
         p.reset[lane] = (unsigned char)reset;
         p.terminal[lane] = (unsigned char)terminal;
         p.truncated[lane] = (unsigned char)(g.ended && !terminal);
-        float points_won = 0.f;
+        float metrics = 0.f;
         if (g.ended)
-            points_won = n_points ? (float)g.score[side] / (float)n_points : 0.5f;
-        p.points_won[lane] = points_won;
+            metrics = n_points ? (float)g.score[side] / (float)n_points : 0.5f;
+        p.metrics[lane] = metrics;
     }
 }
 
