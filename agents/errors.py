@@ -10,7 +10,7 @@ EXIT_CODES = {
     1: "training stopped because of NaN or infinite numbers, a checkpoint is damaged, a job of a "
     "sweep failed, or a result or a run was not reproduced",
     2: "error in the configuration, environment, a file, or memory: one sentence with the cure",
-    3: "one of several ranks was killed, hangs or cannot be reached; the last checkpoint is intact",
+    3: "one of several ranks was killed or cannot be reached; the last checkpoint is intact",
     4: "an environment of another package or of your own raised an error: all is saved, and its "
     "traceback is in the run's `env_error.txt`",
     129: "stopped by SIGHUP; a checkpoint was saved",

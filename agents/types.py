@@ -160,7 +160,6 @@ class LearnerOptions(Protocol):
             load_state_dict(state). Checkpoints hold it where it is small enough.
         n_steps: T, for `dry_run=true`.
         n_minibatches: minibatches of an update, for the same.
-        gamma, lambda_: of its generalised advantages, for `curriculum=plr`.
         coefficients: the `megastep.coefficients.Coefficients` that it uses, which follow their
             schedules. None: it has none.
         warmup: updates over which the learning rate rises to the initial one.
@@ -175,8 +174,6 @@ class LearnerOptions(Protocol):
     replay_buffer: Any = None
     n_steps: int | None = None
     n_minibatches: int | None = None
-    gamma: float | torch.Tensor | None = None
-    lambda_: float | torch.Tensor | None = None
     coefficients: Coefficients | None = None
     warmup: int = 0
     read_lr: Callable[[], float] | None = None

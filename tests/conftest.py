@@ -118,23 +118,6 @@ def home(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def no_curves():
-    """Leaves out curves.png, which is most of the time of a short run. Yields what draws it."""
-    from megastep.agents.training import curves
-
-    plot_curves = curves.plot_curves
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(curves, "plot_curves", lambda folder: None)
-        yield plot_curves
-
-
-@pytest.fixture
-def with_curves(no_curves, monkeypatch):
-    """Has runs in this test draw curves.png."""
-    monkeypatch.setattr("megastep.agents.training.curves.plot_curves", no_curves)
-
-
 @pytest.fixture(scope="session")
 def cuda_on_cpu():
     """Runs CUDA kernels on a CPU."""

@@ -32,15 +32,13 @@ The most common words:
   opponents.past=0.4 opponents.bot=0.1
                                with several agents: fractions of environments against past selves
                                and a scripted policy; checkpoints.snapshots=8 is for ratings
-  curriculum=sfl               draw homes that are won half of the time more often; plr: where
-                               values err most
+  curriculum=sfl               draw homes that are won half of the time more often
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
                                more_seconds=60 more_samples=1e6 extend its budget
   folder=X resume=auto         start a run in X, or continue it if it has begun, as when a cluster
                                starts the same command again
   ranks=2                      two processes that train together, on a GPU each; all: every GPU;
-                               restarts=2 starts them again if one is killed; dry_run=true only
-                               prints what would run
+                               dry_run=true only prints what would run
   rerun=RUN                    repeat a run, with the learning rates that its clock chose, and
                                compare its metrics.jsonl
   init=RUN                     start a new run from its weights, in its environment and homes; also
@@ -61,7 +59,6 @@ REPEATABLE = (
     "checkpoints.seconds",
     "checkpoints.keep",
     "checkpoints.replay_every",
-    "restarts",
     "dry_run",
     "logger",
     "finish",
@@ -174,8 +171,7 @@ def set_ranks(tree: Tree, typed: list[str]) -> None:
 
 def ready(cfg: settings.Train) -> None:
     """Raises UserError if there are fewer GPUs than ranks, or the folder is taken or in use."""
-    info = environment.rank_info()
-    if environment.rank() > 0 or (info and info.attempt > 0):  # rank 0 checks
+    if environment.rank() > 0:  # rank 0 checks
         return
     launcher.n_ranks(cfg)
     if cfg.resume == AUTO:

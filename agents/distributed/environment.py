@@ -1,6 +1,4 @@
-"""Rank and number of ranks from torchrun's environment variables. Does not import PyTorch, which
-takes seconds.
-"""
+"""Rank and number of ranks from torchrun's environment variables, without PyTorch."""
 
 import os
 import socket
@@ -10,19 +8,12 @@ NAMES = "RANK", "WORLD_SIZE", "LOCAL_RANK"
 
 
 class RankInfo(NamedTuple):
-    """This process among the ranks that torchrun started.
+    """This process among the ranks that torchrun started."""
 
-    Attributes:
-        rank: 0 to `n_ranks` - 1.
-        n_ranks: number of ranks on all machines.
-        local_rank: index among the ranks of this machine.
-        attempt: number of times that torchrun has restarted the ranks.
-    """
-
-    rank: int
-    n_ranks: int
-    local_rank: int
-    attempt: int = 0
+    rank: int  # 0 to `n_ranks` - 1
+    n_ranks: int  # on all machines
+    local_rank: int  # among the ranks of this machine
+    attempt: int = 0  # number of times that torchrun has restarted the ranks
 
 
 def rank_info() -> RankInfo | None:

@@ -11,8 +11,6 @@ from typing import cast
 import torch
 from torch import distributed
 
-from megastep.agents.distributed import symmetric_memory
-from megastep.agents.distributed.bucket import Layout
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
 from megastep.agents.types import Moments
@@ -60,13 +58,8 @@ def all_gather(tensor: torch.Tensor) -> torch.Tensor:
 def pool_moments(*moments: Moments) -> list[Moments]:
     """Pools the moments (count, mean, variance) of all ranks (Chan et al. 1979).
 
-    Takes one collective operation, however many moments there are.
-
-    Args:
-        moments: this rank's moments. Shapes may differ among them, but not among ranks.
-
-    Returns:
-        The moments over the entries of all ranks.
+    Takes one collective operation, however many moments there are. Shapes may differ among them,
+    but not among ranks.
     """
     if n_pooled() == 1 or not moments:
         return list(moments)
@@ -135,11 +128,6 @@ def average_gradients(
     with torch.no_grad():
         held = [(p, p.grad) for p in parameters if p.grad is not None]
         gradients = [gradient.flatten() for _, gradient in held]
-        if n_valid.is_cuda:
-            parts, (*pooled, n) = _averages_on_gpu(gradients, means, n_valid)
-            for (p, _), part in zip(held, parts, strict=True):
-                p.grad = part.view_as(p)
-            return n, pooled
         numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
         # one buffer; each gradient starts at a multiple of 16 bytes, for Adam's vector loads
         sizes = [n + -n % 4 for n in map(len, gradients)]
@@ -154,20 +142,3 @@ def average_gradients(
         for (p, _), part in zip(held, parts, strict=True):
             p.grad = part.view_as(p)
     return n, list(pooled[:-1].unbind())
-
-
-def _averages_on_gpu(gradients, means, n_valid) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """Returns the averages (n,) of gradients (n,), and those of the means, then the sum of
-    n_valid.
-    """
-    layout = Layout([len(gradient) for gradient in gradients], len(means))
-    if (n := n_valid).dtype != torch.float32:
-        n = n.long()
-    shared = symmetric_memory.buffer(layout.n, n.device)
-    bucket = torch.empty(layout.n, device=n.device) if shared is None else shared
-    layout.pack(bucket, gradients, [mean.float() for mean in means], n)
-    if shared is None:
-        all_reduce(bucket)
-    else:
-        symmetric_memory.all_reduce_(bucket)
-    return layout.divide(bucket)

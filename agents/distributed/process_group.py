@@ -1,24 +1,21 @@
 """Joins the process group, and exchanges values between its ranks on the host.
 
 torchrun, or `ranks=` on the command line, starts the ranks and sets their environment variables.
-
-R ranks.
+Every function that exchanges something waits for the other ranks. R ranks.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import dataclasses
 import datetime
 import faulthandler
 import functools
 import itertools
-import json
 import os
-import secrets
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, TypeVar
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch
 from torch import distributed
@@ -30,14 +27,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-#: Seconds within which all ranks must have started, the store must answer if torchrun has started
-#: it, and a rank must have left.
-START_SECONDS, CONNECT_SECONDS, STOP_SECONDS = 300.0, 50.0, 30.0
-
-#: Limit of an operation. A rank may evaluate or write files for long: `watch` finds those that are
-#: lost.
-LONGEST_WAIT = datetime.timedelta(days=1)
-
+#: Seconds within which the store must answer a rank that starts, and a rank must have left.
+CONNECT_SECONDS, STOP_SECONDS = 50.0, 30.0
+#: PyTorch's own limit of an operation, after which ranks end that wait for one that hangs.
+LONGEST_WAIT = datetime.timedelta(minutes=30)
 #: Counts the starts of this process, equally on all ranks.
 _STARTS = itertools.count()
 
@@ -46,78 +39,17 @@ class RankLost(RuntimeError):
     """Another rank has ended or does not answer."""
 
 
-@dataclasses.dataclass
-class Heartbeat:
-    """The progress of a rank, which `watch` compares.
-
-    Attributes:
-        host: name of its machine.
-        number: counts heartbeats.
-        n_operations: collective operations started.
-        n_updates: updates that the ranks have agreed to start.
-        n_phases: phases of updates that the GPU has finished.
-        is_exempt: True while the others wait for this rank without limit, as during an evaluation.
-        is_waiting: True while it waits for the others.
-        has_left: True once it is done and no longer monitored.
-    """
-
-    host: str
-    number: int = 0
-    n_operations: int = 0
-    n_updates: int = 0
-    n_phases: int = 0
-    is_exempt: bool = False
-    is_waiting: bool = False
-    has_left: bool = False
-
-    def finish_phase(self) -> None:
-        self.n_phases += 1
-
-
-counts = Heartbeat(hostname())
-
-
-@contextlib.contextmanager
-def _flagged(name: str) -> Iterator[None]:
-    before = getattr(counts, name)
-    setattr(counts, name, True)
-    try:
-        yield
-    finally:
-        setattr(counts, name, before)
-
-
-def unhurried() -> contextlib._GeneratorContextManager[None]:
-    """Lets the other ranks wait for this one without limit, for example while it evaluates.
-
-    Otherwise a rank counts as hung once the others have waited `watch.HUNG_SECONDS` for it.
-    """
-    return _flagged("is_exempt")
-
-
-def waiting() -> contextlib._GeneratorContextManager[None]:
-    """Wraps a wait for other ranks. If all ranks wait for `watch.HUNG_SECONDS` in the same
-    operation, they cannot reach each other.
-    """
-    return _flagged("is_waiting")
-
-
 def start() -> None:
-    """Joins the ranks that torchrun started; returns when all have joined. A no-op in a single
-    process, or if this one has joined already.
-
-    Raises:
-        RuntimeError, ValueError: the ranks cannot connect.
+    """Joins the ranks that torchrun started, unless this process has joined already. Raises
+    RuntimeError or ValueError if they cannot connect.
     """
     info = rank_info()
     if info is None or distributed.is_initialized():
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-    # a new prefix: after a restart the store may still hold addresses of the ended ranks
-    keys = store(f"ranks {meeting.name or info.attempt} {next(_STARTS)}")
+    keys = store(f"ranks {next(_STARTS)}")
     options: dict = dict(rank=info.rank, world_size=info.n_ranks, timeout=LONGEST_WAIT)
-    with waiting():
-        distributed.init_process_group(backend, store=keys, **options)
+    distributed.init_process_group(backend, store=keys, **options)
     atexit.register(stop)  # gloo threads must not outlive the interpreter
 
 
@@ -136,11 +68,8 @@ def stop() -> None:
 def _store() -> Store:
     """Returns the ranks' key-value store, which whoever started the ranks hosts, or else rank 0."""
     info = rank_info()
-    return _connection(info is not None and info.rank == 0 and not _has_agent())
-
-
-def _has_agent() -> bool:
-    return os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    has_agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    return _connection(info is not None and info.rank == 0 and not has_agent)
 
 
 def _connection(is_master=False) -> TCPStore:
@@ -148,59 +77,20 @@ def _connection(is_master=False) -> TCPStore:
         os.environ["MASTER_ADDR"],
         int(os.environ["MASTER_PORT"]),
         is_master=is_master,
-        timeout=datetime.timedelta(seconds=CONNECT_SECONDS if _has_agent() else START_SECONDS),
+        timeout=datetime.timedelta(seconds=CONNECT_SECONDS),
         wait_for_workers=False,
     )
 
 
 def store(name: str, is_shared: bool = True) -> Store:
-    """Returns the ranks' key-value store.
-
-    Args:
-        name: prefix of its keys.
-        is_shared: uses the connection of this process. False opens one for another thread.
+    """Returns the ranks' key-value store, with a prefix of its keys, over a connection that this
+    process shares or another one, for another thread.
     """
-    keys = _store()  # where rank 0 hosts it, it must do so first
+    keys, info = _store(), rank_info()  # where rank 0 hosts it, it must do so first
     job = os.environ.get("TORCHELASTIC_RUN_ID", "")  # torchrun's --rdzv-id, or a random name
     return distributed.PrefixStore(  # pyright: ignore[reportPrivateImportUsage]
-        f"megastep {job} {name}", keys if is_shared else _connection()
+        f"megastep {job} {info and info.attempt} {name}", keys if is_shared else _connection()
     )
-
-
-class Meeting:
-    """Finds a name for this start of the ranks, the same on all of them and no earlier one's.
-
-    torchrun's count of restarts is none: each machine counts those that its own ranks caused.
-
-    Attributes:
-        name: the name, once it is known.
-    """
-
-    def __init__(self) -> None:
-        self.name: str | None = None
-        self._own = secrets.token_hex(8)
-
-    def poll(self) -> str | None:
-        """Returns the name, or None if rank 0 has not started. Rank 0 calls this until all have."""
-        info = rank_info()
-        assert info is not None
-        keys = store("meeting")
-        if self.name is None:
-            keys.set(f"{info.rank}", self._own)
-        if info.rank == 0:
-            # the store may hold what ended ranks have left; those that start replace it
-            names = (f"{rank}" for rank in range(info.n_ranks))
-            everyones = [keys.get(name).decode() if keys.check([name]) else "" for name in names]
-            keys.set("everyone", json.dumps(everyones))
-            self.name = self._own
-        elif self.name is None and keys.check(["everyone"]):
-            everyones = json.loads(keys.get("everyone"))
-            if self._own in everyones:
-                self.name = everyones[0]
-        return self.name
-
-
-meeting = Meeting()
 
 
 def rank() -> int:
@@ -226,21 +116,15 @@ def rank_label() -> str:
 
 @contextlib.contextmanager
 def communicating() -> Iterator[None]:
-    """Wraps a collective operation: counts it, and turns PyTorch's errors into `RankLost`."""
-    counts.n_operations += 1
+    """Turns what PyTorch raises in a collective operation into `RankLost`."""
     try:
-        with waiting():
-            yield
+        yield
     except RuntimeError as error:
         raise RankLost(str(error).partition("\n")[0]) from error
 
 
 def exchange(numbers: Sequence[float]) -> list[list[float]]:
-    """Returns the numbers of every rank, by rank. Waits for the other ranks; does not use the GPU.
-
-    Args:
-        numbers: the same count on every rank.
-    """
+    """Returns the numbers of every rank, equally many of each, by rank, without the GPU."""
     row = torch.tensor(numbers, dtype=torch.float64)
     if n_ranks() == 1:
         return [row.tolist()]
@@ -251,7 +135,7 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
 
 
 def gather_objects(value: T) -> list[T]:
-    """Returns a small picklable value of every rank, by rank. Waits for the other ranks."""
+    """Returns a small picklable value of every rank, by rank."""
     if n_ranks() == 1:
         return [value]
     values: list = [None] * n_ranks()
@@ -261,10 +145,51 @@ def gather_objects(value: T) -> list[T]:
 
 
 def from_rank(number: int, value: T) -> T:
-    """Returns the picklable value of one rank, such as tensors of the CPU. Waits for the others."""
+    """Returns the picklable value of one rank, such as tensors of the CPU."""
     if n_ranks() == 1:
         return value
     values = [value]
     with communicating():
         distributed.broadcast_object_list(values, src=number)
     return values[0]
+
+
+def together(function: Callable[[], T]) -> T:
+    """Calls a function, which waits for no other rank, on every rank. Returns this rank's result.
+
+    Raises:
+        Exception: on all ranks, the error of the first rank that failed. Unless that is rank 0, its
+            label is in the message.
+    """
+    if n_ranks() == 1:
+        return function()
+    value = failure = None
+    try:
+        value = function()
+    except Exception as error:
+        failure = error
+    for number, first in enumerate(gather_objects(_portable(failure))):
+        if first is not None:
+            raise first if failure is None or number != rank() else failure
+    return cast(T, value)
+
+
+def from_rank_0(function: Callable[[], T]) -> T:
+    """Calls a function on rank 0. Returns its small picklable result, or raises its error, on every
+    rank.
+    """
+    values = gather_objects(together(lambda: function() if rank() == 0 else None))
+    return cast(T, values[0])
+
+
+def _portable(error) -> Exception | None:
+    """Returns an error that can be pickled, with the label of ranks other than 0; None for None."""
+    if error is None:
+        return None
+    if rank() > 0 and len(error.args) == 1 and isinstance(error.args[0], str):
+        error.args = (f"{rank_label()}: {error.args[0]}",)
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{rank_label()}: {type(error).__name__}: {error}")
+    return error

@@ -1,7 +1,7 @@
 """Records a function as several CUDA graphs, with collective operations between them.
 
 NCCL collectives inside CUDA graphs can deadlock, since graphs of different processes may start in
-different orders on a GPU's queues. `symmetric_memory.all_reduce_` cannot.
+different orders on a GPU's queues.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ class SegmentedGraph:
 
     Args:
         function: must not synchronise. Its tensors must keep their addresses.
-        stream: stream to record on.
         generators: random generators that the function uses.
 
     Attributes:
@@ -72,7 +71,6 @@ class SegmentedGraph:
             _recording = None
 
     def begin(self) -> None:
-        """Begins to record the next graph."""
         self.graph = torch.cuda.CUDAGraph()
         for generator in self.generators:
             self.graph.register_generator_state(generator)
@@ -80,7 +78,6 @@ class SegmentedGraph:
         self.graph.capture_begin(self.pool, capture_error_mode="thread_local")
 
     def end(self) -> None:
-        """Ends a graph."""
         self.graph.capture_end()
         self.parts.append(self.graph.replay)
 

@@ -16,13 +16,7 @@ Values = TypeVar("Values", torch.Tensor, arrdict)
 
 
 class Shard:
-    """The environments of one rank.
-
-    Args:
-        n_envs: N.
-        n_homes: D, at most N; 0 without homes.
-        number: r.
-        n_ranks: R, at most N.
+    """The environments of rank `number` of `n_ranks`, at most N, among `n_envs` in `n_homes`.
 
     Attributes:
         envs: indices of its environments among the N.

@@ -238,8 +238,6 @@ class Population:
     size: Annotated[int, Field(ge=1, le=1024)] = 1
     every: Samples = 20_000_000
     vary: dict[str, Variation] = dataclasses.field(default_factory=dict)
-    exploit: Literal["truncation", "tournament"] = "truncation"
-    explore: Literal["factor", "resample"] = "factor"
     score: str = "running"
     schedule: str | None = None
     member: int | None = None
@@ -272,7 +270,6 @@ class Train(Common):
         tuple[Annotated[str, AfterValidator(_callback)], ...], BeforeValidator(_listed)
     ] = ()
     ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
-    restarts: Annotated[int, Field(ge=0, le=1000)] = 0
     dry_run: bool = False
     folder: str | None
     resume: str | None

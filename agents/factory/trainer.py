@@ -29,7 +29,6 @@ from megastep.agents.runs import (
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import budget, loggers, repeat
 from megastep.agents.training.callbacks import Evaluations, Snapshots
-from megastep.agents.training.profiler import Profiler
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.imports import import_object
@@ -108,6 +107,8 @@ def make_trainer(
                 shots = Saver(folder / "snapshots", config, keep_checkpoints=10**9)
                 observers.append(Snapshots(shots, cfg.checkpoints.snapshots))
             if cfg.logging.profile:
+                from megastep.agents.training.profiler import Profiler
+
                 observers.append(Profiler(folder, cfg.logging.profile, device))
         trainer = Trainer(
             opponents or env,

@@ -32,7 +32,6 @@ RESUMABLE = (
     "checkpoints",
     "desync",
     "ranks",
-    "restarts",
     "dry_run",
     "logger",
     "finish",
@@ -40,19 +39,11 @@ RESUMABLE = (
 
 
 class Start(NamedTuple):
-    """How to start or continue a run.
+    """How to start or continue a run."""
 
-    Attributes:
-        cfg: settings to train with; `resume` is still `AUTO` if the run has saved nothing yet.
-        folder: the run folder.
-        is_done: True if the run has used up its budget, or reached `stop`.
-        is_reached: True if it has reached `stop`.
-    """
-
-    cfg: settings.Train
+    cfg: settings.Train  # `resume` is still `AUTO` if the run has saved nothing yet
     folder: Path
-    is_done: bool = False
-    is_reached: bool = False
+    ended: str | None = None  # why nothing is left to do, such as `used up its budget`
 
 
 def with_more(cfg: settings.Train) -> settings.Train:
@@ -65,51 +56,38 @@ def with_more(cfg: settings.Train) -> settings.Train:
     return settings.changed(cfg, **totals)
 
 
-def folder_of(cfg: settings.Train) -> Path:
-    """Returns the folder of the run to start or continue.
-
-    Raises:
-        ConfigErrors: `folder` is missing, and this is not a Slurm job.
-    """
-    if cfg.folder is not None:
-        return Path(cfg.folder)
-    if number := os.environ.get(SLURM_JOB):
-        return folders.RUNS / folders.for_file(f"slurm-{number}")
-    text = f"is needed with resume=auto, outside jobs of Slurm: folder={folders.RUNS}/NAME"
-    raise ConfigErrors([("folder", text)])
-
-
 def automatic(cfg: settings.Train) -> Start:
     """Decides whether `resume=auto` starts a run, continues it or has nothing left to do.
 
     Raises:
-        ConfigErrors: a setting outside `RESUMABLE` differs from the run's, or `more_samples` or
-            `more_seconds` is given.
+        ConfigErrors: a setting outside `RESUMABLE` differs from the run's, `more_samples` or
+            `more_seconds` is given, or `folder` is missing, and this is not a Slurm job.
         UserError: the folder holds something other than a run, or no intact checkpoint.
     """
     for key in ("more_samples", "more_seconds"):
         if getattr(cfg, key) is not None:
             text = f"would be added each time; with resume=auto give the total, {key[5:]}="
             raise ConfigErrors([(key, text)])
-    folder = folder_of(cfg)
-    cfg = settings.changed(cfg, folder=str(folder))
-    if not has_checkpoint(folder):
-        folders.check_free(cfg.folder, is_again=True)
-        return Start(cfg, folder)
-    loaded = folders.load_checkpoint(folders.find(str(cfg.folder)), cfg.trust)
+    if cfg.folder is not None:
+        folder = Path(cfg.folder)
+    elif number := os.environ.get(SLURM_JOB):
+        folder = folders.RUNS / folders.for_file(f"slurm-{number}")
+    else:
+        text = f"is needed with resume=auto, outside jobs of Slurm: folder={folders.RUNS}/NAME"
+        raise ConfigErrors([("folder", text)])
+    if not checkpoint.list_checkpoints(folder / "checkpoints"):  # whole or damaged
+        folders.check_free(str(folder), is_again=True)
+        return Start(settings.changed(cfg, folder=str(folder)), folder)
+    loaded = folders.load_checkpoint(folders.find(str(folder)), cfg.trust)
     if errors := [*_differences(loaded.config["train"], check.as_tree(cfg))]:
         raise ConfigErrors(errors)
-    numbers = loaded.numbers
+    numbers, ended = loaded.numbers, None
     budgets = {name: getattr(cfg, name) for name in ("samples", "seconds")}
-    is_done = any(limit is not None and numbers[name] >= limit for name, limit in budgets.items())
-    is_reached = reaches(evaluation_in(numbers), cfg.evaluation.stop)
-    cfg = settings.changed(cfg, resume=str(folder), folder=None, init=None)
-    return Start(cfg, folder, is_done or is_reached, is_reached)
-
-
-def has_checkpoint(folder: Path) -> bool:
-    """Returns whether a run in a folder has saved anything, whole or damaged."""
-    return bool(checkpoint.list_checkpoints(folder / "checkpoints"))
+    if any(limit is not None and numbers[name] >= limit for name, limit in budgets.items()):
+        ended = "used up its budget"
+    if reaches(evaluation_in(numbers), cfg.evaluation.stop):
+        ended = "reached its stop"
+    return Start(settings.changed(cfg, resume=str(folder), folder=None, init=None), folder, ended)
 
 
 def _differences(saved, typed) -> Iterator[tuple[str, str]]:

@@ -18,22 +18,16 @@ from megastep.atomic_files import write_atomically
 JOB = "MEGASTEP_JOB"
 #: Files of the job folder: settings; how the ranks ended; the run folder's path.
 SETTINGS, ENDING, RUN = "settings.json", "ending.json", "run"
-#: Exit code if a rank was killed, hangs or cannot be reached.
+#: Exit code if a rank was killed or cannot be reached.
 LOST = 3
 
 
 class Ending(NamedTuple):
-    """How a script ended.
-
-    Attributes:
-        code: exit code of the process.
-        text: the error or the signal; empty after success, or if it was printed already.
-        folder: the run folder, after training finished.
-    """
+    """How a script ended."""
 
     code: int = 0
-    text: str = ""
-    folder: str | None = None
+    text: str = ""  # the error or the signal; empty after success, or if it was printed already
+    folder: str | None = None  # the run folder, after training finished
 
     def raise_error(self) -> None:
         """Raises the error or signal that ended the script, as UserError or Interrupted, if any."""
@@ -46,10 +40,7 @@ class Ending(NamedTuple):
 
 
 def ending_of(work: Callable[[], int | None]) -> Ending:
-    """Calls a function and returns how it ended.
-
-    Args:
-        work: returns an exit code, None for 0.
+    """Calls a function, which returns an exit code or None for 0. Returns how it ended.
 
     Raises:
         Exception: errors that the user cannot fix, such as bugs.

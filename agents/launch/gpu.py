@@ -6,12 +6,9 @@ import functools
 import importlib.util
 import os
 import runpy
-import socket
 import sys
 import threading
 from pathlib import Path
-
-from megastep.agents import console
 
 
 def ask_for_queues() -> None:
@@ -65,21 +62,6 @@ def count() -> int:
     assert library is not None
     library.cuDeviceGetCount(ctypes.byref(n_gpus))
     return n_gpus.value
-
-
-def warn_of_job_without() -> None:
-    """Warns that a job of Slurm trains on CPUs because it was given no GPU, unless PyTorch could
-    not use one either.
-    """
-    import torch
-
-    job = os.environ.get("SLURM_JOB_ID")
-    if job and torch.version.cuda and not is_available():
-        console.warn(
-            f"job {job} of Slurm has no GPU on {socket.gethostname()}, so it trains on the CPU: "
-            "ask for GPUs with --gpus-per-node (in a sweep, hydra.launcher.gpus_per_node), or say "
-            "device=cpu"
-        )
 
 
 def wake(device: str) -> None:

@@ -22,23 +22,14 @@ VISIBLE = "CUDA_VISIBLE_DEVICES"
 
 
 def check(jobs: Sequence, hydra: Any) -> None:
-    """Checks that every job has a GPU per rank, before the first job starts.
-
-    Args:
-        jobs: the settings of each job.
-        hydra: Hydra's part of the configuration.
-
-    Raises:
-        ConfigErrors: a job has more ranks than there are GPUs, or Hydra's launcher would run each
-            job several times.
+    """Raises ConfigErrors if a job has more ranks than there are GPUs, or Hydra's launcher would
+    run each job several times.
     """
     kind, options = hydra.runtime.choices["hydra/launcher"], hydra.launcher
+    elsewhere = "a job is one task on one node; docs/scaling.md has a script for several nodes"
     for key in ("nodes", "tasks_per_node"):
         if (n_times := options.get(key) or 1) > 1:
-            text = (
-                f"{n_times} would run each job {n_times} times; a job is one task on one node, and "
-                "starts its ranks itself; docs/scaling.md has a script for several nodes"
-            )
+            text = f"{n_times} would run each job {n_times} times; {elsewhere}"
             raise ConfigErrors([(f"hydra.launcher.{key}", text)])
     for cfg in filter(_has_ranks, jobs):
         if kind != "submitit_slurm":
@@ -47,38 +38,31 @@ def check(jobs: Sequence, hydra: Any) -> None:
         # Slurm assigns the GPUs, so those of this machine do not matter
         n_gpus = options.get("gpus_per_node") or 0
         if n_gpus and cfg.ranks != "all" and cfg.device != "cpu" and int(cfg.ranks) > n_gpus:
-            text = (
-                f"{cfg.ranks} is more than hydra.launcher.gpus_per_node={n_gpus}, and a job is on "
-                "one node; docs/scaling.md has a script for several nodes"
-            )
+            text = f"{cfg.ranks} is more than hydra.launcher.gpus_per_node={n_gpus}; {elsewhere}"
             raise ConfigErrors([("ranks", text)])
 
 
 @contextlib.contextmanager
 def taken(cfg: settings.Common) -> Iterator[settings.Common]:
-    """Takes the slot with the fewest jobs for the duration of the context.
+    """Takes the slot with the fewest jobs for the duration of the context. Yields the settings, in
+    which device=cuda is replaced by the GPU's number.
 
     Ranks are separate processes and see only the GPUs of their slot. For a job in this process, the
     GPU becomes PyTorch's current device, which device=auto uses. A job with device=cpu or cuda:1
     takes no slot.
-
-    Args:
-        cfg: the job's settings.
-
-    Yields:
-        The settings; device=cuda is replaced by the GPU's number, such as cuda:1.
     """
     n_gpus = gpu.count() if cfg.device in ("auto", "cuda") else 0
     if n_gpus < 2:
         yield cfg
         return
     # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
-    visible = os.environ.get(VISIBLE) or ",".join(map(str, range(n_gpus)))
-    names = [name.strip() for name in visible.split(",")][:n_gpus]
-    locks, slot = _locked(names, launcher.n_ranks(cfg) if _has_ranks(cfg) else 1)
-    with locks, contextlib.ExitStack() as stack:
+    before = os.environ.get(VISIBLE)
+    names = [name.strip() for name in (before or ",".join(map(str, range(n_gpus)))).split(",")]
+    names = names[:n_gpus]
+    with contextlib.ExitStack() as stack:
+        slot = _locked(stack, names, launcher.n_ranks(cfg) if _has_ranks(cfg) else 1)
         if _has_ranks(cfg):
-            stack.callback(_make_visible, os.environ.get(VISIBLE))
+            stack.callback(_make_visible, before)
             _make_visible(",".join(names[i] for i in slot))
         else:
             import torch
@@ -100,16 +84,8 @@ def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
 
 
-def _locked(names: list[str], size: int) -> tuple[contextlib.ExitStack, list[int]]:
-    """Locks the first of the slots with the fewest jobs.
-
-    Args:
-        names: names of this process's GPUs.
-        size: GPUs per slot; the first slot starts at the first GPU.
-
-    Returns:
-        The locks, and the indices of the slot's GPUs.
-    """
+def _locked(locks: contextlib.ExitStack, names: list[str], size: int) -> range:
+    """Locks the first of the slots of `size` GPUs with the fewest jobs. Returns its indices."""
     import filelock  # slow to import
 
     starts = range(0, len(names) - size + 1, size)
@@ -119,5 +95,6 @@ def _locked(names: list[str], size: int) -> tuple[contextlib.ExitStack, list[int
                 name = re.sub(r"[^\w-]", "-", f"megastep-{os.getuid()}-gpu-{name}-{n_jobs}")
                 path = Path(tempfile.gettempdir(), f"{name}.lock")
                 stack.enter_context(filelock.FileLock(path, blocking=False))
-            return stack.pop_all(), [*range(start, start + size)]
+            locks.push(stack.pop_all())
+            return range(start, start + size)
     raise AssertionError  # the slots of the loop have no end

@@ -32,8 +32,8 @@ ADDRESS = "127.0.0.1"
 CODE = """import signal, sys
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 sys.path[:] = filter(None, sys.path)
-from megastep.agents.launch import rank_process
-sys.exit(rank_process.main())"""
+from megastep.agents.launch import train
+sys.exit(train.run_rank())"""
 
 
 def n_ranks(cfg: settings.Train) -> int:
@@ -44,7 +44,7 @@ def n_ranks(cfg: settings.Train) -> int:
     """
     if cfg.ranks == 1:
         return 1
-    info, n_gpus = environment.rank_info(), gpu.count() if cfg.device != "cpu" else 0
+    n_gpus = gpu.count() if cfg.device != "cpu" else 0
     if ":" in cfg.device:
         text = f"{cfg.device!r} names one GPU, but every rank needs its own; use device=cuda"
         raise ConfigErrors([("device", text)])
@@ -55,7 +55,7 @@ def n_ranks(cfg: settings.Train) -> int:
             raise ConfigErrors([("ranks", text)])
         return n_gpus
     wanted = int(cfg.ranks)
-    if n_gpus and wanted > n_gpus and info is None:
+    if n_gpus and wanted > n_gpus and environment.rank_info() is None:
         n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
         text = f"{wanted} is more than the {n_here} of this machine; ranks=all uses each GPU once"
         raise ConfigErrors([("ranks", text)])
@@ -64,7 +64,7 @@ def n_ranks(cfg: settings.Train) -> int:
 
 def is_needed(cfg: settings.Train) -> bool:
     """Returns True if this process has to start ranks instead of training itself."""
-    return environment.rank_info() is None and (cfg.ranks != 1 or cfg.restarts > 0)
+    return environment.rank_info() is None and cfg.ranks != 1
 
 
 def run(cfg: settings.Train) -> Path:
@@ -91,15 +91,10 @@ def run(cfg: settings.Train) -> Path:
 
 
 class Job:
-    """The ranks of one training run.
-
-    Args:
-        folder: the job folder, a temporary one.
-        cfg: settings; `ranks` is a number.
-    """
+    """The ranks of one training run, whose `ranks` is a number, and their job folder."""
 
     def __init__(self, folder: Path, cfg: settings.Train):
-        self.folder, self.cfg, self.is_stopped = folder, cfg, False
+        self.folder, self.n_ranks, self.is_stopped = folder, int(cfg.ranks), False
         self.processes: list[subprocess.Popen] = []
         facts = dict(
             settings=check.as_tree(cfg),
@@ -111,52 +106,28 @@ class Job:
         (folder / endings.SETTINGS).write_text(typed_json.dumps(facts))
 
     def run(self) -> endings.Ending:
-        """Runs the ranks, again after a loss or a crash if `restarts` allows. Returns how they
-        ended.
+        """Runs the ranks, in sessions of their own, as this process forwards signals. Returns how
+        they ended. Once one has failed, it kills the others, unless they are saving.
         """
-        listener = socket.create_server((ADDRESS, 0))
-        shared = variables(self.folder, int(self.cfg.ranks))
-        shared |= dict(
-            MASTER_PORT=f"{listener.getsockname()[1]}", TORCHELASTIC_RUN_ID=uuid.uuid4().hex
-        )
-        store = None
-        for attempt in range(self.cfg.restarts + 1):
-            (self.folder / endings.ENDING).unlink(missing_ok=True)
-            with signals.deferred():
-                self.start(shared | {"TORCHELASTIC_RESTART_COUNT": f"{attempt}"})
-            store = store or opened_store(listener)  # while the ranks import modules
-            failure = self.wait()
-            ending = self.ending(failure)
-            if failure is None or self.is_stopped or attempt == self.cfg.restarts:
-                break
-            problem = ending.text.partition(" To continue: ")[0].rstrip(".")
-            again = f"Restarting, {attempt + 1} of restarts={self.cfg.restarts}."
-            console.warn(f"{problem}. {again}")
-        return ending
-
-    def start(self, shared: dict[str, str]) -> None:
-        """Starts the ranks in sessions of their own, as this process forwards signals."""
-        self.processes = []
-        for number in map(str, range(int(self.cfg.ranks))):
-            own = os.environ | shared | dict(RANK=number, LOCAL_RANK=number)
-            command = [sys.executable, "-c", CODE]
-            self.processes.append(subprocess.Popen(command, env=own, start_new_session=True))
-
-    def wait(self) -> tuple[int, int] | None:
-        """Waits for the ranks; once one has failed, kills the others, unless they are saving.
-
-        Returns:
-            The first rank that failed and its exit code; None if all have ended for good.
-        """
-        failure = None
+        listener, failure = socket.create_server((ADDRESS, 0)), None
+        shared = os.environ | variables(self.folder, self.n_ranks)
+        shared |= {"MASTER_PORT": f"{listener.getsockname()[1]}"}
+        with signals.deferred():
+            for number in map(str, range(self.n_ranks)):
+                env = shared | dict(RANK=number, LOCAL_RANK=number)
+                words = [sys.executable, "-c", CODE]
+                self.processes.append(subprocess.Popen(words, env=env, start_new_session=True))
+        store = opened_store(listener)  # while the ranks import modules; answers as long as it is
         while True:
             codes = [process.poll() for process in self.processes]
             failure = failure or next(((n, code) for n, code in enumerate(codes) if code), None)
             if None not in codes:
-                return failure
+                break
             if failure and not self.is_stopped:
                 self.send(signal.SIGKILL)
             time.sleep(0.1)
+        del store
+        return self.ending(failure or (0, 0))
 
     def stop(self, number: int) -> None:
         """Forwards a signal to the ranks."""
@@ -172,11 +143,13 @@ class Job:
         for process in self.processes:
             process.send_signal(number)
 
-    def ending(self, failure: tuple[int, int] | None) -> endings.Ending:
-        """Returns what a rank wrote about its ending, otherwise what its exit code says."""
+    def ending(self, failure: tuple[int, int]) -> endings.Ending:
+        """Returns what a rank wrote about its ending, otherwise what the exit code of the first
+        that failed says.
+        """
         with contextlib.suppress(FileNotFoundError):
             return endings.Ending(*json.loads((self.folder / endings.ENDING).read_text()))
-        number, code = failure or (0, 0)
+        number, code = failure
         text = f"ended with exit code {code}"
         if code < 0:
             name = signal.Signals(-code).name
@@ -207,6 +180,7 @@ def variables(job: Path, n_ranks: int) -> dict[str, str]:
         "WORLD_SIZE": str(n_ranks),
         "LOCAL_WORLD_SIZE": str(n_ranks),
         "MASTER_ADDR": ADDRESS,
+        "TORCHELASTIC_RUN_ID": uuid.uuid4().hex,
         "TORCHELASTIC_USE_AGENT_STORE": "True",
     }
     if (package.ROOT / "train.py").exists():  # a checkout, which may not be installed

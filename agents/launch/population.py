@@ -6,27 +6,27 @@ import contextlib
 import gc
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from megastep import engine
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.agreement import from_rank_0
 from megastep.agents.distributed.pooling import alone
+from megastep.agents.distributed.process_group import from_rank_0
 from megastep.agents.distributed.ranks import ONE
 from megastep.agents.errors import ConfigErrors
-from megastep.agents.evaluation import in_training
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, finishing
-from megastep.agents.launch.run import Run, record
-from megastep.agents.launch.watch import Team
+from megastep.agents.launch.run import Run, evaluator, record
 from megastep.agents.population import decisions
 from megastep.agents.population.population import AgentParts, Population, Streams, hosted
 from megastep.agents.runs import folders, populations
 from megastep.agents.training.callbacks import Progress
-from megastep.agents.training.trainer import Trainer
 from megastep.settings import closest
+
+if TYPE_CHECKING:
+    from megastep.agents.launch.watch import Team
 
 #: Checkpoints that a member keeps at least: while one is being written, and the one before may be
 #: unfinished elsewhere, all members have the one before that.
@@ -41,14 +41,12 @@ class PopulationRun(Run):
 
     def __init__(self, cfg: settings.Train, team: Team | None):
         super().__init__(cfg, team)
-        self.ranks = ONE
         if self.n_ranks > (size := cfg.population.size):
             problem = f"{self.n_ranks} is more than the {size} members of the population"
             text = f"{problem}; use population.size={self.n_ranks} or more"
             raise ConfigErrors([("ranks", text)])
 
     def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:
-        """Returns the folder, locked, and the checkpoint of each member to resume from, if any."""
         if self.cfg.resume is None:
             return super().open(locks)
         root = folders.folder_of(folders.find(self.cfg.resume, None))
@@ -73,11 +71,15 @@ class PopulationRun(Run):
                     *(own, folder, self.device),
                     ranks=ONE,
                     callbacks=[Progress(self.progress.show)] if member == 0 else (),
-                    make_evaluator=in_training.Evaluator,
+                    make_evaluator=evaluator,
                     n_members=1 if self.trainers else len(members),
                     homes=homes,
                 )
-            check_score(chosen.score, trainer)
+            known = [populations.RUNNING, populations.EVALUATED, *trainer.episodes.names]
+            if chosen.score not in known:
+                text = f"{chosen.score} is not a mean over episodes here"
+                cure = closest(chosen.score, known)
+                raise ConfigErrors([("population.score", f"{text}; {cure}")])
             record(trainer, self.device)
             self.trainers.append(trainer)
         self.streams.wait()
@@ -97,7 +99,6 @@ class PopulationRun(Run):
         )
 
     def title(self) -> str:
-        """Returns what the run is doing."""
         return f"Training {self.cfg.population.size} members"
 
     @contextlib.contextmanager
@@ -115,7 +116,6 @@ class PopulationRun(Run):
             gc.unfreeze()
 
     def saved(self) -> str:
-        """Returns how to resume the run after an error."""
         return folders.to_continue(self.folder)
 
     def finish(self) -> None:
@@ -151,35 +151,28 @@ def member_settings(cfg: settings.Train, member: int) -> settings.Train:
     )
 
 
-def check_score(score: str, trainer: Trainer) -> None:
-    """Raises ConfigErrors if a trainer's reports have nothing of this name."""
-    known = [populations.RUNNING, populations.EVALUATED, *trainer.episodes.names]
-    if score not in known:
-        text = f"{score} is not a mean over episodes here; {closest(score, known)}"
-        raise ConfigErrors([("population.score", text)])
-
-
 def table(population: Population, root: Path) -> str:
     """Returns a table of the members: the score by which commands find the best, ancestor at the
     first generation, settings. All ranks call it, once all members have written their metrics.
     """
-    folders = [trainer.saver.folder.parent for trainer in population.trainers]
+    ranked_by = population.chosen.score
     scores = population.gathered(
-        [populations.score_of(folder, population.score) for folder in folders]
+        [
+            populations.score_of(trainer.saver.folder.parent, ranked_by)
+            for trainer in population.trainers
+        ]
     )
-    generations = populations.read(root / populations.FILE)
-    keys = [*population.vary]
-    rows = []
-    for member, score in enumerate(scores):
-        rows.append(
-            [
-                str(member),
-                "" if score is None else f"{score:.4g}",
-                str(populations.lineage(generations, member)[0]),
-                *(f"{population.settings[member][key]:.3g}" for key in keys),
-                str(population.n_diverged[member] or ""),
-            ]
-        )
-    is_return = population.score in (populations.RUNNING, populations.EVALUATED)
-    title = "return" if is_return else population.score
+    generations, keys = populations.read(root / populations.FILE), [*population.chosen.vary]
+    rows = [
+        [
+            str(member),
+            "" if score is None else f"{score:.4g}",
+            str(populations.lineage(generations, member)[0]),
+            *(f"{population.settings[member][key]:.3g}" for key in keys),
+            str(population.n_diverged[member] or ""),
+        ]
+        for member, score in enumerate(scores)
+    ]
+    is_return = ranked_by in (populations.RUNNING, populations.EVALUATED)
+    title = "return" if is_return else ranked_by
     return console.table(["member", title, "descends from", *keys, "diverged"], rows)

@@ -79,7 +79,7 @@ def joined() -> "Iterator[Team | None]":
         raise SystemExit(code) from None
     finally:
         _team = None
-    team.finish()
+    team.leave()
     if has_joined:
         process_group.stop()
 
@@ -92,9 +92,9 @@ def _cause(error, kind) -> BaseException | None:
 
 
 def together(function: Callable[[], T]) -> T:
-    """Calls `agreement.together(function)` if ranks have joined, otherwise just the function."""
+    """Calls `process_group.together(function)` if ranks have joined, otherwise just it."""
     if _team is None:
         return function()
-    from megastep.agents.distributed import agreement
+    from megastep.agents.distributed import process_group
 
-    return agreement.together(function)
+    return process_group.together(function)

@@ -14,16 +14,13 @@ from megastep import engine
 from megastep.agents import console, factory, package
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.agreement import from_rank_0, together
-from megastep.agents.distributed.drift import DriftError
-from megastep.agents.distributed.ranks import ONE, Ranks, world
+from megastep.agents.distributed.process_group import from_rank_0, together
+from megastep.agents.distributed.ranks import DriftError
 from megastep.agents.errors import EnvFailed, NonFinite, UserError, memory_problem
-from megastep.agents.evaluation import in_training
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
-from megastep.agents.launch import again, finishing, gpu, rank_checks, signals
+from megastep.agents.launch import again, rank_checks, signals
 from megastep.agents.runs import folders, provenance
-from megastep.agents.training import curves
 from megastep.agents.training.budget import reaches
 from megastep.agents.training.callbacks import Progress
 
@@ -36,25 +33,20 @@ class Run:
     """The run of an agent, in this process alone or as one of several ranks, which all do the same
     here. `PopulationRun` has what differs for a population.
 
-    Args:
-        cfg: its settings.
-        team: the ranks; None in a single process.
-
     Attributes:
         folder: the run folder.
         training: what trains: the trainer, or the population.
         trainers: those of this rank.
     """
 
-    ranks: Ranks  # those that train a policy together
     of_each = ""  # agent, in messages about samples
     folder: Path
     training: Any
     trainers: Sequence[Trainer]
 
     def __init__(self, cfg: settings.Train, team: Team | None):
-        self.cfg, self.team, self.ranks = cfg, team, world()
-        self.is_first, self.n_ranks = self.ranks.rank == 0, self.ranks.n
+        self.cfg, self.team = cfg, team
+        self.is_first, self.n_ranks = process_group.rank() == 0, process_group.n_ranks()
         self.device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
         self.progress = console.Progress()
 
@@ -67,30 +59,27 @@ class Run:
         """
         if self.cfg.resume == again.AUTO:
             start = together(lambda: again.automatic(self.cfg))
-            if start.is_done:
-                why = "reached its stop" if start.is_reached else "used up its budget"
-                console.say(f"The run in {start.folder} has already {why}.")
+            if start.ended:
+                console.say(f"The run in {start.folder} has already {start.ended}.")
                 return start.folder
             self.cfg = start.cfg
         rank_checks.check_start(self.cfg)
         with contextlib.ExitStack() as locks:
             self.start(locks)
-            self.train()
+            # of a signal to all ranks, the first to get it stops them, and others get it later
+            with signals.handled(lambda number: None) as numbers:
+                self.train()
+            if numbers:
+                signals.interrupt(numbers[0])
             self.finish()
         return self.folder
 
     # ---- Before training ----
 
     def start(self, locks: contextlib.ExitStack) -> None:
-        """Opens the folder, which is removed again if training cannot start, and makes what trains.
-
-        Args:
-            locks: keeps the folder locked.
-        """
-        cfg = self.cfg
-        is_auto = cfg.resume == again.AUTO
-        is_new = not cfg.resume or (is_auto and not os.path.exists(str(cfg.folder)))
-        self.cfg = rank_checks.started_again(cfg, self.team)
+        """Opens the folder, and makes what trains. If that fails, a new folder is removed."""
+        is_auto = self.cfg.resume == again.AUTO
+        is_new = not self.cfg.resume or (is_auto and not os.path.exists(str(self.cfg.folder)))
         with contextlib.ExitStack() as undo:
             with signals.deferred():
                 self.folder, source = from_rank_0(lambda: self.open(locks))
@@ -108,8 +97,6 @@ class Run:
             self.began()
             if self.is_first:
                 folders.record_start(self.folder)
-                if self.cfg.device == "auto":
-                    gpu.warn_of_job_without()
                 where = f"{self.n_ranks} x {self.device.type}" if self.n_ranks > 1 else self.device
                 console.say(f"{self.title()} on {where} in {self.folder}")
             undo.pop_all()
@@ -128,23 +115,17 @@ class Run:
         return folder, cfg.resume
 
     def make(self, source: Any, token: str) -> None:
-        """Makes what trains, without waiting for other ranks.
-
-        Args:
-            source: from `open`.
-            token: of `rank_checks.check_shared`.
-        """
+        """Makes what trains from what `open` returned, without waiting for other ranks."""
         self.cfg = again.with_more(settings.changed(self.cfg, resume=source))
         self.training = make_trainer(
             *(self.cfg, self.folder, self.device, token),
             callbacks=[Progress(self.progress.show)],
-            make_evaluator=in_training.Evaluator,
+            make_evaluator=evaluator,
         )
         self.trainers = [self.training]
 
     def began(self) -> None:
-        """Checks what all ranks have made, and writes what it is."""
-        rank_checks.check_world(self.cfg, self.training)
+        """Writes what all ranks have made."""
         hosts = process_group.gather_objects(process_group.hostname())
         lost = process_group.gather_objects(self.training.lost)
         from_rank_0(lambda: record(self.training, self.device, hosts))
@@ -152,26 +133,16 @@ class Run:
             console.say(f"Resuming, but not bit for bit: {'; '.join(clauses)}.")
 
     def title(self) -> str:
-        """Returns what a run is doing, as the beginning of a sentence."""
         return "Training"
 
     # ---- Training ----
 
     def train(self) -> None:
         """Trains, and turns what may happen into a sentence."""
-        if process_group.n_ranks() == 1:
-            return self._train()
-        # of a signal to all ranks, the first to get it stops them, and the others get it later
-        with signals.handled(lambda number: None) as numbers:
-            self._train()
-        if numbers:
-            signals.interrupt(numbers[0])
-
-    def _train(self) -> None:
         try:
             with (
                 env_failures.caught(self.cfg.env, self.folder, self.saved, process_group.rank()),
-                signals.handled() as numbers,
+                signals.handled(signals.announce) as numbers,
                 self.around(),
                 self.progress if self.is_first else contextlib.nullcontext(),
                 contextlib.closing(self.training),
@@ -189,10 +160,6 @@ class Run:
                 raise
             reason = problem or str(error).partition("\n")[0].rstrip(".")
             raise UserError(f"{reason}. {self.saved()}") from error
-        finally:
-            with process_group.unhurried():
-                for trainer in self.trainers if self.is_first or self.ranks == ONE else ():
-                    curves.plot_curves(trainer.saver.folder.parent)
         # all ranks stop if one got a signal or could not save a checkpoint
         unsaved = next((one.saver.error for one in self.trainers if one.saver.error), None)
         ends = process_group.gather_objects((numbers[:1], unsaved))
@@ -203,7 +170,6 @@ class Run:
             raise UserError(unsaved)
 
     def around(self) -> contextlib.AbstractContextManager:
-        """Returns what training is done inside."""
         return contextlib.nullcontext()
 
     def saved(self) -> str:
@@ -217,10 +183,12 @@ class Run:
 
     def finish(self) -> None:
         """Does what `cfg.finish` asks for, and says what came of the run."""
-        cfg, trainer, folder = self.cfg, self.training, self.folder
-        guard, samples, result = trainer.nonfinite_guard, trainer.samples, self.result()
+        from megastep.agents.launch import finishing  # with all that evaluates and films
+
+        cfg, folder, samples, result = self.cfg, self.folder, self.training.samples, self.result()
+        guard = self.training.nonfinite_guard
         nonfinite, hint = guard.value, guard.hint
-        del self.training, self.trainers, trainer, guard  # frees GPU memory for the evaluation
+        del self.training, self.trainers, guard  # frees GPU memory for the evaluation
         finishing.finish(cfg, folder, samples)
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All other rollouts were used; the run is in {folder}"
@@ -244,6 +212,13 @@ class Run:
             return f"{text}; no episode ended since the last report"
         n = f"{latest['episode/window']:,.0f}"
         return f"{text}; mean return {latest['episode/return']:.4g} of the last {n} episodes"
+
+
+def evaluator(*arguments: Any) -> Any:
+    """Returns an `Evaluator`, for `make_trainer`."""
+    from megastep.agents.evaluation import in_training  # with all that evaluates
+
+    return in_training.Evaluator(*arguments)
 
 
 def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:

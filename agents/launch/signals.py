@@ -1,6 +1,5 @@
-"""Handles Ctrl-C, SIGTERM and SIGHUP, and SIGUSR1 and SIGUSR2, which clusters send before a job's
-time is up. The first signal stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit
-code is 128 plus the signal's number.
+"""Signals: the first stops a script gracefully, a second Ctrl-C or SIGTERM at once. The exit code
+is 128 plus the signal's number.
 """
 
 import contextlib
@@ -26,11 +25,8 @@ SAME = 0.3
 
 
 class Interrupted(BaseException):
-    """A signal stopped the script. A BaseException, so that `except Exception` does not catch it.
-
-    Args:
-        number: the signal's number.
-        message: what was saved and how to continue.
+    """A signal stopped the script: its number, and what was saved and how to continue. A
+    BaseException, so that `except Exception` does not catch it.
     """
 
 
@@ -59,17 +55,13 @@ def exit_on_signals(script: str) -> None:
 
 @contextlib.contextmanager
 def handled(
-    on_first: Callable[[int], None] = announce,
+    on_first: Callable[[int], None],
     on_second: Callable[[int], None] = lambda number: None,
 ) -> Iterator[list[int]]:
     """Handles signals for the duration of the context.
 
     A second Ctrl-C or SIGTERM ends the process at once; after SIGUSR1 or SIGUSR2 it counts as the
     first. Ending at once is safe: checkpoints are written to a temporary folder and renamed.
-
-    Args:
-        on_first: called with the number of the first signal.
-        on_second: called with the number of the second, before the process ends.
 
     Yields:
         A list, empty until the first signal's number is appended.
@@ -126,21 +118,22 @@ def deferred() -> Iterator[None]:
 
 
 def stop(process: int) -> None:
-    """Stops another process gracefully, even if it has already received the terminal's Ctrl-C.
-
-    Sends SIGHUP unless it is ignored: even as the second signal, it does not end a process at once.
+    """Stops another process gracefully, even if it has already received the terminal's Ctrl-C:
+    SIGHUP, unless it is ignored, ends no process at once, even as the second signal.
     """
-    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):
-        os.kill(process, signal.SIGTERM if is_ignored else signal.SIGHUP)
+        os.kill(process, signal.SIGTERM if _is_hangup_ignored() else signal.SIGHUP)
+
+
+def _is_hangup_ignored() -> bool:
+    return signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # by nohup
 
 
 def _install(handler: Callable) -> dict[int, Callable | int | None]:
-    # returns the previous handlers; does nothing outside the main thread; respects nohup
+    """Returns the previous handlers. Does nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         return {}
-    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    return {n: signal.signal(n, handler) for n in SIGNALS[: -1 if is_ignored else None]}
+    return {n: signal.signal(n, handler) for n in SIGNALS[: -1 if _is_hangup_ignored() else None]}
 
 
 def _write(stream: TextIO | None, line: str) -> None:

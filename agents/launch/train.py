@@ -1,13 +1,18 @@
 """Trains, in this process or with several ranks in processes of their own."""
 
+import os
+import sys
+import traceback
+import warnings
 from pathlib import Path
 
+from megastep import workers
 from megastep.agents import console, factory
-from megastep.agents.factory import settings
-from megastep.agents.launch import gpu, launcher, rank
-from megastep.agents.launch.population import PopulationRun
+from megastep.agents.errors import shortened
+from megastep.agents.factory import check, settings
+from megastep.agents.launch import endings, gpu, launcher, rank
 from megastep.agents.launch.run import Run
-from megastep.agents.selfplay.opponents import count_environments
+from megastep.agents.runs import typed_json
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import n_lanes, optional
 
@@ -16,7 +21,7 @@ def run(cfg: settings.Train) -> Path | None:
     """Trains. Returns the run folder, None for a dry run.
 
     If torchrun started this process, it trains as one of the ranks; rank 0 writes the run folder.
-    With `cfg.ranks` or `cfg.restarts`, this process starts the ranks and waits for them.
+    With `cfg.ranks`, this process starts the ranks and waits for them.
 
     Raises:
         Interrupted: a signal came; the run was saved.
@@ -29,8 +34,38 @@ def run(cfg: settings.Train) -> Path | None:
         gpu.ask_for_queues()
     if launcher.is_needed(cfg):
         return launcher.run(cfg)
+    kind = Run
+    if is_population:
+        from megastep.agents.launch.population import PopulationRun as kind
     with rank.joined() as team:
-        return (PopulationRun if is_population else Run)(cfg, team).run()
+        return kind(cfg, team).run()
+
+
+def run_rank() -> int:
+    """Trains as one of the ranks that `launcher` started. Returns the exit code: 0 if this rank has
+    said how it ended.
+    """
+    facts = typed_json.loads(Path(os.environ[endings.JOB], endings.SETTINGS).read_text())
+    sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
+    workers.end_with_parent(facts["parent"])
+    console.open_streams()
+    console.prefix = facts["prefix"]
+    warnings.showwarning = console.warn
+    folder, code = None, 0
+
+    def work() -> None:
+        nonlocal folder
+        folder = run(check.check(settings.Train, facts["settings"]))
+
+    try:
+        ending = endings.ending_of(work)._replace(folder=folder and str(folder))
+    except Exception as error:
+        traceback.print_exc()
+        ending = endings.Ending(1, f"{type(error).__name__}: {shortened(error, 400)}")
+        code = 1
+    if ending.text or ending.folder:
+        endings.report_ending(ending)
+    return code
 
 
 def dry_run(cfg: settings.Train) -> None:
@@ -39,48 +74,43 @@ def dry_run(cfg: settings.Train) -> None:
 
     A machine without a GPU, such as a login node, tells the sizes of `device=cuda`, too.
     """
-    n_ranks = launcher.n_ranks(cfg)
+    n_ranks, n_members = launcher.n_ranks(cfg), cfg.population.size
     is_elsewhere = cfg.device.startswith("cuda") and not gpu.is_available()
     device = factory.make_device("cpu" if is_elsewhere else cfg.device)
-    kind = "cuda" if is_elsewhere else device.type
-    n_members = cfg.population.size
+    numbers = sizes(cfg, device)
     n, part = (n_members, "per member") if n_members > 1 else (n_ranks, "per rank")
-    names = ["", part, "in total"] if n > 1 else ["", "in total"]
+    columns = {"in total": n} if n == 1 else {part: 1, "in total": n}
     rows = [
-        [name, *(f"{number * factor:,}" for factor in {1: None, n: None})]
-        for name, number in sizes(cfg, device).items()
+        [name, *(f"{number * factor:,}" for factor in columns.values())]
+        for name, number in numbers.items()
     ]
     members = f" {n_members} members" if n_members > 1 else ""
     ranks = f"{n_ranks} x " if n_ranks > 1 else ""
-    console.say(f"Would train{members} on {ranks}{kind}:\n{console.table(names, rows)}")
+    where = f"{ranks}{'cuda' if is_elsewhere else device.type}"
+    console.say(f"Would train{members} on {where}:\n{console.table(['', *columns], rows)}")
 
 
 def sizes(cfg: settings.Train, device) -> dict[str, int]:
-    """Returns the sizes of one rank by name; omits those that the learner does not define."""
+    """Returns the sizes of one rank by name; omits those that the learner does not define. Raises
+    UserError if the opponents do not fit.
+    """
     geometries = factory.homes(cfg.env, cfg.geometry, "training")
     options = dict(seed=cfg.seed, device=device, privileged=cfg.agent.critic == "asymmetric")
     sample = factory.make_sample(cfg.env, geometries, **options)
     lanes = cfg.env.n_envs * n_lanes(sample) // sample.n_envs
-    learner = with_defaults(cfg.learner, LearnerOptions)
+    learner, opponents = with_defaults(cfg.learner, LearnerOptions), cfg.opponents
     numbers = {"environments": cfg.env.n_envs, "lanes": lanes}
-    n_opponents = count_opponents(cfg, sample)
-    if n_opponents:
-        lanes -= n_opponents
+    if opponents.past or opponents.bot or opponents.league:
+        from megastep.agents.selfplay.opponents import count_environments
+
+        with factory.errors():
+            shares = opponents.past, opponents.bot, opponents.snapshots, opponents.league
+            n_snapshot, n_bot, n_rival = count_environments(sample, cfg.env.n_envs, *shares)
+        n_played = (n_snapshot + n_rival) * opponents.snapshots + n_bot
+        lanes -= n_played * (optional(sample, "n_agents") - 1)
         numbers["lanes that learn"] = lanes
     if learner.n_steps:
         numbers["samples per update"] = lanes * learner.n_steps
     if learner.n_steps and learner.n_minibatches:
         numbers["samples per minibatch"] = lanes * learner.n_steps // learner.n_minibatches
     return numbers
-
-
-def count_opponents(cfg: settings.Train, sample) -> int:
-    """Returns the number of lanes that opponents control. Raises UserError if they do not fit."""
-    opponents = cfg.opponents
-    if not (opponents.past or opponents.bot or opponents.league):
-        return 0
-    with factory.errors():
-        shares = opponents.past, opponents.bot, opponents.snapshots, opponents.league
-        n_per_snapshot, n_bot, n_per_rival = count_environments(sample, cfg.env.n_envs, *shares)
-    n_past = (n_per_snapshot + n_per_rival) * opponents.snapshots
-    return (n_past + n_bot) * (optional(sample, "n_agents") - 1)

@@ -16,15 +16,10 @@ Settings = dict[str, float]
 
 
 class Decision(NamedTuple):
-    """What a member does at a generation.
+    """What a member does at a generation."""
 
-    Attributes:
-        source: the member that it copies; itself if none.
-        settings: its settings from then on, by key.
-    """
-
-    source: int
-    settings: Settings
+    source: int  # the member that it copies; itself if none
+    settings: Settings  # its settings from then on, by key
 
 
 def member_seed(seed: int, member: int) -> int:
@@ -46,10 +41,9 @@ def decide(
     scores: Sequence[float | None],
     settings: Sequence[Settings],
     vary: Mapping[str, Variation],
-    exploit: str = "truncation",
-    explore: str = "factor",
 ) -> list[Decision]:
-    """Returns the decision of each member.
+    """Returns the decision of each member: the last quarter of the ranking copies members drawn
+    from the first, with settings near theirs.
 
     Args:
         seed: the population's.
@@ -58,37 +52,21 @@ def decide(
             Minus infinity: it has diverged, so it copies another, and is never copied.
         settings: of each member.
         vary: what the settings may be.
-        exploit: "truncation": the last quarter of the ranking copies members drawn from the first.
-            "tournament": each member draws another, and copies it if that has the better score.
-        explore: what a member that copies does with the settings of the other: "factor": each is
-            multiplied by 0.8 or 1.2; "resample": each is drawn anew.
     """
     known = [n for n, score in enumerate(scores) if score is not None]
     ranked = sorted(known, key=lambda n: (-_score(scores[n]), n))
     sound = [n for n in ranked if _score(scores[n]) > -math.inf]
     n_cut = max(1, int(TRUNCATED * len(ranked)))
+    copying = {*ranked[max(n_cut, len(ranked) - n_cut) :], *ranked[len(sound) :]}
     decisions = []
     for member, own in enumerate(settings):
         generator, source = _generator(seed, generation, member), member
-        if member in known and sound:
-            has_diverged = member not in sound
-            if exploit == "tournament" and not has_diverged and len(sound) > 1:
-                rival = generator.choice([n for n in sound if n != member])
-                source = rival if _score(scores[rival]) > _score(scores[member]) else member
-            elif has_diverged or member in ranked[max(n_cut, len(ranked) - n_cut) :]:
-                source = generator.choice(sound[:n_cut])
-                is_better = _score(scores[source]) > _score(scores[member])
-                source = source if is_better else member
-        if source == member:
-            decisions.append(Decision(member, dict(own)))
-            continue
-        numbers = {
-            key: one.draw(generator)
-            if explore == "resample"
-            else one.near(settings[source][key], generator)
-            for key, one in vary.items()
-        }
-        decisions.append(Decision(source, numbers))
+        if sound and member in copying:
+            drawn = generator.choice(sound[:n_cut])
+            source = drawn if _score(scores[drawn]) > _score(scores[member]) else member
+        if source != member:
+            own = {key: one.near(settings[source][key], generator) for key, one in vary.items()}
+        decisions.append(Decision(source, dict(own)))
     return decisions
 
 

@@ -19,14 +19,13 @@ from torch.utils._pytree import tree_map
 
 from megastep import global_generators
 from megastep.agents.algorithms.nonfinite import NonFiniteError
-from megastep.agents.distributed.agreement import from_rank_0
 from megastep.agents.distributed.process_group import (
     exchange,
     from_rank,
+    from_rank_0,
     gather_objects,
     n_ranks,
     rank,
-    unhurried,
 )
 from megastep.agents.distributed.ranks import world
 from megastep.agents.population import decisions
@@ -84,42 +83,28 @@ class Streams:
     @contextlib.contextmanager
     def of(self, member: int) -> Iterator[None]:
         """What is done inside is this member's."""
-        with self._undone(), self._only(member):
-            yield
-
-    def each(self, call: Callable[[int], T]) -> list[T]:
-        """Calls a function of each member in turn, as inside `of`. Returns the results."""
-        results = []
-        with self._undone():
-            for member in range(len(self.of_host)):
-                with self._only(member):
-                    results.append(call(member))
-        return results
-
-    @contextlib.contextmanager
-    def _only(self, member) -> Iterator[None]:
-        """Leaves the member's stream, and the host's global generators as the member did."""
-        self.of_host[member].install()
-        if self.streams is not None and self.gpu_generator is not None:
-            self.gpu_generator.set_state(self.of_gpu[member])
-            torch.cuda.set_stream(self.streams[member])
-        yield
-        self.of_host[member] = global_generators.Held.current()
-        if self.gpu_generator is not None:
-            self.of_gpu[member] = self.gpu_generator.get_state()
-
-    @contextlib.contextmanager
-    def _undone(self) -> Iterator[None]:
-        """Brings the current stream and the host's global generators back."""
-        outside = global_generators.Held.current()
-        stream = contextlib.nullcontext()
+        outside, stream = global_generators.Held.current(), contextlib.nullcontext()
         if self.streams is not None:
-            stream = torch.cuda.stream(torch.cuda.current_stream(self.device))
+            stream = torch.cuda.stream(self.streams[member])
         try:
             with stream:
+                self.of_host[member].install()
+                if self.gpu_generator is not None:
+                    self.gpu_generator.set_state(self.of_gpu[member])
                 yield
+                self.of_host[member] = global_generators.Held.current()
+                if self.gpu_generator is not None:
+                    self.of_gpu[member] = self.gpu_generator.get_state()
         finally:
             outside.install()
+
+    def each(self, call: Callable[[int], T]) -> list[T]:
+        """Calls a function of each member in turn, inside `of`. Returns the results."""
+        results = []
+        for member in range(len(self.of_host)):
+            with self.of(member):
+                results.append(call(member))
+        return results
 
     def wait(self) -> None:
         """Waits until all members have done what is launched."""
@@ -133,13 +118,11 @@ class Population:
     A member that diverges goes on without learning, and copies another at the next generation.
 
     Args:
-        trainers: of the members that this rank hosts. All do the updates that the first plans.
-        streams: in which they were made.
+        trainers: of the members that this rank hosts, made in `streams`. All do the updates that
+            the first plans.
         folder: where `population.jsonl` is written.
-        seed: that decisions are drawn with.
-        chosen: its settings, `factory.settings.Population`. A generation is at the first report
-            after `every` samples, and none when the budget is spent.
-        checkpoint_seconds: seconds between two checkpoints of all members.
+        chosen: its settings. A generation is at the first report after `every` samples, and none
+            when the budget is spent.
         visitor: with several ranks, holds what a member of another one has learnt.
         repeated: the samples after which the generations are, if another population is repeated.
 
@@ -162,28 +145,30 @@ class Population:
         repeated: Collection[int] | None = None,
     ):
         self.trainers, self.streams, self.seed = [*trainers], streams, seed
+        self.leader = self.trainers[0]  # the clock of rank 0's decides
         self.chosen, self.size, self.visitor = chosen, chosen.size, visitor
-        self.members = hosted(self.size)
-        self.rank, self.n_ranks = rank(), n_ranks()
-        self.vary, self.score = chosen.vary, chosen.score
-        self.repeated = repeated
+        self.members, self.n_ranks, self.repeated = hosted(chosen.size), n_ranks(), repeated
         self.checkpoint_seconds, self.saved_at = checkpoint_seconds, time.monotonic()
         self.path = folder / populations.FILE
         generations = from_rank_0(self._earlier)
-        self.lines = json_lines.JsonLines(self.path) if self.rank == 0 else None
-        self.generation = len(generations) - 1
+        self.lines = json_lines.JsonLines(self.path) if rank() == 0 else None
+        self.generation = max(0, len(generations) - 1)
         self.n_diverged = [0] * self.size
         self.samples_at_round = self.leader.samples_at_report
         for trainer in trainers:
             trainer.nonfinite_guard.tolerates_divergence = True
         for trainer in self.trainers[1:]:
-            trainer.clock, trainer.timing.timer = self.leader.clock, None
+            trainer.clock, trainer.timing.times_phases = self.leader.clock, False
         if generations:
-            self._restore(generations)
+            self.settings = [populations.settings_of(row) for row in generations[-1]]
+            for rows in generations:
+                for member, row in enumerate(rows):
+                    self.n_diverged[member] += int(row.get("diverged", 0))
+            self.streams.each(lambda i: self.trainers[i].tuning.set(self.settings[self.members[i]]))
         else:
-            members = range(self.size)
-            self.settings = [decisions.first(seed, member, self.vary) for member in members]
-            self._write([None for _ in members], [*members])
+            numbers = range(self.size)
+            self.settings = [decisions.first(seed, member, chosen.vary) for member in numbers]
+            self._write([None for _ in numbers], [*numbers])
 
     def _earlier(self) -> list[list[Row]]:
         """Returns the generations so far, and removes those after the checkpoints."""
@@ -191,59 +176,42 @@ class Population:
         return populations.read(self.path) if self.path.exists() else []
 
     @property
-    def leader(self) -> Trainer:
-        """The first member of this rank. The clock of rank 0's decides."""
-        return self.trainers[0]
-
-    @property
     def samples(self) -> int:
         """Samples of each member so far."""
-        return self.trainers[0].samples
-
-    def _restore(self, generations: list[list[Row]]) -> None:
-        self.settings = [populations.settings_of(row) for row in generations[-1]]
-        for rows in generations:
-            self.n_diverged = [
-                n + int(row.get("diverged", 0))
-                for n, row in zip(self.n_diverged, rows, strict=True)
-            ]
-        self.streams.each(lambda i: self.trainers[i].tuning.set(self.settings[self.members[i]]))
+        return self.leader.samples
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Trains all members until the budget is spent, one of them ends, or `stop()` returns True,
-        then saves a checkpoint of each.
-
-        Raises:
-            NonFiniteError: all members have diverged; or an environment returns only NaN.
+        then saves a checkpoint of each. Raises NonFiniteError if all have diverged, or an
+        environment returns only NaN.
         """
 
         def ends() -> bool:
             return stop() or any(one.is_stopped for one in self.trainers)
 
-        leader, n_rounds = self.leader, 0
-        evaluates = any(isinstance(one, Evaluations) for one in leader.callbacks)
+        trainers, each, n_rounds = self.trainers, self.streams.each, 0
+        evaluates = any(isinstance(one, Evaluations) for one in self.leader.callbacks)
         try:
-            self.streams.each(lambda i: self.trainers[i].callbacks("on_start", self.trainers[i]))
-            while (plan := leader.plan(ends(), world())).goes_on:
+            each(lambda i: trainers[i].callbacks("on_start", trainers[i]))
+            while (plan := self.leader.plan(ends(), world())).goes_on:
                 # all updates are launched before the first report waits for its own
-                self.streams.each(lambda i: self.trainers[i].update(plan.lr_fraction))
-                if leader.updates % leader.log_every == 0:
+                each(lambda i: trainers[i].update(plan.lr_fraction))
+                if self.leader.updates % self.leader.log_every == 0:
                     if evaluates:
                         self.streams.wait()  # the clock pauses, and counts what is launched before
-                    self.streams.each(lambda i: self.trainers[i].report())
+                    each(lambda i: trainers[i].report())
                 n_rounds += 1
                 # seconds count from the last of these on
                 if n_rounds <= N_PREPARING[self.streams.device.type]:
-                    self.streams.each(lambda i: self.trainers[i].start_clock())
+                    each(lambda i: trainers[i].start_clock())
                     self.saved_at = time.monotonic()
                 self._after_round()
-            self.streams.each(lambda i: self.trainers[i].finish())
+            each(lambda i: trainers[i].finish())
         finally:
-            for one in self.trainers:
+            for one in trainers:
                 with contextlib.suppress(Exception):  # the first error is the one to report
                     one.wait_for_collector()
-                with unhurried():
-                    one.saver.wait()
+                one.saver.wait()
             if self.lines is not None:
                 self.lines.close()
 
@@ -256,8 +224,7 @@ class Population:
         if self.repeated is not None:  # when a budget was spent, the clock may have decided
             is_due, is_left = self.samples in self.repeated, True
         seconds = time.monotonic() - self.saved_at
-        rows = exchange([is_left, seconds >= self.checkpoint_seconds])
-        goes_on, saves = rows[0]
+        goes_on, saves = exchange([is_left, seconds >= self.checkpoint_seconds])[0]
         if is_due and goes_on:
             self.take_over()
         self.meet()
@@ -280,18 +247,13 @@ class Population:
 
     def save(self) -> None:
         """Begins to save a checkpoint of each member, once all have the last one."""
-        with unhurried():
-            for trainer in self.trainers:
-                trainer.saver.wait()
+        for trainer in self.trainers:
+            trainer.saver.wait()
         self.streams.each(lambda i: self.trainers[i].save())
         self.saved_at = time.monotonic()
 
     def take_over(self) -> None:
-        """Lets members copy others, as `decisions.decide` says, and writes who did.
-
-        Raises:
-            NonFiniteError: all members have diverged.
-        """
+        """Lets members copy others, as `decisions.decide` says, and writes who did."""
         scores = self.gathered([self.score_of(trainer) for trainer in self.trainers])
         if all(score == -math.inf for score in scores):
             raise NonFiniteError(
@@ -299,10 +261,7 @@ class Population:
                 False,
             )
         self.generation += 1
-        made = decisions.decide(
-            *(self.seed, self.generation, scores, self.settings, self.vary),
-            *(self.chosen.exploit, self.chosen.explore),
-        )
+        made = decisions.decide(self.seed, self.generation, scores, self.settings, self.chosen.vary)
         self.streams.wait()
         for member in decisions.order(made, scores):
             self.copy(made[member].source, member)
@@ -314,11 +273,11 @@ class Population:
 
     def score_of(self, trainer: Trainer) -> float | None:
         """Returns a member's score: minus infinity if it has diverged, None if it is unknown."""
+        metrics, name = trainer.metrics, self.chosen.score
         if trainer.nonfinite_guard.has_diverged:
             return -math.inf
-        if self.score == populations.EVALUATED:
+        if name == populations.EVALUATED:
             return trainer.evaluation.get("return")
-        metrics, name = trainer.metrics, self.score
         if metrics.get("episode/window", 0) < MIN_EPISODES:
             return None
         return metrics.get(f"episode/{'return' if name == populations.RUNNING else name}")
@@ -373,7 +332,7 @@ class Population:
         for member, (score, source) in enumerate(zip(scores, sources, strict=True)):
             has_diverged = score == -math.inf
             self.n_diverged[member] += has_diverged
-            row: dict[str, float | str] = {"generation": max(self.generation, 0), "member": member}
+            row: dict[str, float | str] = {"generation": self.generation, "member": member}
             row["from"] = source
             if score is not None and not has_diverged:
                 row["score"] = score
@@ -383,12 +342,10 @@ class Population:
             row |= {f"{populations.KEY}{key}": value for key, value in of_settings}
             if self.lines is not None:
                 self.lines.write(self.samples, row)
-        self.generation = max(self.generation, 0)
         if self.lines is not None:
             self.lines.file.sync()
 
     def close(self) -> None:
-        """Closes the members' environments and files."""
         for trainer in self.trainers:
             trainer.close()
 

@@ -31,8 +31,6 @@ class AnnealingRecord:
     a full disk refuses is written later.
     """
 
-    is_slow = True
-
     def __init__(self, folder: Path | str, n_updates: int = 0):
         n_bytes = min(n_updates, len(read(folder))) * array("d").itemsize
         self.file = AppendedFile(Path(folder) / FILE, n_bytes)

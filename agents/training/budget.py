@@ -15,8 +15,7 @@ class Budget:
     """Ends a run after a number of samples or seconds, whichever comes first.
 
     Args:
-        samples: environment steps of all lanes together; None for no limit.
-        seconds: seconds of training; None for no limit.
+        samples, seconds: None for no limit.
         anneal: "samples" or "seconds": the learning rate falls linearly to 0 over that limit.
             "never": it is constant.
         recorded: the factors of the learning rate in the first updates, as an earlier run of the
@@ -34,13 +33,10 @@ class Budget:
 
     @property
     def is_limited(self) -> bool:
-        """True if the run ends by itself."""
         return self.is_rerun or self.samples is not None or self.seconds is not None
 
     def fraction_left(self, updates: int, samples: int, seconds: float) -> float:
-        """Returns the fraction of the budget that is left: 1 if there is no limit, below 0 if it is
-        overspent.
-        """
+        """Returns the fraction that is left: 1 without a limit, below 0 if it is overspent."""
         if self.is_rerun:
             return _fraction_left(updates, len(self.recorded))
         seconds_left = _fraction_left(seconds, self.seconds)
@@ -80,24 +76,17 @@ def reaches(evaluation: Mapping[str, float], stop: Mapping[str, float]) -> bool:
 
 
 class Stopwatch:
-    """Counts seconds of training.
-
-    Attributes:
-        seconds_before: seconds that the run had trained before it was resumed.
-        started: time of `start` on the monotonic clock, or None.
-    """
+    """Counts seconds of training, from `start` on: after the first update, which compiles."""
 
     def __init__(self) -> None:
-        self.seconds_before = 0.0
+        self.seconds_before = 0.0  # that the run had trained before it was resumed
         self.started: float | None = None
 
     def start(self) -> None:
-        """Starts counting. Called after the first update, so compilation does not count."""
         self.started = time.monotonic()
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """What is done inside does not count."""
         began = time.monotonic()
         try:
             yield
@@ -107,7 +96,6 @@ class Stopwatch:
 
     @property
     def is_running(self) -> bool:
-        """Whether the time counts."""
         return self.started is not None
 
     @property

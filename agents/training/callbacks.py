@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -18,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from megastep.agents import console
-from megastep.agents.distributed.drift import check_drift
-from megastep.agents.distributed.process_group import unhurried
 from megastep.agents.errors import UserError, shortened
 from megastep.agents.training.budget import reaches
 from megastep.types import Env, optional
@@ -47,7 +44,6 @@ class Callbacks(list[Any]):
     """Calls the methods that objects have, in the order of the objects.
 
     All ranks call them, each on objects of its own, so that what they change stays the same on all.
-    The other ranks wait without limit for an object with a true attribute `is_slow`.
 
     Raises:
         ValueError: an object has none of `HOOKS`.
@@ -61,10 +57,8 @@ class Callbacks(list[Any]):
                 raise ValueError(f"{type(one).__name__} is not a callback: it has none of {hooks}")
 
     def __call__(self, hook: str, *arguments: object) -> list[object]:
-        """Calls a hook. Returns what the methods do.
-
-        Raises:
-            UserError: naming the callback of a user's that raised an error.
+        """Calls a hook. Returns what the methods do. Raises UserError naming a user's callback that
+        fails.
         """
         results = []
         for one in self:
@@ -72,8 +66,7 @@ class Callbacks(list[Any]):
             if method is None:
                 continue
             try:
-                with unhurried() if getattr(one, "is_slow", False) else contextlib.nullcontext():
-                    results.append(method(*arguments))
+                results.append(method(*arguments))
             except Exception as error:
                 if isinstance(error, UserError) or type(one).__module__.startswith("megastep."):
                     raise
@@ -86,9 +79,7 @@ class Callbacks(list[Any]):
         return False not in self(hook, *arguments)
 
     def close(self, env: Env) -> None:
-        """Calls `close` of those that have it, once an environment, which may be somebody else's
-        and fail at it, is closed.
-        """
+        """Closes an environment, which may fail at it, then the objects that have `close`."""
         try:
             optional(env, "close")()
         except Exception as error:
@@ -102,25 +93,20 @@ class DriftCheck:
     """Checks in each report that all ranks have the same weights."""
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Raises DriftError if the weights differ."""
-        if trainer.ranks.n > 1:
-            check_drift(trainer.policy, trainer.learner_options.extra)
+        trainer.ranks.check_drift(trainer.policy, trainer.learner_options.extra)
 
 
 class Losses:
-    """Reports what the last update returned, means over the ranks.
-
-    A loss that is NaN has no value, as no gradient step was taken; it is left out.
+    """Reports what the last update returned, means over the ranks. NaN, where no gradient step was
+    taken, is left out.
     """
 
     losses: Mapping[str, Any] = {}
 
     def on_update(self, trainer: Trainer, losses: Mapping[str, Any]) -> None:
-        """Keeps the losses."""
         self.losses = losses
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Adds the losses. Synchronises."""
         device, values = trainer.env.device, [*self.losses.values()]
         if values:
             values = torch.stack([torch.as_tensor(one, device=device) for one in values]).tolist()
@@ -131,8 +117,8 @@ class Evaluations:
     """Evaluates the policy for some reports. A checkpoint follows, whose score is the return.
 
     Args:
-        measure: returns numbers by name. Whatever it plays in is not the environment of the
-            training, and its time does not count.
+        measure: returns numbers by name, and changes nothing of the training. Its time does not
+            count.
         every: (number, "samples" or "seconds"): evaluates for the first report after each so many.
         stop: by name, the least that ends the run if all are reached.
     """
@@ -147,14 +133,12 @@ class Evaluations:
         self.last = {"samples": 0.0, "seconds": 0.0}
 
     def on_start(self, trainer: Trainer) -> None:
-        """Continues from the last report, or ends a run that has reached its end before."""
         self.last = {"samples": trainer.samples_at_report, "seconds": trainer.clock.seconds}
         if reaches(trainer.evaluation, self.stop):
             trainer.end()
 
     def on_update(self, trainer: Trainer, losses: object) -> None:
-        """Forgets the score: it was another policy's."""
-        trainer.score = None
+        trainer.score = None  # it was another policy's
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
         """Evaluates if it is time to, which all ranks do at once.
@@ -169,14 +153,13 @@ class Evaluations:
         self.last, trainer.score = now, None
         if not trainer.ranks.any(is_due):
             return
-        with unhurried(), trainer.clock.paused():
+        with trainer.clock.paused():
             measured = self.measure(trainer.policy)
         trainer.evaluation = trainer.ranks.mean({**measured})
         trainer.score, trainer.is_save_due = trainer.evaluation.get("return"), True
         metrics |= {f"eval/{name}": value for name, value in trainer.evaluation.items()}
 
     def on_report(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Ends the run if the evaluation of this report reaches `stop`."""
         if trainer.is_save_due and reaches(trainer.evaluation, self.stop):
             metrics["perf/seconds_to_stop"] = metrics["perf/seconds"]
             trainer.end()
@@ -185,23 +168,15 @@ class Evaluations:
 class Snapshots:
     """Saves what the policy acts with at the end of each of `n` equal parts of the budget, for
     `evaluate.py ratings=true`.
-
-    Args:
-        saver: writes the snapshots.
-        n: their number.
     """
-
-    is_slow = True
 
     def __init__(self, saver: Saver, n: int):
         self.saver, self.n, self.n_parts_done = saver, n, 0
 
     def on_start(self, trainer: Trainer) -> None:
-        """Continues with the part that the run is in."""
         self.n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
 
     def on_update(self, trainer: Trainer, losses: object) -> None:
-        """Saves a snapshot if a part has ended."""
         before = self.n_parts_done
         self.on_start(trainer)
         if self.n_parts_done > before:
@@ -210,17 +185,14 @@ class Snapshots:
 
 
 class Progress:
-    """Shows a line about the run with each report.
-
-    Args:
-        show: gets the fraction of the budget that is spent, None without one, and a few words.
+    """Shows a line about the run with each report: the fraction of the budget that is spent, None
+    without one, and a few words.
     """
 
     def __init__(self, show: Callable[[float | None, list[str]], None]):
         self.show = show
 
     def on_report(self, trainer: Trainer, metrics: Mapping[str, Any]) -> None:
-        """Shows the line."""
         left, latest = trainer.fraction_left, trainer.latest_stats
         words = [f"{console.number(trainer.samples)} samples"]
         if (rate := trainer.timing.rate) is not None:
@@ -228,7 +200,11 @@ class Progress:
         if "episode/return" in latest:
             n_episodes = console.number(latest["episode/window"])
             words.append(f"return {latest['episode/return']:.3g} of {n_episodes} episodes")
-            words += trainer.episodes.few_means(latest)
+            stats = trainer.episodes.stats
+            names = {group: f"episode/return/{group}" for group in stats.groups}
+            names |= {name: f"episode/{name}" for name in stats.metrics}
+            if len(names) <= 4:
+                words += [f"{name} {latest[k]:.3g}" for name, k in names.items() if k in latest]
             won = [(key.partition("episode/won/")[2], rate) for key, rate in latest.items()]
             words += [f"won vs {opponent} {100 * rate:.0f} %" for opponent, rate in won if opponent]
         if "return" in trainer.evaluation:

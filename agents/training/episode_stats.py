@@ -27,14 +27,11 @@ class EpisodeStats:
     """Accumulates return, length and metrics of the episodes that end. Only `pop` synchronises.
 
     Args:
-        n_lanes: B.
-        device: where the transitions are.
         metrics: names of the metrics that worlds carry.
         groups: group name -> (B,) bool. Each group's means are reported beside the overall ones.
         sources: the name of the source of each layout, (D,), or None. The means of the episodes in
             each source's layouts are reported, too, unless a group has its name.
-        skip_first: leaves out each lane's first episode, for lanes that started in the middle of
-            one (`desync`).
+        skip_first: leaves out each lane's first episode, which `desync` cut.
 
     Attributes:
         returns, lengths: (B,) float64, of the episode that each lane is in.
@@ -43,8 +40,8 @@ class EpisodeStats:
             last `pop`: count, return, squared return, length, each metric, and for each metric the
             number of episodes left out of it; for all lanes, for each group and for each source.
         bad_lanes: (M,) int64, the first lane with a metric that was left out; `n_lanes` if none.
-        windows: for all lanes, each group and each source, the sums of the last reports, of all
-            ranks, on the host. The oldest report is dropped once the others hold `MIN_EPISODES`.
+        windows: for all lanes, each group and each source, the sums of the last reports of all
+            ranks, of which the others than the oldest hold fewer than `MIN_EPISODES`.
     """
 
     def __init__(
@@ -96,7 +93,7 @@ class EpisodeStats:
         if self._is_fused(reward, learns, metrics):
             self._add_on_gpu(reward, reset, done, learns, metrics, layouts)
             return
-        reward = _without_nonfinite(reward)
+        reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
         # cumulative sums over all T rows, minus the sum at the last episode end before each row
         returns = self.returns + reward.double().cumsum(0)
         lengths = self.lengths + (~reset).double().cumsum(0)
@@ -113,10 +110,15 @@ class EpisodeStats:
         ]
         by_source = None
         if self.sources:
-            source_of_row = self._sources_of(layouts)
+            last = len(self.source_of_layout) - 1
+            source_of_row = self.source_of_layout[layouts.clamp(0, last).long()]
+            source_of_row = torch.where((layouts >= 0) & (layouts <= last), source_of_row, -1)
             rows = [counts & (source_of_row == source) for source in range(len(self.sources))]
             by_source = torch.stack([self._sum(one, values, metrics) for one in rows], 1)
-        self._add_sums(self._sum(counts, values, metrics), by_source)
+        columns = self._sum(counts, values, metrics) @ self.members
+        if by_source is not None:
+            columns = torch.cat([columns, by_source.sum(2)], 1)
+        self.sums += columns
         # in place, as a CUDA graph wants it
         self.returns.copy_(_sum_since(returns, last_end, slice(-1, None))[0])
         self.lengths.copy_(_sum_since(lengths, last_end, slice(-1, None))[0])
@@ -175,35 +177,22 @@ class EpisodeStats:
             n_lanes=n_lanes,
         )
 
-    def _add_sums(self, sums, source_sums) -> None:
-        """Adds sums (4 + 2 M, B), and those by source (4 + 2 M, S, B) if there are sources."""
-        columns = sums @ self.members
-        self.sums += columns if source_sums is None else torch.cat([columns, source_sums.sum(2)], 1)
-
-    def _sources_of(self, layouts) -> torch.Tensor:
-        """Returns the number of each layout's source, -1 for one that is out of range."""
-        last = len(self.source_of_layout) - 1
-        sources = self.source_of_layout[layouts.clamp(0, last).long()]
-        return torch.where((layouts >= 0) & (layouts <= last), sources, -1)
-
     def _sum(self, counts, values, metrics) -> torch.Tensor:
         """Returns the sums over time of the episodes that count, (4 + 2 M, B)."""
         sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
-        return torch.cat([sums, *self._sum_metrics(counts, metrics)]) if self.metrics else sums
-
-    def _sum_metrics(self, counts, metrics) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the sums of the metrics and the number of episodes left out of each, (M, B)."""
-        values = torch.stack([metrics[name] for name in self.metrics])  # (M, T, B)
-        is_good = values.abs() <= LIMIT
-        sums = torch.where(counts & is_good, values, 0.0).sum(1, dtype=torch.float64)
+        if not self.metrics:
+            return sums
+        of_metrics = torch.stack([metrics[name] for name in self.metrics])  # (M, T, B)
+        is_good = of_metrics.abs() <= LIMIT
         n_left_out = (counts & ~is_good).sum(1, dtype=torch.float64)
         lanes = torch.arange(counts.shape[1], device=counts.device)
         bad_lanes = torch.where(n_left_out > 0, lanes, counts.shape[1]).amin(1)
         torch.minimum(self.bad_lanes, bad_lanes, out=self.bad_lanes)
-        return sums, n_left_out
+        totals = torch.where(counts & is_good, of_metrics, 0.0).sum(1, dtype=torch.float64)
+        return torch.cat([sums, totals, n_left_out])
 
     def pop_bad_metrics(self) -> dict[str, int]:
-        """Returns metrics that some episode was left out of, each once, with the first such lane.
+        """Returns metrics that an episode was left out of, each once, with the first such lane.
         Synchronises.
         """
         lanes = dict(zip(self.metrics, self.bad_lanes.tolist(), strict=True))
@@ -273,14 +262,11 @@ class EpisodeStats:
         return stats
 
     def state_dict(self) -> StateDict:
-        """Returns a copy of the episodes in progress, the sums since the last report and those of
-        earlier ones.
-        """
         windows = [torch.tensor(window, dtype=torch.float64) for window in self.windows]
         return {name: getattr(self, name).clone() for name in _SAVED} | {"windows": windows}
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Restores a `state_dict`. Ignores one with other metrics or groups."""
+        """Restores a `state_dict`, unless it has other metrics or groups."""
         if state["sums"].shape != self.sums.shape:
             return
         for name in _SAVED:
@@ -290,15 +276,12 @@ class EpisodeStats:
 
 
 def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Returns groups of an environment's lanes: one per role, and one per kind of opponent.
+    """Returns groups of an environment's lanes by name, (B,) bool: one per role, and one per kind
+    of opponent.
 
     Args:
-        env: `env.roles` names the role of each agent slot; several slots may share a role.
-            `env.matchups` is that of `selfplay.opponents.Opponents`. Both are optional.
+        env: may have `roles`, of each agent slot, and `matchups`, of `selfplay.opponents`.
         stored: (all lanes,) bool, the lanes to keep in each group, such as those that learn.
-
-    Returns:
-        Group name -> (B,) bool.
     """
     groups, roles = {}, optional(env, "roles") or ()
     for role in dict.fromkeys(roles):
@@ -309,10 +292,8 @@ def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch
 
 
 def _sum_since(cumulative, ends, rows=slice(None)) -> torch.Tensor:
-    """Returns cumulative sums (T, B) at some rows, minus those at the row of the last episode end.
-
-    Args:
-        ends: (T, B) int64, the row of that end, -1 if there was none.
+    """Returns cumulative sums (T, B) at some rows, minus those at the row where the last episode
+    ended, -1 if none did.
     """
     ends = ends[rows]
     at_end = torch.where(ends >= 0, cumulative.gather(0, ends.clamp(min=0)), 0.0)
@@ -320,7 +301,7 @@ def _sum_since(cumulative, ends, rows=slice(None)) -> torch.Tensor:
 
 
 def _add_report(window, report) -> list[float]:
-    """Adds the sums of a report to a window, in place. Returns the sums over the window."""
+    """Adds a report's sums to a window, in place. Returns the sums over it."""
     if report[0]:
         window.append(report)
     counts = [report[0] for report in window]
@@ -328,8 +309,3 @@ def _add_report(window, report) -> list[float]:
         window.popleft()
         del counts[0]
     return [math.fsum(column) for column in zip(*window, strict=True)] or [0.0] * len(report)
-
-
-def _without_nonfinite(values) -> torch.Tensor:
-    """Returns numbers with 0 in place of NaN, infinity and those beyond `nonfinite.LIMIT`."""
-    return torch.where(values.abs() <= LIMIT, values, 0.0)

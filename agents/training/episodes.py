@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 
 class Episodes:
-    """Counts the episodes of a training, on a GPU as a CUDA graph.
-
-    Args:
-        trainer: whose environment has been reset.
+    """Counts the episodes of a trainer, whose environment has been reset, on a GPU as a CUDA graph.
 
     Attributes:
         stats: the statistics.
@@ -44,10 +41,9 @@ class Episodes:
 
         Args:
             sources: the name of the source of each layout of the environment, whose episodes have
-                statistics of their own; None for none.
-            desync: starts the first episodes at random ages, so that not all lanes end theirs at
-                the same time, if the environment has a method `desync()`. Statistics leave these
-                episodes out.
+                statistics of their own.
+            desync: starts the first episodes at random ages, if the environment has a method
+                `desync()`, and leaves them out.
         """
         env, rollout = trainer.env, trainer.rollout
         allocate_layouts = getattr(trainer.collect, "allocate_layouts", None)
@@ -68,15 +64,7 @@ class Episodes:
         kinds = [] if self.opponents is None else [*self.opponents.matchups]
         return [*self.stats.names, *(f"won/{kind}" for kind in kinds if kind != "now")]
 
-    def few_means(self, latest: dict[str, float]) -> list[str]:
-        """The returns of groups of lanes, and metrics, if they are few enough for one line."""
-        names = {group: f"episode/return/{group}" for group in self.stats.groups}
-        names |= {name: f"episode/{name}" for name in self.stats.metrics}
-        shown = [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
-        return shown if len(names) <= 4 else []
-
     def on_update(self, trainer: Trainer, losses: object) -> None:
-        """Counts the episodes of the rollout, and has curriculum and opponents learn from it."""
         rollout = trainer.rollout
         (self.graph if self._keeps_tensors(rollout) else self.count)(rollout)
         if trainer.curriculum is not None:
@@ -85,8 +73,8 @@ class Episodes:
             self.opponents.refresh_snapshots(trainer.policy, trainer.updates)
 
     def _keeps_tensors(self, rollout) -> bool:
-        """Returns whether a rollout is in the memory that it was in at the first update, as a CUDA
-        graph wants it. A user's own rollout may replace its tensors, and so may a callback.
+        """Returns whether a rollout is where it was at the first update, as a CUDA graph wants it.
+        A user's own rollout may replace its tensors, and so may a callback.
         """
         if type(rollout) is not Rollout:
             return False
@@ -96,7 +84,7 @@ class Episodes:
         return all(map(operator.is_, tensors, self.counted_tensors))
 
     def count(self, rollout: Rollout) -> dict[str, torch.Tensor]:
-        """Counts the episodes of a rollout. Returns nothing in a dict, as an update would."""
+        """Counts the episodes of a rollout. Returns no metrics."""
         self.stats.add(
             rollout.reward,
             rollout.reset,
@@ -108,7 +96,6 @@ class Episodes:
         return {}
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Adds the statistics since the last report. Synchronises."""
         stats = self.stats.pop(trainer.ranks.sum)
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates(trainer.ranks.sum)

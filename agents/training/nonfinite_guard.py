@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
-from megastep.agents.distributed.process_group import rank_label, unhurried
+from megastep.agents.distributed.process_group import rank_label
 from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
@@ -26,9 +26,7 @@ MAX_SKIPPED = 20
 
 class NonFiniteGuard:
     """Warns of the first NaN or infinity of a run, says how to reproduce it, and ends a run whose
-    updates are all skipped.
-
-    All ranks must call it at the same updates; they exchange their detections.
+    updates are all skipped. All ranks call it at the same updates; they exchange what they found.
 
     Args:
         env: the environment.
@@ -55,25 +53,21 @@ class NonFiniteGuard:
         self.value, self.hint = None, ""
 
     def on_measure(self, trainer: Trainer, metrics: object) -> None:
-        """Warns of metrics of episodes."""
         self.warn_of_metrics(trainer.episodes.stats, trainer.rollout)
 
     def on_report(self, trainer: Trainer, metrics: object) -> None:
-        """Checks the last update, once it is reported."""
         self.check(trainer.rollout)
 
     def may_save(self, trainer: Trainer) -> bool:
-        """Returns whether the last update was applied, or the policy is about to be replaced."""
+        """Returns whether the last update was applied, or the policy is about to be replaced: the
+        last checkpoint precedes a NaN.
+        """
         return self.tolerates_divergence or self.check(trainer.rollout)
 
     def check(self, rollout: RolloutLike) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.
 
-        Warns of the first NaN or infinity of the run. Call it before a checkpoint is saved, so that
-        the last checkpoint precedes the NaN.
-
-        Args:
-            rollout: the latest rollout.
+        Warns of the first NaN or infinity of the run.
 
         Raises:
             NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
@@ -89,8 +83,7 @@ class NonFiniteGuard:
         _, value, label = next((one for one in reports if one[1]), reports[0])
         text = f"{value}{f' ({label})' * (len(reports) > 1)}"
         if value and self.value is None:
-            with unhurried():
-                self.value, self.hint = value, self.ranks.from_first(lambda: self.make_hint(value))
+            self.value, self.hint = value, self.ranks.from_first(lambda: self.make_hint(value))
             if self.ranks.rank == 0:
                 warnings.warn(f"{text}; its rollout was skipped{self.hint}", stacklevel=2)
         self.has_diverged = n_skipped >= MAX_SKIPPED
@@ -110,12 +103,11 @@ class NonFiniteGuard:
 
     def warn_of_metrics(self, episode_stats: EpisodeStats, rollout: RolloutLike) -> None:
         """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
-        bad = {
-            name: lane_name(_env_lanes(rollout)[lane], self.n_agents)
+        of_rank = {
+            name: (lane_name(_env_lanes(rollout)[lane], self.n_agents), rank_label())
             for name, lane in episode_stats.pop_bad_metrics().items()
         }
-        of_rank = {name: (lane, rank_label()) for name, lane in bad.items()}
-        reports = self.ranks.gather_if_any(of_rank, bool(bad))
+        reports = self.ranks.gather_if_any(of_rank, bool(of_rank))
         of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
         episode_stats.named |= of_all.keys()
         for name, (lane, label) in of_all.items() if self.ranks.rank == 0 else ():

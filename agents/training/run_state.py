@@ -31,21 +31,8 @@ class RunState:
         else:
             self.env_state = EnvState(self.opponents.env, self.opponents.scripted)
         self.replay_buffer = trainer.learner_options.replay_buffer
+        self.is_resumable = optional(self.env_state.env, "resumable")  # checkpoints hold it
         self.has_named_unreachable = False
-
-    @property
-    def is_resumable(self) -> bool:
-        """Whether checkpoints hold the environment."""
-        return optional(self.env_state.env, "resumable")
-
-    def incomplete(self) -> str | None:
-        """Returns why checkpoints do not hold everything, as a clause; None if they do."""
-        if not self.is_resumable:
-            return f"they do not hold {type(self.env_state.env).__name__}"
-        if not hasattr(self.trainer.collect, "state_dict"):
-            return f"{type(self.trainer.collect).__name__} has no state_dict"
-        names = self.env_state.unreachable()
-        return f"they cannot hold {', '.join(names)} of the environment" if names else None
 
     def state_dict(self, has_episodes: bool = True) -> StateDict:
         """Returns the state as dicts of tensors and plain values, once no collector steps.
@@ -70,22 +57,17 @@ class RunState:
         if has_episodes and self.is_resumable:
             parts["env"] = self.env_state.state_dict()
             parts["collector"] = self.collect.state_dict()
-        if self.opponents is not None:
-            parts["opponents"] = self.opponents.state_dict()
-        if trainer.curriculum is not None:
-            parts["curriculum"] = trainer.curriculum.state_dict()
-        if self.replay_buffer is not None:
-            parts["replay"] = self.replay_buffer.state_dict()
-        return parts
+        others = dict(opponents=self.opponents, curriculum=trainer.curriculum)
+        others["replay"] = self.replay_buffer
+        return parts | {k: part.state_dict() for k, part in others.items() if part is not None}
 
     def of_policy(self) -> StateDict:
         """Returns what the policy acts with: its weights, and what wrappers of the environment have
         learnt, if anything.
         """
         wrappers = optional(self.env_state.env, "wrapper_state")()
-        return dict(
-            policy=self.trainer.policy.state_dict(), **({"wrappers": wrappers} if wrappers else {})
-        )
+        learnt = {"wrappers": wrappers} if wrappers else {}
+        return dict(policy=self.trainer.policy.state_dict(), **learnt)
 
     def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> None:
         """Restores a `state_dict`. `trainer.lost` gets a clause for each part that could not be
@@ -108,12 +90,12 @@ class RunState:
         trainer.learner.load_state_dict(state["learner"])
         lost = self._load_episodes(state)
         if self.opponents is not None:
-            of_episodes = {"lanes"} if lost else set()
-            parts = state["opponents"].items()
-            self.opponents.load_state_dict({k: v for k, v in parts if k not in of_episodes})
+            parts = state["opponents"]
+            if lost:
+                parts = {name: part for name, part in parts.items() if name != "lanes"}
+            self.opponents.load_state_dict(parts)
         if trainer.curriculum is not None:
-            parts = state["curriculum"]
-            trainer.curriculum.load_state_dict(parts if not lost else parts | {"lanes": None})
+            trainer.curriculum.load_state_dict(state["curriculum"])
         if self.replay_buffer is not None:
             if "replay" in state:
                 self.replay_buffer.load_state_dict(state["replay"])
@@ -126,12 +108,12 @@ class RunState:
         report.
         """
         stats, own = state["episode_stats"], self.state_dict(has_episodes=False)
-        pairs = ((name, state[name]) for name in ("learner", "opponents") if name in state)
-        parts = {name: _with_generators(saved, own[name]) for name, saved in pairs}
+        names = [name for name in ("learner", "opponents") if name in state]
+        parts = {name: _with_generators(state[name], own[name]) for name in names}
         return {**state, **parts, "episode_stats": stats | {"sums": 0 * stats["sums"]}}
 
     def _load_episodes(self, state) -> list[str]:
-        """Restores env, actor state and episode statistics; returns as `load_state_dict`."""
+        """Restores env, actor state and episode statistics. Returns what is lost."""
         lost = []
         if "env" not in state:
             lost.append("environments were not saved, so new episodes start")
@@ -144,15 +126,14 @@ class RunState:
                 self.env_state.load_state_dict(state["env"])
             except ValueError as error:
                 lost.append(f"{error}; new episodes start")
-        if lost and "wrappers" in state:
-            optional(self.env_state.env, "load_wrapper_state")(state["wrappers"], False)
-        if lost:  # unfinished episodes are lost
-            state["episode_stats"] = {
-                name: state["episode_stats"][name] for name in ("sums", "windows")
-            }
+        stats = state["episode_stats"]
+        if lost:  # unfinished episodes are, too
+            if "wrappers" in state:
+                optional(self.env_state.env, "load_wrapper_state")(state["wrappers"], False)
+            stats = {name: stats[name] for name in ("sums", "windows")}
         else:
             self.collect.load_state_dict(state["collector"])
-        self.trainer.episodes.stats.load_state_dict(state["episode_stats"])
+        self.trainer.episodes.stats.load_state_dict(stats)
         return lost
 
     def warn_of_unreachable(self) -> None:

@@ -7,9 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError
-from megastep.agents.distributed.agreement import Plan, agree
-from megastep.agents.distributed.process_group import unhurried
-from megastep.agents.distributed.ranks import Ranks, world
+from megastep.agents.distributed.ranks import Plan, Ranks, world
 from megastep.agents.runs.saver import NoSaver, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.callbacks import Callbacks, DriftCheck, Losses
@@ -108,7 +106,7 @@ class Trainer:
 
     @property
     def is_saved(self) -> bool:
-        """True if the last checkpoint holds every update, once `saver.wait()` has returned."""
+        """Whether the last checkpoint holds every update, once `saver.wait()` has returned."""
         return self.updates_at_checkpoint == self.updates and self.saver.error is None
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
@@ -137,13 +135,10 @@ class Trainer:
         finally:
             with contextlib.suppress(Exception):  # as above
                 self.wait_for_collector()
-            with unhurried():
-                self.saver.wait()
+            self.saver.wait()
 
     def _rescue(self, error) -> None:
-        """Saves what was learnt before an error, without episodes: the environment may be the
-        cause, or the error came in the middle of a rollout.
-        """
+        """Saves what was learnt before an error, without episodes, which may be broken."""
         if not isinstance(error, NonFiniteError) and self.ranks.n > 1:  # the others are elsewhere
             self.saver.give_up()
         elif not isinstance(error, NonFiniteError) or error.is_from_env:
@@ -161,7 +156,7 @@ class Trainer:
         )
         # a slow disk does not stop training, unless a checkpoint of each update is wanted
         is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
-        return agree(plan, is_stopped or self.is_stopped, is_behind, ranks or self.ranks)
+        return (ranks or self.ranks).agree(plan, is_stopped or self.is_stopped, is_behind)
 
     def update(self, lr_fraction: float = 1.0) -> None:
         """Collects a rollout and learns from it, at a fraction of the initial learning rate."""
@@ -177,7 +172,7 @@ class Trainer:
             self.start_clock()
 
     def start_clock(self) -> None:
-        """Begins to count seconds, once everything is compiled. Synchronises."""
+        """Counts seconds from now on, as everything is compiled. Synchronises."""
         self.timing.restart(self)
         self.seconds_at_checkpoint = self.clock.seconds
 
@@ -190,8 +185,6 @@ class Trainer:
             lr: learning rate.
             anneal: what the learning rate falls with.
             schedule/NAME: a setting of the learner or the environment that has a schedule.
-
-        Raises the errors that `env.check()` and callbacks do.
         """
         self.wait_for_collector()
         optional(self.env, "check")()
@@ -200,17 +193,15 @@ class Trainer:
         self.updates_at_report, self.is_save_due = self.updates, False
         metrics: dict[str, Any] = {}
         self.callbacks("on_measure", self, metrics)
-        metrics |= self.tuning.scheduled_values() | {"updates": self.updates, "lr": self.lr}
-        self.metrics = metrics | {"anneal": self.budget.anneal, "samples": self.samples}
+        metrics |= self.tuning.scheduled_values()
+        metrics |= {"updates": self.updates, "lr": self.lr, "anneal": self.budget.anneal}
+        self.metrics = metrics | {"samples": self.samples}
         self.callbacks("on_report", self, self.metrics)
 
     def save(self, state: StateDict | None = None, is_last: bool = False) -> None:
-        """Begins to save a checkpoint, unless the last one holds every update, or a callback's
-        `may_save` returns False. All ranks call it.
-
-        Args:
-            state: of `run_state`; None: that of now.
-            is_last: no other checkpoint follows, and no callback is asked.
+        """Begins to save a checkpoint of a state of `run_state`, by default that of now, unless the
+        last one holds every update, or a callback's `may_save` returns False, which the last one
+        does not ask. All ranks call it.
         """
         self.seconds_at_checkpoint = self.clock.seconds
         if not self.ranks.any(not self.is_saved or (is_last and self.saver.lacks_replay)):
@@ -219,27 +210,23 @@ class Trainer:
             return
         self.run_state.warn_of_unreachable()
         state = self.run_state.state_dict() if state is None else state
-        with unhurried():
-            self.saver(self.samples, state, self.score, is_last)
+        self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
         self.callbacks("on_checkpoint", self)
 
     def finish(self) -> None:
-        """Writes the last report and the last checkpoint."""
         state = self.run_state.state_dict()  # a resumed run repeats what the last report empties
         if self.updates > self.updates_at_report:
             self.report()
         self.save(state, is_last=True)
-        with unhurried():
-            self.saver.wait()
+        self.saver.wait()
         self.callbacks("on_end", self)
 
     def end(self) -> None:
-        """Ends training after the current update, as for a callback; all ranks do if one does."""
+        """Ends training after the current update; all ranks do if one does."""
         self.is_stopped = True
 
     def close(self) -> None:
-        """Closes the environment and the callbacks, after training."""
         self.callbacks.close(self.env)
 
     def wait_for_collector(self) -> None:

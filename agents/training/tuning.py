@@ -38,17 +38,11 @@ class Tuning:
             )
 
     def follow(self, timetable: Sequence[tuple[int, Mapping[str, float]]]) -> None:
-        """Changes settings later on.
-
-        Args:
-            timetable: (samples, settings) each, in order: settings by key, such as `learner.lr`,
-                that are set after so many samples, see `set`.
-
-        Raises:
-            ValueError: a setting cannot change.
+        """Sets settings later on: (samples, settings as for `set`) each, in order. Raises
+        ValueError if one cannot change.
         """
         for key in {key for _, values in timetable for key in values}:
-            self._owner(key)  # raises if there is none
+            self._owner(key)
         self.timetable = [*timetable]
 
     def set(self, values: Mapping[str, float]) -> None:
@@ -60,12 +54,11 @@ class Tuning:
         Raises:
             ValueError: a setting cannot change while training.
         """
-        trainer = self.trainer
-        trainer.wait_for_collector()
+        self.trainer.wait_for_collector()
         for key, value in values.items():
             self._owner(key).set(**{key.partition(".")[2]: value})
             if key == "learner.lr":
-                trainer.lr = trainer.learner.lr = value
+                self.trainer.lr = self.trainer.learner.lr = value
 
     def _owner(self, key) -> Coefficients:
         """Returns what holds a setting that may change. Raises ValueError if nothing does."""
@@ -80,11 +73,7 @@ class Tuning:
         )
 
     def on_collect(self, trainer: Trainer) -> None:
-        """Sets what has a schedule.
-
-        Raises:
-            UserError: a schedule of the user's fails.
-        """
+        """Sets what has a schedule. Raises UserError if a schedule of the user's fails."""
         while self.timetable and self.timetable[0][0] <= trainer.samples:
             self.set(self.timetable.pop(0)[1])
         if self.has_env_schedules:

@@ -44,8 +44,7 @@ CASES = {
     "memory": ["env=memory", "env.res=8", "env.limit=9", *SMALL],
     "pointgoal": ["env=pointgoal", "env.res=8", *SMALL, "learner.n_minibatches=2"],
     "deathmatch": FIGHT,
-    "plr": [*DRAWN, "env=pointgoal", "env.limit=12", "curriculum=plr", "curriculum.every=3"],
-    "sfl": [*DRAWN, "env=explorer", "env.patience=3", "curriculum=sfl"],
+    "sfl": [*DRAWN, "env=explorer", "env.patience=3", "curriculum=sfl", "curriculum.every=3"],
     "rounds": [
         *(*FIGHT, "geometry=bench", "geometry.n=4", "env.resample=true", "env.limit=12"),
         *(*SELF_PLAY, "curriculum=sfl"),
@@ -87,7 +86,6 @@ FAST = (
     "opponents",
     "stranger",
     "beta",
-    "plr",
     "hooks",
     "wrappers",
 )

@@ -1,6 +1,5 @@
 """A run's NaN or infinity is reproduced by the command that its warning names."""
 
-import os
 import shlex
 from pathlib import Path
 
@@ -24,17 +23,14 @@ class Walks:
 
     Args:
         wage: reward of a step ahead.
-        resumable: as in an environment's contract.
-        opaque: it has something that checkpoints cannot reach.
     """
 
     obs_space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 3)
     n_agents = A
 
-    def __init__(self, n_envs, device="cpu", seed=1, wage=0.0, resumable=True, opaque=False):
-        self.n_envs, self.device, self.resumable = n_envs, torch.device(device), resumable
+    def __init__(self, n_envs, device="cpu", seed=1, wage=0.0):
+        self.n_envs, self.device = n_envs, torch.device(device)
         self.generator = torch.Generator(device).manual_seed(seed)
-        self.opaque = iter(range(99)) if opaque else None
         self.wage, self.earned = wage, 0.0
         self.clock = torch.zeros((), dtype=torch.int64, device=device)
         self.places = torch.zeros(n_envs * A, device=device)
@@ -134,35 +130,6 @@ def test_a_budget_that_was_extended_is_part_of_the_command(capsys):
     assert again == number
 
 
-def test_the_learning_rate_of_another_clock_cannot_be_repeated(capsys):
-    words = ["learner.anneal=seconds", "seconds=60"]
-    assert train.main([*TINY, *PPO, f"samples={2 * UPDATE}", *words]) == 0
-    _, hint = met(capsys, "resume=run", f"samples={12 * UPDATE}", "seconds=70")
-    clause = "seconds= has changed since the last one, and with it the learning rate"
-    assert hint == f". Checkpoints cannot repeat it, as {clause}"
-
-
-@pytest.mark.parametrize(
-    "word, clause",
-    [
-        ("env.resumable=false", "they do not hold Walks"),
-        ("env.opaque=true", "they cannot hold opaque (range_iterator) of the environment"),
-    ],
-)
-def test_what_checkpoints_do_not_hold_is_named(word, clause, capsys):
-    number, hint = met(capsys, *TINY, *PPO, EVERY_UPDATE, word)
-    how = ". To try from the start, once this run has ended: python train.py rerun=run"
-    assert hint == f". Checkpoints cannot repeat it, as {clause}{how}"
-    again, _ = met(capsys, "rerun=run", "folder=again")
-    assert again == number
-
-
-def test_a_replay_buffer_that_was_not_saved_is_named(capsys, monkeypatch):
-    monkeypatch.setattr("megastep.agents.runs.saver.SMALL_REPLAY", 0)
-    _, hint = met(capsys, *TINY, *R2D2, EVERY_UPDATE)
-    assert "as they lack episodes or the replay buffer. To try from the start" in hint
-
-
 def test_a_checkpoint_that_cannot_be_kept_ends_no_run(capsys, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
@@ -171,18 +138,6 @@ def test_a_checkpoint_that_cannot_be_kept_ends_no_run(capsys, monkeypatch):
     _, hint = met(capsys, *TINY, *PPO, EVERY_UPDATE)
     assert hint.startswith(". The checkpoint before it could not be kept ([Errno 28] No space")
     assert not Path("run/nonfinite").exists()
-
-
-def test_files_are_copied_where_they_cannot_have_two_names(capsys, monkeypatch):
-    def link(source, target, real=os.link):
-        if "nonfinite" in str(target):
-            raise PermissionError
-        real(source, target)
-
-    monkeypatch.setattr(os, "link", link)
-    number, hint = met(capsys, *TINY, *PPO, EVERY_UPDATE)
-    again, _ = met(capsys, *shlex.split(hint)[-1:])
-    assert again == number
 
 
 def test_a_policy_that_diverges_is_not_repeated_without_a_checkpoint(capsys):

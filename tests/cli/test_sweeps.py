@@ -311,7 +311,6 @@ def test_ranks_see_the_gpus_of_their_place_only(gpus, monkeypatch):
     for words, visible in (
         (["ranks=2"], "6,4"),
         (["ranks=all"], "6,4,GPU-8a,3"),
-        (["restarts=1"], "6"),
         (["ranks=2", "device=cpu"], "6, 4,GPU-8a,3"),
     ):
         with gpu_slots.taken(gpus(4, *words)):

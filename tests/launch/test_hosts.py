@@ -13,7 +13,7 @@ from megastep.agents.launch.endings import LOST
 from megastep.agents.runs import checkpoint, json_lines
 from tests.cli.test_exact_resume import differences
 from tests.helpers import tiny
-from tests.helpers.hosts import INTERFACE, NAMES, Cable, descendants, hosts, training
+from tests.helpers.hosts import INTERFACE, NAMES, descendants, hosts, training
 from tests.helpers.processes import HUNG, is_running, wait_until
 
 __all__ = ["hosts"]
@@ -27,7 +27,7 @@ CONTINUE = "Its last checkpoint is intact. To continue: python train.py resume=r
 HASTY = """
 import os, sys
 from megastep.agents.cli import train
-from megastep.agents.distributed import drift
+from megastep.agents.distributed import ranks
 from megastep.agents.launch import watch
 from megastep.agents.training import trainer
 
@@ -35,7 +35,7 @@ report, watch.PERIOD = trainer.Trainer.report, 0.5
 
 def report_and_note(self):
     report(self)
-    sums = drift.checksums(self.policy.parameters()).tolist()
+    sums = ranks.checksums(self.policy.parameters()).tolist()
     with open(f"sums-{os.environ['RANK']}", "a") as file:
         print(self.updates, *sums, file=file)
     watch.LOST_SECONDS, watch.SILENT_SECONDS = 5.0, 9.0
@@ -44,29 +44,14 @@ trainer.Trainer.report = report_and_note
 sys.exit(train.main(sys.argv[1:]))
 """
 
-KILLED = """
-import os
-from pathlib import Path
-from megastep.envs import Minimal
-
-class Killed(Minimal):
-    def step(self, decision):
-        saved = [p for p in Path("run/checkpoints").glob("step_*") if p.name[5:].isdecimal()]
-        if os.environ["RANK"] == "1" and saved and not Path("killed").exists():
-            Path("killed").touch()
-            os.kill(os.getpid(), 9)
-        return super().step(decision)
-"""
-
 LATE = """
 import os, sys, time
 from megastep.agents.cli import entry
-from megastep.agents.distributed import process_group
 from megastep.agents.launch import watch
 
 if os.environ["RANK"] == "1":
     time.sleep(3600)
-watch.NOTICE_SECONDS, process_group.START_SECONDS = 2.0, 8.0
+watch.START_SECONDS = 8.0
 sys.exit(entry.run_command("train"))
 """
 
@@ -111,7 +96,7 @@ def test_both_sides_of_a_cut_cable_end(here, hosts):
         assert second.poll() is not None or code == LOST
     lost = f"train.py: rank 1 on {NAMES[1]} does not answer: "
     silent = f"rank 1 on {NAMES[1]}: train.py: {NAMES[0]}, where torchrun keeps the ranks' store, "
-    for error, words in zip(errors, (lost, f"{silent}has not answered for ")):
+    for error, words in zip(errors, (lost, f"{silent}does not answer: ")):
         (line,) = (line for line in error.splitlines(keepends=True) if words in line)
         assert line.endswith(CONTINUE)
     assert checkpoint.load_latest(here / "run" / "checkpoints").step > 0
@@ -197,22 +182,6 @@ def test_host_whose_processes_are_killed(here, hosts, number):
 
 
 @pytest.mark.nightly
-def test_network_between_ranks_that_is_down_while_the_store_answers(here, hosts):
-    """As with InfiniBand beside Ethernet: gradients go through a second cable, which is cut."""
-    with Cable(hosts, "ib0", "10.78.0", "fd78:") as second:
-        with training(hosts, here, *TINY, GLOO_SOCKET_IFNAME="ib0") as processes:
-            wait_until(lambda: checkpoints(here), processes[0])
-            pids = [pid for process in processes for pid in descendants(process.pid)]
-            second.loss = 1.0
-            wait_for_ranks(pids, 60)
-            endings = finished(processes)
-    errors = [line for *_, error in endings for line in error.splitlines() if "train.py: " in line]
-    (line,) = errors
-    assert "The ranks on hosta, hostb reach torchrun's store, but not each other" in line
-    assert f"{line}\n".endswith(CONTINUE)
-
-
-@pytest.mark.nightly
 def test_folder_that_hosts_do_not_share(here, hosts):
     hosts.run(1, "mount", "-t", "tmpfs", "tmpfs", str(here))
     with training(hosts, here, *TINY) as processes:
@@ -252,17 +221,6 @@ def test_hosts_of_ipv6(here, hosts):
     assert len(rows(here)) == 5
 
 
-@pytest.mark.nightly
-def test_restart_heals(here, hosts):
-    (here / "killed.py").write_text(KILLED)
-    words = ["env=killed:Killed", *TINY[1:], f"samples={100 * UPDATE}"]
-    with training(hosts, here, *words, options=["--max-restarts=2"]) as processes:
-        endings = finished(processes)
-    assert [code for code, *_ in endings] == [0, 0], endings
-    assert endings[0][1].count("Training on 2 x cpu in run\n") == 2
-    assert [row["updates"] for row in rows(here)] == [*range(1, 101)]
-
-
 # ---- Hosts that differ, or do not come ----
 
 
@@ -272,10 +230,8 @@ def test_rank_that_does_not_start_is_named(here, hosts):
     (here / "late.py").write_text(LATE)
     with training(hosts, here, *TINY, script="late.py") as processes:
         endings = finished(processes)
-    text = "rank 1 of 2 did not start within {} s; see what torchrun printed on the other machines"
-    error = endings[0][2]
-    assert f"warning: {text.format(2)}. Waiting on\n" in error
-    assert f"train.py: {text.format(8)}\n" in error and not (here / "run").exists()
+    text = "rank 1 of 2 did not start within 8 s; see what torchrun printed on the other machines"
+    assert f"train.py: {text}\n" in endings[0][2] and not (here / "run").exists()
 
 
 @pytest.mark.nightly

@@ -258,15 +258,6 @@ def replayed(here, root, folder):
     return line, samples
 
 
-def test_replay_of_a_lineage_without_copies_has_the_bits_of_its_member(here):
-    run(*POPULATION, LONG, "population.every=1e9")
-    line, _ = replayed(here, "P", "one")
-    member = here / f"P/member-{line[0]}"
-    assert (member / "metrics.jsonl").read_bytes() == (here / "one/metrics.jsonl").read_bytes()
-    states = [state(folder) for folder in ("one", member)]
-    assert differences(*states) == []
-
-
 def test_replay_of_a_lineage_has_its_bits_until_the_first_copy_and_its_settings_to_the_end(here):
     """What an ancestor's rollouts and random numbers were after that, no single agent has."""
     run(*POPULATION, LONG)

@@ -1,15 +1,11 @@
 """Callbacks: when they are called, and what they can do."""
 
-from pathlib import Path
-
 import pytest
 
 import megastep
 from megastep.agents.cli import train
-from megastep.agents.distributed import process_group
 from megastep.agents.errors import UserError
 from megastep.agents.training.callbacks import HOOKS, Callbacks
-from tests.helpers import ranks
 from tests.helpers.pages import ROOT, code
 from tests.helpers.tiny import TINY
 
@@ -61,28 +57,6 @@ def test_hooks_are_called_in_order(here):
 def test_a_callback_stops_training_with_a_checkpoint(here):
     assert run(Stop) == 0
     assert [*here.glob("run/checkpoints/step_96")]
-
-
-class StopOnRank1:
-    """Ends training where only rank 1 sees the reason, and notes what it was called for."""
-
-    def on_start(self, trainer):
-        self.rank = process_group.rank()
-
-    def on_update(self, trainer, losses):
-        if self.rank == 1 and trainer.updates == 3:
-            trainer.end()
-
-    def on_end(self, trainer):
-        Path(f"ended_{self.rank}").write_text(str(trainer.updates))
-
-
-@pytest.mark.slow
-def test_a_callback_of_one_rank_stops_all(here):
-    name = "tests.training.test_callbacks:StopOnRank1"
-    ranks.train(*TINY, "samples=960", f"callbacks=[{name}]", "folder=run")
-    assert [(here / f"ended_{rank}").read_text() for rank in range(2)] == ["3", "3"]
-    assert [*here.glob("run/checkpoints/step_192")]
 
 
 def test_a_callback_that_raises_is_named_and_what_was_learnt_is_saved(here, capsys):

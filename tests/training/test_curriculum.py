@@ -1,22 +1,18 @@
 """Curricula: scores by hand, draws that follow them, and what a run logs and keeps of them."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
 
 from megastep import envs, spaces, toys
-from megastep.agents.algorithms.returns import gae
 from megastep.agents.cli import train
 from megastep.agents.runs import json_lines
 from megastep.agents.storage.rollout import Rollout
-from megastep.agents.training.curriculum import PLR, SFL
+from megastep.agents.training.curriculum import SFL
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
 from tests.helpers.synchronisation import no_synchronisation
 
-LEARNER = SimpleNamespace(gamma=0.9, lambda_=0.8)
 SMALL = [
     *("device=cpu", "env.n_envs=4", "env.res=8", "agent.width=8", "learner.n_steps=8"),
     *("learner.n_minibatches=2", "logging.every=1"),
@@ -85,7 +81,7 @@ def random_rollout(rollout, seed):
 def test_homes_solved_half_of_the_time_are_drawn_most():
     """Home 0 is always solved, home 1 never, home 2 every second time, home 3 nine times in ten."""
     rollout = empty_rollout(1, 4)
-    sfl = SFL(Homes(4), LEARNER, rollout, uniform=0.2, lr=0.01)
+    sfl = SFL(Homes(4), None, rollout, uniform=0.2, lr=0.01)
     assert drawn(sfl).tolist() == 4 * [0.25]
     for n in range(1000):
         play(sfl, rollout, [0, 1, 2, 3], [1.0, 0.0, n % 2, n % 10 > 0])
@@ -99,7 +95,7 @@ def test_homes_solved_half_of_the_time_are_drawn_most():
 def test_learnability_of_a_coverage_is_its_variance():
     """Home 0 is always covered to 0.8; home 1 wholly in 80 % of its episodes, else not at all."""
     rollout = empty_rollout(1, 2, metrics=["coverage"])
-    sfl = SFL(Homes(2), LEARNER, rollout, uniform=0.0, lr=0.01)
+    sfl = SFL(Homes(2), None, rollout, uniform=0.0, lr=0.01)
     for n in range(1000):
         play(sfl, rollout, [0, 1], [0.8, float(n % 5 > 0)], "coverage")
     assert sfl.scores.tolist() == pytest.approx([0, 0.16], abs=0.02)
@@ -109,17 +105,17 @@ def test_learnability_of_a_coverage_is_its_variance():
 def test_running_means_by_hand():
     """The first outcomes are their mean; n later ones weigh 1 - (1 - lr)^n together."""
     rollout = empty_rollout(1, 3)
-    sfl = SFL(Homes(2), LEARNER, rollout, lr=0.5)
+    sfl = SFL(Homes(2), None, rollout, lr=0.5)
     play(sfl, rollout, [0, 0, 0], [1.0, 0.0, 0.0])
     assert sfl.means.tolist() == pytest.approx([1 / 3, 0]) and sfl.scores[1] == 0.25
     play(sfl, rollout, [0, 0, 1], [1.0, 1.0, 1.0])
     assert sfl.means.tolist() == pytest.approx([1 / 3 + 0.75 * 2 / 3, 1])
-    assert sfl.n_episodes.tolist() == [5, 1] and sfl.staleness.tolist() == [0, 0]
+    assert sfl.n_episodes.tolist() == [5, 1]
 
 
 def test_duels_count_as_decided_by_kills_or_deaths():
     rollout = empty_rollout(1, 3, metrics=["kills", "deaths"])
-    sfl = SFL(Homes(3), LEARNER, rollout)
+    sfl = SFL(Homes(3), None, rollout)
     rollout.metrics.deaths[0, 0] = 1.0
     play(sfl, rollout, [0, 1, 2], [0.0, 2.0, 0.0], "kills")
     assert sfl.means.tolist() == [1, 1, 0]
@@ -127,7 +123,7 @@ def test_duels_count_as_decided_by_kills_or_deaths():
 
 def test_lanes_that_do_not_learn_and_outcomes_of_nan_count_for_nothing():
     rollout = empty_rollout(1, 2)
-    sfl = SFL(Homes(2), LEARNER, rollout)
+    sfl = SFL(Homes(2), None, rollout)
     rollout.learns[0, 1] = False
     play(sfl, rollout, [0, 1], [torch.nan, 1.0])
     assert sfl.n_episodes.tolist() == [1, 0] and sfl.means.tolist() == [0, 0]
@@ -135,65 +131,19 @@ def test_lanes_that_do_not_learn_and_outcomes_of_nan_count_for_nothing():
 
 def test_probabilities_change_every_so_many_updates():
     rollout = empty_rollout(1, 2)
-    sfl = SFL(Homes(2), LEARNER, rollout, every=2)
+    sfl = SFL(Homes(2), None, rollout, every=2)
     play(sfl, rollout, [0, 0], [1.0, 1.0])
     assert drawn(sfl).tolist() == [0.5, 0.5]
     play(sfl, rollout, [0, 0], [1.0, 1.0])
     assert drawn(sfl) == pytest.approx([0.25, 0.75])
 
 
-# ---- Prioritised level replay ----
-
-
-@pytest.mark.parametrize("score", ["absolute", "positive"])
-def test_score_is_the_mean_advantage_of_an_episode(score):
-    """Against a loop over lanes and steps; episodes reach across rollouts."""
-    rollout = empty_rollout(6, 8)
-    plr = PLR(Homes(5), LEARNER, rollout, score=score, lr=0.25)
-    running, n_seen = np.zeros(5), np.zeros(5, int)
-    so_far = [[] for _ in range(8)]
-    for seed in range(4):
-        random_rollout(rollout, seed)
-        plr.update(rollout)
-        a = gae(**rollout.transitions(), gamma=0.9, lambda_=0.8).advantages.numpy()
-        a = np.abs(a) if score == "absolute" else np.maximum(a, 0)
-        ended = [[] for _ in range(5)]
-        for t in range(6):
-            for b in range(8):
-                if not rollout.reset[t, b]:
-                    so_far[b].append(a[t, b])
-                if rollout.terminal[t, b] or rollout.truncated[t, b]:
-                    if rollout.learns[t, b]:
-                        ended[rollout.layouts[t, b]].append(sum(so_far[b]) / max(len(so_far[b]), 1))
-                    so_far[b] = []
-        for home, scores in enumerate(ended):
-            if scores:
-                rate = 1 - 0.75 ** len(scores) if n_seen[home] else 1
-                running[home] += rate * (np.mean(scores) - running[home])
-                n_seen[home] += len(scores)
-    assert plr.n_episodes.tolist() == n_seen.tolist() and n_seen.min() > 0
-    assert plr.scores.numpy() == pytest.approx(running, abs=1e-5)
-
-
-def test_draws_follow_ranks_and_staleness():
-    rollout = empty_rollout(1, 1)
-    plr = PLR(Homes(4), LEARNER, rollout, temperature=0.5, staleness=0.4)
-    plr.n_episodes.fill_(1)
-    plr.scores.copy_(torch.tensor([0.1, 0.4, 0.3, 0.2]))
-    plr.staleness.copy_(torch.tensor([0, 0, 1, 3]))
-    ranks = 1 / np.array([4, 1, 2, 3]) ** 2
-    expected = 0.6 * ranks / ranks.sum() + 0.4 * np.array([0, 0, 1, 3]) / 4
-    assert plr.probabilities().numpy() == pytest.approx(expected, abs=1e-6)
-    plr.n_episodes[0] = 0
-    assert plr.probabilities().argmax() == 0, "an unseen home ranks first"
-
-
 # ---- On both devices ----
 
 
-def scored(kind, device):
+def scored(device):
     rollout = empty_rollout(6, 8, device)
-    curriculum = kind(Homes(5, device), LEARNER, rollout)
+    curriculum = SFL(Homes(5, device), None, rollout)
     for seed in range(5):
         random_rollout(rollout, seed)
         curriculum.update(rollout)
@@ -201,9 +151,8 @@ def scored(kind, device):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("kind", [SFL, PLR])
-def test_cpu_and_gpu_agree_and_a_gpu_repeats_its_bits(kind):
-    once, again, on_cpu = scored(kind, "cuda"), scored(kind, "cuda"), scored(kind, "cpu")
+def test_cpu_and_gpu_agree_and_a_gpu_repeats_its_bits():
+    once, again, on_cpu = scored("cuda"), scored("cuda"), scored("cpu")
     for name, value in once.items():
         assert torch.equal(value, again[name]), name
         torch.testing.assert_close(value.double(), on_cpu[name].double(), rtol=1e-4, atol=8)
@@ -211,10 +160,9 @@ def test_cpu_and_gpu_agree_and_a_gpu_repeats_its_bits(kind):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("kind", [SFL, PLR])
-def test_an_update_does_not_synchronise(kind):
+def test_an_update_does_not_synchronise():
     rollout = empty_rollout(6, 8, "cuda")
-    curriculum = kind(Homes(5, "cuda"), LEARNER, rollout)
+    curriculum = SFL(Homes(5, "cuda"), None, rollout)
     curriculum.update(rollout)
     torch.cuda.synchronize()
     with no_synchronisation():
@@ -281,12 +229,11 @@ def test_run_logs_outcomes_by_source(here):
 @pytest.mark.parametrize(
     "words",
     [
-        POINTGOAL,
         [*POINTGOAL, "learner=vtrace", "learner.lag=1"],
         [*POINTGOAL, "env.resample=false", "env.n_envs=2"],
         ["env=deathmatch", "env.n_agents=2", "env.limit=5", "opponents.bot=0.5"],
     ],
-    ids=["ppo", "lag", "fewer environments than homes", "opponents"],
+    ids=["lag", "fewer environments than homes", "opponents"],
 )
 def test_run_in_a_mix_logs_episodes_by_source(words, here):
     """Also without a curriculum. Every episode is one of its source's."""
@@ -324,16 +271,10 @@ def test_without_a_curriculum_nothing_is_stored_or_logged(here, trainers):
     "words, text",
     [
         (["env=pong"], "env=pong draws no home for each episode; use curriculum=none"),
-        (["env=minimal"], "env=minimal draws no home"),
         (["env=pointgoal", "env.resample=false"], "use env.resample=true"),
-        (["env=deathmatch", "env.n_agents=2"], "use env.resample=true"),
         (["env=pointgoal", "geometry=box"], "there is one home only"),
         (["env=explorer", "env.metrics=false"], "none of the metrics that tell the outcome"),
         (["env=explorer", "learner=vtrace", "learner.lag=1"], "use learner.lag=0"),
-        (["env=explorer", "learner=vtrace", "curriculum=plr"], "use curriculum=sfl"),
-        (["env=explorer", "curriculum.lr=0"], "curriculum.lr: 0 is out of range"),
-        (["env=explorer", "curriculum.staleness=0.1"], "curriculum=plr has it"),
-        (["env=explorer", "curriculum=slf"], "did you mean sfl?"),
         (["env=tests.cli.test_exact_resume:Steered"], "Steered has no homes to draw"),
     ],
     ids=lambda value: value if isinstance(value, str) else None,

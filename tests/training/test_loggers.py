@@ -16,7 +16,6 @@ from PIL import Image
 
 from megastep.agents.runs import json_lines
 from megastep.agents.training import loggers
-from megastep.agents.training.curves import panels_of, plot_curves, smoothed
 from megastep.agents.training.loggers import Loggers
 from megastep.agents.training.loggers.csv import CSV
 from megastep.agents.training.loggers.tensorboard import TensorBoard
@@ -98,18 +97,6 @@ def test_damaged_line_is_named_and_skipped(tmp_path, damage):
     assert [row["samples"] for row in json_lines.read(path)] == [0, 1, 3, 9]
 
 
-@pytest.mark.filterwarnings("error::UserWarning")
-def test_last_line_cut_short_causes_no_warning(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_bytes(lines(3)[:-5])
-    assert [row["samples"] for row in json_lines.read(path)] == [0, 1]
-    path.write_bytes(lines(3)[:-1])  # only its newline is missing
-    run_loggers = Loggers(tmp_path, step=9)
-    run_loggers.write(9, {})
-    run_loggers.close()
-    assert [row["samples"] for row in json_lines.read(path)] == [0, 1, 2, 9]
-
-
 def test_run_resumes_after_damage_to_any_byte(tmp_path):
     path, intact = tmp_path / "metrics.jsonl", lines(4, x=0.5)
     for n in range(len(intact) - 1):
@@ -161,16 +148,6 @@ def test_csv_of_a_resumed_run_has_no_row_after_its_checkpoint(tmp_path, cut):
     logger.write(40, {"x": 4, "y": 5})
     rows = [["10", "10", ""], ["20", "20", ""], ["30", "-1", ""], ["40", "4", "5"]]
     assert table(tmp_path) == [["samples", "x", "y"], *rows]
-
-
-def test_csv_that_fails_is_dropped_and_keeps_what_it_has(tmp_path):
-    run_loggers = Loggers(tmp_path, others={"csv": lambda: CSV(tmp_path, 0)})
-    run_loggers.write(1, {"x": 1})
-    with faults.full_disk(0), pytest.warns(UserWarning, match="File too large") as warnings:
-        run_loggers.write(2, {"y": 2})
-    run_loggers.close()
-    assert str(warnings[-1].message).startswith("logger=csv failed and is dropped (")
-    assert table(tmp_path) == [["samples", "x"], ["1", "1"]]
 
 
 # ---- Weights & Biases ----
@@ -309,61 +286,6 @@ def test_full_disk_is_one_warning_per_file_and_loses_no_line(tmp_path):
         assert [row["samples"] for row in json_lines.read(tmp_path / name)] == [1, 2, 3, 4]
 
 
-def test_curves_are_drawn_from_the_files(tmp_path):
-    from matplotlib.image import imread
-
-    rows = [{"samples": n, "episode/return": n, "loss/value": None} for n in range(3)]
-    (tmp_path / "metrics.jsonl").write_text("")
-    (tmp_path / "perf.jsonl").write_text("")
-    plot_curves(tmp_path)
-    assert not (tmp_path / "curves.png").exists(), "there is nothing to draw yet"
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    plot_curves(tmp_path)
-    assert imread(tmp_path / "curves.png").shape[1] > 200
-
-
-def test_training_ends_without_curves_where_matplotlib_fails(tmp_path, monkeypatch):
-    (tmp_path / "metrics.jsonl").write_text('{"samples": 1, "episode/return": 1.0}\n')
-    (tmp_path / "perf.jsonl").write_text("")
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)  # as a bad MPLBACKEND does
-    with pytest.warns(UserWarning, match="curves.png cannot be drawn .*matplotlib.figure"):
-        plot_curves(tmp_path)
-
-
-def test_curves_are_means_in_a_band():
-    values = np.r_[np.zeros(40), np.ones(40)]
-    mean, deviation = smoothed(values)  # of two on either side
-    assert mean[:38].tolist() == [0] * 38 and mean[[0, -1]].tolist() == [0, 1]
-    assert mean[38:42] == pytest.approx([0.2, 0.4, 0.6, 0.8])
-    assert deviation[39] == pytest.approx(0.24**0.5) and deviation[0] == pytest.approx(0, abs=1e-7)
-
-
-def test_curves_leave_out_what_never_changes():
-    rows = [{"samples": n, "episode/return": n, "loss/kl": 0.0, "loss/td": n} for n in (1, 2)]
-    rows[1] |= {"eval/return": 5.0, "eval/coverage": 0.5}
-    panels = panels_of(rows, [])
-    assert [*panels] == ["return", "coverage", "loss/td"]
-    assert panels["return"] == {"all": [(1, 1), (2, 2)], "evaluated": [(2, 5.0)]}
-    assert [*panels_of([{"samples": n, "loss/kl": 0.0} for n in (1, 2)], [])] == ["loss/kl"]
-
-
-def test_curves_are_those_that_the_rows_have():
-    """A learner without entropy has a panel for each loss that it does have."""
-    none = {"samples": 1, "episode/count": 0, "loss/td": None, "updates": 1, "anneal": "never"}
-    episodes = {"count": 3, "window": 5, "return": 1.0, "coverage": 0.5, "return_std": 0.1}
-    episodes |= {"count/left": 1, "return/left": 3.0, "won/past": 0.25}
-    row = {f"episode/{name}": value for name, value in episodes.items()}
-    row |= {"samples": 2, "loss/td": 7.0}
-    perf = [{"samples": 1, "perf/seconds": 0.0}, {"samples": 2, "perf/rate": 9.0}]
-    assert panels_of([none, row], perf) == {
-        "return": {"all": [(2, 1.0)], "left": [(2, 3.0)]},
-        "coverage": {"all": [(2, 0.5)]},
-        "won": {"past": [(2, 0.25)]},
-        "loss/td": {"": [(2, 7.0)]},
-        "samples / s": {"": [(2, 9.0)]},
-    }
-
-
 def logged_with_real_wandb(folder, mode, **environment):
     """Writes one report in a process of its own. Returns the warnings."""
     script = f"""
@@ -396,12 +318,11 @@ run_loggers.close()"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key, message", [("", "it has no key here"), (40 * "a", "did not start")])
-def test_real_wandb_without_a_network_is_one_warning(tmp_path, key, message):
+def test_real_wandb_without_a_network_is_one_warning(tmp_path):
     (warning,) = logged_with_real_wandb(
-        tmp_path, "online", WANDB_BASE_URL="http://127.0.0.1:9", WANDB_API_KEY=key
+        tmp_path, "online", WANDB_BASE_URL="http://127.0.0.1:9", WANDB_API_KEY=40 * "a"
     )
-    assert message in warning
+    assert "did not start" in warning
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from megastep.agents.cli import train
-from megastep.agents.training.profiler import N_SKIPPED, Profiler
-from tests.helpers import ranks, tiny
+from megastep.agents.training.profiler import N_SKIPPED
+from tests.helpers import tiny
 
 pytestmark = pytest.mark.usefixtures("here")
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
@@ -18,10 +18,10 @@ WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={12 * tiny.UPDATE}", "loggi
 
 
 def table_of(folder):
-    """Returns the first line of a profile, and the first numbers of each row."""
-    text = Path(folder, "profile.md").read_text()
-    rows = re.findall(r"^\| (.+?) +\| ([\d.e+]+) ", text, re.M)
-    return text.partition("\n")[0], {name: float(number) for name, number in rows}
+    """Returns the first line of a profile, and how often each operation was called."""
+    head, *lines = Path(folder, "profile.txt").read_text().splitlines()
+    rows = [re.split(r"  +", line.strip()) for line in lines]
+    return head, {row[0]: int(row[-1]) for row in rows if len(row) > 5 and row[-1].isdigit()}
 
 
 def events_of(folder):
@@ -34,13 +34,13 @@ def test_profiled_run_has_a_trace_a_table_and_the_same_metrics(device, learner, 
     words = [*WORDS, f"device={device}", f"learner={learner}"]
     assert train.main([*words, "folder=run", "logging.profile=4"]) == 0
     output = capsys.readouterr()
-    assert "Profile: run/profile.md" in output.out and not output.err
+    assert "Profile: run/profile.txt" in output.out and not output.err
     assert train.main([*words, "folder=plain"]) == 0
     metrics = [Path(run, "metrics.jsonl").read_bytes() for run in ("run", "plain")]
     assert metrics[0] == metrics[1] and not list(Path("plain").glob("profile*"))
     head, numbers = table_of("run")
     assert head.startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 4} on {device}")
-    assert min(numbers[phase] for phase in ("collect", "update", "rest")) > 0
+    assert [numbers[phase] for phase in ("collect", "update", "rest")] == [4, 4, 4]
     ranges = [event for event in events_of("run") if event.get("cat") == "user_annotation"]
     names = [event["name"] for event in ranges]
     assert [names.count(phase) for phase in ("collect", "update", "rest")] == [4, 4, 4]
@@ -60,20 +60,7 @@ def test_run_that_ends_early_has_a_profile_of_fewer_updates(capsys):
     assert table_of("run")[0].startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 2} on cpu")
 
 
-def test_operations_are_counted_per_update(tmp_path):
-    profiler, matrix = Profiler(tmp_path, 2, torch.device("cpu")), torch.rand(200, 200)
-    for _ in range(N_SKIPPED + 5):
-        profiler.start("collect")
-        for _ in range(3):
-            torch.mm(matrix, matrix)
-        profiler.start("update")
-        profiler.start("rest")
-    head, numbers = table_of(tmp_path)
-    assert head.startswith(f"Updates {N_SKIPPED + 1} to {N_SKIPPED + 2}")
-    assert numbers["aten::mm"] == 3 and profiler.path == tmp_path / "profile.md"
-
-
-@pytest.mark.parametrize("method", ["start", "stop", "export_chrome_trace"])
+@pytest.mark.parametrize("method", ["start", "export_chrome_trace"])
 def test_profile_that_cannot_be_made_ends_no_run(method, monkeypatch, capsys):
     def fail(*_):
         raise RuntimeError("CUPTI is in use\nby another")
@@ -82,14 +69,4 @@ def test_profile_that_cannot_be_made_ends_no_run(method, monkeypatch, capsys):
     assert train.main([*WORDS, "folder=run", "logging.profile=4"]) == 0
     output = capsys.readouterr()
     assert output.err == "warning: The profile could not be made: CUPTI is in use\n"
-    assert "Profile" not in output.out and not Path("run/profile.md").exists()
-
-
-@pytest.mark.slow
-def test_only_rank_0_is_profiled():
-    for process in ranks.train(*WORDS, "folder=run", "logging.profile=2"):
-        assert not process.stderr.strip()
-    assert sorted(path.name for path in Path("run").glob("profile*")) == [
-        "profile.json.gz",
-        "profile.md",
-    ]
+    assert "Profile" not in output.out and not Path("run/profile.txt").exists()

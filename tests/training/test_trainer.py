@@ -198,7 +198,8 @@ def test_the_host_is_at_most_some_updates_ahead_of_a_gpu(tmp_path, monkeypatch):
             event.is_reached = True
 
     run = make_trainer(tmp_path, samples=40 * UPDATE, every=100)
-    run.timing.timer.device, run.timing.timer._now = torch.device("cuda"), Event
+    run.timing.device, run.timing._now = torch.device("cuda"), Event
+    monkeypatch.setattr(torch.cuda, "memory_stats", lambda device: {})
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: reach())
     monkeypatch.setattr(performance.time, "sleep", lambda seconds: reach(1))
     collect = run.collect
@@ -213,23 +214,9 @@ def test_the_host_is_at_most_some_updates_ahead_of_a_gpu(tmp_path, monkeypatch):
     assert MAX_AHEAD <= max(n_behind) <= MAX_AHEAD + 1
 
 
-def test_the_host_does_not_wait_for_ever_for_a_gpu(monkeypatch):
-    """A GPU may itself wait for another rank, which was killed."""
-    timer, now = performance.PhaseTimer("cuda"), [0.0]
-    timer._now = lambda: SimpleNamespace(query=lambda: False)
-    monkeypatch.setattr(performance.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(performance.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + 1))
-    for _ in range(9):
-        timer.start("update")
-    timer.wait(8)
-    assert now == [0]
-    timer.wait(7)
-    assert now == [performance.PATIENCE]
-
-
 @pytest.mark.cuda
 def test_phases_are_timed_on_a_gpu_without_waiting_for_it():
-    timer, matrix = performance.PhaseTimer("cuda"), torch.rand(2048, 2048, device="cuda")
+    timer, matrix = performance.Timing("cuda"), torch.rand(2048, 2048, device="cuda")
     torch.cuda.synchronize()
     with no_synchronisation():
         for _ in range(20):
@@ -239,8 +226,6 @@ def test_phases_are_timed_on_a_gpu_without_waiting_for_it():
     seconds = timer.pop()
     assert set(seconds) == {"work", "rest"} and seconds["work"] > seconds["rest"] >= 0
     assert set(timer.pop()) == {"rest"}
-    memory = performance.device_memory("cuda")
-    assert matrix.nbytes <= memory["allocated"] <= min(memory["peak"], memory["reserved"])
 
 
 def test_loss_without_a_gradient_step_is_left_out(tmp_path):
@@ -406,8 +391,7 @@ def test_recorded_factors_replace_the_clocks():
     assert again.fraction_left(1, 50, 99.0) == 0.5 and again.fraction_left(2, 50, 1.0) == 0
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30])
-@pytest.mark.parametrize("name", ["reward", "obs"])
+@pytest.mark.parametrize("name, value", [("reward", 1e30), ("obs", torch.nan)])
 def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_path, name, value):
     step, lane = 6, 3  # in the second rollout
     run = make_trainer(tmp_path, {(name, step, lane): value}, samples=8 * UPDATE)
@@ -431,14 +415,13 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_nonfinite_metric_is_named_once_and_left_out(tmp_path, bad):
+def test_nonfinite_metric_is_named_once_and_left_out(tmp_path):
     """The metric of lane 2, a leader, is never finite; that of lane 3, a follower, is 80."""
 
     class BadMetric(Pairs):
         def _world(self, reset):
             world = super()._world(reset)
-            world.metrics.age[2] = bad
+            world.metrics.age[2] = torch.nan
             return world
 
     run = make_trainer(tmp_path, env=BadMetric(), samples=50 * UPDATE, every=5)
@@ -457,20 +440,11 @@ def test_nonfinite_metric_is_named_once_and_left_out(tmp_path, bad):
     assert row["episode/age"] == pytest.approx(mean)
 
 
-@pytest.mark.parametrize("part", ["env", "obs", "episode_stats"])
-def test_what_is_not_learnt_may_be_nonfinite_in_a_checkpoint(tmp_path, part):
+def test_what_is_not_learnt_may_be_nonfinite_in_a_checkpoint(tmp_path):
     run = make_trainer(tmp_path)
-    state = {**run.run_state.state_dict(), part: {"x": torch.tensor([torch.inf, torch.nan])}}
-    run.saver(UPDATE, state)
+    run.saver(UPDATE, {**run.run_state.state_dict(), "env": {"x": torch.tensor([torch.nan])}})
     run.saver.wait()
-    assert checkpoint.load_latest(tmp_path).state[part]["x"].isnan().any()
-
-
-def test_nonfinite_number_is_named_without_a_later_report(tmp_path):
-    run = make_trainer(tmp_path, {("reward", 6, 3): torch.nan}, samples=8 * UPDATE, every=100)
-    with pytest.warns(UserWarning, match="reward of lane 3 was nan at step 6"):
-        run.train()
-    assert run.nonfinite_guard.value.step == 6
+    assert checkpoint.load_latest(tmp_path).state["env"]["x"].isnan().any()
 
 
 @pytest.mark.parametrize("every", [1, 7])
@@ -505,11 +479,10 @@ def test_finite_gradient_restarts_the_count_of_skipped_updates(tmp_path):
     assert run.updates == 50
 
 
-@pytest.mark.parametrize("lr", [10.0, 1e3])
 @pytest.mark.filterwarnings("ignore:value of lane")
-def test_divergence_ends_the_run_and_keeps_the_last_good_checkpoint(tmp_path, lr):
-    run = make_trainer(tmp_path, lr=lr, checkpoint_seconds=0.0)
-    with pytest.raises(NonFiniteError, match=f"learning rate smaller than {lr:g}"):
+def test_divergence_ends_the_run_and_keeps_the_last_good_checkpoint(tmp_path):
+    run = make_trainer(tmp_path, lr=1e3, checkpoint_seconds=0.0)
+    with pytest.raises(NonFiniteError, match="learning rate smaller than 1000"):
         run.train()
     assert run.updates < 200
     loaded = checkpoint.load_latest(tmp_path)

@@ -62,8 +62,6 @@ class Loggers:
             except Exception as error:
                 warnings.warn(f"logger={name} skipped: {first_line(error)}", stacklevel=2)
 
-    is_slow = True
-
     def on_report(self, trainer: "Trainer", metrics: Mapping[str, float | str]) -> None:
         """Writes a report."""
         self.write(trainer.samples, metrics)

@@ -3,14 +3,12 @@
 import pytest
 import torch
 
-from megastep.agents.distributed import agreement, drift, environment, process_group
-from megastep.agents.distributed.agreement import Plan, agree, together
-from megastep.agents.distributed.drift import check_drift
-from megastep.agents.distributed.ranks import ONE, Ranks
+from megastep.agents.distributed import environment, process_group, ranks
+from megastep.agents.distributed.process_group import together
+from megastep.agents.distributed.ranks import ONE, Plan, Ranks
 from megastep.agents.errors import UserError
 from megastep.agents.generator import rank_seed
 from megastep.agents.launch import rank_checks
-from tests.helpers import ranks
 
 GOES_ON = Plan(goes_on=True, saves=False, lr_fraction=0.75)
 
@@ -62,29 +60,29 @@ def others(monkeypatch):
             return [*values[:rank], value, *values[rank:]]
 
         monkeypatch.setattr(process_group, "exchange", gathered)
-        monkeypatch.setattr(agreement, "gather_objects", gathered)
-        monkeypatch.setattr(agreement, "n_ranks", lambda: 1 + len(values))
-        monkeypatch.setattr(agreement, "rank", lambda: rank)
-        monkeypatch.setattr(agreement, "rank_label", lambda: f"rank {rank} on here")
+        monkeypatch.setattr(process_group, "gather_objects", gathered)
+        monkeypatch.setattr(process_group, "n_ranks", lambda: 1 + len(values))
+        monkeypatch.setattr(process_group, "rank", lambda: rank)
+        monkeypatch.setattr(process_group, "hostname", lambda: "here")
         return said
 
     return are
 
 
 def test_one_process_follows_its_own_plan():
-    assert agree(GOES_ON, False, False, ONE) == GOES_ON
-    assert not agree(GOES_ON, True, False, ONE).goes_on
-    assert not agree(GOES_ON._replace(saves=True), False, True, ONE).saves
+    assert ONE.agree(GOES_ON, False, False) == GOES_ON
+    assert not ONE.agree(GOES_ON, True, False).goes_on
+    assert not ONE.agree(GOES_ON._replace(saves=True), False, True).saves
 
 
 def test_clock_of_rank_0_decides_unless_a_rank_has_a_signal_or_a_slow_disk(others):
     others([[True, True, 0.5, False, False]], rank=1)
-    assert agree(Plan(False, False, 0.25), False, False, Ranks(1, 2)) == Plan(True, True, 0.5)
+    assert Ranks(1, 2).agree(Plan(False, False, 0.25), False, False) == Plan(True, True, 0.5)
     saving = GOES_ON._replace(saves=True)
     others([[1, 1, 0.9, 0, 0], [1, 1, 0.9, 1, 0]])
-    assert agree(saving, False, False, Ranks(0, 3)) == saving._replace(goes_on=False)
+    assert Ranks(0, 3).agree(saving, False, False) == saving._replace(goes_on=False)
     others([[1, 1, 0.9, 0, 0], [1, 1, 0.9, 0, 1]])
-    assert agree(saving, False, False, Ranks(0, 3)) == GOES_ON
+    assert Ranks(0, 3).agree(saving, False, False) == GOES_ON
 
 
 def failing(error):
@@ -151,19 +149,18 @@ def test_checksum_sees_one_bit(dtype):
     tensor = torch.ones(3, 5, dtype=dtype)
     other = tensor.clone()
     other[1, 2] = 0
-    before, same, after = (drift.checksums([x]) for x in (tensor, tensor.clone(), other))
+    before, same, after = (ranks.checksums([x]) for x in (tensor, tensor.clone(), other))
     assert torch.equal(before, same) and not torch.equal(before, after)
 
 
 def test_checksum_sees_negative_zero_and_nan():
     values = torch.tensor([0.0, -0.0, torch.nan, torch.inf])
-    assert len({drift.checksums([value]).item() for value in values}) == 4
+    assert len({ranks.checksums([value]).item() for value in values}) == 4
 
 
 def test_first_difference_names_tensor_and_ranks(monkeypatch):
     network = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2))
-    check_drift(network)  # of one process
-    monkeypatch.setattr(drift, "n_ranks", lambda: 3)
+    ONE.check_drift(network)
 
     def gather(sums):
         rows = sums.repeat(3, 1)
@@ -171,25 +168,7 @@ def test_first_difference_names_tensor_and_ranks(monkeypatch):
         rows[2, 4] += 1
         return rows
 
-    monkeypatch.setattr(drift, "all_gather", gather)
+    monkeypatch.setattr(ranks, "all_gather", gather)
     text = "policy.0.bias differs on ranks 1 and 2; .*average_gradients"
-    with pytest.raises(drift.DriftError, match=text):
-        check_drift(network)
-
-
-def drifted():
-    """Returns what is said before and after a buffer of rank 1 differs."""
-    network, texts = torch.nn.BatchNorm1d(2), []
-    for _ in range(2):
-        try:
-            check_drift(network)
-        except drift.DriftError as error:
-            texts.append(str(error))
-        network.running_mean[1] += 1e-6 * process_group.rank()
-    return texts
-
-
-@pytest.mark.slow
-def test_two_ranks_drift():
-    for (text,) in ranks.call(drifted):
-        assert "policy.running_mean differs on rank 1" in text
+    with pytest.raises(ranks.DriftError, match=text):
+        Ranks(0, 3).check_drift(network)
