@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from megastep.workers import terminal_signals_blocked
 from tests.helpers.processes import is_running
 
 ROOT = Path(__file__).parents[1]
@@ -20,18 +19,6 @@ def blocked_signals(process):
     lines = Path(f"/proc/{process}/status").read_text().splitlines()
     (mask,) = (line.split()[1] for line in lines if line.startswith("SigBlk"))
     return int(mask, 16)
-
-
-def test_processes_started_inside_never_receive_signals_of_the_terminal():
-    before = blocked_signals("self")
-    with terminal_signals_blocked():
-        child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    try:
-        mask = blocked_signals(child.pid)
-        assert all(mask >> number - 1 & 1 for number in (signal.SIGINT, signal.SIGHUP))
-        assert blocked_signals("self") == before
-    finally:
-        child.communicate(b"\n")
 
 
 #: Starts two workers, as recording does, in a process that has started none before, and prints

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import capture, contract
-from megastep.agents.storage.collector import Collector
+from megastep import contract
 from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
 from megastep.envs import Gymnasium
@@ -55,11 +54,6 @@ class Reader(Counter):
     observation_space = gymnasium.spaces.Dict(
         a=gymnasium.spaces.Box(0, 1), b=gymnasium.spaces.Tuple([gymnasium.spaces.Text(3)])
     )
-
-
-class Fussy(gymnasium.Wrapper):
-    def __init__(self, env, needed):
-        super().__init__(env)
 
 
 class Doubled(gymnasium.ObservationWrapper):
@@ -185,22 +179,6 @@ def test_error_of_an_environment_is_named_with_its_traceback(vectorization):
 # ---- On a GPU ----
 
 
-@pytest.mark.parametrize("capturable", [True, False])
-def test_only_capturable_environments_are_captured(capturable):
-    class Env:
-        device = torch.device("cuda")
-
-        def step(self, decision):
-            return "stepped"
-
-    env = Env()
-    env.capturable = capturable
-    assert Collector(env, None, None, actor_state=arrdict()).can_capture == capturable
-    if not capturable:
-        assert capture.Captured(env).step(arrdict(actions=None)) == "stepped"
-    assert not cart_pole().capturable
-
-
 @pytest.mark.cuda
 def test_gpu_learner_gets_the_same_worlds_and_no_graph():
     from megastep.agents.algorithms.ppo import PPO
@@ -286,10 +264,6 @@ def test_resumable_if_all_state_is_in_python():
             r"^CartPole-v1 cannot be made with env.kwargs={'mass': 3}: .*unexpected .* 'mass'$",
         ),
         ({"id": "CartPole-v1", "wrappers": ("nowhere:A",)}, "^env.wrappers: nowhere:A cannot be"),
-        (
-            {"id": "TestCounter-v0", "wrappers": (f"{__name__}:Fussy",)},
-            "^TestCounter-v0 cannot be made: .*required positional argument: 'needed'",
-        ),
         ({"id": "Acrobot-v1", "vectorization": "own"}, "no vector environment of its own; use"),
         (
             {"id": "TestCounter-v0", "vectorization": "own"},

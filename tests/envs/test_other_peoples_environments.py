@@ -85,11 +85,9 @@ def test_the_try_leaves_global_generators_alone():
     [
         (np.full((2, 3, 3), 7, np.uint8), 7),
         (np.full((2, 3), 7, np.uint8), 7),
-        (np.full((2, 3, 1), 7, np.int64), 7),
         (np.full((2, 3, 4), 7, np.uint8), 7),
         (np.full((2, 3, 3), 128.0), 128),
         (np.full((2, 3, 3), 0.5), 128),
-        (np.full((2, 3, 3), 1.0), 255),
         (np.full((2, 3, 3), 255.0), 255),
     ],
 )
@@ -106,7 +104,6 @@ def test_frames(rendered, expected):
         ("a frame", "render() returned <U7 of shape ()"),
         (np.zeros((2, 3, 2)), "float64 of shape (2, 3, 2)"),
         (np.full((2, 3, 3), 300.0), "numbers from 300 to 300"),
-        (np.full((2, 3, 3), -3), "numbers from -3 to -3"),
     ],
 )
 def test_frames_that_are_no_images_are_named(rendered, text):

@@ -2,7 +2,6 @@
 not there.
 """
 
-import json
 import sys
 import types
 
@@ -255,19 +254,6 @@ def test_a_mask_that_does_not_fit_is_a_sentence():
     env.vector.envs[0].n = 5
     with pytest.raises(BadValue, match=r"environment 0, one: .* \(5,\), and before it had \(4"):
         env.reset()
-
-
-def test_trains_and_evaluates(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = [
-        *("env=pettingzoo", f"env.id={__name__}:Free", "device=cpu", "env.n_envs=4"),
-        *("learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8", "samples=96"),
-    ]
-    assert train.main([*words, "folder=run"]) == 0
-    assert evaluate.main(["run=run", "episodes=4", "against=random"]) == 0
-    assert evaluate.main(["run=run", "episodes=30", "baseline=false"]) == 0
-    (path,) = (tmp_path / "run" / "evaluations").glob("[!d]*.json")
-    assert json.loads(path.read_text())["rows"][0]["lanes"] == 30, "of ten environments"
 
 
 class Doubled:
