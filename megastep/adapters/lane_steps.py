@@ -2,17 +2,16 @@
 conversions. N environments, B lanes.
 """
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar, cast
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch
-from torch.utils import _pytree
 
 from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.capture import Graph, capture
+from megastep.dotdict import leaves, mapping
 from megastep.types import Env, Tree, World, n_lanes, optional, takes_masks
 
 __all__ = ["Copies", "Lanes", "ended", "fresh"]
@@ -26,20 +25,11 @@ def ended(world: World) -> torch.Tensor:
     return world["terminal"] | world["truncated"]
 
 
-Method = TypeVar("Method", bound=Callable)
-
-
-def _in_plain_tensors(method: Method) -> Method:
-    """Decorates a method that keeps tensors, so that it may be called in an inference mode, whose
-    tensors cannot be changed outside it.
-    """
-
-    @functools.wraps(method)
-    def call(*args, **kwargs) -> object:
-        with torch.inference_mode(False), torch.no_grad():
-            return method(*args, **kwargs)
-
-    return cast(Method, call)
+@torch.inference_mode(False)
+@torch.no_grad()
+def fresh(tree: Tree) -> Tree:
+    """Returns a copy of a tree of tensors: for one, memory of its own for each is quickest."""
+    return mapping(torch.clone)(tree)
 
 
 class Copies:
@@ -49,11 +39,10 @@ class Copies:
     """
 
     def __init__(self, tree: Tree):
-        leaves = _pytree.tree_leaves(tree)
-        self._built = _builder(tree)
-        self._at = [i for i, leaf in enumerate(leaves) if _is_words(leaf)]
-        self._others = [(i, leaf) for i, leaf in enumerate(leaves) if i not in self._at]
-        self._leaves = [leaves[i] for i in self._at]
+        self._tree, all_leaves = tree, leaves(tree)
+        self._at = [i for i, leaf in enumerate(all_leaves) if _is_words(leaf)]
+        self._others = [(i, leaf) for i, leaf in enumerate(all_leaves) if i not in self._at]
+        self._leaves = [all_leaves[i] for i in self._at]
         self._words = [leaf.view(-1).view(torch.int32) for leaf in self._leaves]
         self._blank: list[tuple[torch.Tensor, ...]] = []
 
@@ -68,9 +57,11 @@ class Copies:
                 copies[i] = part
         for i, leaf in self._others:
             copies[i] = leaf.clone()
-        return self._built(iter(copies))
+        rest = iter(copies)
+        return mapping(lambda _: next(rest))(self._tree)
 
-    @_in_plain_tensors
+    @torch.inference_mode(False)  # they may be called in one, whose tensors stay in it
+    @torch.no_grad()
     def _block(self) -> list[tuple[torch.Tensor, ...]]:
         """Returns memory for some copies: all words of each, and a view per leaf."""
         sizes = [*map(len, self._words)]
@@ -81,23 +72,6 @@ class Copies:
             for part, leaf in zip(block.split(sizes, 1), self._leaves)
         ]
         return [*zip(block.unbind(), *parts)]
-
-
-def _builder(tree) -> Callable:
-    """Returns a function that makes a tree of the same kind from an iterator over its leaves, in a
-    third of a pytree's time.
-    """
-    if not isinstance(tree, Mapping):
-        return next
-    kind = cast(Callable, type(tree))
-    parts = [(key, _builder(part)) for key, part in tree.items()]
-    return lambda leaves: kind({key: part(leaves) for key, part in parts})
-
-
-@_in_plain_tensors
-def fresh(tree: Tree) -> Tree:
-    """Returns a copy of a tree of tensors: for one, memory of its own for each is quickest."""
-    return _builder(tree)(leaf.clone() for leaf in _pytree.tree_leaves(tree))
 
 
 def _is_words(leaf) -> bool:
@@ -132,7 +106,8 @@ class Lanes:
         self._step: Callable | None = None
         self._resets: dict[int, Callable] = {}  # by their number of arguments
 
-    @_in_plain_tensors
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def reset(self, seed: int | Sequence[int | None] | None = None, mask: Tree = None) -> World:
         """Returns the first world, or with a mask the last one with new rows.
 
@@ -207,11 +182,11 @@ class Lanes:
         """
         if isinstance(self._step, Graph):  # which reads the decision, so inference mode may stay
             with torch.no_grad():
-                leaves = spaces.leaves(self._decision(actions))
-                return self._step.with_leaves([*leaves.values()])
+                return self._step.with_leaves(leaves(self._decision(actions)))
         return self._eager_step(actions)
 
-    @_in_plain_tensors
+    @torch.inference_mode(False)
+    @torch.no_grad()
     def _eager_step(self, actions) -> tuple[World, World, torch.Tensor]:
         decision = self._decision(actions)
         if self._step is None:

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from torch.utils import _pytree
 
 from megastep import envs
 from megastep.adapters.gymnasium_spaces import (
@@ -21,7 +20,7 @@ from megastep.adapters.gymnasium_spaces import (
     without_agents,
 )
 from megastep.adapters.lane_steps import Copies, Lanes, ended, fresh
-from megastep.dotdict import mapping
+from megastep.dotdict import leaves, mapping
 from megastep.plotting import rasterise
 from megastep.types import Env, Tree, optional
 
@@ -132,7 +131,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if stepped is not self._stepped:  # on a GPU the same each time
             self._stepped, self._views = stepped, self._parts(*stepped)
             self._copies = Copies(self._views)
-            floats = filter(torch.is_floating_point, _pytree.tree_leaves(self._views["obs"]))
+            floats = filter(torch.is_floating_point, leaves(self._views["obs"]))
             self._casts = any(leaf.dtype != self.dtype for leaf in floats)
         parts = self._copies() if self.copy else self._views
         if not self._casts:
