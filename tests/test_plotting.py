@@ -155,20 +155,6 @@ def test_bad_image_shapes_are_refused(shape, transpose):
 # ---- Plans ----
 
 
-def test_walls_keep_their_hue_and_are_never_dark():
-    dark, grey, red = plotting.wall_colours([[0, 0, 0.001], [0.2, 0.2, 0.2], [1, 0, 0]], 0.5, 1.0)
-    assert dark[2] >= 0.5 and dark[0] == dark[1] == 0
-    assert grey[0] == grey[1] == grey[2] and np.allclose(red, [1, 0, 0])
-
-
-def test_bars_are_grouped_by_name(ax):
-    drawn = plotting.plot_bars(("turn", "ahead"), [[0.5, -1], [0, 1]], ax)
-    assert drawn is ax and [bar.get_height() for bar in ax.patches] == [0.5, -1, 0, 1]
-    assert [bar.get_x() for bar in ax.patches] == pytest.approx([-0.4, 0.6, 0, 1])
-    assert [label.get_text() for label in ax.get_xticklabels()] == ["turn", "ahead"]
-    assert plotting.plot_bars(("turn",), [0.5]).figure is not ax.figure
-
-
 SQUARE = np.array([[[1, 1], [5, 1]], [[5, 1], [5, 5]], [[5, 5], [1, 5]], [[1, 5], [1, 1]]], float)
 LIT = [np.ones((80, 3)) * [1.0, 0, 0] for _ in SQUARE]
 
@@ -214,12 +200,6 @@ def test_what_is_seen_later_is_drawn_over_what_is_kept(theme):
     assert pixel(image, plan, (1.5, 1))[0] > 0.7
 
 
-def test_no_lines():
-    figure, plan, _ = plotting.panels()
-    assert plotting.plot_scenery(np.zeros((0, 2, 2)), [], ax=plan) is plan
-    plotting.rasterise(figure)
-
-
 def test_methods_of_axes_draw_over_an_area():
     figure, plan, _ = plotting.panels()
     plotting.plot_scenery(SQUARE, LIT, ax=plan)
@@ -244,17 +224,6 @@ def test_agents_are_at_least_12_pixels_wide_in_their_colour():
     column, row = plan.transform.transform((50, 50)).astype(int)
     across = image[len(image) - 1 - row - 8 : len(image) - 1 - row + 9, column]
     assert ((across[:, 0] > 200) & (across[:, 1] < 60)).sum() >= 12
-
-
-def test_trails_fade_and_are_cut_where_nothing_is_known():
-    figure, plan, _ = plotting.panels()
-    plan.fit(np.array([0.0, 0.0]), np.array([10.0, 10.0]))
-    points = np.stack([np.linspace(0, 10, 40), np.full(40, 5.0)], 1)
-    points[:8] = np.nan
-    plotting.plot_trail(plan, points, "#0000ff")
-    image = plotting.rasterise(figure)
-    unknown, early, late = (pixel(image, plan, (x, 5))[0] for x in (1, 3, 9.5))
-    assert unknown == 1 and unknown > early > late
 
 
 # ---- Figures ----

@@ -110,17 +110,15 @@ def _several(every: list[runs.Run], charts: "Charts") -> str:
     groups = runs.groups_of(every)
     tasks = "; ".join(dict.fromkeys(run.task for run in every))
     parts = [f"<h1>{len(every)} runs</h1>", f"<p>{_text(tasks)}</p>"]
-    head = ["runs", "seeds", "IQM of the return", "95 % interval", "mean", "samples"]
-    rows, scored = [], {}
-    for name, group in groups.items():
-        values = [score for run in group if (score := run.score()) is not None]
-        samples = max(run.metrics[-1]["samples"] for run in group)
-        numbers = 3 * ["none"]
-        if values:
-            scored[name] = values
-            middle, lower, upper = seeds.interval([values])
-            numbers = [f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}", f"{np.mean(values):.4g}"]
-        rows.append([name, str(len(group)), *numbers, f"{samples:,}"])
+    all_scores = {
+        name: [score for run in group if (score := run.score()) is not None]
+        for name, group in groups.items()
+    }
+    scored = {name: scores for name, scores in all_scores.items() if scores}
+    rows = seeds.pooled(all_scores)
+    for row, group in zip(rows, groups.values(), strict=True):
+        row.append(f"{max(run.metrics[-1]['samples'] for run in group):,}")
+    head = [*(text.format("the return") for text in seeds.POOLED), "samples"]
     parts += ["<h2>Results</h2>", _table(head, rows), f"<p>{METHOD}</p>"]
     if keys := runs.differing(every):
         values = [[key, *(str(g[0].settings().get(key)) for g in groups.values())] for key in keys]
@@ -129,8 +127,8 @@ def _several(every: list[runs.Run], charts: "Charts") -> str:
     named = [(group, name) for name, group in groups.items()]
     parts += ["<h2>Curves</h2>", _curves(every, named, charts)]
     if scored:
-        all_scores = np.concatenate([*scored.values()])
-        limits = np.linspace(all_scores.min() - 1e-9, all_scores.max(), 200)
+        values = np.concatenate([*scored.values()])
+        limits = np.linspace(values.min() - 1e-9, values.max(), 200)
         lines = {name: seeds.profile([values], limits) for name, values in scored.items()}
         place = charts.add("seeds above a return", limits, lines, "return")
         parts += ["<h2>Performance profiles</h2>", f'<div class="grid">{place}</div>']

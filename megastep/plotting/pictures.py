@@ -132,27 +132,30 @@ class Area(Artist):
         """Adds a function that draws with a renderer."""
         self._things.append((z, thing))
 
-    def polygon(self, points, z=0.0, *, fill=None, edge=None, width=0.0, alpha=1.0) -> None:
+    def polygon(
+        self, points, z=0.0, *, fill=None, edge=None, width=0.0, alpha=1.0, clip=True
+    ) -> None:
         """Draws a closed polygon, (n, 2); the edge's ``width`` is in points."""
         points = np.asarray(points, float)
-        self.path(
-            Path(np.concatenate([points, points[:1]]), closed=True), z, fill, edge, width, alpha
-        )
+        path, look = Path(np.concatenate([points, points[:1]]), closed=True), (fill, edge, width)
+        self.add(lambda r: self.draw_path(r, path, self.transform, *look, alpha, clip=clip), z)
 
     def line(self, points, z=0.0, *, colour, width=1.0, alpha=1.0) -> None:
         """Draws a line through points, (n, 2)."""
-        self.path(Path(np.asarray(points, float)), z, None, colour, width, alpha)
-
-    def path(self, path, z, fill=None, edge=None, width=0.0, alpha=1.0, hatch=None) -> None:
-        """Draws a matplotlib path."""
-
-        def draw(renderer) -> None:
-            self.draw_path(renderer, path, self.transform, fill, edge, width, alpha, hatch)
-
-        self.add(draw, z)
+        path = Path(np.asarray(points, float))
+        self.add(lambda r: self.draw_path(r, path, self.transform, None, colour, width, alpha), z)
 
     def draw_path(
-        self, renderer, path, transform, fill=None, edge=None, width=0.0, alpha=1.0, hatch=None
+        self,
+        renderer,
+        path,
+        transform,
+        fill=None,
+        edge=None,
+        width=0.0,
+        alpha=1.0,
+        hatch=None,
+        clip=True,
     ) -> None:
         """Draws a matplotlib path at once."""
         gc = renderer.new_gc()
@@ -160,7 +163,7 @@ class Area(Artist):
         gc.set_foreground(to_rgba(edge if edge is not None else "k", alpha), isRGBA=True)
         gc.set_joinstyle("round")
         gc.set_capstyle("round")
-        gc.set_clip_rectangle(self.bbox)
+        gc.set_clip_rectangle(self.bbox if clip else None)
         if hatch is not None:
             gc.set_hatch("//")
             gc.set_hatch_color(to_rgba(hatch))
@@ -335,16 +338,9 @@ def plot_level(area: Area, level: float) -> None:
     colour = (0.85 * (1 - level) + 0.1, 0.25 + 0.45 * level, 0.2)
     bottom, top = area.height + 0.02, area.height + 0.07
     for right, fill in (1, area.style.colours.outside), (level, colour):
-        corners = [(0, bottom), (right * area.width, bottom), (right * area.width, top), (0, top)]
-        bar = Path(np.array([*corners, corners[0]], float), closed=True)
-
-        def draw(renderer, bar=bar, fill=fill) -> None:
-            gc = renderer.new_gc()
-            gc.set_linewidth(0)
-            renderer.draw_path(gc, bar, area._inches, to_rgba(fill))
-            gc.restore()
-
-        area.add(draw, 1)
+        width = right * area.width
+        corners = [(0, bottom), (width, bottom), (width, top), (0, top)]
+        area.polygon(corners, 1, fill=fill, clip=False)
 
 
 def rasterise(figure: Figure) -> np.ndarray:

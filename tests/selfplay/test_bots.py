@@ -48,7 +48,7 @@ def test_agents_fit_on_nodes_and_ways_in_a_box_are_straight(device):
     torch.testing.assert_close(plans.lengths.cpu().float(), straight, atol=4e-3, rtol=0)
 
 
-@pytest.mark.parametrize("settings", [{}, dict(resample=True), dict(control="continuous")])
+@pytest.mark.parametrize("settings", [{}, dict(control="continuous")])
 def test_walker_reaches_goals(settings, device):
     env = envs.PointGoal(64, HOMES, device=device, **settings)
     metrics = first_episodes(env, Walker(env)).metrics
@@ -103,21 +103,11 @@ def test_what_a_seeker_remembers_is_worth_finds():
     assert found[Mapper] > 3 * found[Wanderer], found
 
 
-@pytest.mark.parametrize(
-    "homes, opponent, least",
-    [
-        pytest.param(HOMES, "bot", 0.6, marks=pytest.mark.slow, id="homes-bot"),
-        pytest.param(DENSE, "random", 0.8, marks=pytest.mark.nightly, id="dense-random"),
-        pytest.param(HOMES, "random", 0.8, marks=pytest.mark.nightly, id="homes-random"),
-        pytest.param(DENSE, "bot", 0.6, marks=pytest.mark.nightly, id="dense-bot"),
-    ],
-)
-def test_hunter_wins_duels(homes, opponent, least):
-    env = envs.Deathmatch(128, homes, n_agents=2, device="cpu")
-    random = RandomActions(env.action_space)
-    played = duels.play(env, Hunter(env), random if opponent == "random" else env.bot(env.core.fov))
-    (row,) = duels.summaries(played)
-    assert row["won"] > least and row["wins"] > 2 * row["losses"], row
+@pytest.mark.slow
+def test_hunter_wins_duels():
+    env = envs.Deathmatch(128, HOMES, n_agents=2, device="cpu")
+    (row,) = duels.summaries(duels.play(env, Hunter(env), env.bot(env.core.fov)))
+    assert row["won"] > 0.6 and row["wins"] > 2 * row["losses"], row
 
 
 def test_bots_play_alike_in_some_lanes(device):

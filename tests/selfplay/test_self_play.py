@@ -96,8 +96,6 @@ class NeedsRgb(Always):
         (["env.self_play=false"], "at least two agents; Pong has one"),
         (["opponents.past=0.9"], "opponents.past=0.9 and opponents.bot=0.25"),
         (["opponents.snapshots=5"], "opponents.snapshots=5"),
-        (["opponents.snapshots=0"], "opponents.snapshots: 0"),
-        (["opponents.bot_class=tests.helpers.games:Hihg"], "High"),
         (["opponents.bot_class=test_self_play:NeedsRgb"], "test_self_play:NeedsRgb"),
         (["samples=null", "checkpoints.snapshots=8"], "snapshots: "),
     ],

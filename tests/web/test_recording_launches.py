@@ -7,7 +7,7 @@ import re
 import pytest
 import torch
 
-from megastep import envs, geometries, spaces, toys
+from megastep import envs, spaces, toys
 from megastep.arrdict import arrdict
 from megastep.spaces import random_actions
 from megastep.types import n_lanes
@@ -100,16 +100,3 @@ def test_masks_and_environments_in_python_are_refused():
     env = envs.Gymnasium(2, id="CartPole-v1", device="cpu")
     with pytest.raises(ValueError, match="Gymnasium cannot be exported: it steps in Python"):
         record(env)
-
-
-def test_homes_have_outlines():
-    from megastep.plotting.plans import room_outlines
-
-    (outline,) = room_outlines(*outline_of(toys.box()))
-    assert outline[0] == outline[-1] and len(outline) >= 4
-    homes = geometries.sample("homes", 1, seed=7)
-    assert room_outlines(*outline_of(homes[0]))
-
-
-def outline_of(home):
-    return home.walls, home.lights

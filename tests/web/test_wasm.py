@@ -215,12 +215,3 @@ def test_a_page_plays_in_a_browser(agent_page, tmp_path):
         assert names == ["you", "agent"] and before != after
         browser.key("Escape", True)
         assert browser.value("megastep.game.players.length") == 1
-
-
-@pytest.mark.slow
-def test_a_browser_without_webassembly_gets_a_sentence(agent_page, tmp_path):
-    text = agent_page.replace("<script>", "<script>WebAssembly = undefined;</script><script>", 1)
-    (tmp_path / "page.html").write_text(text)
-    with Browser(tmp_path) as browser:
-        browser.send("Page.navigate", url=f"file://{tmp_path}/page.html")
-        browser.until("document.getElementById('problem')?.textContent.includes('WebAssembly')")
