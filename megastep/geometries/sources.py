@@ -1,6 +1,7 @@
 """The sources of geometries: functions `(n, split, seed, **options) -> list`.
 
-Their arguments are the settings of a run's `geometry`.
+Their arguments are the settings of a run's `geometry`. The split is training, test or all; a split
+with fewer than n geometries repeats them.
 """
 
 import functools
@@ -74,8 +75,7 @@ def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str)
     """Returns geometries from an `.npz` file. The last tenth of it is the test split.
 
     Args:
-        n: number of geometries; a split with fewer repeats them.
-        split, seed: training, test or all, and the order in which geometries of it are drawn.
+        n, split, seed: how many are drawn, from which split, in which order.
         path: the file.
     """
     file = Path(path)
@@ -97,8 +97,7 @@ def homes(
     Homes of another density or clutter are generated from as many seeds at their first use.
 
     Args:
-        n: number of geometries; a split with fewer repeats them.
-        split, seed: training, test or all, and the order in which geometries of it are drawn.
+        n, split, seed: how many are drawn, from which split, in which order.
         outer: if False, outer walls have no outer faces, which cannot be seen from inside.
         density: 3: more rooms, narrower doors and corridors, and furniture: three times as many
             walls.
@@ -115,8 +114,7 @@ def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdi
     """Returns homes from the 512 dense ones on which the benchmarks run.
 
     Args:
-        n: number of geometries; a split with fewer repeats them.
-        split, seed: training, test or all, and the order in which geometries of it are drawn.
+        n, split, seed: how many are drawn, from which split, in which order.
     """
     return files(n, split, seed, path=str(BENCH))
 
@@ -125,8 +123,8 @@ def cubicasa(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[do
     """Returns floors of CubiCasa5k's real homes, which `megastep import source=cubicasa` imported.
 
     Args:
-        n: number of geometries; a split with fewer repeats them.
-        split, seed: as of `homes`; floors of one home are in the same split.
+        n, split, seed: how many are drawn, from which split, in which order. Floors of one home
+            are in the same split.
     """
     return imported.pick("cubicasa", n, split, seed)
 
@@ -135,8 +133,7 @@ def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[d
     """Returns floor plans of HouseExpo, which `megastep import source=houseexpo` imported.
 
     Args:
-        n: number of geometries; a split with fewer repeats them.
-        split, seed: training, test or all, and the order in which geometries of it are drawn.
+        n, split, seed: how many are drawn, from which split, in which order.
     """
     return imported.pick("houseexpo", n, split, seed)
 
@@ -165,8 +162,7 @@ def maze(
     """Returns square mazes from 5,000 of them.
 
     Args:
-        n: number of geometries; a split with fewer repeats them.
-        split, seed: training, test or all, and the order in which geometries of it are drawn.
+        n, split, seed: how many are drawn, from which split, in which order.
         size: cells per side.
         corridor: width of the corridors, in metres, at least 0.32, so that agents fit.
         thickness: thickness of the walls, in metres.
@@ -189,8 +185,7 @@ def memory_maze(
     """Returns mazes of rooms and corridors, as those of Memory Maze, from 5,000 of each size.
 
     Args:
-        n: number of geometries; a split with fewer repeats them.
-        split, seed: training, test or all, and the order in which geometries of it are drawn.
+        n, split, seed: how many are drawn, from which split, in which order.
         size: cells per side: 9, 11, 13 or 15.
         cell: side of a cell, in metres, at least 0.5.
     """

@@ -25,7 +25,7 @@ TOLERANCE = 0.02  # metres by which contours are simplified, and at least STEP o
 STEP = 0.6
 SPECKLE = 0.03  # m2; smaller objects on the floor, and smaller holes in walls, are no walls
 BUMP = 2  # cells that differ from most around them and may be a bump; more are a thin wall
-MAX_PIECES = 5_000  # of floor and walls
+MAX_SIDES = 400_000  # of cells, between floor and what is not
 MAX_ANGLE = 5.0  # degrees by which a map is straightened
 MIN_ANGLE = 0.15
 ROUGH = 0.05  # metres by which contours are simplified to find their angle
@@ -118,7 +118,10 @@ def _image(path) -> tuple[np.ndarray, np.ndarray]:
             if image.mode.startswith("I"):  # 16 bits
                 values = np.asarray(image, np.float32) / 65_535
                 return values.clip(0, 1), np.ones_like(values)
-            values = np.asarray(image.convert("RGBA"), np.uint8)
+            if image.mode in ("1", "L"):
+                values = np.asarray(image.convert("L")) / 255
+                return values, np.broadcast_to(1.0, values.shape)
+            values = np.asarray(image.convert("RGBA"))
             return values[..., :3].mean(-1) / 255, values[..., 3] / 255
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise ValueError(f"its image {path.name!r} cannot be read, or is cut short") from error
@@ -201,9 +204,12 @@ def _small(cells, n_cells, touching=ANY) -> np.ndarray:
 def _area(cells, resolution) -> BaseGeometry:
     """Returns the area of cells (H, W) in metres. Touching at a corner does not connect them."""
     heights = np.pad(cells, 1).astype(np.float32)
+    n_sides = sum((np.diff(heights, axis=axis) != 0).sum() for axis in (0, 1))
+    if n_sides > MAX_SIDES:
+        raise ValueError(
+            f"its walls are too ragged: {n_sides:,} sides of cells, but {MAX_SIDES:,} are allowed"
+        )
     rings_of, offsets_of = contour_generator(z=heights, fill_type="OuterOffset").filled(0.5, 2)
-    if len(rings_of) > MAX_PIECES:
-        raise ValueError(f"it has {len(rings_of):,} pieces, but {MAX_PIECES:,} are allowed")
     parts = []
     for points, offsets in zip(rings_of, offsets_of):
         rings = [_with_corners(points[a : b - 1]) for a, b in zip(offsets, offsets[1:])]

@@ -20,6 +20,7 @@ CURVED = 0.02  # metres by which contours of drawings and maps are simplified
 MAX_EXTENT = geometry.MAX_EXTENT - 2 * geometry.MARGIN
 MAX_WALLS = 8_192
 MAX_CORNERS = 200_000  # of a drawing
+MAX_MEETINGS = 1_000_000  # of the boxes around its segments
 MIN_AREA = 1.0  # m2 of floor that an agent can reach
 LIT = 0.1  # metres; minimum distance of a light from a wall
 JAMB = 0.05  # metres; a doorway is so much wider than its door, on either side
@@ -60,44 +61,35 @@ def ring(points: np.ndarray) -> list[Polygon]:
     return polygons(Polygon(points)) if len(points) >= 3 else []
 
 
-MAX_MEETINGS = 2_000_000  # of the boxes around the segments of a shape
-
-
-def check_meetings(shapes: Sequence[BaseGeometry]) -> None:
-    """Raises ValueError for shapes that cross so often that their area would take minutes."""
+def check_meetings(shapes: Sequence[BaseGeometry], before: int = 0) -> int:
+    """Returns `before` and how often the boxes around segments meet. Raises ValueError if that is
+    so often that areas would take minutes.
+    """
     points, of_shape = shapely.get_coordinates(shapes, return_index=True)
     segments = np.stack([points[:-1], points[1:]], 1)[of_shape[:-1] == of_shape[1:]]
     boxes = shapely.box(*segments.min(1).T, *segments.max(1).T)
-    tree, n = shapely.STRtree(boxes), 0
+    tree, n = shapely.STRtree(boxes), before
     for start in range(0, len(boxes), 256):
         n += tree.query(boxes[start : start + 256]).shape[1]
         if n > MAX_MEETINGS:
             raise ValueError("its lines cross one another too often")
+    return n
 
 
-def area_of(rings: Sequence[np.ndarray], is_even_odd: bool = False) -> list[BaseGeometry]:
-    """Returns the area that rings (P, 2) enclose by one of SVG's fill rules, in a list: none for
-    nothing.
-    """
-    shapes = [Polygon(points) for points in rings]
-    if len(shapes) == 1 and shapes[0].is_valid:
-        return shapes
-    lines = [shape.exterior for shape in shapes]
-    if not lines:
-        return []
-    check_meetings(lines)
+def area_of(rings: Sequence[np.ndarray], is_even_odd: bool = False) -> BaseGeometry:
+    """Returns the area that rings (P, 2) enclose by one of SVG's fill rules."""
+    lines = [shapely.LinearRing(points) for points in rings]
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all(lines)]))
     points = shapely.get_coordinates(shapely.point_on_surface(faces))
     edges = np.concatenate([np.stack([r, np.roll(r, -1, 0)], 1) for r in rings])
     (x0, y0), (x1, y1) = edges[:, 0].T, edges[:, 1].T
-    winding = np.zeros(len(points), int)
-    for i, (x, y) in enumerate(points):
+    inside = []
+    for x, y in points:
         is_left = (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0)
-        winding[i] = (is_left & (y0 <= y) & (y < y1)).sum() - (
-            ~is_left & (y1 <= y) & (y < y0)
-        ).sum()
-    inside = winding % 2 == 1 if is_even_odd else winding != 0
-    return [shapely.union_all(faces[inside])]
+        n_up, n_down = is_left & (y0 <= y) & (y < y1), ~is_left & (y1 <= y) & (y < y0)
+        winding = int(n_up.sum()) - int(n_down.sum())
+        inside.append(winding % 2 == 1 if is_even_odd else winding != 0)
+    return shapely.union_all(faces[np.array(inside, bool)])
 
 
 def filled(shape: BaseGeometry) -> BaseGeometry:
@@ -137,6 +129,7 @@ def geometry_of(
     n_corners = int(shapely.get_num_coordinates(shapes).sum())
     if n_corners > MAX_CORNERS:
         raise ValueError(f"it has {n_corners:,} corners, but the limit is {MAX_CORNERS:,}")
+    check_meetings(shapes)
     rooms = drawing.rooms if sealed else [*drawing.rooms, *drawing.outdoors]
     if not rooms:
         raise ValueError("it has no room" + " indoors" * bool(drawing.outdoors))
@@ -173,7 +166,7 @@ def geometry_of(
     corners = np.concatenate([walls.reshape(-1, 2), *map(shapely.get_coordinates, inside)])
     shift = geometry.MARGIN - corners.min(0)
     walls = walls + shift
-    inside = [[_moved(part, shift) for part in parts] for parts in inside if parts]
+    inside = [[shapely.transform(p, lambda xy: xy + shift) for p in ps] for ps in inside if ps]
     doors = [line for door in openings if (line := _across(door, floor)) is not None]
     result = dotdict(
         id=0,
@@ -199,20 +192,16 @@ def _openings(drawing, solids, rooms) -> tuple[list[BaseGeometry], int]:
     return inner, len(drawing.doors) - len(inner)
 
 
-def _moved(polygon, shift) -> Polygon:
-    return shapely.transform(polygon, lambda points: points + shift)
-
-
-def _rings(polygon) -> list[np.ndarray]:
-    return [np.array(line.coords[:-1]) for line in (polygon.exterior, *polygon.interiors)]
-
-
 def _masks(walls, rooms, extent) -> np.ndarray:
     """Returns the masks of rooms, each a list of polygons. A room in pieces has them all."""
     pieces = [(number, part) for number, parts in enumerate(rooms, 1) for part in parts]
     if len(pieces) > geometry.MAX_ROOMS:
         raise ValueError(f"it has {len(pieces):,} rooms, but the limit is {geometry.MAX_ROOMS:,}")
-    cells = geometry.masks(walls, [_rings(part) for _, part in pieces], extent=extent)
+    rings = [
+        [np.array(line.coords[:-1]) for line in (part.exterior, *part.interiors)]
+        for _, part in pieces
+    ]
+    cells = geometry.masks(walls, rings, extent=extent)
     numbers = np.array([-1, 0, *(number for number, _ in pieces)], np.int16)
     return numbers[cells + 1]
 
@@ -221,10 +210,10 @@ def merged(lines: BaseGeometry) -> np.ndarray:
     """Returns the segments (M, 2, 2) of lines that are split where they meet. Segments that go on
     straight, where no other meets them, are one.
     """
-    cm = [np.rint(np.array(part.coords) / GRID).astype(int) for part in _lines(lines)]
     edges: dict[tuple, set] = {}
-    for part in cm:
-        for a, b in zip(map(tuple, part[:-1].tolist()), map(tuple, part[1:].tolist())):
+    for part in _lines(lines):
+        points = [*map(tuple, np.rint(np.array(part.coords) / GRID).astype(int).tolist())]
+        for a, b in zip(points, points[1:]):
             if a != b:
                 edges.setdefault(a, set()).add(b)
                 edges.setdefault(b, set()).add(a)
@@ -272,11 +261,9 @@ def _reachable(g, rooms, n_sealed, warnings) -> tuple[dotdict, Notes]:
     can_spawn = (fine > 0) & (distance >= checks.SPAWN)
     if not can_spawn.any():
         raise ValueError("it has no room that an agent fits into; check the scale")
-    main = np.bincount(labels[can_spawn]).argmax()
+    main, (height, width) = np.bincount(labels[can_spawn]).argmax(), g.masks.shape
     ratio = round(g.res / cell)
-    is_other = (can_spawn & (labels != main)).reshape(
-        g.masks.shape[0], ratio, g.masks.shape[1], ratio
-    )
+    is_other = (can_spawn & (labels != main)).reshape(height, ratio, width, ratio)
     cells = np.where(is_other.any((1, 3)) & (g.masks > 0), 0, g.masks)
     fine = np.where(np.maximum(cells, 0).repeat(ratio, 0).repeat(ratio, 1) > 0, fine, 0)
     kept = np.unique(fine[can_spawn & (labels == main) & (fine > 0)])
@@ -346,7 +333,7 @@ def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Dr
     inner = [door for door in doors if hull.covers(door.buffer(2 * JAMB, **MITRE))]
     gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in inner])
     floor = hull.difference(solids.difference(gaps))
-    pieces = polygons(floor)
+    pieces = [part for part in polygons(floor) if part.area > 0.01]
     parts = [part for part in pieces if part.area > 0.3]
     if not parts:
         raise ValueError(

@@ -40,11 +40,15 @@ OWN = {
 UNITS = {"px": 1, "pt": 4 / 3, "pc": 16, "mm": 96 / 25.4, "cm": 96 / 2.54, "in": 96, "em": 16}
 LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(%|[a-z]*)", re.I)
 RULE = re.compile(r"([^{}]+)\{([^{}]*)\}")
+#: What is ignored: fonts, other files, and styles of print and other media.
+MEDIA = re.compile(
+    r"@(?:import|charset)[^;]*;|@font-face[^}]*\}|@media[^{]*\{(?:[^{}]*\{[^{}]*\})*[^{}]*\}"
+)
 COMPOUND = re.compile(r"(>?)(\*|[\w-]+)?((?:[.#][\w-]+)*)")
 CURVE = np.linspace(0, 1, 49)  # points of a curve, which are simplified later
 CAPS = {"butt": "flat", "round": "round", "square": "square"}
 JOINS = {"round": "round", "bevel": "bevel"}
-MAX_PATHS = 2 << 20  # characters of all marked paths
+MAX_PATHS = 1 << 19  # characters of all marked paths
 MAX_SHAPES = 20_000
 MAX_WORK = 2_000_000  # of elements, each of which costs as much as VISIT rules of style
 VISIT = 20
@@ -129,10 +133,14 @@ def is_marked(element: Element, mark: str) -> bool:
     return is_id or any(word.lower() in (mark, f"{mark}s") for word in words)
 
 
-def declarations(text: str) -> dict[str, str]:
-    """Returns the properties of a style."""
-    pairs = (one.partition(":")[::2] for one in text.split(";"))
-    return {key.strip().lower(): value.strip() for key, value in pairs if value.strip()}
+def declarations(text: str) -> tuple[dict[str, str], dict[str, str]]:
+    """Returns the properties of a style, and the important ones."""
+    found: tuple[dict, dict] = {}, {}
+    for key, _, value in (one.partition(":") for one in text.split(";")):
+        value, mark, _ = value.partition("!important")
+        if value.strip():
+            found[bool(mark)][key.strip().lower()] = value.strip()
+    return found
 
 
 def is_painted(paint: str, opacity: str) -> bool:
@@ -152,7 +160,7 @@ class _Reader:
         self.scale, self.marks = np.array((scale, -scale)), marks
         self.shapes: dict[str, list[BaseGeometry]] = {key: [] for key in marks}
         self.unread: Counter[str] = Counter()
-        self.n_characters = self.n_shapes = self.n_corners = self.work = 0
+        self.n_characters = self.n_shapes = self.n_corners = self.meetings = self.work = 0
         self.ids, self.rules = {}, []
         for element in root.iter():
             self.ids.setdefault(element.get("id"), element)
@@ -162,13 +170,13 @@ class _Reader:
         self._visit(root, _Place(Matrix(), INHERITED, 1.0, "", (0, 0), None, ()))
 
     def _add_rules(self, text) -> None:
-        for selectors, body in RULE.findall(re.sub(r"/\*.*?\*/|<!--|-->|@import[^;]*;", "", text)):
+        text = re.sub(r"/\*.*?\*/|<!--|-->", "", text, flags=re.S)
+        for selectors, body in RULE.findall(MEDIA.sub("", text)):
             for selector in selectors.split(","):
                 words = re.sub(r"\s*>\s*", " >", selector.strip()).split()
                 parts = [COMPOUND.fullmatch(word) for word in words]
                 if not parts or None in parts:
-                    if not selector.strip().startswith("@font-face"):
-                        self.unread[f"the style {selector.strip()[:40]!r}"] += 1
+                    self.unread[f"the style {selector.strip()[:40]!r}"] += 1
                     continue
                 found = [(p[1], p[2], re.findall(r"[.#][\w-]+", p[3])) for p in parts if p]
                 names = [name for *_, names in found for name in names]
@@ -182,14 +190,9 @@ class _Reader:
         sheets = [body for _, parts, body in self.rules if _matches(parts, chain)]
         sheets.append(declarations(element.get("style") or ""))
         found = {**element.attrib}
-        for body in sheets:
-            found |= {k: v for k, v in body.items() if "!important" not in v}
-        for body in sheets:
-            found |= {
-                k: v.partition("!important")[0].strip()
-                for k, v in body.items()
-                if "!important" in v
-            }
+        for is_important in (False, True):
+            for body in sheets:
+                found |= body[is_important]
         return found
 
     def _visit(self, element, place, box=None) -> None:
@@ -213,14 +216,9 @@ class _Reader:
         if once["display"] == "none":
             return
         opacity = place.opacity * length(once["opacity"], 1)
-        kind = next(
-            (key for key, mark in self.marks.items() if is_marked(element, mark)), place.kind
-        )
-        matrix, size, clip = (
-            transform(once["transform"], place.matrix, place.size),
-            place.size,
-            place.clip,
-        )
+        marked = [key for key, mark in self.marks.items() if is_marked(element, mark)]
+        kind, size, clip = (*marked, place.kind)[0], place.size, place.clip
+        matrix = transform(once["transform"], place.matrix, size)
 
         def of(key, default: Any = 0) -> float:
             axis = next((letter for letter in key if letter in "xywh"), "r")
@@ -228,35 +226,25 @@ class _Reader:
             return length(str(own.get(key, default)), whole)
 
         if name in ("svg", "symbol"):
-            view = own.get("viewBox")
-            numbers = safe.numbers(view) if view else []
-            if len(numbers) == 4 and min(numbers[2:]) <= 0:
+            own |= box or {}
+            x, y = (of(key) if name == "svg" else 0.0 for key in "xy")
+            width, height = (of(key, "100%") for key in ("width", "height"))
+            view = safe.numbers(own.get("viewBox", "")) or [0.0, 0.0, width, height]
+            if len(view) != 4 or place.chain and min(width, height, *view[2:]) <= 0:
                 return
             if place.chain:  # the root's own units are the drawing's
-                own |= box or {}
-                x, y, width, height = (
-                    *(of(key) if name == "svg" else 0.0 for key in "xy"),
-                    *(of(key, "100%") for key in ("width", "height")),
-                )
                 if once["overflow"] in ("hidden", "scroll", "clip"):
-                    frame = np.array(
-                        [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-                    )
-                    visible = shapely.Polygon(apply(matrix, frame) * self.scale)
+                    corners = shapely.get_coordinates(shapely.box(x, y, x + width, y + height))
+                    visible = shapely.Polygon(apply(matrix, corners) * self.scale)
                     clip = visible if clip is None else clip & visible
-                moved = f"translate({x}, {y})"
-                if len(numbers) == 4:
-                    aspect = own.get("preserveAspectRatio")
-                    moved = Viewbox.viewbox_transform(x, y, width, height, *numbers, aspect)
-                matrix, size = transform(moved, matrix), (width, height)
-            elif len(numbers) != 4:
-                size = of("width", 100), of("height", 100)
-            size = (numbers[2], numbers[3]) if len(numbers) == 4 else size
+                aspect = own.get("preserveAspectRatio")
+                moved = Viewbox.viewbox_transform(x, y, width, height, *view, aspect)
+                matrix = transform(moved, matrix)
+            size = view[2], view[3]
         place = _Place(matrix, style, opacity, kind, size, clip, chain)
         if name == "use":
-            target = self.ids.get(
-                next((own[k][1:] for k in HREFS if own.get(k, "")[:1] == "#"), None)
-            )
+            href = next((own[key] for key in HREFS if key in own), "")
+            target = self.ids.get(href[1:]) if href[:1] == "#" else None
             if target is None:
                 self.unread["use of what is not in the file"] += bool(kind)
                 return
@@ -281,9 +269,20 @@ class _Reader:
         if area < 1e-12 or not lines:
             return
         self.unread.update(key for key, value in UNREAD.items() if style[key] not in (value, "0"))
+        self.n_shapes += 1
+        self.n_corners += sum(len(line) for line, _ in lines)
+        if self.n_shapes > MAX_SHAPES or self.n_corners > outlines.MAX_CORNERS:
+            raise ValueError(
+                f"it marks more than {MAX_SHAPES:,} shapes, or {outlines.MAX_CORNERS:,} corners"
+            )
+        drawn = [shapely.LineString([*line, line[0]]) for line, _ in lines]
         if is_painted(style["fill"], style["fill-opacity"]):
             rings = [metres(line) for line, _ in lines if len(line) > 2]
-            shapes += outlines.area_of(rings, style["fill-rule"] == "evenodd")
+            first = shapely.Polygon(rings[0] if rings else None)
+            if len(rings) > 1 or not first.is_valid:
+                self.meetings = outlines.check_meetings(drawn, self.meetings)
+                first = outlines.area_of(rings, style["fill-rule"] == "evenodd")
+            shapes.append(first)
         width = length(style["stroke-width"], float(np.hypot(*place.size)) / 2**0.5)
         if width > 0 and is_painted(style["stroke"], style["stroke-opacity"]):
             size = self.scale[0] * (1 if is_fixed else area**0.5)
@@ -293,13 +292,11 @@ class _Reader:
                 join_style=JOINS.get(style["stroke-linejoin"], "mitre"),
                 mitre_limit=max(1.0, length(style["stroke-miterlimit"], 1)),
             )
+            self.meetings = outlines.check_meetings(drawn, self.meetings)
             for line, is_closed in lines:
                 line = apply(place.matrix, line) if is_fixed else line
                 closes = is_closed and len(np.unique(line, axis=0)) > 2
-                drawn = shapely.LinearRing(line) if closes else shapely.LineString(line)
-                if len(line) > 200:
-                    outlines.check_meetings([drawn])
-                stroke = drawn.buffer(**pen)
+                stroke = (shapely.LinearRing if closes else shapely.LineString)(line).buffer(**pen)
                 if is_fixed:
                     shapes.append(shapely.transform(stroke, lambda p: p * self.scale))
                 else:
@@ -307,12 +304,6 @@ class _Reader:
         if place.clip is not None:
             shapes = [shape & place.clip for shape in shapes]
         self.shapes[place.kind] += [shape for shape in shapes if not shape.is_empty]
-        self.n_shapes += 1
-        self.n_corners += int(shapely.get_num_coordinates(shapes).sum())
-        if self.n_shapes > MAX_SHAPES or self.n_corners > outlines.MAX_CORNERS:
-            raise ValueError(
-                f"it marks more than {MAX_SHAPES:,} shapes, or {outlines.MAX_CORNERS:,} corners"
-            )
 
     def _outline(self, name, own, of) -> list[tuple[np.ndarray, bool]]:
         """Returns the lines (P, 2) of a shape, and whether each is closed; none for a group."""
@@ -320,9 +311,8 @@ class _Reader:
             x, y, width, height = (of(key) for key in ("x", "y", "width", "height"))
             if width <= 0 or height <= 0:
                 return []
-            rx, ry = own.get("rx", own.get("ry", "0")), own.get("ry", own.get("rx", "0"))
-            own |= {"rx": rx, "ry": ry}
-            rx, ry = min(of("rx"), width / 2), min(of("ry"), height / 2)
+            rx, ry = of("rx", own.get("ry", 0)), of("ry", own.get("rx", 0))
+            rx, ry = min(rx, width / 2), min(ry, height / 2)
             if rx <= 0 or ry <= 0:
                 corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
                 return [(np.array(corners), True)]
