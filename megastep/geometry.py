@@ -62,9 +62,8 @@ def centers(indices: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.
 
 
 def indices(coords: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.ndarray:
-    """Returns the cells of points: (i, j), (..., 2) int64, for (x, y) in metres, (..., 2).
-
-    The inverse of `centers`. Points outside the masks give indices outside `shape`.
+    """Returns the cells of points: (i, j), (..., 2) int64, for (x, y) in metres, (..., 2). Points
+    outside the masks give indices outside `shape`.
     """
     cells = np.floor(np.asarray(coords, np.float64) / res).astype(np.int64)
     return np.stack([shape[0] - 1 - cells[..., 1], cells[..., 0]], -1)
@@ -158,9 +157,7 @@ def masks(
 
 
 def _array(g, key, kinds, shape) -> np.ndarray:
-    """Returns entry `key` of a geometry as an array. It must be of one of numpy's `kinds` and of
-    `shape`, in which None stands for any length.
-    """
+    """Returns entry `key` of a geometry, of one of numpy's `kinds` and of `shape`; None is any."""
     if key not in g:
         raise ValueError(f"has no '{key}'")
     value = np.asarray(g[key])
@@ -175,9 +172,7 @@ def _array(g, key, kinds, shape) -> np.ndarray:
 
 
 def _coordinates(g, key, shape, limit) -> np.ndarray:
-    """Returns points of a geometry as float32. They must be finite, above 0, within the extent, and
-    at most `limit`.
-    """
+    """Returns points as float32: finite, above 0, within the extent, and at most `limit`."""
     given = _array(g, key, "iuf", shape)
     if len(given) > limit:
         raise ValueError(f"has {len(given):,} {key}, but the limit is {limit:,}")
@@ -237,14 +232,13 @@ def mirror_image(g: dotdict) -> dotdict:
     """
     g = validate_geometry(dotdict(g))
     width = g.masks.shape[1] * g.res
-    segments = {key: g[key] for key in ("walls", "lights", "doors") if key in g}
-    furthest = max(points[..., 0].max(initial=0) for points in segments.values())
+    mirrored = {key: g[key].copy() for key in ("walls", "lights", "doors") if key in g}
+    furthest = max(points[..., 0].max(initial=0) for points in mirrored.values())
     if furthest >= width:
         raise ValueError(
             f"geometry {g.id} has no mirror image: a wall or light is at x = {furthest:g} m, but "
             f"its masks end at {width:g} m"
         )
-    mirrored = {key: points.copy() for key, points in segments.items()}
     for points in mirrored.values():
         points[..., 0] = width - points[..., 0]
     cells = np.ascontiguousarray(g.masks[:, ::-1])
@@ -271,16 +265,9 @@ def display(g: dotdict, ax: "Axes | None" = None) -> "Axes":
     tints[g.masks < 0] = 0.92
     ax.imshow(tints, extent=(0, width * g.res, 0, height * g.res), interpolation="nearest")
     ax.add_collection(collections.LineCollection(g.walls, colors="k", linewidths=1))
-    ax.scatter(
-        g.lights[:, 0], g.lights[:, 1], c="gold", s=12, edgecolors="k", linewidths=0.3, zorder=3
-    )
-    ax.set(
-        xlim=(0, width * g.res),
-        ylim=(0, height * g.res),
-        aspect="equal",
-        xlabel="x, m",
-        ylabel="y, m",
-    )
+    ax.scatter(*g.lights.T, c="gold", s=12, edgecolors="k", linewidths=0.3, zorder=3)
+    ax.set(xlim=(0, width * g.res), ylim=(0, height * g.res))
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m")
     return ax
 
 

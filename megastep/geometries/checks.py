@@ -62,30 +62,24 @@ def _crosses(ends) -> bool:
     """True if two walls cross at a point that is inside both, or lie on one another for more than a
     point.
     """
-    starts, vectors = ends[:, :2], ends[:, 2:] - ends[:, :2]
-    lengths = np.hypot(*vectors.T)
-    units = vectors / lengths[:, None]
+    starts, stops = ends[:, 0] + 1j * ends[:, 1], ends[:, 2] + 1j * ends[:, 3]  # x + iy
+    lengths = np.abs(stops - starts)
+    units = (stops - starts) / lengths
     for low in range(0, len(ends), CHUNK):
-        part = slice(low, low + CHUNK)
-        # a wall further on begins further right
-        stop = np.searchsorted(ends[:, 0], ends[part, 2].max() + NEAR)
-        others = slice(low, stop)
-        sine = units[part, None, 0] * units[others, 1] - units[part, None, 1] * units[others, 0]
-        x, y = np.moveaxis(starts[others] - starts[part, None], -1, 0)
-        is_parallel = np.abs(sine) < PARALLEL
-        sine = np.where(is_parallel, 1, sine)
-        along = (x * units[others, 1] - y * units[others, 0]) / sine
-        across = (x * units[part, None, 1] - y * units[part, None, 0]) / sine
-        is_crossing = (along > NEAR) & (along < lengths[part, None] - NEAR)
-        is_crossing &= (across > NEAR) & (across < lengths[others] - NEAR) & ~is_parallel
-        # parallel ones: both ends of the other, along this wall and beside it
-        beside = np.abs(x * units[part, None, 1] - y * units[part, None, 0])
-        first = x * units[part, None, 0] + y * units[part, None, 1]
-        cosine = units[part, None, 0] * units[others, 0] + units[part, None, 1] * units[others, 1]
-        second = first + cosine * lengths[others]
-        shared = np.minimum(np.maximum(first, second), lengths[part, None])
-        shared -= np.maximum(np.minimum(first, second), 0)
-        is_overlap = is_parallel & (beside < NEAR) & (shared > NEAR)
+        # of others, of which those further on begin further right, as walls of this chunk see them
+        own = slice(low, low + CHUNK)
+        others = slice(low, np.searchsorted(ends[:, 0], ends[own, 2].max() + NEAR))
+        first = (starts[others] - starts[own, None]) * units[own, None].conj()
+        way = units[others] * units[own, None].conj()
+        is_parallel = np.abs(way.imag) < PARALLEL
+        reach = -first.imag / np.where(is_parallel, 1, way.imag)  # on the other, to this one's line
+        along = first.real + reach * way.real
+        is_crossing = (along > NEAR) & (along < lengths[own, None] - NEAR) & ~is_parallel
+        is_crossing &= (reach > NEAR) & (reach < lengths[others] - NEAR)
+        last = first.real + way.real * lengths[others]
+        shared = np.minimum(np.maximum(first.real, last), lengths[own, None])
+        shared -= np.maximum(np.minimum(first.real, last), 0)
+        is_overlap = is_parallel & (np.abs(first.imag) < NEAR) & (shared > NEAR)
         np.fill_diagonal(is_overlap, False)
         if (is_crossing | is_overlap).any():
             return True

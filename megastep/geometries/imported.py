@@ -40,15 +40,8 @@ def prepare() -> None:
 
 
 def write(name: str, plans: Sequence[dotdict], files: Sequence[int]) -> tuple[Path, str]:
-    """Writes a database, atomically. Returns its path and sha256.
-
-    Args:
-        name: of the source.
-        plans: its geometries.
-        files: the number of the file that each is from.
-
-    Raises:
-        OSError: if the folder cannot be written.
+    """Writes the database of a source, atomically: its plans, and the number of the file that each
+    is from. Returns its path and sha256. Raises OSError if the folder cannot be written.
     """
     content = database.pack(plans, zipfile.ZIP_DEFLATED, files=np.array(files, "<i4"))
     digest = hashlib.sha256(content).hexdigest()
@@ -70,10 +63,8 @@ def _arrays(name, listing, modified) -> database.Arrays:
 
 
 def pick(name: str, n: int, split: str, seed: int) -> list[dotdict]:
-    """Returns n geometries of an imported database; all of a file are in the same split.
-
-    Raises:
-        ValueError: if it was not imported, or is damaged.
+    """Returns n geometries of an imported database; all of a file are in the same split. Raises
+    ValueError if it was not imported, or is damaged.
     """
     listing = folder() / f"{name}.sha256"
     if not listing.exists():

@@ -66,10 +66,6 @@ def test_the_test_split_is_a_tenth(name, total, test):
     assert ids["test"][test : 2 * test] == ids["test"][:test], "repeated if n exceeds the split"
 
 
-def test_the_test_split_of_homes_is_the_last_seeds():
-    assert sorted(g.id for g in geometries.sample("homes", 500, "test")) == list(range(4500, 5000))
-
-
 def rooms(n=4, split="training", seed=1, longest=9.0):
     """A source of one's own: n rooms, 5 m to `longest` wide."""
     widths = np.random.default_rng([seed, split == "test"]).uniform(5, longest, n)
@@ -221,12 +217,6 @@ def test_save_and_load(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["some.npz"]
     (g,) = geometries.sample("files", 1, "all", path=path)
     assert g.id in [g.id for g in saved]
-
-
-def test_a_single_geometry_is_in_every_split(tmp_path):
-    files.save(tmp_path / "one.npz", [toys.box()])
-    for split in geometries.SPLITS:
-        assert len(geometries.sample("files", 2, split, path=tmp_path / "one.npz")) == 2
 
 
 def test_a_changed_file_is_loaded_again(tmp_path):

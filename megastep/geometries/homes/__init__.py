@@ -89,17 +89,15 @@ def generate(seed: int, density: float = 1, clutter: float = 0) -> dotdict:
 
     Args:
         seed: any integer.
-        density: from 1 to 3, at which a home has about three times as many walls: more
-            rooms, narrower doors and corridors, fewer openings without a door, furniture, and
-            lights off the middle of their rooms.
-        clutter: from 0 to 1, at which many pieces of furniture leave narrow gaps, 24 to 46 cm wide:
-            to walls, to other furniture, and in doorways, which they half block.
+        density: from 1 to 3, at which a home has about three times as many walls: more rooms,
+            narrower doors, fewer openings without one, furniture, lights off the middle of rooms.
+        clutter: from 0 to 1, at which much of the furniture leaves gaps of 24 to 46 cm to walls, to
+            other furniture, and in doorways.
 
     Returns:
         A geometry with further keys: `rooms`, the kind of each room in the order of the masks'
-        numbers; `areas`, their clear areas in m2; `doors` and `openings`, (K, 2, 2) float32, the
-        segments in metres across the gaps with and without a door; `n_outer`, the number of walls,
-        the last ones, that are the envelope's outer face.
+        numbers; `areas`, their clear areas in m2; `openings`, as `doors` where is none; `n_outer`,
+        the number of walls, the last ones, that are the envelope's outer face.
     """
     generator, style = PortableGenerator(seed), plan.style(density, clutter)
     _, footprint, rooms, meetings, depth, gaps = _best_plan(generator, style)

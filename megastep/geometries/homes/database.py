@@ -103,11 +103,8 @@ def pack(
 def unpack(
     content: bytes, n_homes: int, remedy: str = REMEDY, further: Sequence[str] = ()
 ) -> Arrays:
-    """Returns a database, with `further` arrays.
-
-    Raises:
-        ValueError: for one that is larger than `n_homes` homes can be, before it is unpacked, or
-            cannot be read. The message ends with the remedy.
+    """Returns a database, with `further` arrays. Raises ValueError, which ends with the remedy, for
+    one that cannot be read, or would unpack to more than `n_homes` homes can have.
     """
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
@@ -125,10 +122,8 @@ def unpack(
 def read(
     listing: Path, n_homes: int, what: str, remedy: str, further: Sequence[str] = ()
 ) -> Arrays:
-    """Returns the database that `listing`, a file of its sha256 and its name, lies beside.
-
-    Raises:
-        ValueError: saying of `what` that it cannot be read or has another sha256, and the remedy.
+    """Returns the database that `listing`, a file of its sha256 and its name, lies beside. Raises
+    ValueError, saying of `what` that it cannot be read or has another sha256, and the remedy.
     """
     try:
         digest, name = listing.read_text().split()

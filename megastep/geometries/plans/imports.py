@@ -108,16 +108,8 @@ def run(
     options: Options, path: Path, show: Callable[[int], None], processes: int | None = None
 ) -> tuple[list[Plan], list[safe.Member]]:
     """Returns the plans of all files of an archive, folder or file, sorted by name, and the first
-    files that are plans.
-
-    Args:
-        options: how they are read.
-        path: the archive, folder or file.
-        show: called with the number of files that are read.
-        processes: that read in parallel; None: one per core.
-
-    Raises:
-        ValueError: if there is no file, it is damaged, or none of the files is a plan.
+    files that are plans. `show` is called with the number of files that are read, by as many
+    `processes`; None: one per core. Raises ValueError if none is a plan, or one is damaged.
     """
     n_processes = loky.cpu_count() if processes is None else processes
     suffix = READERS[options.source].SUFFIX

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -15,32 +14,25 @@ from megastep.dotdict import dotdict
 from megastep.geometries.plans import outlines
 from megastep.geometries.plans.outlines import Drawing
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 COLUMNS = 4  # pairs in a row
 COLOURS = {"outdoors": "#cfe8cf", "rooms": "#f3e2b8", "walls": "#555555", "doors": "#d62728"}
 
 
-def draw(drawing: Drawing, ax: "Axes") -> None:
+def _draw(drawing, ax) -> None:
     """Draws the polygons of a floor plan: rooms yellow, walls grey, doors red."""
-    shapes = dict(drawing._asdict())
-    if drawing.floor is not None:
-        shapes["rooms"] = [drawing.floor, *shapes["rooms"]]
+    floor = [drawing.floor] if drawing.floor is not None else []
+    shapes = drawing._replace(rooms=[*floor, *drawing.rooms])
     for key, colour in COLOURS.items():
-        for shape in shapes[key]:
-            for part in outlines.polygons(shape):
-                rings = [np.array(r.coords) for r in (part.exterior, *part.interiors)]
-                path = Outline.make_compound_path(*(Outline(r, closed=True) for r in rings))
-                ax.add_patch(PathPatch(path, facecolor=colour, edgecolor="k", linewidth=0.3))
+        for part in (part for shape in getattr(shapes, key) for part in outlines.polygons(shape)):
+            rings = [np.array(r.coords) for r in (part.exterior, *part.interiors)]
+            path = Outline.make_compound_path(*(Outline(r, closed=True) for r in rings))
+            ax.add_patch(PathPatch(path, facecolor=colour, edgecolor="k", linewidth=0.3))
     ax.set_aspect("equal")
     ax.autoscale_view()
 
 
 def write(
-    path: Path,
-    pairs: Sequence[tuple[str, "Drawing | np.ndarray", dotdict]],
-    columns: int = COLUMNS,
+    path: Path, pairs: Sequence[tuple[str, Drawing | np.ndarray, dotdict]], columns: int = COLUMNS
 ) -> None:
     """Writes a sheet of (title, drawing or image, geometry), `columns` in a row, as an image.
 
@@ -54,13 +46,11 @@ def write(
     axes = figure.subplots(rows, 2 * columns, squeeze=False)
     for ax in axes.flat:
         ax.set_axis_off()
-    for (title, original, g), left, right in zip(
-        pairs, axes.reshape(-1, 2)[:, 0], axes.reshape(-1, 2)[:, 1]
-    ):
+    for (title, original, g), (left, right) in zip(pairs, axes.reshape(-1, 2)):
         if isinstance(original, np.ndarray):
             left.imshow(original)
         else:
-            draw(original, left)
+            _draw(original, left)
         geometry.display(g, right)
         for line in g.get("doors", ()):
             right.plot(*line.T, color="#d62728", linewidth=1.5)

@@ -69,7 +69,7 @@ class _Place(NamedTuple):
 def read(
     content: bytes, scale: float, walls: str = "wall", doors: str = "door"
 ) -> tuple[Drawing, list[str]]:
-    """Returns the drawing of an SVG, and what of it is not read.
+    """Returns the drawing of an SVG, and what of it is not read. Raises ValueError.
 
     Args:
         content: of the file.
@@ -77,9 +77,6 @@ def read(
         walls: the mark of walls: an id, perhaps followed by a number, a word of the class, or a
             label of Inkscape or Illustrator.
         doors: the mark of doors, in gaps of the walls or upon them.
-
-    Raises:
-        ValueError: saying what is wrong with the file.
     """
     reader = _Reader(safe.svg(content), scale, {"walls": walls, "doors": doors})
     if not reader.shapes["walls"]:
