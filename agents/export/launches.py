@@ -14,7 +14,7 @@ from megastep.agents.errors import UserError
 from megastep.agents.networks.continuous_outputs import BetaOutput, GaussianOutput
 from megastep.agents.networks.cores import CORES, GRU, Feedforward, Stack
 from megastep.agents.networks.duelling_output import DuellingOutput
-from megastep.agents.networks.encoders import ENCODERS, Cnn, Conv, Flat, OneHot
+from megastep.agents.networks.intakes import ENCODERS, Cnn, Conv, Flat, OneHot
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
 from megastep.agents.networks.outputs import MultiDiscreteOutput

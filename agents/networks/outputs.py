@@ -108,23 +108,24 @@ class _Terms(torch.autograd.Function):
         actions = actions.flatten(0, -2).long().contiguous()
         ctx.save_for_backward(logits, actions)
         results = logits.new_empty(2, len(logits))
-        _launch_terms("", logits, actions, logprobs=results[0], entropies=results[1])
+        _launch_terms("", logits, actions, results[0], results[1], None)
         return tuple(each.view(lead) for each in results)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_logprobs, d_entropies) -> tuple[torch.Tensor, None]:
         logits, actions = ctx.saved_tensors
-        d = dict(d_logprobs=d_logprobs.contiguous(), d_entropies=d_entropies.contiguous())
         d_logits = torch.empty_like(logits)
-        _launch_terms("_backward", logits, actions, **d, d_logits=d_logits)
+        of = d_logprobs.contiguous(), d_entropies.contiguous(), d_logits
+        _launch_terms("_backward", logits, actions, *of)
         return d_logits.unflatten(0, d_logprobs.shape), None
 
 
-def _launch_terms(direction, logits, actions, **fields) -> None:
-    sizes = dict(zip(("n_rows", "n_agents", "n_choices"), logits.shape))
+def _launch_terms(direction, logits, actions, logprobs, entropies, d_logits) -> None:
+    fields = dict(logits=logits, actions=actions, logprobs=logprobs, entropies=entropies)
+    fields |= dict(zip(("n_rows", "n_agents", "n_choices"), logits.shape), d_logits=d_logits)
     where = LIBRARY, f"categorical_terms{direction}", logits.device, len(logits)
-    launch(*where, logits=logits, actions=actions, **fields, **sizes)
+    launch(*where, **fields)
 
 
 class MultiDiscreteOutput(Output):

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
-from megastep.agents.networks import cores, encoders, heads, running_norm
+from megastep.agents.networks import cores, heads, intakes, running_norm
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
@@ -50,7 +50,7 @@ class Policy(nn.Module):
         width: units of the recurrent core and of all features.
         core: a name in `cores.CORES`, or an import path.
         layers: recurrent cores, stacked with residual connections.
-        encoder: encoder of images, a name in `encoders.ENCODERS`, or an import path.
+        encoder: encoder of images, a name in `intakes.ENCODERS`, or an import path.
         activation: of the intake, and of the hidden layer of the core "none": "relu" or "tanh".
         output: "softmax" samples actions by their probabilities, continuous ones too; "duelling"
             takes the action of the highest value.
@@ -82,7 +82,7 @@ class Policy(nn.Module):
         width: Annotated[int, Field(ge=1, le=8192)] = 256,
         core: Annotated[str, _name_in(cores.CORES)] = "lstm",
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
-        encoder: Annotated[str, _name_in(encoders.ENCODERS)] = "linear",
+        encoder: Annotated[str, _name_in(intakes.ENCODERS)] = "linear",
         activation: Literal["relu", "tanh"] = "relu",
         output: Literal["softmax", "duelling"] = "softmax",
         continuous: Literal["gaussian", "beta"] = "gaussian",

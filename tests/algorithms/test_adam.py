@@ -89,28 +89,3 @@ def test_skipped_step_changes_nothing():
     assert all(map(torch.equal, skipping, plain))
     assert first.n_steps == second.n_steps == 2
     assert all(map(torch.equal, first.squares, second.squares))
-
-
-def test_parameters_without_gradient_are_skipped():
-    params, frozen = parameters(), torch.nn.Parameter(torch.ones(2), requires_grad=False)
-    adam, alone = Adam([frozen, *params], torch.tensor(0.1)), Adam(parameters(), torch.tensor(0.1))
-    for seed in range(2):
-        set_gradients(params, alone.parameters, seed=seed)
-        adam.step(YES)
-        alone.step(YES)
-    assert frozen.tolist() == [1, 1] and all(map(torch.equal, params, alone.parameters))
-
-
-def test_state_dict_resumes():
-    params, resumed = parameters(), parameters()
-    first = Adam(params, torch.tensor(0.1))
-    set_gradients(params, seed=0)
-    first.step(YES)
-    second = Adam(resumed, torch.tensor(0.1))
-    second.load_state_dict(first.state_dict())
-    for target, source in zip(resumed, params):
-        target.data.copy_(source.data)
-    set_gradients(params, resumed, seed=1)
-    first.step(YES)
-    second.step(YES)
-    assert all(map(torch.equal, params, resumed))

@@ -223,7 +223,7 @@ def test_a_schedule_needs_a_budget_and_the_learning_rate_one_master(here, capsys
 # ---- Optimizers ----
 
 
-@pytest.mark.parametrize("name", ["adam", "adamw", "torch.optim:RMSprop"])
+@pytest.mark.parametrize("name", ["adam", "torch.optim:RMSprop"])
 def test_optimizers_learn_and_resume_bit_for_bit(name):
     settings = dict(optimizer=name, weight_decay=0.01, desired_kl=0.01)
     policy, learner, collect = make(**settings)

@@ -5,7 +5,6 @@ import torch
 
 from megastep import contract, spaces
 from megastep.agents.cli import evaluate, train
-from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
 from tests.helpers.learners import LEARNERS
@@ -101,23 +100,6 @@ def test_the_loss_is_of_the_policy_that_acted(kind, space):
     assert abs(float(ratio)) < 1e-6
     if space is MOVES:
         assert 0 < losses[kind == "vtrace"]["loss/entropy"] < 2 * torch.tensor(3.0).log()
-
-
-@pytest.mark.parametrize("output", ["softmax", "duelling"])
-def test_gradients_of_forbidden_actions_are_zero(output):
-    policy = Policy(Forbidding.obs_space, MOVES, width=8, output=output)
-    world = Forbidding().reset()
-    obs, reset = world.obs[None], world.reset[None]
-    out = policy.unroll(obs, reset, policy.initial(B), mask=world.mask[None])
-    logits = out.logits[0]
-    assert bool((logits[~world.mask] < -1e8).all())
-    logits.retain_grad()
-    best = logits.argmax(-1)
-    assert bool(world.mask.gather(-1, best[..., None]).all())
-    if output == "softmax":
-        total = logits.exp().sum(-1)
-        torch.testing.assert_close(total, torch.ones_like(total))
-        assert policy.output.entropy(logits).isfinite().all()
 
 
 def test_random_actions_are_allowed_ones_and_uniform():

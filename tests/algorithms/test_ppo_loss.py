@@ -94,14 +94,3 @@ def test_gae_on_a_gpu_takes_other_layouts_and_float64(change, to_gpu):
         torch.testing.assert_close(
             other[name].cpu().to(leaf.dtype), leaf, rtol=1e-5, atol=1e-5, check_stride=False
         )
-
-
-def test_fused_loss_takes_other_layouts(to_gpu):
-    leaves, batch, scale, settings = case(to_gpu, 0.3, True)
-    results = []
-    for change in (torch.Tensor.contiguous, transposed):
-        inputs = [change(leaf.detach()).requires_grad_() for leaf in leaves]
-        loss, _ = loss_of(inputs, batch.map(change), scale, settings)
-        results.append([loss.detach(), *torch.autograd.grad(loss, inputs)])
-    for one, other in zip(*results, strict=True):
-        assert torch.equal(one, other)

@@ -95,15 +95,6 @@ def test_no_learning_before_first_whole_sequence():
     assert not torch.equal(weights(learner.policy), before) and learner.n_taken == 4
 
 
-def test_learning_waits_for_replay_start():
-    learner, collect = make(replay=ReplaySettings(capacity=6 * T * B, burn_in=3, start=4 * T * B))
-    taken = []
-    for _ in range(5):
-        update(learner, collect, 1)
-        taken.append(learner.n_taken.item())
-    assert taken == [0, 0, 0, 4, 8]
-
-
 def by_hand(learner, batch, m, gamma, n, eta):
     """Computes step by step, for sequence m: the errors after the burn-in, whether they are valid,
     and the priority.
@@ -263,10 +254,7 @@ def test_train_resume_evaluate_and_init(tmp_path, monkeypatch):
         (["agent.output=softmax"], "agent.output=duelling"),
         (["learner.replay.burn_in=9", "learner.replay.length=9"], "replay.burn_in=9"),
         (["learner.replay.capacity=30"], "replay.capacity=30"),
-        (["learner.replay.capacity=1e12"], "learner.replay.capacity"),
         (["learner.gradient_steps=1000"], "fewer gradient_steps"),
-        (["learner.replay.images=fp8"], "learner.replay.images: 'fp8'"),
-        (["learner.replay.capaciti=9"], "did you mean learner.replay.capacity?"),
     ],
 )
 def test_command_line_refuses_bad_settings(words, cure, tmp_path, monkeypatch, capsys):

@@ -64,19 +64,6 @@ def test_actions_do_not_depend_on_privileged(name):
     assert len(first.actions.unique()) == 3
 
 
-def test_actor_has_no_gradient_to_privileged():
-    policy = policy_of()
-    privileged = values_of(PRIVILEGED, B).map(torch.Tensor.requires_grad_)
-    decision, _ = policy(world_of(privileged), policy.initial(B))
-    for output in (decision.logits, decision.logprobs, decision.features):
-        grads = torch.autograd.grad(
-            output.sum(), list(privileged.values()), retain_graph=True, allow_unused=True
-        )
-        assert grads == (None, None)
-    value = policy.value(decision.features, privileged)
-    assert all(grad.any() for grad in torch.autograd.grad(value.sum(), list(privileged.values())))
-
-
 def test_actor_gradient_does_not_reach_critic():
     policy = policy_of()
     decision, _ = policy(world_of(values_of(PRIVILEGED, B)), policy.initial(B))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.networks import encoders, heads, intakes, running_norm
+from megastep.agents.networks import heads, intakes, running_norm
 from megastep.agents.networks.fused import plain_operations
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.arrdict import arrdict
@@ -28,7 +28,7 @@ def random_obs(space, *lead, seed=0, dtype=torch.float32):
     return space.map(leaf) if isinstance(space, dict) else leaf(space)
 
 
-@pytest.mark.parametrize("encoder", encoders.ENCODERS)
+@pytest.mark.parametrize("encoder", intakes.ENCODERS)
 @pytest.mark.parametrize(
     "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
 )
@@ -39,7 +39,7 @@ def test_intake_shape(space, encoder, lead):
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
-@pytest.mark.parametrize("encoder", encoders.ENCODERS)
+@pytest.mark.parametrize("encoder", intakes.ENCODERS)
 def test_every_pixel_and_leaf_has_a_gradient(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)

@@ -13,8 +13,6 @@ from megastep.agents.networks import heads
 from megastep.agents.networks import linear as linear_module
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.fused import plain_operations
-from megastep.agents.networks.policy import Policy
-from megastep.arrdict import arrdict
 
 BF16 = torch.bfloat16
 NAMES = "logprobs", "entropies", "errors", "values", "d features"
@@ -125,17 +123,3 @@ def test_value_without_a_gradient_matches_the_plain_form():
             fused = critic(features, privileged)
     assert fused.dtype == torch.float32 and fused.shape == (5, 9)
     torch.testing.assert_close(fused, plain, rtol=0, atol=0.02 * plain.abs().max().item())
-
-
-@pytest.mark.cuda
-def test_other_heads_are_not_fused():
-    moves, privileged = spaces.MultiDiscrete(1, 3), spaces.MultiVector(1, 8)
-    features, encoded = torch.randn(2, 3, 64).cuda().to(BF16), torch.randn(2, 3, 8).cuda().to(BF16)
-    policy = Policy(spaces.MultiVector(1, 4), moves, privileged, width=64).cuda()
-    of = policy.output, policy.critic, policy.prediction
-    assert critic_module._fits_joint(*of, features, encoded, None)
-    assert not critic_module._fits_joint(*of, features.float(), encoded, None)
-    assert not critic_module._fits_joint(*of[:2], None, features, encoded, None)
-    for space in (spaces.MultiContinuous(1, 2), arrdict(one=moves)):
-        output = heads.output(space, 64).cuda()
-        assert not critic_module._fits_joint(output, *of[1:], features, encoded, None)

@@ -14,7 +14,7 @@ from megastep.agents.networks import lstm as lstm_module
 from megastep.agents.networks.fused import aligned, launch_units, plain_operations
 from megastep.agents.networks.lstm import IN_STEPS, LSTM, ON_CLUSTERS, ON_CPU, WIDTHS
 from megastep.arrdict import arrdict
-from tests.helpers.recurrent import assert_close, check_captured
+from tests.helpers.recurrent import assert_close
 
 T, B, W = 9, 5, 16
 CLOSE = dict(rtol=1e-5, atol=1e-5)  # float32 sums of 16 products, nine steps deep, in another order
@@ -266,14 +266,6 @@ def test_gates_saturate_and_nan_propagates(where, width):
         )
 
 
-@pytest.mark.cuda
-@pytest.mark.parametrize("bf16", [False, True])
-def test_captured_unroll_matches_steps(bf16):
-    lstm = LSTM(256)
-    slack = SLACK[torch.bfloat16 if bf16 else torch.float32]
-    check_captured(lstm, "cell", slack, bf16)
-
-
 # ---- A whole sequence in one kernel ----
 
 
@@ -356,21 +348,6 @@ def test_sequence_on_chip_cuts_nan_at_resets():
     )
     assert outputs[: n_steps // 2].isnan().any() and outputs[n_steps // 2 :].isfinite().all()
     assert cell.isfinite().all() and d_x[n_steps // 2 :].isfinite().all()
-
-
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
-def test_no_gradient_of_the_last_cell_is_one_of_zeros(device):
-    torch.manual_seed(0)
-    dtype = torch.bfloat16 if device == "cuda" else torch.float32
-    options = dict(dtype=dtype, device=device, requires_grad=True)
-    x, weight = torch.randn(3, 50, 256, **options), torch.randn(1024, 256, **options)
-    bias, states = torch.zeros(1024, **options), torch.zeros(2, 50, 256, device=device).unbind()
-    reset = torch.zeros(3, 50, dtype=torch.bool, device=device)
-    outputs, _, cell = lstm_module.lstm_sequence(x, weight, bias, weight, reset, *states, False)
-    d, leaves = torch.randn_like(outputs), (x, weight, bias)
-    alone = torch.autograd.grad(outputs, leaves, d, retain_graph=True)
-    both = torch.autograd.grad([outputs, cell], leaves, [d, torch.zeros_like(cell)])
-    assert all(map(torch.equal, alone, both))
 
 
 # ---- The kernels of a whole sequence on the CPU ----

@@ -6,16 +6,6 @@ import torch
 from megastep.agents.networks.running_norm import masked_moments, normalise_masked
 
 
-def test_only_valid_numbers_count():
-    x, valid = torch.tensor([1.0, torch.nan, 5.0]), torch.tensor([True, False, True])
-    (of_x, of_double) = masked_moments(valid, x, 2 * x)
-    assert [number.item() for number in of_x] == [2, 3, 4]
-    assert [number.item() for number in of_double] == [2, 6, 16]
-    assert normalise_masked(x, valid, of_x).tolist() == pytest.approx([-1, 0, 1])
-    ((n, mean, variance),) = masked_moments(torch.zeros_like(valid), x)
-    assert (n, mean, variance) == (0, 0, 0)
-
-
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize("shape", [(1,), (3, 5), (2048,), (32, 1000), (7, 70_001)])
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.8, 1.0])

@@ -35,20 +35,6 @@ def act(policy, world, **options):
     return stack(decisions), state
 
 
-@pytest.mark.parametrize("encoder", ["linear", "conv"])
-def test_steps_match_unroll(encoder):
-    policy, world = Policy(OBS, MOVES, width=32, encoder=encoder), worlds()
-    decisions, state = act(policy, world)
-    unrolled = policy.unroll(world.obs, world.reset, policy.initial(B))
-    # the same float32 products over T rows at once and over one row at a time
-    close = dict(rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(decisions.logits.movement, unrolled.logits.movement, **close)
-    torch.testing.assert_close(decisions.features, unrolled.features, **close)
-    torch.testing.assert_close(state.cell, unrolled.state.cell, **close)
-    logprobs = policy.output.logprob(unrolled.logits, decisions.actions)
-    torch.testing.assert_close(decisions.logprobs, logprobs, **close)
-
-
 @pytest.mark.parametrize("layers", [1, 3])
 @pytest.mark.parametrize("core", CORES)
 def test_steps_match_unroll_for_every_core(core, layers):
@@ -86,38 +72,6 @@ def test_burn_in_only_warms_up_the_hidden_state(core, device):
     )
     for one, other in zip(*gradients, strict=True):
         torch.testing.assert_close(one, other, **close)
-
-
-@pytest.mark.parametrize("core", CORES)
-def test_activation_bytes_bound_saved_tensors(core):
-    def saved_bytes(policy):
-        """Returns the bytes saved for the gradient per step and lane."""
-        weights, sizes = {p.data_ptr() for p in policy.parameters()}, {}
-
-        def pack(tensor):
-            if tensor.data_ptr() not in weights:
-                sizes[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-            saved.append(tensor)
-            return tensor
-
-        saved, world = [], worlds()
-        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-            policy.unroll(world.obs, world.reset, policy.initial(B))
-        return sum(sizes.values()) / (T * B)
-
-    policies = [Policy(OBS, MOVES, width=32, core=core, layers=n) for n in (1, 2)]
-    n_saved = saved_bytes(policies[1]) - saved_bytes(policies[0])
-    estimate = policies[1].activation_bytes - policies[0].activation_bytes
-    assert estimate / 8 <= n_saved <= 1.1 * estimate  # resets and the hidden state come on top
-
-
-def test_shapes_of_decision():
-    policy = Policy(OBS, MOVES, width=32)
-    decision, state = policy(worlds()[0], policy.initial(B))
-    assert decision.actions.movement.shape == (B, 1) and decision.logits.fire.shape == (B, 1, 2)
-    value = policy.value(decision.features)
-    assert decision.logprobs.shape == value.shape == (B,) and value.dtype == torch.float32
-    assert state.cell.shape == (B, 32)
 
 
 def test_seed_determines_weights_and_actions():
@@ -170,17 +124,6 @@ def test_generator_resumes():
     # a GPU's state means nothing on a CPU: starts again from the seed
     other.load_state_dict({**saved, "device": "cuda"}, cpu)
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), start)
-
-
-@pytest.mark.cuda
-def test_gpu_generator_resumes_from_state_on_gpu():
-    device = torch.device("cuda", torch.cuda.current_device())
-    generator, other = SeededGenerator(3), SeededGenerator(8)
-    torch.rand(4, device=device, generator=generator.on(device))
-    saved = {**generator.state_dict(), "generator": generator.state_dict()["generator"].to(device)}
-    other.load_state_dict(saved, device)
-    expected = torch.rand(4, device=device, generator=generator.on(device))
-    assert torch.equal(torch.rand(4, device=device, generator=other.on(device)), expected)
 
 
 @pytest.mark.cuda

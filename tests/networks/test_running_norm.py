@@ -42,14 +42,6 @@ def test_masked_lanes_do_not_count():
     assert torch.equal(norm.mean, before) and norm.count == 1
 
 
-def test_batches_have_equal_weight():
-    norm, batches = RunningNorm(spaces.MultiVector(1, 1)), torch.randn(5, 8, 1, 1) * 3 + 2
-    for batch in batches:
-        update(norm, batch)
-    torch.testing.assert_close(norm.mean, batches.mean((0, 1)))
-    torch.testing.assert_close(norm.scale, batches.std((0, 1), correction=0))
-
-
 def test_gpu_adds_the_same_moments_as_the_cpu(to_gpu):
     """Images, vectors, a NaN in a lane that does not count, and another in a leaf of its own."""
     check_gpu(to_gpu, torch.float16)

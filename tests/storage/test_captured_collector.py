@@ -101,20 +101,3 @@ def test_an_array_that_counts_steps_is_refused(monkeypatch):
     graph, messages = collected(env, policy_for(env), monkeypatch)
     assert not isinstance(graph, Graph) and "n_steps changed during the call" in messages[0]
     assert env.n_steps == 3 * 4 and len(messages) == 1
-
-
-def test_generators_and_tensors_are_no_reason(monkeypatch):
-    class Noisy(envs.Minimal):
-        def __init__(self, *args, **settings):
-            super().__init__(*args, **settings)
-            self.generator, self.last = torch.Generator().manual_seed(1), torch.zeros(6)
-
-        def step(self, decision):
-            self.last = torch.rand(6, generator=self.generator)
-            world = super().step(decision)
-            world["reward"] = world.reward + self.last
-            return world
-
-    env = Noisy(6, homes(), device="cpu")
-    graph, messages = collected(env, policy_for(env), monkeypatch)
-    assert isinstance(graph, Graph) and not messages

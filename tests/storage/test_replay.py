@@ -304,15 +304,6 @@ def test_bytes_match_allocated_bytes():
     assert replay.bytes == buffer_of_64_pixels(16, 32).bytes, "also on the device meta"
 
 
-def test_is_ready_after_start():
-    world, is_ready = World(4), []
-    replay = buffer_of(world, 3, length=4, start=4 * 4 * B)
-    for _ in range(6):
-        replay.add(world.next())
-        is_ready.append(replay.is_ready.item())
-    assert is_ready == [False] * 3 + [True] * 3
-
-
 def test_priorities_do_not_change_before_start():
     world, steps = World(4), []
     replay = buffer_of(world, 5, length=4, start=4 * 4 * B, alpha=1.0)

@@ -101,15 +101,6 @@ def test_rows_line_up_with_env(n_rollouts):
         assert torch.equal(rollout.actions.fire[row], env.actions[time].fire)
 
 
-def test_actor_state_is_updated_in_place():
-    env, policy, rollout, actor_state = collected()
-    addresses = [leaf.data_ptr() for leaf in leaves(actor_state)]
-    again = collect(env, policy, rollout, actor_state)
-    assert [leaf.data_ptr() for leaf in leaves(again)] == addresses
-    assert actor_state.world.obs.eye.data_ptr() != env.obs.eye.data_ptr()
-    assert torch.equal(actor_state.world.obs.eye[:, 0, 0, 0, 0], env.label(2 * T))
-
-
 def test_actions_are_stored_as_they_were_chosen():
     """An environment may change the actions that it is given, for example to clip them."""
 

@@ -6,7 +6,6 @@ import torch
 from torch import testing
 
 from megastep.agents.storage.sum_tree import SumTree
-from megastep.capture import Graph
 
 
 def filled(values, device="cpu", **options):
@@ -123,26 +122,3 @@ def test_kernels_match_pytorch(n, to_gpu):
     # sums in another order may select a neighbour
     assert (drawn.cpu() != expected).float().mean() < 0.01
     assert (plain.priorities[drawn.cpu()] > 0).all()
-
-
-@pytest.mark.cuda
-def test_captured_tree_matches_eager():
-    values = torch.rand(5000, device="cuda")
-    results = []
-    for is_captured in (False, True):
-        tree = filled(values.cpu().numpy(), "cuda")
-        generator = torch.Generator("cuda").manual_seed(1)
-        out = torch.zeros(4, 64, dtype=torch.int64, device="cuda")
-
-        def work(tree=tree, generator=generator, out=out):
-            for row in out:
-                row.copy_(tree.draw(64, generator)[0])
-                tree.set(row, tree.probability(row) * 100)
-
-        if is_captured:
-            work = Graph(work, (), (tree, generator, out))
-        for _ in range(3):
-            work()
-        results.append((out.cpu(), tree.priorities.cpu()))
-    for eager, captured in zip(*results):
-        assert torch.equal(eager, captured)

@@ -105,12 +105,12 @@ KERNEL BOUNDS(64) categorical_terms(CategoricalTermsParams p) {
     p.entropies[row] = entropy;
 }
 
-KERNEL BOUNDS(64) categorical_terms_backward(CategoricalTermsBackwardParams p) {
+KERNEL BOUNDS(64) categorical_terms_backward(CategoricalTermsParams p) {
     wait_for_previous();
     int row = blockIdx.x * blockDim.x + threadIdx.x;
     if (row >= p.n_rows)
         return;
-    float d_logprob = p.d_logprobs[row], d_entropy = p.d_entropies[row];
+    float d_logprob = p.logprobs[row], d_entropy = p.entropies[row];
     for (int agent = 0; agent < p.n_agents; agent++) {
         long long first = (long long)row * p.n_agents + agent;
         const float* logits = p.logits + first * p.n_choices;

@@ -244,19 +244,9 @@ struct CategoricalActParams {
 struct CategoricalTermsParams {
     const float* logits;       // (n_rows, A, n), log-probabilities
     const long long* actions;  // (n_rows, A)
-    float* logprobs;           // (n_rows), of the joint actions
-    float* entropies;          // (n_rows)
-    int n_rows;
-    int n_agents;
-    int n_choices;
-};
-
-struct CategoricalTermsBackwardParams {
-    const float* logits;
-    const long long* actions;
-    const float* d_logprobs;   // (n_rows)
-    const float* d_entropies;  // (n_rows)
-    float* d_logits;           // (n_rows, A, n)
+    float* logprobs;           // (n_rows), of the joint actions, or their gradient
+    float* entropies;          // (n_rows), or their gradient
+    float* d_logits;           // (n_rows, A, n) in the backward pass, else null
     int n_rows;
     int n_agents;
     int n_choices;

@@ -48,21 +48,18 @@ DEVICE int word_at(int row, int word) { return row * ROW_BYTES + (word ^ (row & 
 // What a block of a minGRU of W units computes.
 struct Block {
     int first_lane, first_unit;
-    long long policy, first_row;  // row: of arrays (P, B, W)
 };
 
 template <int W>
-DEVICE Block find_block(const MingruStepParams& p) {
+DEVICE Block find_block() {
     int first_lane = LANES * (blockIdx.x / (W / UNITS));
-    int first_unit = UNITS * (blockIdx.x % (W / UNITS));
-    long long policy = blockIdx.y, first_row = policy * p.n_lanes + first_lane;
-    return {first_lane, first_unit, policy, first_row};
+    return {first_lane, UNITS * ((int)blockIdx.x % (W / UNITS))};
 }
 
-// Where a lane of a block is in arrays (P, B, W). A lane that does not exist is the last one.
+// Where a lane of a block is in arrays (B, W). A lane that does not exist is the last one.
 template <int W>
 DEVICE long long lane_at(const Block& block, int lane, const MingruStepParams& p) {
-    return (block.first_row + min(lane, p.n_lanes - 1 - block.first_lane)) * W;
+    return (long long)min(block.first_lane + lane, p.n_lanes - 1) * W;
 }
 
 // Begins to copy the biases.
@@ -70,7 +67,7 @@ template <int W>
 DEVICE void begin_biases(unsigned char* biases, const Block& block, const MingruStepParams& p) {
     constexpr int WORDS = ROW_BYTES / WORD;  // of a gate
     int gate = threadIdx.x / WORDS, word = threadIdx.x % WORDS;
-    const Bits* bias = (const Bits*)p.bias + (2 * block.policy + gate) * W + block.first_unit;
+    const Bits* bias = (const Bits*)p.bias + gate * W + block.first_unit;
     if (gate < 2)
         begin_copy(biases + gate * ROW_BYTES + word * WORD, bias + word * (WORD / 2));
 }
@@ -86,7 +83,7 @@ DEVICE void begin_parts(unsigned char* parts, const Block& block, const MingruSt
 #pragma unroll
     for (int i = 0; i < LANES / STEP; i++)
         lanes[i] = lane_at<W>(block, row + i * STEP, p);
-    long long output = 2 * block.policy * W + block.first_unit + row;
+    long long output = block.first_unit + row;
     const Bits* x = (const Bits*)p.x + word * (WORD / 2);
     const Bits* weight = (const Bits*)p.weight + output * W + word * (WORD / 2);
 #pragma unroll 1  // the first copies begin before all addresses are known
@@ -235,7 +232,7 @@ template <int W>
 DEVICE void write_results(const unsigned char* part, const unsigned char* states, int lanes,
                           int units, const Block& block, const MingruStepParams& p) {
     int thread = threadIdx.x % 32, n_lanes = p.n_lanes - block.first_lane;
-    long long first = block.first_row * W + block.first_unit + units;
+    long long first = (long long)block.first_lane * W + block.first_unit + units;
     // Eight threads that read at once read from four words of rows r and r + 4, in other banks.
     int row = lanes + thread / 8 + thread / 4 % 2 * 4, word = thread % 4;
     Bits* outputs = (Bits*)p.outputs + first + row * W + word * (WORD / 2);
@@ -258,7 +255,7 @@ template <int W>
 DEVICE void mingru_step(const MingruStepParams& p) {
     constexpr int PARTS = W / UNITS;
     static_assert(W % UNITS == 0 && PARTS <= STEP_PARTS, "parts are whole and fit");
-    Block block = find_block<W>(p);
+    Block block = find_block<W>();
     int warp = threadIdx.x / 32;
     int lanes = warp / (UNITS / WARP_UNITS) * WARP_LANES;
     int units = warp % (UNITS / WARP_UNITS) * WARP_UNITS;
@@ -270,7 +267,7 @@ DEVICE void mingru_step(const MingruStepParams& p) {
     begin_states<W>(states, block, p);
     // of a lane of the warp for each thread
     int lane = min(block.first_lane + lanes + (int)threadIdx.x % 32, p.n_lanes - 1);
-    bool is_reset = p.reset[block.policy * p.n_lanes + lane];
+    bool is_reset = p.reset[lane];
 
     Sums sums;
 #pragma unroll 1  // keeps the code short
