@@ -54,7 +54,7 @@ REPORTERS = {
     "Evaluations in training": "megastep.agents.training.callbacks:Evaluations.on_measure",
     "Episodes": "megastep.agents.training.episode_stats:EpisodeStats.pop",
     "Self-play": "megastep.agents.selfplay.opponents:Opponents.pop_win_rates",
-    "Curricula": "megastep.agents.training.curriculum:Curriculum.stats",
+    "Curricula": "megastep.agents.training.curriculum:SFL.stats",
 }
 # ---- Settings ----
 

@@ -12,7 +12,7 @@ from typing import Any
 from megastep.agents import console, package
 from megastep.agents.errors import ConfigErrors, user_errors
 from megastep.agents.factory import check
-from megastep.agents.launch import endings, gpu, rank
+from megastep.agents.launch import endings, rank
 from megastep.agents.runs import folders, populations
 
 #: Options of commands that files configure, which are Hydra's: names, and argparse's arguments.
@@ -142,14 +142,10 @@ def _run_composed(command, options, argv, parser) -> int:
     elif options.multirun:
         return sweeps.sweep(composer, words)
     else:
-        if "device=cpu" not in words:
-            gpu.start_driver()  # beside composing
-        with rank.joined() if command.has_ranks else contextlib.nullcontext() as team:
+        with rank.joined() if command.has_ranks else contextlib.nullcontext():
             cfg = rank.together(lambda: _ready(composer, words))
             if cfg is None:
                 return sweeps.sweep(composer, words)
-            if team is None and (cfg.device != "auto" or gpu.is_available()):
-                gpu.wake(cfg.device)  # beside the imports of what runs
             command.run(cfg)
     return 0
 

@@ -233,7 +233,7 @@ class Job:
                 cfg = composer.settings(words)
                 if isinstance(cfg, settings.Train):
                     cfg = self.own_settings(cfg, row["folder"], is_again)
-                with gpu_slots.taken(cfg) as cfg:
+                with gpu_slots.taken(cfg, number) as cfg:
                     result = composer.command.run(cfg)
                 row |= {"state": DONE, **(scores.outcome(result) if result else {})}
         except signals.Interrupted as stop:

@@ -1,16 +1,10 @@
-"""Assigns the GPUs of this machine to the jobs of a sweep. A *slot* is a job's GPUs, one per rank.
-
-Jobs may run in separate processes, so they count each other by lock files, one per GPU and job on
-it. The system releases a lock when its process ends.
+"""Assigns the GPUs of this machine to the jobs of a sweep, in turn. A *slot* is a job's GPUs, one
+per rank.
 """
 
 import contextlib
-import itertools
 import os
-import re
-import tempfile
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, TypeGuard
 
 from megastep.agents.errors import ConfigErrors
@@ -43,9 +37,9 @@ def check(jobs: Sequence, hydra: Any) -> None:
 
 
 @contextlib.contextmanager
-def taken(cfg: settings.Common) -> Iterator[settings.Common]:
-    """Takes the slot with the fewest jobs for the duration of the context. Yields the settings, in
-    which device=cuda is replaced by the GPU's number.
+def taken(cfg: settings.Common, number: int) -> Iterator[settings.Common]:
+    """Gives a job a slot, by its number in the sweep, for the duration of the context. Yields the
+    settings, in which device=cuda is replaced by the GPU's number.
 
     Ranks are separate processes and see only the GPUs of their slot. For a job in this process, the
     GPU becomes PyTorch's current device, which device=auto uses. A job with device=cpu or cuda:1
@@ -55,22 +49,22 @@ def taken(cfg: settings.Common) -> Iterator[settings.Common]:
     if n_gpus < 2:
         yield cfg
         return
-    # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
-    before = os.environ.get(VISIBLE)
-    names = [name.strip() for name in (before or ",".join(map(str, range(n_gpus)))).split(",")]
-    names = names[:n_gpus]
+    size = launcher.n_ranks(cfg) if _has_ranks(cfg) else 1
+    first = number % (n_gpus // size) * size
     with contextlib.ExitStack() as stack:
-        slot = _locked(stack, names, launcher.n_ranks(cfg) if _has_ranks(cfg) else 1)
         if _has_ranks(cfg):
+            # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
+            before = os.environ.get(VISIBLE)
+            names = (before or ",".join(map(str, range(n_gpus)))).split(",")
             stack.callback(_make_visible, before)
-            _make_visible(",".join(names[i] for i in slot))
+            _make_visible(",".join(name.strip() for name in names[first : first + size]))
         else:
             import torch
 
             stack.callback(torch.cuda.set_device, torch.cuda.current_device())
-            torch.cuda.set_device(slot[0])
+            torch.cuda.set_device(first)
             if cfg.device == "cuda":
-                cfg = settings.changed(cfg, device=f"cuda:{slot[0]}")
+                cfg = settings.changed(cfg, device=f"cuda:{first}")
         yield cfg
 
 
@@ -82,19 +76,3 @@ def _make_visible(names) -> None:
 
 def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":
     return isinstance(cfg, settings.Train) and launcher.is_needed(cfg)
-
-
-def _locked(locks: contextlib.ExitStack, names: list[str], size: int) -> range:
-    """Locks the first of the slots of `size` GPUs with the fewest jobs. Returns its indices."""
-    import filelock  # slow to import
-
-    starts = range(0, len(names) - size + 1, size)
-    for n_jobs, start in ((n, start) for n in itertools.count() for start in starts):
-        with contextlib.suppress(filelock.Timeout), contextlib.ExitStack() as stack:
-            for name in names[start : start + size]:
-                name = re.sub(r"[^\w-]", "-", f"megastep-{os.getuid()}-gpu-{name}-{n_jobs}")
-                path = Path(tempfile.gettempdir(), f"{name}.lock")
-                stack.enter_context(filelock.FileLock(path, blocking=False))
-            locks.push(stack.pop_all())
-            return range(start, start + size)
-    raise AssertionError  # the slots of the loop have no end

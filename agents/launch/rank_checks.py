@@ -1,19 +1,17 @@
-"""Checks before training that all ranks run the same code, settings and homes, and see the same run
-folder. A single process has nothing to check.
+"""Checks before training that all ranks run the same code and settings, and see one run folder.
+A single process has nothing to check.
 """
 
-import hashlib
 import os
 import platform
 import secrets
 import time
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from megastep.agents import factory, package
+from megastep.agents import package
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
 from megastep.agents.distributed.ranks import ranks_named
@@ -26,7 +24,7 @@ SHARED_SECONDS = 10.0
 
 
 def check_start(cfg: settings.Train) -> None:
-    """Raises UserError if the ranks differ in versions, code, settings or homes."""
+    """Raises UserError if the ranks differ in versions, code or settings."""
     if process_group.n_ranks() == 1:
         return
     facts = {
@@ -38,8 +36,6 @@ def check_start(cfg: settings.Train) -> None:
         "the commit of the checkout": provenance.commit(package.ROOT),
     }
     check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
-    homes = together(lambda: factory.homes(cfg.env, cfg.geometry, "training"))
-    check_equal({"the digest of the training homes": digest(homes)})
 
 
 def check_equal(facts: dict[str, object]) -> None:
@@ -57,17 +53,6 @@ def check_equal(facts: dict[str, object]) -> None:
                 f"The ranks differ: {name} is {', and '.join(values)}; start all with the same "
                 "code, packages and options"
             )
-
-
-def digest(homes: Iterable[dict]) -> str:
-    """Returns a hash of geometries, 16 hexadecimal digits."""
-    total = hashlib.sha256()
-    for home in homes:
-        for name in sorted(home):
-            value = np.asarray(home[name])
-            total.update(f"{name} {value.dtype} {value.shape}".encode())
-            total.update(str(value).encode() if value.dtype == object else value.tobytes())
-    return total.hexdigest()[:16]
 
 
 def check_shared(folder: Path) -> str:

@@ -346,6 +346,7 @@ class Population:
             self.lines.file.sync()
 
     def close(self) -> None:
+        """Closes the members' environments and files."""
         for trainer in self.trainers:
             trainer.close()
 

@@ -33,6 +33,7 @@ class Budget:
 
     @property
     def is_limited(self) -> bool:
+        """Whether the run ends by itself."""
         return self.is_rerun or self.samples is not None or self.seconds is not None
 
     def fraction_left(self, updates: int, samples: int, seconds: float) -> float:
@@ -83,10 +84,12 @@ class Stopwatch:
         self.started: float | None = None
 
     def start(self) -> None:
+        """Starts counting."""
         self.started = time.monotonic()
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
+        """What is done inside does not count."""
         began = time.monotonic()
         try:
             yield
@@ -96,6 +99,7 @@ class Stopwatch:
 
     @property
     def is_running(self) -> bool:
+        """Whether the time counts."""
         return self.started is not None
 
     @property

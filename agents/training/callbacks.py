@@ -93,6 +93,7 @@ class DriftCheck:
     """Checks in each report that all ranks have the same weights."""
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Raises DriftError if the weights differ."""
         trainer.ranks.check_drift(trainer.policy, trainer.learner_options.extra)
 
 
@@ -104,9 +105,11 @@ class Losses:
     losses: Mapping[str, Any] = {}
 
     def on_update(self, trainer: Trainer, losses: Mapping[str, Any]) -> None:
+        """Keeps the losses."""
         self.losses = losses
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Adds the losses. Synchronises."""
         device, values = trainer.env.device, [*self.losses.values()]
         if values:
             values = torch.stack([torch.as_tensor(one, device=device) for one in values]).tolist()
@@ -133,12 +136,14 @@ class Evaluations:
         self.last = {"samples": 0.0, "seconds": 0.0}
 
     def on_start(self, trainer: Trainer) -> None:
+        """Ends a run that has reached its end before."""
         self.last = {"samples": trainer.samples_at_report, "seconds": trainer.clock.seconds}
         if reaches(trainer.evaluation, self.stop):
             trainer.end()
 
     def on_update(self, trainer: Trainer, losses: object) -> None:
-        trainer.score = None  # it was another policy's
+        """Forgets the score: it was another policy's."""
+        trainer.score = None
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
         """Evaluates if it is time to, which all ranks do at once.
@@ -160,6 +165,7 @@ class Evaluations:
         metrics |= {f"eval/{name}": value for name, value in trainer.evaluation.items()}
 
     def on_report(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Ends the run if the evaluation reaches `stop`."""
         if trainer.is_save_due and reaches(trainer.evaluation, self.stop):
             metrics["perf/seconds_to_stop"] = metrics["perf/seconds"]
             trainer.end()
@@ -174,9 +180,11 @@ class Snapshots:
         self.saver, self.n, self.n_parts_done = saver, n, 0
 
     def on_start(self, trainer: Trainer) -> None:
+        """Continues with the part that the run is in."""
         self.n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
 
     def on_update(self, trainer: Trainer, losses: object) -> None:
+        """Saves a snapshot if a part has ended."""
         before = self.n_parts_done
         self.on_start(trainer)
         if self.n_parts_done > before:
@@ -193,6 +201,7 @@ class Progress:
         self.show = show
 
     def on_report(self, trainer: Trainer, metrics: Mapping[str, Any]) -> None:
+        """Shows the line."""
         left, latest = trainer.fraction_left, trainer.latest_stats
         words = [f"{console.number(trainer.samples)} samples"]
         if (rate := trainer.timing.rate) is not None:

@@ -110,6 +110,7 @@ class EpisodeStats:
         ]
         by_source = None
         if self.sources:
+            assert layouts is not None
             last = len(self.source_of_layout) - 1
             source_of_row = self.source_of_layout[layouts.clamp(0, last).long()]
             source_of_row = torch.where((layouts >= 0) & (layouts <= last), source_of_row, -1)
@@ -262,6 +263,7 @@ class EpisodeStats:
         return stats
 
     def state_dict(self) -> StateDict:
+        """Returns a copy of everything that changes."""
         windows = [torch.tensor(window, dtype=torch.float64) for window in self.windows]
         return {name: getattr(self, name).clone() for name in _SAVED} | {"windows": windows}
 

@@ -65,6 +65,7 @@ class Episodes:
         return [*self.stats.names, *(f"won/{kind}" for kind in kinds if kind != "now")]
 
     def on_update(self, trainer: Trainer, losses: object) -> None:
+        """Counts episodes, and has curriculum and opponents learn from them."""
         rollout = trainer.rollout
         (self.graph if self._keeps_tensors(rollout) else self.count)(rollout)
         if trainer.curriculum is not None:
@@ -96,6 +97,7 @@ class Episodes:
         return {}
 
     def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Adds the statistics since the last report. Synchronises."""
         stats = self.stats.pop(trainer.ranks.sum)
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates(trainer.ranks.sum)

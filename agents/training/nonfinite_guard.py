@@ -53,9 +53,11 @@ class NonFiniteGuard:
         self.value, self.hint = None, ""
 
     def on_measure(self, trainer: Trainer, metrics: object) -> None:
+        """Warns of metrics of episodes."""
         self.warn_of_metrics(trainer.episodes.stats, trainer.rollout)
 
     def on_report(self, trainer: Trainer, metrics: object) -> None:
+        """Checks the last update."""
         self.check(trainer.rollout)
 
     def may_save(self, trainer: Trainer) -> bool:

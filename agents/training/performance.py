@@ -42,12 +42,15 @@ class Timing:
         self._starts = deque()  # (phase, its start); the ends of all but the last are starts too
 
     def on_collect(self, trainer: Trainer) -> None:
+        """Begins the first phase."""
         self.start(PHASES[0])
 
     def on_rollout(self, trainer: Trainer, rollout: object) -> None:
+        """Begins the second."""
         self.start(PHASES[1])
 
     def on_update(self, trainer: Trainer, losses: object) -> None:
+        """Begins the last."""
         self.start(PHASES[2])
 
     def start(self, phase: str) -> None:

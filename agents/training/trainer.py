@@ -21,7 +21,6 @@ from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
-    from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.types import Learner, StateDict
 
 
@@ -92,7 +91,7 @@ class Trainer:
         self.score: float | None = None
         self.is_stopped = self.is_save_due = False
         self.lost: list[str] = []
-        self.curriculum: Curriculum | None = None
+        self.curriculum: Any = None
         self.timing, self.tuning, self.episodes = Timing(env.device), Tuning(self), Episodes(self)
         self.nonfinite_guard = NonFiniteGuard(env, learner, self.ranks)
         standard = [self.timing, DriftCheck(), self.tuning, self.episodes, Losses()]
@@ -215,6 +214,7 @@ class Trainer:
         self.callbacks("on_checkpoint", self)
 
     def finish(self) -> None:
+        """Writes the last report and the last checkpoint."""
         state = self.run_state.state_dict()  # a resumed run repeats what the last report empties
         if self.updates > self.updates_at_report:
             self.report()
@@ -227,6 +227,7 @@ class Trainer:
         self.is_stopped = True
 
     def close(self) -> None:
+        """Closes the environment and the callbacks."""
         self.callbacks.close(self.env)
 
     def wait_for_collector(self) -> None:

@@ -289,21 +289,25 @@ def gpus(here, monkeypatch):
     return settings
 
 
-def test_jobs_share_gpus(gpus):
-    cfg = gpus(3, "device=cuda")
-    jobs = [gpu_slots.taken(cfg) for _ in range(6)]
-    devices = [job.__enter__().device for job in jobs[:5]]
-    assert devices == ["cuda:0", "cuda:1", "cuda:2", "cuda:0", "cuda:1"]
-    jobs[1].__exit__(None, None, None)  # one job of two on GPU 1 ends
-    assert jobs[5].__enter__().device == "cuda:1" and gpus.current[-1] == 1
-    with gpu_slots.taken(gpus(3, "device=auto")) as cfg:
+def test_jobs_take_gpus_in_turn(gpus):
+    for number in range(4):
+        with gpu_slots.taken(gpus(3, "device=cuda"), number) as cfg:
+            assert cfg.device == f"cuda:{number % 3}" and gpus.current[-1] == number % 3
+    with gpu_slots.taken(gpus(3, "device=auto"), 2) as cfg:
         assert cfg.device == "auto" and gpus.current[-1] == 2
-    for job in (jobs[0], *jobs[2:]):
-        job.__exit__(None, None, None)
     gpus.current.clear()
     for n_gpus, word in ((1, "device=cuda"), (3, "device=cuda:2"), (3, "device=cpu")):
-        with gpu_slots.taken(gpus(n_gpus, word)) as cfg:
+        with gpu_slots.taken(gpus(n_gpus, word), 1) as cfg:
             assert f"device={cfg.device}" == word and not gpus.current
+
+
+def test_jobs_of_several_gpus(gpus):
+    visible = []
+    for number in range(3):
+        with gpu_slots.taken(gpus(5, "ranks=2"), number):
+            visible.append(os.environ["CUDA_VISIBLE_DEVICES"])
+        assert "CUDA_VISIBLE_DEVICES" not in os.environ
+    assert visible == ["0,1", "2,3", "0,1"]  # the fifth GPU stays idle
 
 
 def test_ranks_see_the_gpus_of_their_place_only(gpus, monkeypatch):
@@ -313,7 +317,7 @@ def test_ranks_see_the_gpus_of_their_place_only(gpus, monkeypatch):
         (["ranks=all"], "6,4,GPU-8a,3"),
         (["ranks=2", "device=cpu"], "6, 4,GPU-8a,3"),
     ):
-        with gpu_slots.taken(gpus(4, *words)):
+        with gpu_slots.taken(gpus(4, *words), 0):
             assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "6, 4,GPU-8a,3" and not gpus.current
 

@@ -157,16 +157,6 @@ def test_cable_that_is_plugged_in_again(here, hosts, seconds, goes_on):
 
 
 @pytest.mark.nightly
-def test_slow_cable_goes_on(here, hosts):
-    """50 ms and 1 % of frames lost: each operation between the hosts takes so long."""
-    for folder in "fast", "run":
-        with training(hosts, here, *TINY, f"samples={100 * UPDATE}", f"folder={folder}") as both:
-            assert [code for code, *_ in finished(both)] == [0, 0]
-        hosts.cable.delay, hosts.cable.loss = 0.05, 0.01
-    assert (here / "run/metrics.jsonl").read_bytes() == (here / "fast/metrics.jsonl").read_bytes()
-
-
-@pytest.mark.nightly
 @pytest.mark.parametrize("number", range(2))
 def test_host_whose_processes_are_killed(here, hosts, number):
     with training(hosts, here, *TINY) as processes:
@@ -193,24 +183,6 @@ def test_folder_that_hosts_do_not_share(here, hosts):
 
 
 @pytest.mark.nightly
-def test_two_runs_on_one_port(here, hosts):
-    """The second run's ranks use the store of the first, and end with it."""
-    words = [*TINY, "samples=1e9"]
-    with training(hosts, here, *words, options=["--rdzv-id=one"]) as first:
-        wait_until(lambda: checkpoints(here), first[0])
-        words = [*TINY, "samples=1e9", "folder=other"]
-        with training(hosts, here, *words, options=["--rdzv-id=two"]) as second:
-            wait_for_rows(here, 3, second[0], "other")
-            n = len(rows(here))
-            wait_for_rows(here, n + 3, first[0])
-            for process in first:
-                process.send_signal(signal.SIGTERM)
-            endings = finished(second)
-    assert checkpoint.load_latest(here / "other" / "checkpoints").step > 0
-    assert "To continue: python train.py resume=other" in endings[0][2] + endings[1][2]
-
-
-@pytest.mark.nightly
 def test_hosts_of_ipv6(here, hosts):
     hosts.table.write_text("::1 localhost\nfd77::1 hosta\nfd77::2 hostb\n")
     for number in range(2):
@@ -232,16 +204,3 @@ def test_rank_that_does_not_start_is_named(here, hosts):
         endings = finished(processes)
     text = "rank 1 of 2 did not start within 8 s; see what torchrun printed on the other machines"
     assert f"train.py: {text}\n" in endings[0][2] and not (here / "run").exists()
-
-
-@pytest.mark.nightly
-def test_full_disk_of_the_first_host(here, hosts):
-    """The run ends in one sentence, on the host that has the disk."""
-    (here / "disk").mkdir()
-    hosts.run(0, "mount", "-t", "tmpfs", "-o", "nr_inodes=1", "tmpfs", str(here / "disk"))
-    with training(hosts, here, *TINY, "folder=disk/run") as processes:
-        endings = finished(processes)
-    errors = [line for *_, error in endings for line in error.splitlines() if "train.py: " in line]
-    (line,) = errors
-    assert "No space left on device" in line and line in endings[0][2]
-    assert all(code for code, *_ in endings)

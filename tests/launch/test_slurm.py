@@ -169,11 +169,3 @@ def test_job_of_a_sweep_that_outlives_its_time_goes_on_in_another(cluster, check
     assert row["state"] == "done"
     (folder,) = Path("sweep").glob("0*")
     assert len(json_lines.read(folder / "provenance.jsonl")) == 2
-
-
-def test_job_without_gpus_names_its_node(cluster, checkout):
-    words = sys.executable, "train.py", *WORDS, "device=cuda"
-    done = cluster.run("srun", "--ntasks=1", *words, capture_output=True, text=True)
-    assert done.returncode == 2
-    text = r"PyTorch sees no GPU on node[ab].*, and job \d+ of Slurm may have been given none "
-    assert re.search(text, done.stderr), done.stderr

@@ -165,19 +165,6 @@ def test_means_reach_back_over_100_episodes():
     assert (stats["episode/window"], stats["episode/return"]) == (250, 2)
 
 
-def test_means_of_a_group_reach_back_over_its_own_episodes():
-    """Lane 1's episodes end in every report, lane 0's in the first only."""
-    groups = {"rare": torch.tensor([True, False]), "often": torch.tensor([False, True])}
-    episodes, none = EpisodeStats(2, "cpu", groups=groups), torch.zeros(60, 2, dtype=torch.bool)
-    reward = torch.tensor([[3.0, 5.0]]).expand(60, 2)
-    for lanes in ([True, True], [False, True], [False, True]):
-        episodes.add(reward, none, torch.tensor([lanes]).expand(60, 2))
-        stats = episodes.pop()
-    assert (stats["episode/count/rare"], stats["episode/window/rare"]) == (0, 60)
-    assert (stats["episode/window/often"], stats["episode/return/often"]) == (120, 5)
-    assert stats["episode/return/rare"] == 3 and stats["episode/window"] == 120
-
-
 def test_first_episodes_are_left_out_where_they_are_cut():
     """Lane 0's first episode ends in the first rollout, lane 1's in the second."""
     episodes, none = EpisodeStats(2, "cpu", skip_first=True), torch.zeros(3, 2, dtype=torch.bool)

@@ -1,7 +1,6 @@
 """The logger of docs/loggers.md: it is trained with, resumed, and dropped when it fails."""
 
 import sqlite3
-from pathlib import Path
 
 from megastep.agents.cli import train
 from megastep.agents.runs import json_lines
@@ -36,13 +35,3 @@ def test_logger_that_cannot_start_is_one_warning(tmp_path, monkeypatch, capsys):
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and "logger=sqlite skipped: unable to open database file" in err
     assert json_lines.read(tmp_path / "run/metrics.jsonl") and not (tmp_path / "all.db").exists()
-
-
-def test_wrong_setting_is_refused_before_training(tmp_path, monkeypatch, capsys):
-    write_file(tmp_path)
-    with pages.inside(tmp_path, monkeypatch):
-        assert train.main([*tiny.TINY, PATH, "logger.sqlite.fle=x"]) == 2
-    assert "logger.sqlite.fle: no such key; did you mean logger.sqlite.file?" in (
-        capsys.readouterr().err
-    )
-    assert not Path(tmp_path, "runs").exists()
