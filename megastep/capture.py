@@ -10,16 +10,14 @@ import collections
 import contextlib
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
 from torch.utils import _pytree
 
 from megastep.engine.state_tree import (
-    OPAQUE,
     SCALARS,
-    children,
     rebind,
     restore,
     snapshot,
@@ -45,7 +43,7 @@ class _StateBefore:
         self.leaves = self._walk()
         self.containers = [
             (node, dict(node) if isinstance(node, dict) else [*node])
-            for node in _containers(self.roots)
+            for _, _, node in walk(self.roots, (list, collections.deque, dict)).values()
         ]
 
     def _walk(self) -> dict[str, tuple]:
@@ -109,19 +107,6 @@ def _refuse_changed(path, old, new) -> None:
             f"during the call, but a CUDA graph replays tensors only: make it a tensor on the "
             f"device."
         )
-
-
-def _containers(root) -> Iterator[Any]:
-    """Yields every list, deque and dict that is reachable."""
-    visited, stack = set(), [root]
-    while stack:
-        node = stack.pop()
-        is_leaf = isinstance(node, (*OPAQUE, *SCALARS, torch.Tensor, torch.Generator))
-        if not is_leaf and id(node) not in visited:
-            visited.add(id(node))
-            if isinstance(node, (list, collections.deque, dict)):
-                yield node
-            stack += [child for _, child in children(node)]
 
 
 def _storage(tensor) -> tuple[torch.device, int]:

@@ -62,8 +62,8 @@ def children(node: object, only_state: bool = True) -> list[tuple[str, Any]]:
 def walk(
     root: object, types: type | tuple[type, ...], only_state: bool = True
 ) -> dict[str, tuple[Any, str, Any]]:
-    """Returns {path: (parent, step, leaf)} of the leaves reachable from ``root`` that are of one of
-    these types. Paths read like attributes, ``.core.agents.positions``; ``step`` is a path's last
+    """Returns {path: (parent, step, node)} of what is reachable from ``root`` and of one of these
+    types. Paths read like attributes, ``.core.agents.positions``; ``step`` is a path's last
     part. An object with children is visited once, by its first path.
     """
     leaves, visited, stack = {}, set(), [("", None, "", root)]
@@ -71,7 +71,7 @@ def walk(
         path, parent, step, node = stack.pop()
         if isinstance(node, types):
             leaves[path] = (parent, step, node)
-        elif not isinstance(node, (*OPAQUE, *SCALARS, *_LEAVES)) and id(node) not in visited:
+        if not isinstance(node, (*OPAQUE, *SCALARS, *_LEAVES)) and id(node) not in visited:
             visited.add(id(node))
             below_node = reversed(children(node, only_state))
             stack += [(path + below, node, below, child) for below, child in below_node]
