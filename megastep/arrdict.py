@@ -110,12 +110,8 @@ def _join(name: str, torch_join: Callable, numpy_join: Callable, trees: Iterable
 
 @mapping
 def torchify(leaf: Any) -> torch.Tensor:
-    """Converts arrays, numbers and Raggeds to CPU tensors. Tensors are returned unchanged.
-
-    float64, numpy's default, becomes float32. Other dtypes stay, and share memory with the result.
-
-    Raises:
-        ValueError: for a leaf that no tensor can hold, such as a string.
+    """Converts arrays, numbers and Raggeds to CPU tensors. Tensors are returned unchanged. float64,
+    numpy's default, becomes float32; other dtypes stay, and share memory with the result.
     """
     if isinstance(leaf, torch.Tensor):
         return leaf
@@ -135,9 +131,7 @@ def torchify(leaf: Any) -> torch.Tensor:
 
 @mapping
 def numpyify(leaf: Any) -> object:
-    """Converts tensors and Raggeds to numpy arrays, also in lists and tuples. Other leaves are
-    returned unchanged.
-
+    """Converts tensors and Raggeds to numpy arrays, also in lists and tuples; other leaves stay.
     CPU tensors share memory with the result. bfloat16, which numpy lacks, becomes float32.
     """
     if isinstance(leaf, torch.Tensor):

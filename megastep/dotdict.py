@@ -84,11 +84,7 @@ class dotdict(dict):
         return _map(lambda leaf: f(leaf, *args, **kwargs), self)
 
     def starmap(self, f: Callable, *others: dict, **kwargs: object) -> "Self":
-        """Returns the tree of ``f(leaf, other_leaf, ...)``.
-
-        Raises:
-            ValueError: if the trees in ``others`` do not have the same keys.
-        """
+        """Returns the tree of ``f(leaf, other_leaf, ...)``. All trees have the same keys."""
         return _map(functools.partial(f, **kwargs), self, *others)
 
     def __repr__(self) -> str:
@@ -106,9 +102,7 @@ def leaves(tree: object) -> list:
 
 
 def mapping(f: Callable) -> Callable:
-    """Decorates a function of a leaf, ``f(leaf, ...)``, to take trees and to keep their keys and
-    types.
-    """
+    """Decorates a function of a leaf, ``f(leaf, ...)``, to take trees."""
 
     @functools.wraps(f)
     def mapped(tree, *args, **kwargs) -> Any:
@@ -145,9 +139,6 @@ class _Missing(Exception):
 
 
 def _attribute(value, name: str) -> Any:
-    """Returns ``value.name``. For a dict, returns its item of that name, or the tree of its values'
-    attributes.
-    """
     if isinstance(value, dict):
         if name in value:
             return value[name]
@@ -174,9 +165,6 @@ def _absent(tree: dict, name: str, leaf: object = None) -> str:
 
 
 def _rows(tree: dict) -> Iterator[str]:
-    """Yields one line per item, the key and the value. The items of a nested tree are indented to
-    below its name.
-    """
     column = max((len(str(key)) for key in tree), default=0) + _INDENT
     for key, value in tree.items():
         if isinstance(value, dict):
@@ -187,9 +175,6 @@ def _rows(tree: dict) -> Iterator[str]:
 
 
 def _summary(value, column: int) -> str:
-    """Returns one line for a leaf: shape and dtype of an array, a shape in full, the length of
-    another collection, or the text of any other value.
-    """
     name = type(value).__name__
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{name}({tuple(value.shape)}, {value.dtype})"

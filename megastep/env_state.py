@@ -113,10 +113,8 @@ class EnvState:
 
     def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:
         """Restores a `state_dict`, whose tensors may be on any device. Tensors change in place, so
-        that whatever refers to them sees it.
-
-        Raises:
-            ValueError: it does not fit this environment. Nothing has changed.
+        that whatever refers to them sees it. If it raises ValueError, since the state does not fit,
+        nothing has changed.
         """
         before = {
             path: (record[0], record[1].clone(), *record[2:]) if record[0] == "tensor" else record

@@ -33,9 +33,6 @@ class Ragged(SetOnce):
     Args:
         vals: (V, ...) backing array.
         widths: (D,) integers, not negative, that add up to V. They become int64.
-
-    Raises:
-        ValueError: if ``widths`` does not fit.
     """
 
     vals: Any
@@ -97,7 +94,6 @@ class Ragged(SetOnce):
         return self.vals[starts[i] : ends[i]]
 
     def _index(self, index: SupportsIndex) -> int:
-        """Returns a subarray's index from 0 up."""
         try:
             i = operator.index(index)
         except TypeError:

@@ -13,11 +13,8 @@ _WRITING = ("__setitem__", "__delitem__", "__set__", "__delete__")
 
 class ReadOnlyTensor(torch.Tensor):
     """A tensor that cannot be written, nor can its views. Results of operations are plain tensors;
-    ``numpy()`` returns a read-only array, ``untyped_storage()`` a copy.
-
-    Args:
-        tensor: the tensor to protect.
-        refusal: message of the ValueError that a write raises.
+    ``numpy()`` returns a read-only array, ``untyped_storage()`` a copy. A write raises ValueError
+    with the message `refusal`.
     """
 
     refusal: str
@@ -62,9 +59,6 @@ class ReadOnlyTensor(torch.Tensor):
 
 
 def _writes(name: str) -> bool:
-    """Returns True if the PyTorch function of this name, such as add_ or __iadd__, writes into its
-    first argument.
-    """
     in_place = name.endswith("_") and not name.endswith("__")
     return in_place or name in _WRITING or name.startswith("__i") and name not in _READING
 
@@ -76,9 +70,6 @@ _READING = ("__index__", "__int__", "__invert__", "__init__", "__init_subclass__
 class SetOnce:
     """An object whose attributes are set once. Tensors may be written in place but not replaced,
     because the engine and CUDA graphs hold their addresses.
-
-    Raises:
-        AttributeError: if an attribute is replaced or deleted.
     """
 
     _replaceable: tuple[str, ...] = ()

@@ -30,9 +30,8 @@ _TRIED = 0.0, 0.5, 1.0
 
 @dataclasses.dataclass(frozen=True)
 class Scheduled(annotated_types.BaseMetadata):
-    """Metadata of an annotation: the setting is a number within bounds, or a schedule of such.
-
-    A schedule may end at an exclusive bound, as one that falls to 0 does.
+    """Metadata of an annotation: the setting is a number within bounds, or a schedule of such,
+    which may end at an exclusive bound, as one that falls to 0 does.
     """
 
     ge: float | None = None

@@ -87,9 +87,6 @@ class Lanes:
         env: the environment.
         same_step: begin a new episode in the step that ends one, by a masked reset.
         purpose: what needs masked resets, for the message; None if nothing does.
-
-    Raises:
-        ValueError: if the environment's resets take no masks, but must.
     """
 
     def __init__(self, env: Env, same_step: bool = False, purpose: str | None = None):
@@ -114,9 +111,6 @@ class Lanes:
         Args:
             seed: of lane 0; the next has the next seed. Or one seed per lane.
             mask: (B,) bool, a tensor or an array, lanes that begin.
-
-        Raises:
-            ValueError: naming what does not fit.
         """
         if not self.takes_masks and seed is None and mask is None:
             return self.env.reset()

@@ -21,11 +21,8 @@ class RslRlVecEnv(VecEnv):
     time limit ended it. Actions are clipped to their bounds.
 
     Args:
-        env: the environment, such as Explorer or PointGoal with ``control="continuous"``.
-
-    Raises:
-        ValueError: if its actions are not one `MultiContinuous` space of one agent per lane, or its
-            resets take no masks.
+        env: the environment, whose resets take masks, such as Explorer or PointGoal with
+            ``control="continuous"``.
     """
 
     def __init__(self, env: Env):

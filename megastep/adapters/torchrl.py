@@ -28,9 +28,6 @@ class TorchRLEnv(EnvBase):
     Args:
         env: the environment, whose resets take masks.
         dtype: of observations in floats.
-
-    Raises:
-        ValueError: if they do not.
     """
 
     def __init__(self, env: Env, dtype: torch.dtype = torch.float32):

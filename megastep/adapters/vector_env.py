@@ -86,9 +86,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Args:
             seed: an integer s, for seeds s, s + 1, ... of the lanes, or one seed per lane.
             options: ``reset_mask``: (B,) bool, lanes that begin; the others stay as they are.
-
-        Raises:
-            ValueError: naming an option that there is not, or does not fit.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
         options = dict(options or {})

@@ -24,11 +24,8 @@ OTHERS = gymnasium.Env, gymnasium.Space, types.ModuleType, type
 
 
 def wrapper_state(env: Any, paths: Collection[str] | None = None) -> Tree:
-    """Returns copies of the numbers, the arrays and the lists of numbers in wrappers by path, such
-    as `0.NormalizeObservation.obs_rms.mean`; wrapper 0 is the outermost.
-
-    Args:
-        paths: those wanted. None: all.
+    """Returns copies of the numbers, the arrays and the lists of numbers in wrappers by path, or of
+    some, such as `0.NormalizeObservation.obs_rms.mean`; wrapper 0 is the outermost.
     """
     found, visited, stack = {}, set(), [*reversed(_wrappers(env).items())]
     while stack:
@@ -50,9 +47,7 @@ def wrapper_state(env: Any, paths: Collection[str] | None = None) -> Tree:
 
 def load_wrapper_state(env: Any, state: Tree) -> None:
     """Puts a `wrapper_state`, which may be a stranger's, into the wrappers of another environment.
-
-    Raises:
-        ValueError: it is not in such wrappers.
+    Raises ValueError if it is not in such wrappers.
     """
     wrappers = _wrappers(env)
     for path, value in state.items():
