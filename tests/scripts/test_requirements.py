@@ -1,11 +1,8 @@
-"""The lock of packages, and the Dockerfile that installs from it."""
+"""The lock of packages."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
-import check_image
 import lock
 import pytest
 from packaging.requirements import Requirement
@@ -48,21 +45,3 @@ def test_lock_fits_pyproject_and_constraints():
         name = wanted.name.lower()
         versions = [str(req.specifier)[2:] for req in LOCKED if req.name == name]
         assert versions and all(map(wanted.specifier.contains, versions)), wanted
-
-
-# ---- The Dockerfile ----
-
-
-@pytest.mark.nightly
-def test_image_is_built_and_trains_for_any_user_without_a_network(tmp_path):
-    """On a base image that is made here; the CPU's PyTorch is whichever pip finds."""
-    if reason := check_image.problem():
-        pytest.skip(reason)
-    script = ROOT / "scripts" / "check_image.py"
-    words = "--stand-in", "--torch=torch==2.13.0", f"--store={tmp_path}", "--samples=2e5"
-    try:
-        done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    finally:
-        removes = check_image.Builder(tmp_path).words("rmi", "--all", "--force")
-        subprocess.run(removes, capture_output=True)
