@@ -111,10 +111,7 @@ class _Checked:
 
 def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:
     """Returns {name: address} of the agents' tensors ``names``. Each is checked only if it is
-    another one than in the last call, or has moved.
-
-    Raises:
-        TypeError, ValueError: naming the first tensor that does not fit the scenery.
+    another one than in the last call, or has moved: TypeError or ValueError name it.
     """
     tensors = vars(agents)
     checked = tensors.get("_checked")
@@ -157,11 +154,7 @@ def seed_params(seed: int) -> dict[str, int]:
 def texel_bits(
     scenery: Scenery, name: str, bits: torch.Tensor, axes: tuple[int, ...]
 ) -> tuple[int, int]:
-    """Returns the address and ``n_words`` of a tensor (*axes, n_words) of texels.
-
-    Raises:
-        TypeError, ValueError: naming it, if it does not fit the scenery.
-    """
+    """Returns the address and ``n_words`` of a tensor (*axes, n_words) of a scenery's texels."""
     min_words = -(-scenery.layouts.max_texels // 32)
     n_words = checks.length(name, bits, axis=-1)
     if n_words < min_words:

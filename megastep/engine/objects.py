@@ -147,11 +147,8 @@ class Objects(SetOnce):
         return self.records.view(torch.bool)[..., 26]
 
     def at_lines(self, lines: torch.Tensor, n_agent_lines: int) -> torch.Tensor:
-        """Returns the object of each line, int64 and -1 for others.
-
-        Args:
-            lines: int32, indices into the lines of an environment, as ``Render.indices``.
-            n_agent_lines: those of agents, which come first.
+        """Returns the object, int64 and -1 for none, of each of ``lines`` int32, as in
+        ``Render.indices``. Those of agents come first.
         """
         index = lines.long() - n_agent_lines
         is_object = (index >= 0) & (index < len(self.line_object))
@@ -160,12 +157,8 @@ class Objects(SetOnce):
 
 
 def check_objects(objects: Objects) -> None:
-    """Raises the error of an object that the device flagged since the last check, if any.
-
-    :func:`megastep.engine.check` does so too. Synchronises host and device.
-
-    Raises:
-        EngineError: naming the environment and the object.
+    """Raises EngineError, naming environment and object, if the device flagged an object since the
+    last check; so does :func:`megastep.engine.check`. Synchronises host and device.
     """
     flag = objects.error_flag.item()
     if flag:

@@ -85,7 +85,6 @@ class SceneryEnv(DisplayedEnv):
 
     def check(self) -> None:
         """Raises EngineError if the engine flagged an error on the device since the last check.
-
         Synchronises host and device, so do not call it from ``step``.
         """
         engine.check(self.core.agents)
@@ -97,9 +96,7 @@ class SceneryEnv(DisplayedEnv):
 
     def weigh_layouts(self) -> torch.Tensor:
         """Has the layouts of new episodes be drawn by weights from now on, first by equal ones.
-        Returns the cumulative weights, (D,) int32, to be changed in place.
-
-        Raises:
-            ValueError: if environments keep their layouts.
+        Returns the cumulative weights, (D,) int32, to be changed in place. ValueError if
+        environments keep their layouts.
         """
         return self.spawner.weigh_layouts()

@@ -2,7 +2,6 @@
 Sensors and movements have a ``.space``.
 """
 
-from megastep.modules.free_points import FreePoints
 from megastep.modules.lifecycle import (
     ENDLESS,
     CounterGenerator,
@@ -22,7 +21,7 @@ from megastep.modules.movement import (
 )
 from megastep.modules.objects import COLOURS, Crate, Disc, Door, Objects, doorways
 from megastep.modules.sensors import IMU, RGB, Depth, downsample, render
-from megastep.modules.spawning import RandomSpawns, spawn_points
+from megastep.modules.spawning import FreePoints, RandomSpawns, spawn_points
 from megastep.modules.visibility import TEXELS_PER_POINT, visible_texels
 
 __all__ = ["COLOURS", "ENDLESS", "IMU", "MOVES", "RGB", "TEXELS_PER_POINT", "TURNS", "Crate"]

@@ -1,10 +1,11 @@
-"""Spawning: a search for points where agents fit, and a module that puts agents there. N
-environments, A agents, D layouts, P points, M walls.
+"""Spawning: a search for points where agents fit, and modules that put agents there or draw such
+points. N environments, A agents, D layouts, P points, M walls.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -14,8 +15,10 @@ from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.geometry import centers, contents
+from megastep.modules.lifecycle import CounterGenerator, derived_seed
 from megastep.modules.movement import to_agents
 
+T = TypeVar("T")
 CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
 PREFIX = "spawn-points-"  # of the files in the cache
 MAX_FILES = 64  # in the cache, half a megabyte each for 512 layouts
@@ -35,6 +38,18 @@ def distances(points, walls) -> np.ndarray:
     dx -= along * vx
     dy -= along * vy
     return np.sqrt((dx * dx + dy * dy).min(1, initial=np.inf))
+
+
+def per_geometry(
+    geometries: Sequence[dotdict], seed: int, function: Callable[[dotdict, np.random.Generator], T]
+) -> list[T]:
+    """Returns what a function of a geometry and a generator gives for each; equal ones share it."""
+    found: dict[int, T] = {}
+    for g in geometries:
+        if id(g) not in found:
+            random = np.random.Generator(np.random.Philox([seed, len(found)]))
+            found[id(g)] = function(g, random)
+    return [found[id(g)] for g in geometries]
 
 
 def candidates(g, n, random) -> Iterator[np.ndarray]:
@@ -169,10 +184,7 @@ class RandomSpawns:
 
     def weigh_layouts(self) -> torch.Tensor:
         """Has layouts be drawn by weights from now on, first by equal ones. Returns ``cumulative``,
-        to be changed in place.
-
-        Raises:
-            ValueError: if environments keep their layouts.
+        to be changed in place. ValueError if environments keep their layouts.
         """
         if not self.resample:
             raise ValueError("environments keep their homes: use resample=True to draw them anew")
@@ -198,3 +210,62 @@ def cached_points(
         return build()["points"]
     parts = Path(__file__), n, n_agents, radius, seed, *contents(geometries)
     return cache.arrays(PREFIX, parts, build, MAX_FILES)["points"]
+
+
+class FreePoints:
+    """Draws random points in the rooms of environments' homes, such as goals or places for objects.
+
+    A disc of an agent's radius around each point is 5 cm clear of every wall. A point is drawn in
+    the layout that the environment shows at the call, so call it after the spawner. The k-th draw
+    is the same on the CPU, on a GPU and in a CUDA graph; a call does not synchronise.
+
+    Args:
+        geometries: those that the scenery was made from.
+        core: the environment's core.
+        n_points: points per layout to draw from.
+        per_env: points drawn per environment, K. Default: one per agent.
+        seed: of the points and draws. Default: the core's. Two instances with equal seeds draw
+            equal points.
+
+    Attributes:
+        points: (D, n_points, 2) float32 metres, the points of each layout.
+
+    Raises:
+        ValueError: if a geometry has no point where an agent fits, or there are fewer geometries
+            than layouts.
+    """
+
+    def __init__(
+        self,
+        geometries: Sequence[dotdict],
+        core: Core,
+        n_points: int = 128,
+        per_env: int | None = None,
+        seed: int | None = None,
+    ):
+        per_env = core.n_agents if per_env is None else per_env
+        self.core, self.per_env = core, checks.integer("per_env", per_env, 1)
+        n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
+        seed = core.seed if seed is None else checks.integer("seed", seed, 0)
+        seed = derived_seed(seed, "points")
+        n_layouts = len(core.scenery.layouts)
+        if len(geometries) < n_layouts:
+            raise ValueError(
+                f"geometries must be those that the scenery was made from, one for each of its "
+                f"{n_layouts} layouts, but {len(geometries)} were given"
+            )
+        geometries = geometries[:n_layouts]
+        points = cached_points(geometries, n_points, 1, core.agents.radius, seed)
+        self.points = torch.as_tensor(points, device=core.device)
+        self.generator = CounterGenerator(core.n_envs * self.per_env, seed, core.device)
+
+    def __call__(self, mask: torch.Tensor) -> torch.Tensor:
+        """Draws new points where ``mask``, (N, K) or (N * K,) bool, is True.
+
+        Returns (N, K, 2) float32 metres. Elsewhere these are the points of the last draw. If the
+        environment has moved to another layout since, they are arbitrary points of that one.
+        """
+        n_points = self.points.shape[1]
+        index = (self.generator(mask)[:, 0] * n_points).long().view(-1, self.per_env)
+        rows = self.core.scenery.layout.long()[:, None] * n_points + index
+        return self.points.flatten(0, 1)[rows]

@@ -144,16 +144,6 @@ def test_both_sides_observe_the_court_mirrored(pixels, device):
 # ---- Display ----
 
 
-def test_text_shows_the_score_and_the_court():
-    court = Court(points=3).place(x=20.5, y=9.25, vx=1, vy=0.75, left=5, right=6)
-    court.env.games[8] = 2
-    court.step()
-    lines = court.env.text().splitlines()
-    assert len(lines) == 33 and lines[0].strip() == "2 : 0" and lines[1] == lines[32] == 40 * "-"
-    assert lines[2 + 4] == "" and lines[2 + 5] == "|"
-    assert lines[2 + 9] == 20 * " " + "." + 18 * " " + "|" and lines[2 + 10] == 21 * " " + "o"
-
-
 # ---- Errors ----
 
 

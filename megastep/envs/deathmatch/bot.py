@@ -31,10 +31,8 @@ class Bot:
         self.fov = fov
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state, (B,) each.
-
-        `lost`: steps since an agent was in view. `side`: direction to turn, 1 left or -1 right.
-        `around`: steps left to turn away from a wall. `pushed`: the last action was forward.
+        """Returns the initial state, (B,) each: steps since an agent was in view; direction to
+        turn, 1 left or -1 right; steps left to turn from a wall; the last action was forward.
         """
         zeros = torch.zeros(n_lanes, dtype=torch.int64, device=device)
         return arrdict(
@@ -48,18 +46,9 @@ class Bot:
         sample: bool = True,
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, arrdict]:
-        """Chooses actions for all lanes.
-
-        Args:
-            world: of Deathmatch.
-            state: of the last step, or :meth:`initial`.
-            sample, generator: ignored; the bot is deterministic.
-
-        Returns:
-            (arrdict(actions (B, 1) int64), new state).
-
-        Raises:
-            ValueError: if the observations are not Deathmatch's.
+        """Chooses actions (B, 1) for the lanes of a world of Deathmatch, by the state of the last
+        step or :meth:`initial`; ``sample`` and ``generator`` change nothing. Returns
+        (arrdict(actions), new state). ValueError if the observations are not Deathmatch's.
         """
         obs = world["obs"]
         if not isinstance(obs, Mapping) or not {"rgb", "d", "imu"} <= obs.keys():

@@ -16,7 +16,7 @@ import numpy as np
 
 from megastep import cache, geometry
 from megastep.dotdict import dotdict
-from megastep.modules.spawning import CLEARANCE, candidates, distances
+from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
 
 RES = 0.1  # metres per cell, of the areas
 N_POINTS = 512  # drawn per layout
@@ -38,11 +38,8 @@ class Episodes(NamedTuple):
 
 
 class Areas:
-    """The areas of a home.
-
-    Attributes:
-        labels: (H, W) int, the area of each cell from 1, 0 where a wall or doorway is.
-        sides: (K, 2) int, the areas beside each doorway, 0 if there is none.
+    """The areas of a home: ``labels`` (H, W), of each cell from 1, 0 where a wall or doorway is;
+    ``sides`` (K, 2), those beside each doorway, 0 if there is none.
     """
 
     def __init__(self, g: dotdict):
@@ -75,31 +72,19 @@ def cached_episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed:
 
 
 def episodes(geometries: Sequence[dotdict], n: int, n_colours: int, seed: int) -> Episodes:
-    """Returns n random episodes of each geometry, with up to `n_colours` shut doors.
-
-    Args:
-        geometries: floor plans. The same object may occur several times.
-        n: episodes per layout.
-        n_colours: shut doors, at most.
-        seed: of the draws.
-
-    Raises:
-        ValueError: no geometry has a doorway between two of its areas, or one has no room.
+    """Returns n random episodes of each geometry, with up to `n_colours` shut doors. ValueError if
+    no geometry has a doorway between two of its areas, or one has no room.
     """
-    distinct = {id(g): g for g in geometries}
     n_doors = max(len(np.reshape(g.get("doors", ()), (-1, 2, 2))) for g in geometries)
-    found = {}
-    for d, (key, g) in enumerate(distinct.items()):
-        random = np.random.Generator(np.random.Philox([seed, d]))
-        found[key] = _episodes(g, n, n_colours, n_doors, random)
-    if not any((part[1] == part[1]).any() for part in found.values()):
+    found = per_geometry(
+        geometries, seed, lambda g, random: _episodes(g, n, n_colours, n_doors, random)
+    )
+    starts, keys, goals, doors = (np.stack(parts) for parts in zip(*found))
+    if np.isnan(keys).all():
         raise ValueError(
             f"geometry {geometries[0].id} has no doorway between two of its parts, nor has any "
             "other: Keys needs homes with doors, such as geometry=homes"
         )
-    starts, keys, goals, doors = (
-        np.stack([found[id(g)][part] for g in geometries]) for part in range(4)
-    )
     return Episodes(
         starts.astype(np.float32), keys.astype(np.float32), goals.astype(np.float32), doors
     )
@@ -134,9 +119,8 @@ def _episodes(g, n, n_colours, n_doors, random) -> tuple[np.ndarray, ...]:
 
 
 def _doors(areas, usable, n_colours, random) -> tuple[np.ndarray, list, np.ndarray]:
-    """Draws which doors are shut. Returns the zone of each area, -1 if it cannot be reached; the
-    doors in the order in which they are opened, as (colour, zone where the key lies, zone behind);
-    and the states of all doorways (K,).
+    """Draws which doors are shut. Returns the zone of each area, -1 if it cannot be reached; doors
+    in the order of opening, as (colour, zone of the key, zone behind); and states of doorways (K,).
     """
     n_areas = int(areas.labels.max()) + 1
     part, tree, states = [*range(n_areas)], [], np.full(len(areas.sides), OPEN, np.int32)
@@ -186,8 +170,8 @@ def _lock_ways_around(areas, usable, zones, locked, states) -> None:
 
 
 def _points(points, zones, opened, random) -> list | None:
-    """Draws points (2,) for start, goal and the key of each door, apart from each other; None if
-    there is no room. `zones` (P,) are those of the points.
+    """Draws points (2,) in their zones (P,) for start, goal and the key of each door; None if there
+    is no room.
     """
     first = opened[0][1] if opened else zones[random.integers(len(zones))] if len(zones) else 0
     last, chosen = opened[-1][2] if opened else first, []

@@ -19,7 +19,7 @@ from megastep.kernels.build.kernel_library import KernelLibrary
 from megastep.kernels.build.launch import launch
 from megastep.modules.lifecycle import derived_seed
 from megastep.modules.objects import REACH
-from megastep.modules.spawning import CLEARANCE, candidates, distances
+from megastep.modules.spawning import CLEARANCE, candidates, distances, per_geometry
 from megastep.settings import checked
 
 if TYPE_CHECKING:
@@ -40,27 +40,14 @@ def arrangements(
     geometries: Sequence[dotdict], n: int, n_objects: int, radius: float, apart: float, seed: int
 ) -> np.ndarray:
     """Returns random points for objects, (D, n, n_objects, 2) float32 metres, each in a room of its
-    own if there are as many. If fewer arrangements are found, some are repeated.
-
-    Args:
-        geometries: floor plans. The same object may occur several times.
-        n: arrangements per layout.
-        n_objects: points of each.
-        radius: metres; discs of it around the points are 5 cm clear of walls.
-        apart: metres between two points, at least.
-        seed: of the points.
-
-    Raises:
-        ValueError: naming a geometry where the objects do not fit.
+    own if there are as many. If fewer of the n arrangements are found, some are repeated. Discs of
+    ``radius`` around the points are 5 cm clear of walls, and any two points ``apart`` metres apart.
+    ValueError naming a geometry where the objects do not fit.
     """
-    distinct = {id(g): g for g in geometries}
-    found = {
-        key: _arrangements(g, n, n_objects, radius, apart, np.random.Generator(bits))
-        for (key, g), bits in zip(
-            distinct.items(), (np.random.Philox([seed, d]) for d in range(len(distinct)))
-        )
-    }
-    return np.stack([found[id(g)] for g in geometries]).astype(np.float32)
+    found = per_geometry(
+        geometries, seed, lambda g, random: _arrangements(g, n, n_objects, radius, apart, random)
+    )
+    return np.stack(found).astype(np.float32)
 
 
 def _arrangements(g, n, n_objects, radius, apart, random) -> np.ndarray:

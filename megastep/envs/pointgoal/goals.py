@@ -124,16 +124,9 @@ def _in_range(layout, nearest, furthest) -> np.ndarray:
 def all_geodesics(
     geometries: Sequence[dotdict], radius: float, seed: int, device: torch.device | str = "cpu"
 ) -> list[Geodesics]:
-    """Returns the geodesics of each geometry.
-
-    A GPU computes them in less time than a file takes to read. A CPU takes some seconds for 512
-    homes: it shows a progress bar and caches them.
-
-    Args:
-        geometries: floor plans. The same object may occur several times.
-        radius: of the agents, in metres.
-        seed: of goals and spawn points.
-        device: where to compute. The results do not depend on it.
+    """Returns the geodesics of each geometry, the same on any device. A GPU computes them in less
+    time than a file takes to read. A CPU takes some seconds for 512 homes: it shows a progress bar
+    and caches them.
     """
     distinct = list({id(g): g for g in geometries}.values())
     generators = [np.random.Generator(np.random.Philox([seed, d])) for d in range(len(distinct))]

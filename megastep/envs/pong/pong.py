@@ -11,7 +11,7 @@ import torch
 from pydantic import Field
 
 from megastep import engine, plotting, spaces
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.devices import threads
 from megastep.engine import checks
 from megastep.engine.launch_params import seed_params
@@ -28,14 +28,10 @@ __all__ = ["Pong"]
 CELL = LIBRARY.constants["CELL"]  # units of position per cell; a cell is one pixel
 FEATURES = LIBRARY.constants["N_FEATURES"]  # of an observation
 GAME_FIELDS = LIBRARY.constants["GAME_FIELDS"]  # of a game's state
-PIXELS = LIBRARY.constants["ROWS"], LIBRARY.constants["COLUMNS"]
-ROWS, COLUMNS = PIXELS
-PADDLE_ROWS, TRAIL_GREY, PADDLE_GREY, BALL_GREY = (
-    LIBRARY.constants[name] for name in ("PADDLE_ROWS", "TRAIL_GREY", "PADDLE_GREY", "BALL_GREY")
-)
+ROWS, COLUMNS = LIBRARY.constants["ROWS"], LIBRARY.constants["COLUMNS"]
+PADDLE_ROWS = LIBRARY.constants["PADDLE_ROWS"]
 LIMITS = 1, 1, 1, 1, 1, 1, 2, 2  # of the features' magnitudes
 N_DRAWS, ENDED = 11, 12  # rows of a game's state
-TEXT = {0: " ", TRAIL_GREY: ".", PADDLE_GREY: "|", BALL_GREY: "o"}  # character of each grey
 
 
 class Pong(DisplayedEnv):
@@ -171,24 +167,6 @@ class Pong(DisplayedEnv):
             scores=game[8:10],
             age=game[10],
         )
-
-    @staticmethod
-    def image(state: arrdict) -> np.ndarray:
-        """Returns the left side's pixels (30, 40) uint8 in a numpyified :meth:`state`."""
-        pixels = np.zeros((ROWS, COLUMNS), np.uint8)
-        for top, column in zip(state.paddles.astype(int), (0, -1), strict=True):
-            pixels[top : top + PADDLE_ROWS, column] = PADDLE_GREY
-        for (x, y), grey in ((state.last_ball, TRAIL_GREY), (state.ball, BALL_GREY)):
-            pixels[int(y), int(x)] = grey
-        return pixels
-
-    def text(self, e: int = 0) -> str:
-        """Draws environment ``e`` as text: the score above 30 lines of the court."""
-        state = numpyify(self.state(e))
-        lines = ["".join(TEXT[grey] for grey in row) for row in self.image(state).tolist()]
-        left, right = state.scores
-        score, edge = f"{left} : {right}".center(COLUMNS).rstrip(), COLUMNS * "-"
-        return "\n".join([score, edge, *(line.rstrip() for line in lines), edge])
 
     @classmethod
     def plot_state(cls, state: arrdict) -> "Figure":

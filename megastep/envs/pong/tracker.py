@@ -11,13 +11,8 @@ from megastep.kernels.build.kernel_library import KernelLibrary
 __all__ = ["Tracker"]
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels")
-FEATURES, PIXELS = (
-    LIBRARY.constants["N_FEATURES"],
-    (
-        LIBRARY.constants["ROWS"],
-        LIBRARY.constants["COLUMNS"],
-    ),
-)
+FEATURES = LIBRARY.constants["N_FEATURES"]
+PIXELS = LIBRARY.constants["ROWS"], LIBRARY.constants["COLUMNS"]
 NOTHING, UP, DOWN = 0, 1, 2
 PADDLE_ROWS, PADDLE_GREY, BALL_GREY = (
     LIBRARY.constants[name] for name in ("PADDLE_ROWS", "PADDLE_GREY", "BALL_GREY")
@@ -50,18 +45,9 @@ class Tracker:
         sample: bool = True,
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, arrdict]:
-        """Chooses actions for all lanes.
-
-        Args:
-            world: of Pong.
-            state: of the last step, or :meth:`initial`.
-            sample, generator: ignored; the tracker is deterministic.
-
-        Returns:
-            (arrdict(actions (B, 1) int64), new state).
-
-        Raises:
-            ValueError: if the observations are not Pong's.
+        """Chooses actions (B, 1) for the lanes of a world of Pong, by the state of the last step or
+        :meth:`initial`; ``sample`` and ``generator`` change nothing. Returns (arrdict(actions), new
+        state). ValueError if the observations are not Pong's.
         """
         below = _cells_below(world["obs"])
         saved = state["saved"].masked_fill(world["reset"], 0.0) + self.tracker_speed
