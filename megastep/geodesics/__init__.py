@@ -3,13 +3,5 @@
 from megastep.geodesics.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.geodesics.tables import Geodesics, draw_points, geodesics, largest_part, n_cells
 
-__all__ = [
-    "CELL",
-    "MAX_GOALS",
-    "Geodesics",
-    "PathGraph",
-    "draw_points",
-    "geodesics",
-    "largest_part",
-    "n_cells",
-]
+__all__ = ["CELL", "MAX_GOALS", "Geodesics", "PathGraph", "draw_points", "geodesics"]
+__all__ += ["largest_part", "n_cells"]

@@ -187,21 +187,10 @@ class PathGraph:
         return [field.reshape(s) for field, s in zip(np.split(lengths, ends), shapes)]
 
     def _all_lengths(self, goals, counts, points=None) -> torch.Tensor:
-        """Returns lengths (P * G,): for each home G rows, one after the other.
-
-        Args:
-            goals: (D, G, 2).
-            counts: (D,), number of points in each home.
-            points: (P, 2); by default the centres of all cells.
+        """Returns lengths (P * G,), for each home G rows, from points (P, 2), by default the
+        centres of all cells, ``counts`` (D,) in each home, to goals (D, G <= MAX_GOALS, 2).
         """
         n_goals = goals.shape[1]
-        if n_goals > MAX_GOALS:
-            parts = np.array_split(goals, -(-n_goals // MAX_GOALS), axis=1)
-            by_home = [
-                self._all_lengths(part, counts, points).split((part.shape[1] * counts).tolist())
-                for part in parts
-            ]
-            return torch.cat([rows[d] for d in range(len(counts)) for rows in by_home])
         goals = self.tensor(goals, np.float32)
         distances = torch.empty((len(self.corner_homes), MAX_GOALS), device=self.device)
         launch(

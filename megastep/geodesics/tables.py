@@ -43,22 +43,10 @@ def geodesics(
     generators: Sequence[np.random.Generator],
     device: torch.device | str = "cpu",
 ) -> Iterator[Geodesics]:
-    """Draws goals and spawn points from the largest connected part of each geometry, and computes
-    the shortest paths between them.
-
-    Args:
-        geometries: the homes.
-        n_spawns: number of spawn points S.
-        n_goals: number of goals G.
-        radius: of the agents, in metres.
-        generators: of the points, one per geometry.
-        device: where to compute. The results do not depend on it.
-
-    Yields:
-        The geodesics of each geometry, in order.
-
-    Raises:
-        ValueError: naming the geometry, if it has no room for an agent, no walls or is too large.
+    """Draws ``n_spawns`` spawn points and up to MAX_GOALS goals from the largest connected part of
+    each geometry, by its generator, and yields them with the shortest paths of agents of ``radius``
+    metres between them, the same on any device. ValueError, naming the geometry, if it has no room
+    for an agent, no walls or is too large.
     """
     device = torch.device(device)
     n_threads = threads() if device.type == "cpu" else 1
@@ -76,16 +64,14 @@ def geodesics(
 
 
 def n_cells(g: dotdict) -> int:
-    """Returns the number of cells in the grid of a geometry.
-
-    Raises:
-        ValueError: naming the geometry, if it has no walls, or more than a million cells.
+    """Returns the number of cells in the grid of a geometry. ValueError, naming it, if it has no
+    walls, or more than a million cells.
     """
     if not len(g.walls):
         raise ValueError(f"geometry {g.id} has no walls, but PointGoal needs homes with walls")
     size = g.walls.max((0, 1)) - g.walls.min((0, 1))
     n = int(np.prod(np.ceil(size / CELL) + 2))
-    if not n <= MAX_CELLS:
+    if n > MAX_CELLS:
         raise ValueError(
             f"geometry {g.id} is {size[0]:.0f} m x {size[1]:.0f} m, but PointGoal's homes have at "
             f"most {MAX_CELLS * CELL**2:,.0f} m2: use smaller ones, or check the unit"

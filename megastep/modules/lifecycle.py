@@ -40,9 +40,8 @@ class CounterGenerator:
         self.values = torch.zeros((n_lanes, 4), device=device)
 
     def __call__(self, mask: torch.Tensor) -> torch.Tensor:
-        """Draws four uniform numbers in [0, 1) for each lane where ``mask``, (B,) bool, is True.
-
-        Returns (B, 4) float32. The other lanes keep the numbers of their last draw.
+        """Draws four uniform numbers in [0, 1), (B, 4) float32, for each lane where ``mask``, (B,)
+        bool, is True. The other lanes keep those of their last draw.
         """
         checks.length("mask", mask)
         return engine.uniform(self.counts, mask.reshape(-1), self.seed, self.values)
@@ -108,15 +107,14 @@ class Lifecycle:
 
     def __init__(self, core: Core, limit: int | RandomLifespans | None = None):
         self.lifespans = limit if isinstance(limit, RandomLifespans) else None
-        n_steps = ENDLESS
-        if limit is not None and self.lifespans is None:
-            n_steps = checks.integer("limit", limit, 1, ENDLESS)
         n_lanes, device = core.n_envs * core.n_agents, core.device
         self.n_agents, self.seed = core.n_agents, core.seed
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, device=device)
         self.limits = torch.zeros_like(self.ages)
         if self.lifespans is None:
-            self.limits.fill_(n_steps)
+            self.limits.fill_(
+                ENDLESS if limit is None else checks.integer("limit", limit, 1, ENDLESS)
+            )
         self.ended = torch.zeros(n_lanes, dtype=torch.bool, device=device)
         self._never = torch.zeros_like(self.ended)
 
@@ -141,9 +139,6 @@ class Lifecycle:
             reset: (B,) bool, lanes that begin an episode in this step.
             terminal: (B,) bool, lanes whose episode ends by the environment's own rule. Ignored
                 where ``reset`` is True; takes precedence over the time limit.
-
-        Raises:
-            TypeError, ValueError: naming the mask that does not fit.
         """
         checks.alike("reset", reset, self.ended)
         if terminal is not None:

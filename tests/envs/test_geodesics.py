@@ -237,14 +237,6 @@ def test_fields_are_known_wherever_a_body_fits():
     assert known[reached].all() and reached.mean() > 0.3
 
 
-def test_more_goals_than_one_launch_takes():
-    g = sample("homes", 1)[0]
-    many, few = geodesics_of(g, 24, 40), geodesics_of(g, 24 + 36, 4)
-    order = [(many.goals == goal).all(1).nonzero()[0][0] for goal in few.goals]
-    assert many.lengths.shape == (24, 40) and len(many.fields) == 40
-    np.testing.assert_array_equal(many.fields[order], few.fields)
-
-
 def test_a_homes_paths_do_not_depend_on_the_homes_beside_it():
     homes = toys.box(3), room(((3, 0), (3, 2)), width=5.0)
     generators = [np.random.Generator(np.random.Philox(1)) for _ in homes]
