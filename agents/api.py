@@ -125,9 +125,8 @@ class Run:
 
 
 def make(env: object, privileged: bool = False, **settings_of_env: object) -> "Env":
-    """Returns an environment: `megastep.make("explorer", n_envs=64, geometry="homes")`.
-
-    On a CPU this sets the number of threads as training does: the engine gets all, PyTorch one.
+    """Returns an environment: `megastep.make("explorer", n_envs=64, geometry="homes")`. On a CPU
+    this sets the number of threads as training does: the engine gets all, PyTorch one.
 
     Args:
         env: name, class, import path, or dict with `name` and settings.
@@ -160,8 +159,7 @@ def train(**settings: object) -> Run | None:
         settings: words of `megastep train`, which `megastep train --help` explains.
 
     Raises:
-        UserError: training cannot start or continue; nothing is written then, or what was learnt
-            is saved.
+        UserError: training cannot start or continue; what was learnt is saved.
         KeyboardInterrupt: Ctrl-C, or a notebook's stop button; the message says how to continue.
     """
     from megastep.agents.launch import rank
@@ -176,16 +174,14 @@ def train(**settings: object) -> Run | None:
 def evaluate(
     run: "Run | str | os.PathLike | PolicyLike", env: object = None, **settings: object
 ) -> "list[Row]":
-    """Measures an agent in homes it was not trained in. Returns the rows of the table.
+    """Measures an agent in homes it was not trained in. Returns the rows of the table. Raises
+    UserError if it cannot be evaluated so.
 
     Args:
         run: a run, its folder, `latest`, or the name of a packaged agent. Or a policy, with the
             environment that it plays in, each lane one episode; nothing is written then.
         env: as on the command line; for a policy an environment that `make` returned.
         settings: words of `megastep evaluate`; for a policy `seed`, `greedy` and `max_steps`.
-
-    Raises:
-        UserError: there is no such run, or it cannot be evaluated so.
     """
     from megastep.agents.evaluation import evaluate_run, playing, statistics  # with PyTorch
 
@@ -203,6 +199,7 @@ def record(
     **settings: object,
 ) -> "Film":
     """Films an agent in one home. Returns the path of the video, which a notebook shows as a film.
+    Raises UserError if it cannot be filmed so.
 
     Args:
         run: as for `evaluate`; None with `env` films random actions. A policy needs its
@@ -210,9 +207,6 @@ def record(
         env: as for `evaluate`.
         settings: words of `megastep record`; for a policy `file`, `steps`, `greedy`, `seed` and
             the look.
-
-    Raises:
-        UserError: there is no such run, or it cannot be filmed so.
     """
     from megastep import recording
     from megastep.agents.evaluation import filming  # with PyTorch

@@ -1,8 +1,7 @@
 """Protocols of the learner's parts, and the defaults of what is optional.
 
-Nothing has to inherit from them: any object with these attributes will do. A protocol `XLike` is
-what the class `X` of megastep and any stand-in for it have in common. The rules behind them are in
-:mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
+Nothing has to inherit from them: any object with these attributes will do. The rules behind them
+are in :mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
 """
 
 from __future__ import annotations
@@ -46,10 +45,8 @@ T = TypeVar("T")
 
 
 class Actor(PolicyLike, Protocol):
-    """A policy as :func:`megastep.agents.storage.collector.collect` runs it.
-
-    If the rollout stores values, the actor also needs `value(features, privileged)`, and its
-    decisions need `features`.
+    """A policy as :func:`megastep.agents.storage.collector.collect` runs it. If the rollout stores
+    values, it also needs `value(features, privileged)`, and its decisions `features`.
     """
 
     def compute_dtype(self) -> torch.autocast:
@@ -115,8 +112,8 @@ class CollectorOptions(Protocol):
 
     @staticmethod
     def state_dict() -> StateDict:
-        """Returns all that it carries from rollout to rollout, so that a run can be resumed bit for
-        bit. Empty: a resumed run begins new episodes.
+        """Returns all that it carries from rollout to rollout, to resume bit for bit. Empty: a
+        resumed run begins new episodes.
         """
         return {}
 
@@ -192,9 +189,7 @@ class LearnerOptions(Protocol):
 
 
 def with_defaults(owner: object, options: type[T]) -> T:
-    """Returns the attributes of `options`, a protocol with defaults: those that `owner` has, and
-    the defaults of the others.
-    """
+    """Returns the attributes of `options`, a protocol with defaults, with those that `owner` has."""
     names = (name for name in vars(options) if not name.startswith("_"))
     values = {name: getattr(owner, name, getattr(options, name)) for name in names}
     return cast(T, SimpleNamespace(**values))
@@ -205,9 +200,8 @@ class Logger(Protocol):
 
     Its constructor takes those that it wants of `folder`, the run folder, a Path; `step`, the
     environment steps at which a resumed run starts, 0 in others; `run_name`, the folder's name; and
-    `config`, the run's settings as nested dicts. Its other arguments are settings.
-
-    If the constructor or a method raises, the logger is dropped with a warning and the run goes on.
+    `config`, the run's settings as nested dicts. Its other arguments are settings. A logger that
+    raises is dropped with a warning, and the run goes on.
     """
 
     def write(self, step: int, values: Mapping[str, float | str]) -> None:

@@ -170,11 +170,9 @@ def check_memory(
     n_members: int = 1,
     **arguments,
 ) -> None:
-    """Raises UserError with the number that fits, if there are too many environments, or too many
-    observations in a replay buffer, or too many members of a population, for the memory.
-
-    The `sample` gives an upper bound of what an environment takes, as it counts what environments
-    share. Only if that does not fit, more of them are made.
+    """Raises UserError with the number that fits, if environments, a replay buffer or members of a
+    population need more than the memory. The `sample` counts what environments share; only if that
+    is too much, more of them are made.
     """
 
     def fit(bytes_each) -> None:
