@@ -189,7 +189,7 @@ class LearnerOptions(Protocol):
 
 
 def with_defaults(owner: object, options: type[T]) -> T:
-    """Returns the attributes of `options`, a protocol with defaults, with those that `owner` has."""
+    """Returns the attributes of `options`, a protocol with defaults, as `owner` has them."""
     names = (name for name in vars(options) if not name.startswith("_"))
     values = {name: getattr(owner, name, getattr(options, name)) for name in names}
     return cast(T, SimpleNamespace(**values))

@@ -44,16 +44,18 @@ def caught(
 
 def _failure(error, env) -> EnvError | None:
     """Returns the error of an environment as an EnvError, None if another's code raised it."""
-    if isinstance(error, EnvError):
+    if isinstance(error, (EnvError, UserError)):
+        while error is not None and not isinstance(error, EnvError):
+            error = error.__cause__
         return error
-    if isinstance(error, UserError):
-        return _failure_below(error.__cause__)
     is_sentence = isinstance(error, engine.EngineError)
     if isinstance(error, (MemoryError, RuntimeError)):
         is_sentence |= memory_problem(error) is not None
     if is_sentence or env.name.startswith("megastep."):
         return None
-    codes = {_code(import_object(env.name), name) for name in METHODS} - {None}
+    kind = import_object(env.name)
+    methods = [inspect.unwrap(getattr(kind, name, None) or kind) for name in METHODS]
+    codes = {method.__code__ for method in methods if hasattr(method, "__code__")}
     frames = error.__traceback__
     while frames and frames.tb_frame.f_code not in codes:
         frames = frames.tb_next
@@ -61,17 +63,6 @@ def _failure(error, env) -> EnvError | None:
     if not frames:
         return None
     return EnvError(f"{env.name} failed: {one_line(error)}", trace)
-
-
-def _failure_below(error) -> EnvError | None:
-    """Returns an EnvError that others were raised from."""
-    while error is not None and not isinstance(error, EnvError):
-        error = error.__cause__
-    return error
-
-
-def _code(kind, name) -> object:
-    return getattr(inspect.unwrap(getattr(kind, name, None) or kind), "__code__", None)
 
 
 def _write(folder, name, trace) -> object:

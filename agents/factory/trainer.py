@@ -65,7 +65,10 @@ def make_trainer(
     """
     number, n_ranks = ranks = world() if ranks is None else ranks
     seed = rank_seed(cfg.seed, number)
-    seed_everything(seed)
+    of_users = stream_seed(seed, "global")  # which only code of theirs draws from
+    torch.manual_seed(of_users)
+    np.random.seed(of_users % 2**32)
+    random.seed(of_users)
     homes = factory.homes(cfg.env, cfg.geometry, "training") if homes is None else homes
     critic = cfg.agent.critic
     where = dict(geometries=homes, seed=seed, device=device, privileged=critic == "asymmetric")
@@ -188,14 +191,6 @@ def differing(before: "Row", now: "Row") -> list[str]:
         for name, value in before.items()
         if value != now.get(name)
     ]
-
-
-def seed_everything(seed: int) -> None:
-    """Seeds the global generators, which only code of the user's draws from."""
-    seed = stream_seed(seed, "global")
-    torch.manual_seed(seed)
-    np.random.seed(seed % 2**32)
-    random.seed(seed)
 
 
 def budget_of(
