@@ -152,7 +152,8 @@ def load(cfg, policy, env, learner, device, rank) -> checkpoint.Checkpoint | Non
     restore.load_weights(policy, loaded, env)
     if cfg.init:
         restore.load_wrappers(env, loaded, is_frozen=False)
-    elif check_state := getattr(learner, "check_state", None):
+    check_state = getattr(learner, "check_state", None)
+    if cfg.resume and check_state:
         with state_errors(loaded.path):
             check_state((loaded.state or {})["learner"])  # before anything is written
     if rank == 0 and policy.critic is not None and agent_file.is_agent_file(path):
