@@ -28,17 +28,9 @@ class UserError(Exception):
 
     code = 2
 
-
-class NonFinite(UserError):
-    """Training stopped on numbers that are not finite, or went on without them."""
-
-    code = 1
-
-
-class Differs(UserError):
-    """A run that was repeated gave other numbers."""
-
-    code = 1
+    def __init__(self, text: object, code: int | None = None):
+        super().__init__(text)
+        self.code = self.code if code is None else code
 
 
 class EnvFailed(UserError):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from megastep.agents import console
 from megastep.agents.distributed import process_group
-from megastep.agents.errors import Differs
+from megastep.agents.errors import UserError
 from megastep.agents.evaluation import evaluate_run, filming, tables
 from megastep.agents.factory import settings
 from megastep.agents.factory.trainer import make_loggers
@@ -58,7 +58,7 @@ def next_command(cfg: settings.Train, folder: Path) -> str:
 
 
 def compare(folder: Path, original: Path) -> None:
-    """Checks that two runs have the same metrics. Raises Differs if not."""
+    """Checks that two runs have the same metrics. Raises UserError if not."""
     generation = populations.first_copy(original)
     cause = generation and (
         f"in generation {generation} it copied another member, which a run of its own cannot: "
@@ -70,7 +70,7 @@ def compare(folder: Path, original: Path) -> None:
 
 def compare_population(folder: Path, original: Path) -> None:
     """Checks that two populations have the same generations, and their members the same metrics.
-    Raises Differs if not.
+    Raises UserError if not.
     """
     members = populations.members(original)
     for name in (*(f"{member.name}/{METRICS}" for member in members), populations.FILE):
@@ -90,4 +90,4 @@ def _check(name: str, folder: Path, original: Path, cause: str = "") -> None:
     cause = cause or (
         f"equal bits need the same versions, device and threads: see {provenance.FILE} of both"
     )
-    raise Differs(f"{name} differs from that of {original} from line {number} on; {cause}")
+    raise UserError(f"{name} differs from that of {original} from line {number} on; {cause}", 1)

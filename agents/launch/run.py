@@ -16,7 +16,7 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
 from megastep.agents.distributed.ranks import DriftError
-from megastep.agents.errors import EnvFailed, NonFinite, UserError, memory_problem
+from megastep.agents.errors import EnvFailed, UserError, memory_problem
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
 from megastep.agents.launch import again, rank_checks, signals
@@ -151,7 +151,7 @@ class Run:
         except NonFiniteError as error:
             hint = "" if self.of_each else self.trainers[0].nonfinite_guard.hint
             text = f"{error}. Earlier checkpoints are in {self.folder}{hint}"
-            raise NonFinite(text) from error
+            raise UserError(text, 1) from error
         except DriftError as error:
             raise UserError(f"{error}. Earlier checkpoints are in {self.folder}") from error
         except (MemoryError, RuntimeError) as error:
@@ -192,7 +192,7 @@ class Run:
         finishing.finish(cfg, folder, samples)
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All other rollouts were used; the run is in {folder}"
-            raise NonFinite(f"{nonfinite}. {learnt}{hint}")
+            raise UserError(f"{nonfinite}. {learnt}{hint}", 1)
         if cfg.rerun and self.is_first:
             finishing.compare(folder, Path(cfg.rerun))
         console.say(f"{result}. The run is in {folder}\n{finishing.next_command(cfg, folder)}")

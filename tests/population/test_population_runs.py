@@ -14,7 +14,7 @@ import yaml
 from megastep.agents.algorithms.learner import GradientLearner
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.cli import entry, train
-from megastep.agents.errors import Differs
+from megastep.agents.errors import UserError
 from megastep.agents.launch.finishing import compare_population
 from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations, scores
@@ -201,7 +201,7 @@ def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
 
     copied = next(row for rows in generations for row in rows if row["from"] != row["member"])
     words = "rerun=P", f"member={copied['member']}", "folder=one"
-    err = refused(capsys, *words, code=Differs.code)
+    err = refused(capsys, *words, code=1)
     assert f"in generation {copied['generation']} it copied another member" in err
     assert "rerun=P repeats the whole population" in err
     assert populations.first_copy(Path("P/member-9")) is None
@@ -209,7 +209,7 @@ def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
 
     with open("P/member-1/metrics.jsonl", "a") as file:
         file.write("{}\n")
-    with pytest.raises(Differs, match="member-1/metrics.jsonl differs from that of P from line"):
+    with pytest.raises(UserError, match="member-1/metrics.jsonl differs from that of P from line"):
         compare_population(Path("again"), Path("P"))
     (here / "P" / populations.FILE).unlink()
     err = refused(capsys, "rerun=P", "folder=third")
