@@ -9,7 +9,8 @@ from megastep.agents import package
 from megastep.agents.errors import UserError
 from megastep.agents.launch import signals
 
-#: The commands, each a module of this package with `main(words) -> int`, the exit code.
+#: The commands, each a module of this package with `main(words) -> int`, the exit code, but for
+#: `rerun`, which is `train rerun=`.
 COMMANDS = {
     "train": "trains a policy; --help says more",
     "evaluate": "measures a trained policy; --help says more",
@@ -57,6 +58,10 @@ def run_command(name: str, words: list[str] | None = None) -> int:
 
     console.open_streams()
     try:
+        if name == "rerun":
+            if not words:
+                raise UserError("takes a run: its folder, or latest")
+            name, words = "train", [f"rerun={words[0]}", *words[1:]]
         return importlib.import_module(f"megastep.agents.cli.{name}").main(words)
     except UserError as error:
         console.say(f"{package.command(name)}: {error}", sys.stderr)
