@@ -29,18 +29,16 @@ The most common words:
                                one reaches this return, or evaluation.stop.success=0.95
   finish.evaluate=true finish.record=true
                                a table and a video at the end
-  opponents.past=0.4 opponents.bot=0.1
-                               with several agents: fractions of environments against past selves
-                               and a scripted policy; checkpoints.snapshots=8 is for ratings
-  curriculum=sfl               draw homes that are won half of the time more often
+  opponents.past=0.4 opponents.bot=0.1 curriculum=sfl
+                               fractions of environments against past selves and a scripted
+                               policy; homes that are won half of the time are drawn more often
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
                                more_seconds=60 more_samples=1e6 extend its budget
   folder=X resume=auto         start a run in X, or continue it if it has begun, as when a cluster
                                starts the same command again
   ranks=2                      two processes that train together, on a GPU each; all: every GPU;
                                dry_run=true only prints what would run
-  rerun=RUN                    repeat a run, with the learning rates that its clock chose, and
-                               compare its metrics.jsonl
+  rerun=RUN                    repeat a run and compare its metrics.jsonl
   init=RUN                     start a new run from its weights, in its environment and homes; also
                                the name of a pretrained agent
   population.size=8 'population.vary={learner.lr: {min: 3e-4, max: 3e-3, log: true}}'
