@@ -92,11 +92,10 @@ class Saver:
         """
         self.wait()
         self._number += 1
-        state = self._with_replay(state, is_last)
-        copy = {key: _on_host(part, (key,), self._pinned) for key, part in state.items()}
-        for device in {leaf.device for leaf in tree_leaves(state) if hasattr(leaf, "is_cuda")}:
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
+        state, devices = self._with_replay(state, is_last), set()
+        copy = {key: _on_host(part, (key,), self._pinned, devices) for key, part in state.items()}
+        for device in devices:
+            torch.cuda.synchronize(device)
         # environments may hold infinities, weights may not
         learnt = {name: copy[name] for name in ("policy", "learner") if name in copy}
         if path := nonfinite_leaf(learnt):
@@ -206,12 +205,15 @@ class NoSaver(Saver):
         """Does nothing."""
 
 
-def _on_host(node, path, pinned) -> object:
-    """Returns a copy on the CPU, from a GPU into pinned memory that is reused, asynchronously."""
+def _on_host(node, path, pinned, devices) -> object:
+    """Returns a copy on the CPU, from a GPU into pinned memory that is reused, asynchronously: then
+    the GPU is one of the devices.
+    """
     if isinstance(node, dict):
-        return {key: _on_host(part, (*path, key), pinned) for key, part in node.items()}
+        return {key: _on_host(part, (*path, key), pinned, devices) for key, part in node.items()}
     if isinstance(node, (list, tuple)):
-        return type(node)(_on_host(part, (*path, i), pinned) for i, part in enumerate(node))
+        parts = (_on_host(part, (*path, i), pinned, devices) for i, part in enumerate(node))
+        return type(node)(parts)
     if not isinstance(node, torch.Tensor):
         check_plain(node, ".".join(map(str, path)))
         return node
@@ -223,6 +225,7 @@ def _on_host(node, path, pinned) -> object:
     kept = pinned.get(path)
     if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
         kept = pinned[path] = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+    devices.add(tensor.device)
     return kept.copy_(tensor, non_blocking=True)
 
 
