@@ -10,7 +10,7 @@ import torch
 
 from megastep import geometries
 from megastep.agents import package, pretrained
-from megastep.agents.cli import evaluate, export, inspect, record, train
+from megastep.agents.cli import evaluate, export, inspect, train
 from megastep.agents.errors import UserError
 from megastep.agents.export import agent
 from megastep.agents.networks.policy import TRAINING_ONLY
@@ -154,13 +154,6 @@ def test_meets_others_in_duels(exported, capsys):
         assert Path(f"runs/pretrained-{NAME}/ratings.csv").exists()
         assert evaluate.main([f"run={NAME}", "ratings=true", *words]) == 2
         assert "nothing to compare it with" in capsys.readouterr().err
-
-
-def test_is_recorded_into_its_folder(folder):
-    words = [f"run={NAME}", "geometry=box", "steps=1", "device=cpu"]
-    assert record.main(words) == record.main([*words, f"against={NAME}"]) == 0
-    names = sorted(path.name for path in Path(f"runs/pretrained-{NAME}").iterdir())
-    assert names == ["video-2.mp4", "video.mp4"]
 
 
 def test_starts_a_run_with_a_new_critic(file, capsys):

@@ -12,7 +12,6 @@ from matplotlib import pyplot as plt
 
 from megastep import recording
 from megastep.agents.cli import record, train
-from megastep.agents.runs import checkpoint
 from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
 
@@ -149,16 +148,6 @@ def test_video_that_cannot_be_made(trained, here, monkeypatch, capsys, file, tex
     monkeypatch.setattr(recording, "film_moments", lambda *_: pytest.fail("it is drawn"))
     assert record.main([f"run={trained}", "steps=1", "device=cpu", f"file={file}"]) == 2
     assert text in capsys.readouterr().err and os.listdir() == ["folder.mp4"]
-
-
-def test_run_of_another_environment(trained, tmp_path, capsys):
-    loaded = checkpoint.load_latest(trained / "checkpoints")
-    loaded.config["train"]["env"]["res"] = 16
-    checkpoint.save(tmp_path / "checkpoints", 32, loaded.state, loaded.config)
-    assert record.main([f"run={tmp_path}", "steps=1", "device=cpu"]) == 2
-    error = capsys.readouterr().err
-    assert re.search(r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)", error)
-    assert os.listdir(tmp_path) == ["checkpoints"]
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import itertools
 import json
 import os
 import pathlib
-import random
 import signal
 import time
 
@@ -244,45 +243,3 @@ def test_signal_during_imports(here, number=signal.SIGINT):
     assert process.returncode == 128 + number and out == ""
     assert err == f"train.py: stopped by {number.name}\n"
     assert not any(here.iterdir())
-
-
-def at_any_moment(here, seed):
-    """Sends a signal to a run at a random time, and checks what always holds."""
-    draw = random.Random(seed)
-    number, folder = draw.choice(SIGNALS), here / str(seed)
-    words = f"samples={8 * UPDATE}", "checkpoints.seconds=1e-9", f"folder={folder}", *WHOLE
-    process = start("train", *TINY, *words)
-    time.sleep(draw.uniform(0.1, 12))
-    if draw.random() < 0.5:
-        os.killpg(process.pid, number)  # as a terminal does: workers get it, too
-    else:
-        process.send_signal(number)
-    out, err = process.communicate(timeout=HUNG)
-    case = (seed, number.name, process.returncode, out, err)
-    if process.returncode == -number:  # before the script's first line, or after its last
-        assert not folder.exists() or "Filmed" in out, case
-        return
-    assert process.returncode in (0, 128 + number), case
-    assert not {"Traceback", "cannot", "warning"} & {*err.replace(":", "").split()}, case
-    if folder.exists() and "Training on" in out:
-        steps = [p.name for p in (folder / "checkpoints").glob("*")]
-        assert not any("tmp" in name for name in steps), case
-        if "Stopped after 0 samples" not in err:
-            assert checkpoint.load_latest(folder / "checkpoints").step > 0, case
-        assert not (folder / "lock").exists() and not list(folder.glob(".*")), case
-        for name in ("metrics.jsonl", "perf.jsonl"):
-            for line in (folder / name).read_text().splitlines():
-                json.loads(line)
-    elif process.returncode:
-        assert not folder.exists(), case
-
-
-@pytest.mark.parametrize(
-    "seed",
-    [
-        pytest.param(seed, marks=pytest.mark.nightly if seed else pytest.mark.slow)
-        for seed in range(20)
-    ],
-)
-def test_signal_at_a_random_moment(here, seed):
-    at_any_moment(here, seed)
