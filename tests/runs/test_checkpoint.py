@@ -269,16 +269,19 @@ checkpoint.save(folder, 1, {"n": 1, "w": torch.zeros(50_000)}, {})
 random.seed(1)
 newest = 1
 for kill in range(kills):
+    begun, begins = os.pipe()
     child = os.fork()
     if not child:
         for n in range(newest + 1, 10**9):
+            os.write(begins, b".")
             step = 1 if again else n
             checkpoint.save(folder, step, {"n": n, "w": torch.zeros(50_000)}, {})
+    os.read(begun, 1), os.read(begun, 1)  # it has saved once
     time.sleep(random.uniform(0, 0.08))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
     loaded = checkpoint.load_latest(folder).state["n"]
-    assert loaded >= newest, (loaded, newest)
+    assert loaded > newest, (loaded, newest)
     newest = loaded
 checkpoint.save(folder, newest + 1, {"n": newest + 1}, {})
 print(newest, *sorted(os.listdir(folder)))
@@ -298,8 +301,7 @@ def test_kill_9_at_random_leaves_the_newest_checkpoint_intact(tmp_path, kills, s
         stdout=subprocess.PIPE,
     )
     assert process.returncode == 0
-    newest, *files = process.stdout.split()
-    assert int(newest) > kills // 10, "too few processes lived long enough to save"
+    _, *files = process.stdout.split()
     assert len(files) == 2 and not any("tmp" in name for name in files), files
 
 
