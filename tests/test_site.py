@@ -23,7 +23,7 @@ def outputs(folder, notebook):
     return text, kinds.count("image/png"), films
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_site_builds_without_warnings_and_its_notebooks_show_what_they_say(tmp_path, monkeypatch):
     """All but the writing of HTML, which is half of the time: notebooks run, links and anchors are
     resolved.

@@ -21,7 +21,14 @@ CONCEPTS = ["../performance.md"] + sorted(
 )
 #: Pages that take more than about three seconds on an idle core.
 LONG = {"deathmatch.md", "explorer.md", "from-python.md", "keys-and-memory.md"}
-LONG |= {"own-floor-plans.md", "scaling-out.md", "training.md"}
+LONG |= {
+    "own-floor-plans.md",
+    "scaling-out.md",
+    "setting-up.md",
+    "sweeps.md",
+    "training.md",
+    "waypoint.md",
+}
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\S*)[^\n]*\n(.*?)```", re.S)
 FILE = re.compile(r"(?:#|//|<!--) (\S+\.(?:py|h|cpp|cu|svg))(?: -->)?\n")
 PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"

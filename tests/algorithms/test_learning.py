@@ -255,7 +255,7 @@ def test_learns_to_reach(name, continuous):
     assert rewards / valid > 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "core, min_return, max_return", [("gru", 0.9, 1), ("mingru", 0.9, 1), ("none", 0.1, 0.4)]
 )
@@ -266,7 +266,7 @@ def test_recurrent_cores_remember_cue(core, min_return, max_return):
     assert min_return < rewards / ends <= max_return
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_hidden_state_is_reset_with_episode():
     env, settings = Clock(), dict(n_updates=60, lr=1e-2, entropy_coef=0.03)
     _, rewards, _, valid, _ = learn(env, **settings)

@@ -102,13 +102,8 @@ def test_comparisons_see_a_hidden_state_that_is_never_reset():
         runtimes.compare(step, never, policy, env, "x.onnx", n_steps=100)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param(kind, marks=pytest.mark.slow if kind == "masked" else pytest.mark.nightly)
-        for kind in KINDS
-    ],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", KINDS)
 def test_files_act_as_the_policy_for_1000_steps(kind, tmp_path):
     policy, env, step = made(kind)
     runtimes.write_torch(step, tmp_path / "a.pt2")

@@ -30,7 +30,6 @@ async function main() {
       hash();
     }
     for (const { section } of greedy ? simulation.data.policies : []) simulation.change(section, "greedy", () => 1);
-    const started = process.cpuUsage();
     for (let t = 0; t < (greedy ?? 0); t++) {
       simulation.step({});
       const lanes = simulation.data.policies.flatMap(({ lanes: [a, b], logits: leaf }) => (
@@ -38,7 +37,7 @@ async function main() {
       logits.push(lanes);
       taken.push(lanes.map((_, lane) => simulation.leaf(simulation.data.actions, lane)));
     }
-    console.log(JSON.stringify({ hashes, taken, logits, seconds: process.cpuUsage(started).user / 1e6 }));
+    console.log(JSON.stringify({ hashes, taken, logits }));
   }
 }
 

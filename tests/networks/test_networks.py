@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
     return place
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_commands_of_page_train_and_evaluate(folder, monkeypatch):
     scripts = pages.type_all(PAGE.read_text(), folder, monkeypatch)
     assert scripts == 2 * ["train.py"] + 2 * ["train.py", "evaluate.py"]

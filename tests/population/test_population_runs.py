@@ -444,13 +444,8 @@ def newest(folder):
     return paths[-1].name if paths else None
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name == "r2d2" else pytest.mark.nightly)
-        for name in ("r2d2", "vtrace", "lag", "wrappers")
-    ],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("case", ("r2d2", "vtrace", "lag", "wrappers"))
 def test_copies_of_every_learner_resume_with_the_same_bits(here, monkeypatch, case):
     """What a copy leaves out would come back from the checkpoint, or not."""
 

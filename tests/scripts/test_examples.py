@@ -8,9 +8,8 @@ import pytest
 
 from tests.algorithms.test_learning import Cue, Reach
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.nightly
 @pytest.mark.parametrize("make, first, last", [(Cue, 0.4, 0.9), (Reach, 1.0, 3.2)])
 def test_ppo_learns(make, first, last):
     """At best returns are 1 and 4; without memory or a look at the goal, 1/4 and less than 0."""
@@ -27,6 +26,7 @@ def test_ppo_learns(make, first, last):
     assert reports[0]["return"] < first and reports[-1]["return"] > last
 
 
+@pytest.mark.slow
 def test_command_line(monkeypatch, capsys):
     def run(words):
         monkeypatch.setattr(sys, "argv", ["ppo_single_file.py", *words.split()])

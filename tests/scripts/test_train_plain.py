@@ -17,7 +17,7 @@ def test_an_unknown_part_is_refused(capsys):
     assert len(train_plain.chosen("all")) > 30 and train_plain.chosen("none") == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_plain_parts_learn_the_same(tmp_path):
     losses = {}
     for word in ("none", "all"):

@@ -234,7 +234,7 @@ def test_lanes_with_learns_false_are_not_learned_from(shows):
     "options",
     [
         dict(bot=1.0, scripted=Middle()),
-        pytest.param(dict(past=1.0, snapshots=2, every=10), marks=pytest.mark.slow),
+        pytest.param(dict(past=1.0, snapshots=2, every=10), marks=pytest.mark.nightly),
     ],
 )
 def test_policy_learns_to_beat_its_opponents(tmp_path, options):
