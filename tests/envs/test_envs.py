@@ -56,8 +56,21 @@ SHORT = {
 }
 
 
-#: The slow tests have all settings, the fast ones those of each environment's first line.
-FIRST = [name if "," not in name else pytest.param(name, marks=pytest.mark.slow) for name in SHORT]
+def chosen(names):
+    """Leaves all settings but these to the nightly tests."""
+    nightly = pytest.mark.nightly
+    return [name if name in names else pytest.param(name, marks=nightly) for name in SHORT]
+
+
+#: Each environment's first line, and the settings that compute most.
+FIRST = chosen(envs.ENVS)
+MOST = chosen(
+    (
+        *("minimal", "explorer, privileged", "explorer, continuous", "explorer, cameras"),
+        *("memory, privileged", "keys, privileged", "deathmatch, privileged"),
+        *("pointgoal, continuous", "pong, pixels of both"),
+    )
+)
 
 
 def make(name, device="cpu", n_envs=12, seed=1, **settings):
@@ -187,13 +200,7 @@ class TestOnTheGPU:
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[2]))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if name == "deathmatch, all rules" else name
-        for name in SHORT
-    ],
-)
+@pytest.mark.parametrize("name", MOST)
 def test_cuda_kernels_on_a_cpu_give_equal_episodes(name, cuda_on_cpu, monkeypatch):
     """With the threads of a block in the order opposite to that of the CPU's loops."""
     expected = arrdict.stack(contract.rollout(make(name), 24, check=False))
@@ -202,7 +209,7 @@ def test_cuda_kernels_on_a_cpu_give_equal_episodes(name, cuda_on_cpu, monkeypatc
     assert contract.same(expected, arrdict.stack(contract.rollout(make(name), 24, check=False)))
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", MOST)
 def test_number_of_threads_changes_no_bit(name):
     runs = []
     try:

@@ -301,7 +301,7 @@ def whole_sequence(
 
 @pytest.mark.parametrize(
     "n_steps, n_lanes, is_residual, width",
-    [(2, 1, False, 256), (2, 1, True, 256), (5, 45, True, 256), (5, 45, True, 128)],
+    [(2, 1, False, 256), (2, 45, True, 256), (5, 45, True, 128)],
 )
 def test_sequence_on_chip_matches_float32_in_every_order(
     cuda_on_cpu, monkeypatch, n_steps, n_lanes, is_residual, width
