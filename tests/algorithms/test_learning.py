@@ -243,7 +243,7 @@ def test_remembers_cue(name):
     [
         ("ppo", "gaussian"),
         ("ppo", "beta"),
-        pytest.param("vtrace", "beta", marks=pytest.mark.slow),
+        pytest.param("vtrace", "beta", marks=pytest.mark.nightly),
         pytest.param("vtrace-replay", "gaussian", marks=pytest.mark.slow),
     ],
 )

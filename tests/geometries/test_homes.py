@@ -288,7 +288,7 @@ def test_statistics_of_generated_homes(generated):
     assert make_homes.outside(make_homes.statistics(generated), medians) == []
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_training_and_test_share_no_home(packaged):
     assert len({make_homes.fingerprint(g) for g in packaged}) == 5000
 

@@ -103,7 +103,7 @@ def test_what_a_seeker_remembers_is_worth_finds():
     assert found[Mapper] > 3 * found[Wanderer], found
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_hunter_wins_duels():
     env = envs.Deathmatch(128, HOMES, n_agents=2, device="cpu")
     (row,) = duels.summaries(duels.play(env, Hunter(env), env.bot(env.core.fov)))

@@ -317,7 +317,7 @@ run_loggers.close()"""
     return [line for line in process.stderr.splitlines() if "UserWarning" in line]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_real_wandb_without_a_network_is_one_warning(tmp_path):
     (warning,) = logged_with_real_wandb(
         tmp_path, "online", WANDB_BASE_URL="http://127.0.0.1:9", WANDB_API_KEY=40 * "a"
