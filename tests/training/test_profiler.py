@@ -18,10 +18,15 @@ WORDS = [*tiny.TINY, *tiny.SHORT_EPISODES, f"samples={12 * tiny.UPDATE}", "loggi
 
 
 def table_of(folder):
-    """Returns the first line of a profile, and how often each operation was called."""
+    """Returns the first line of a profile, and how often each operation was called. A phase has two
+    rows on a GPU, of which one has only the times in which kernels ran.
+    """
     head, *lines = Path(folder, "profile.txt").read_text().splitlines()
     rows = [re.split(r"  +", line.strip()) for line in lines]
-    return head, {row[0]: int(row[-1]) for row in rows if len(row) > 5 and row[-1].isdigit()}
+    numbers = {}
+    for name, *_, number in (row for row in rows if len(row) > 5 and row[-1].isdigit()):
+        numbers[name] = max(int(number), numbers.get(name, 0))
+    return head, numbers
 
 
 def events_of(folder):
