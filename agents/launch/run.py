@@ -5,21 +5,27 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import platform
+import secrets
 import shutil
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
 
 from megastep import engine
 from megastep.agents import console, factory, package
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.process_group import from_rank_0, together
-from megastep.agents.distributed.ranks import DriftError
-from megastep.agents.errors import EnvFailed, UserError, memory_problem
-from megastep.agents.factory import env_failures, settings
+from megastep.agents.distributed.ranks import DriftError, ranks_named
+from megastep.agents.errors import EnvFailed, UserError, memory_problem, user_errors
+from megastep.agents.factory import check, env_failures, settings
 from megastep.agents.factory.trainer import make_trainer
-from megastep.agents.launch import again, rank_checks, signals
+from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training.budget import reaches
 from megastep.agents.training.callbacks import Progress
@@ -27,6 +33,9 @@ from megastep.agents.training.callbacks import Progress
 if TYPE_CHECKING:
     from megastep.agents.launch.watch import Team
     from megastep.agents.training.trainer import Trainer
+
+#: Seconds within which a file of rank 0 must be visible on the other machines.
+SHARED_SECONDS = 10.0
 
 
 class Run:
@@ -63,7 +72,7 @@ class Run:
                 console.say(f"The run in {start.folder} has already {start.ended}.")
                 return start.folder
             self.cfg = start.cfg
-        rank_checks.check_start(self.cfg)
+        check_start(self.cfg)
         with contextlib.ExitStack() as locks:
             self.start(locks)
             # of a signal to all ranks, the first to get it stops them, and others get it later
@@ -85,7 +94,7 @@ class Run:
                 self.folder, source = from_rank_0(lambda: self.open(locks))
                 if self.is_first and is_new:
                     undo.callback(shutil.rmtree, self.folder, ignore_errors=True)
-            token = rank_checks.check_shared(self.folder)
+            token = check_shared(self.folder)
             if self.team:
                 self.team.set_folder(self.folder)
             told = env_failures.caught(self.cfg.env, self.folder, rank=process_group.rank())
@@ -226,3 +235,70 @@ def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
     folder = trainer.saver.folder.parent
     folders.write_config(folder, trainer.saver.config["train"])
     provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, hosts)
+
+
+# ---- What ranks check before training ----
+
+
+def check_start(cfg: settings.Train) -> None:
+    """Raises UserError if the ranks differ in versions, code or settings."""
+    if process_group.n_ranks() == 1:
+        return
+    facts = {
+        "torch": torch.__version__,
+        "CUDA": torch.version.cuda,
+        "NumPy": np.__version__,
+        "Python": platform.python_version(),
+        "megastep": package.version(),
+        "the commit of the checkout": provenance.commit(package.ROOT),
+    }
+    check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
+
+
+def check_equal(facts: dict[str, object]) -> None:
+    """Compares facts of all ranks by name, the most important first. Raises UserError with the
+    first that differs, such as `learner.lr is 0.001 on rank 0, and 0.01 on ranks 1 and 3`.
+    """
+    everyones = process_group.gather_objects({name: str(value) for name, value in facts.items()})
+    for name in dict.fromkeys(name for theirs in everyones for name in theirs):
+        holders: dict[str, list[int]] = {}
+        for rank, theirs in enumerate(everyones):
+            holders.setdefault(theirs.get(name, "missing"), []).append(rank)
+        if len(holders) > 1:
+            values = (f"{value} on {ranks_named(ranks)}" for value, ranks in holders.items())
+            raise UserError(
+                f"The ranks differ: {name} is {', and '.join(values)}; start all with the same "
+                "code, packages and options"
+            )
+
+
+def check_shared(folder: Path) -> str:
+    """Checks that all ranks see the run folder of rank 0. Returns a random name of this start, the
+    same on all ranks.
+
+    Raises:
+        UserError: on all ranks, if one of them does not see the folder.
+    """
+    name = from_rank_0(secrets.token_hex)
+    if process_group.n_ranks() == 1:
+        return name
+    path = folder / f".ranks-{name}"
+
+    def wait_for_file() -> None:
+        deadline = time.monotonic() + SHARED_SECONDS
+        while not (folder.is_dir() and path.name in os.listdir(folder)):
+            if time.monotonic() > deadline:
+                raise UserError(
+                    f"The run folder {folder.absolute()} of rank 0 is not here; start all ranks "
+                    "in one folder that their machines share, or give folder= with a path there"
+                )
+            time.sleep(0.1)
+
+    with user_errors(folders.CANNOT.format(folder)):
+        from_rank_0(path.touch)
+    try:
+        together(wait_for_file)
+    finally:
+        if process_group.rank() == 0:
+            path.unlink(missing_ok=True)
+    return name

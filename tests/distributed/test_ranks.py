@@ -8,7 +8,7 @@ from megastep.agents.distributed.process_group import together
 from megastep.agents.distributed.ranks import ONE, Plan, Ranks
 from megastep.agents.errors import UserError
 from megastep.agents.generator import rank_seed
-from megastep.agents.launch import rank_checks
+from megastep.agents.launch import run as launch_run
 
 GOES_ON = Plan(goes_on=True, saves=False, lr_fraction=0.75)
 
@@ -136,10 +136,10 @@ def test_numbers_of_ranks(monkeypatch):
     ],
 )
 def test_first_differing_fact(monkeypatch, everyones, expected):
-    rank_checks.check_equal({"a": 1})
+    launch_run.check_equal({"a": 1})
     monkeypatch.setattr(process_group, "gather_objects", lambda facts: everyones)
     with pytest.raises(UserError, match=f"^The ranks differ: {expected}; start all with the same "):
-        rank_checks.check_equal({})
+        launch_run.check_equal({})
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import envs, spaces, toys
+from megastep import envs, spaces
 from megastep.agents.cli import train
 from megastep.agents.runs import json_lines
 from megastep.agents.storage.rollout import Rollout
@@ -190,27 +190,6 @@ def test_episodes_begin_in_the_homes_that_are_drawn(name, device):
     env.step(still)
     env.check()
     assert 2 in env.layout.tolist()
-
-
-def test_a_round_of_deathmatch_ends_all_episodes_at_once():
-    """Agents that died in it are in a later episode. Their truncated ones have metrics."""
-    env = envs.Deathmatch(
-        64, 8 * [toys.box()], n_agents=2, device="cpu", res=16, limit=12, resample=True, damage=1.0
-    )
-    random, world, n_moves, n_deaths = torch.Generator().manual_seed(0), env.reset(), 0, 0
-    for _ in range(40):
-        before, last = env.layout.clone(), world
-        actions = torch.randint(7, (128, 1), generator=random)
-        world = env.step(arrdict(actions=actions))
-        moved = before != env.layout
-        ended = (last.terminal | last.truncated).view(64, 2)
-        assert ended[moved].all() and world.reset.view(64, 2)[moved].all()
-        assert not (last.terminal & last.truncated).any()
-        assert torch.equal(world.reset, last.terminal | last.truncated)
-        n_moves, n_deaths = n_moves + moved.sum(), n_deaths + world.terminal.sum()
-        assert not world.metrics.accuracy.isnan().any()
-    assert n_moves > 64 and n_deaths > 0
-    assert env.round_ages.max() <= 12 + 2
 
 
 # ---- Runs ----
