@@ -209,9 +209,10 @@ class Scenery(SetOnce):
         agents = layouts.agent_textures[d] * self.agent_light[e, :, None]
         texels = layouts.texels[bounds[0] : bounds[-1]]
         walls = texels[:, :3] * texels[:, 3:]
-        lines = torch.cat([*moving, layouts.lines[d]])
+        lines = torch.cat([*moving, layouts.lines.vals[first:last]])
+        lights = layouts.lights.vals[slice(*layouts.light_starts[d : d + 2].tolist())]
         lit = *agents.split(_widths(model_bounds)), *of_objects, *walls.split(_widths(bounds))
-        return lines, lit, layouts.lights[d].clone()
+        return lines, lit, lights.clone()
 
 
 def _same(name, what, expected, actual) -> None:

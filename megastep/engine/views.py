@@ -32,8 +32,9 @@ def _joined(
     of_pieces = torch.stack(widths, 1).flatten()
     first = torch.repeat_interleave(starts - (of_pieces.cumsum(0) - of_pieces), of_pieces)
     index = torch.arange(len(first), device=first.device) + first
+    total = torch.stack(widths).sum(0)
     return RaggedTorch(
-        ReadOnlyTensor(torch.cat(vals)[index], refusal), ReadOnlyTensor(sum(widths), refusal)
+        ReadOnlyTensor(torch.cat(vals)[index], refusal), ReadOnlyTensor(total, refusal)
     )
 
 

@@ -65,7 +65,7 @@ def packed(
     distinct = {id(field): field for field in fields}
     ends = np.cumsum([field.size for field in distinct.values()])
     starts = {key: end - field.size for (key, field), end in zip(distinct.items(), ends)}
-    arrays = GoalFields(
+    arrays = (
         points.astype(np.float32),
         origins.astype(np.float32),
         np.where(is_allowed, lengths, 0.0).astype(np.float32),  # of others they may be infinite
@@ -74,7 +74,7 @@ def packed(
         np.array([field.shape[1:] for field in fields], np.int32),
         np.argsort(~is_allowed, axis=2, kind="stable").astype(np.int32),
         is_allowed.sum(2, dtype=np.int32),
-    )
+    )  # as the fields of GoalFields
     return GoalFields(*(torch.from_numpy(array).to(device) for array in arrays))
 
 
