@@ -130,9 +130,7 @@ def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int
 
 
 def world_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, bytes | int]:
-    """Returns the fields ``scenery`` and ``error_flag``, the flag that
-    :func:`~megastep.engine.check` reads, and those of :func:`state_params`.
-    """
+    """Returns the fields ``scenery`` and ``error_flag``, and those of :func:`state_params`."""
     flag = checks.address("agents.error_flag", agents.error_flag, (1,), torch.int32, scenery.device)
     packed = scenery_params(scenery, agents.radius)
     return dict(scenery=packed, error_flag=flag, **state_params(scenery, agents, *names))

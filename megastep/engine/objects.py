@@ -114,37 +114,15 @@ class Objects(SetOnce):
         self.texels = torch.zeros((n, len(shapes), 4), device=device)
         self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
 
-    @property
-    def positions(self) -> torch.Tensor:
-        return self.records[..., :2]
-
-    @property
-    def angles(self) -> torch.Tensor:
-        return self.records[..., 2]
-
-    @property
-    def sizes(self) -> torch.Tensor:
-        return self.records[..., 3]
-
-    @property
-    def carriers(self) -> torch.Tensor:
-        return self.records.view(torch.int32)[..., 4]
-
-    @property
-    def colours(self) -> torch.Tensor:
-        return self.records.view(torch.int32)[..., 5]
-
-    @property
-    def visible(self) -> torch.Tensor:
-        return self.records.view(torch.bool)[..., 24]
-
-    @property
-    def solid(self) -> torch.Tensor:
-        return self.records.view(torch.bool)[..., 25]
-
-    @property
-    def open(self) -> torch.Tensor:
-        return self.records.view(torch.bool)[..., 26]
+    # views of records: four floats, two integers, three flags
+    positions = property(lambda self: self.records[..., :2])
+    angles = property(lambda self: self.records[..., 2])
+    sizes = property(lambda self: self.records[..., 3])
+    carriers = property(lambda self: self.records.view(torch.int32)[..., 4])
+    colours = property(lambda self: self.records.view(torch.int32)[..., 5])
+    visible = property(lambda self: self.records.view(torch.bool)[..., 24])
+    solid = property(lambda self: self.records.view(torch.bool)[..., 25])
+    open = property(lambda self: self.records.view(torch.bool)[..., 26])
 
     def at_lines(self, lines: torch.Tensor, n_agent_lines: int) -> torch.Tensor:
         """Returns the object, int64 and -1 for none, of each of ``lines`` int32, as in

@@ -59,18 +59,9 @@ class Resets:
         seed: int | torch.Tensor | None = None,
         mask: torch.Tensor | None = None,
     ) -> "arrdict":
-        """Begins episodes, as described at ``reset`` of :class:`~megastep.types.Env`.
-
-        Args:
-            env: the environment.
-            begin: takes a mask (B,), begins an episode in these lanes, and returns a world. What it
-                does to other lanes is undone.
-            seed: from 0 to 2**63 - 1, or (B,) int64, a seed per lane.
-            mask: (B,) bool, lanes that begin. Default: all.
-
-        Raises:
-            TypeError, ValueError: naming the argument that does not fit; with a mask, if there is
-                no last world.
+        """Begins episodes, as described at ``reset`` of :class:`~megastep.types.Env`. ``begin``
+        takes a mask (B,), begins an episode in these lanes, and returns a world. What it does to
+        other lanes is undone. TypeError or ValueError name an argument that does not fit.
         """
         everyone = torch.ones(n_lanes(env), dtype=torch.bool, device=env.device)
         world = self.last

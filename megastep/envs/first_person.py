@@ -148,9 +148,7 @@ class FirstPerson(SceneryEnv):
 
     def _world(self, free: torch.Tensor | None = None) -> arrdict:
         """Respawns agents whose episode has ended, computes rewards and flags, and renders.
-
-        Args:
-            free: (N, A), the fraction of the step that was free; None if no step was taken.
+        ``free``: (N, A), the fraction of the step that was free; None if no step was taken.
         """
         raise NotImplementedError
 
@@ -167,13 +165,8 @@ class FirstPerson(SceneryEnv):
     def _draw(
         cls, state: arrdict, title: str, goal: tuple | None = None, seen: Any = None
     ) -> "Figure":
-        """Draws a numpyified state: the floor plan, above the agent's RGB and depth.
-
-        Args:
-            state: with ``core``, ``rgb`` and ``d``.
-            title: of the figure.
-            goal: (place, radius in metres) of a ring.
-            seen: as :meth:`Core.plot_state`.
+        """Draws a numpyified state: the floor plan, with a ring around ``goal``, (place, radius in
+        metres), above the agent's RGB and depth. ``seen``: as :meth:`Core.plot_state`.
         """
         yaws = state.core.yaws
         figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))

@@ -71,10 +71,9 @@ def doorways(geometries: Sequence[dotdict]) -> RaggedNumpy:
 
 
 class Objects:
-    """The objects of an environment, by kind. ``objects["key"]`` is a :class:`Kind`.
-
-    They are invisible until they are placed. Cameras see them, agents bump into the solid ones, and
-    all that an environment does with them is PyTorch on :attr:`Kind.positions` and other tensors.
+    """The objects of an environment, by kind. ``objects["key"]`` is a :class:`Kind`. They are
+    invisible until they are placed. Cameras see them, agents bump into the solid ones, and all that
+    an environment does with them is PyTorch on :attr:`Kind.positions` and other tensors.
 
     Args:
         geometries: those that the scenery was made from.
@@ -198,9 +197,8 @@ class Kind:
         self.carriers.masked_fill_(mask, -1)
 
     def touching(self, reach: float = REACH) -> torch.Tensor:
-        """Returns (N, A, K) bool: which agents are within ``reach`` metres of which objects' edges.
-
-        Nobody touches an object that is not there, or is carried.
+        """Returns (N, A, K) bool: which agents are within ``reach`` metres of which objects'
+        edges. Nobody touches an object that is not there, or is carried.
         """
         agents, objects = self._objects.core.agents, self._objects.all
         offset = agents.positions[:, :, None] - self.positions[:, None]
@@ -216,10 +214,8 @@ class Kind:
         return (ahead.square() + aside.square() <= limit.square()) & self._loose()[:, None]
 
     def looked_at(self, centre_line: torch.Tensor) -> torch.Tensor:
-        """Returns (N, A, K) bool: which objects are at the centre of which agents' screens.
-
-        Args:
-            centre_line: (N, A) or (N, A, C) int32, of :func:`megastep.engine.observe`.
+        """Returns (N, A, K) bool: which objects are at the centre of which agents' screens, by
+        ``centre_line``, (N, A) or (N, A, C) int32, of :func:`megastep.engine.observe`.
         """
         core, n_agent_lines = self._objects.core, self._objects.core.scenery.agent_lines.shape[1]
         objects = self._objects.all.at_lines(centre_line, n_agent_lines)
@@ -228,9 +224,8 @@ class Kind:
         return (objects == own).any(2)
 
     def carry(self, mask: torch.Tensor) -> None:
-        """Has agents pick up objects where ``mask``, (N, A, K) bool, is True.
-
-        If several agents want one, the first has it. Nobody picks up what is not there, or carried.
+        """Has agents pick up objects where ``mask``, (N, A, K) bool, is True. If several agents want
+        one, the first has it. Nobody picks up what is not there, or carried.
         """
         taken = mask.any(1) & self._loose()
         self.carriers.copy_(torch.where(taken, mask.int().argmax(1).int(), self.carriers))
