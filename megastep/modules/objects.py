@@ -224,8 +224,8 @@ class Kind:
         return (objects == own).any(2)
 
     def carry(self, mask: torch.Tensor) -> None:
-        """Has agents pick up objects where ``mask``, (N, A, K) bool, is True. If several agents want
-        one, the first has it. Nobody picks up what is not there, or carried.
+        """Has agents pick up objects where ``mask``, (N, A, K) bool, is True. If several want one,
+        the first has it. Nobody picks up what is not there, or carried.
         """
         taken = mask.any(1) & self._loose()
         self.carriers.copy_(torch.where(taken, mask.int().argmax(1).int(), self.carriers))
