@@ -48,7 +48,7 @@ def run(cfg: Export) -> Path:
     policy, env = pretrained.load_with_env(run, "cpu")
     with user_errors(f"{path} cannot be written: "):
         path.parent.mkdir(parents=True, exist_ok=True)
-    step = runtimes.Step(policy, env.obs_space, env.reset().get("mask"))
+    step = runtimes.Step(policy, env.reset())
     write, runner = runtimes.write_torch, runtimes.run_torch
     if kind == "onnx":
         write, runner = runtimes.write_onnx, runtimes.run_onnx

@@ -32,9 +32,7 @@ class Labels(NamedTuple):
     choice: str  # of homes, for titles; empty if there are none
 
     def title(self, what: str, n_homes: int | None) -> str:
-        """Returns `minimal: 1,024 episodes in 512 homes, geometry=homes, split=test` of `what`,
-        such as `1,024 episodes`.
-        """
+        """`minimal: 1,024 episodes in 512 homes, geometry=homes, split=test`."""
         homes = f" in {n_homes:,} home{'s' * (n_homes > 1)}" if n_homes else ""
         return f"{self.env}: {what}{homes}{self.choice}"
 

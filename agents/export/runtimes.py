@@ -28,7 +28,7 @@ from megastep.agents.networks.outputs import FORBIDDEN
 from megastep.arrdict import arrdict
 from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves, mapping
-from megastep.types import Env, Space, Tree, n_lanes
+from megastep.types import Env, Tree, World, n_lanes
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
@@ -58,16 +58,19 @@ class Step(nn.Module):
 
     Args:
         policy: the policy, which acts.
-        obs_space: its observation space.
-        mask: an action mask of the environment. None: it has none.
+        world: an example of what it sees.
     """
 
-    def __init__(self, policy: "Policy", obs_space: Space, mask: Tree = None):
+    def __init__(self, policy: "Policy", world: World):
         super().__init__()
-        self.policy, self.obs_space = policy.actor().eval(), obs_space
-        self.masks = {} if mask is None else spaces.leaves(mask)
-        self.n_state = len(leaves(self.policy.initial(1)))
-        self.example = self.tensors(self._world(2), self.policy.initial(2))
+        self.policy = policy.actor().eval()
+        self.masks = [*spaces.leaves(world["mask"])] if "mask" in world else []
+        # a graph of any number of lanes needs an example of more than one
+        world = arrdict({name: world[name] for name in ("obs", "mask", "reset") if name in world})
+        world = world.map(lambda leaf: torch.stack(2 * [leaf[0]]))
+        state = self.policy.initial(2)
+        self.n_state = len(leaves(state))
+        self.example = self.tensors(world, state)
         self.inputs = [*map(_port, self._input_names(), self.example)]
         self.outputs = [*map(_port, self._output_names(), self(*self.example))]
 
@@ -85,7 +88,7 @@ class Step(nn.Module):
         actions = self.policy.output.greedy(logits)
         return *leaves(actions), *leaves(logits), *leaves(state)
 
-    def tensors(self, world: arrdict, state: arrdict) -> tuple[torch.Tensor, ...]:
+    def tensors(self, world: World, state: arrdict) -> tuple[torch.Tensor, ...]:
         """Returns the inputs for a world and a hidden state."""
         obs = spaces.leaves(world["obs"])
         values = [obs[path] for path in self.policy.intake.paths]
@@ -98,17 +101,6 @@ class Step(nn.Module):
         n = (len(outputs) - self.n_state) // 2
         state = _filled(self.policy.initial(1), [*outputs[2 * n :]])
         return [*outputs[:n]], [*outputs[n : 2 * n]], state
-
-    def _world(self, n_lanes) -> arrdict:
-        def zeros(space) -> torch.Tensor:
-            integers = isinstance(space, spaces.MultiDiscrete)
-            dtype = torch.int64 if integers else getattr(space, "dtype", None) or FLOAT
-            return torch.zeros(n_lanes, *space.shape, dtype=dtype)
-
-        reset = torch.ones(n_lanes, dtype=torch.bool)
-        masks = {path: leaf.new_ones(n_lanes, *leaf.shape[1:]) for path, leaf in self.masks.items()}
-        obs = spaces.map(zeros, self.obs_space)
-        return arrdict(obs=obs, reset=reset, **({"mask": _nested(masks)} if masks else {}))
 
     def _trees(self, tensors) -> tuple[Tree, Tree, torch.Tensor, arrdict]:
         paths = self.policy.intake.paths

@@ -82,8 +82,7 @@ class Area(Artist):
 
     def _place(self, figure, bbox) -> None:
         self.bbox, self._overlay, self._things, self.style = bbox, None, [], current()
-        self._low: Any = None
-        self._high: Any = None
+        self._limits: dict = {}  # of an overlay
         self.set_figure(figure)
 
     def __getattr__(self, name: str) -> Any:
@@ -97,8 +96,7 @@ class Area(Artist):
             figure: Any = self.get_figure()
             place = self.bbox.transformed(figure.transFigure.inverted())
             self._overlay = figure.add_axes(place, frameon=False, xticks=[], yticks=[])
-            if self._low is not None:
-                self._set_limits()
+            self._overlay.set(**self._limits)
         return self._overlay
 
     def fit(self, low: np.ndarray, high: np.ndarray, foot: float = 0.0) -> None:
@@ -112,19 +110,12 @@ class Area(Artist):
         size = np.array([self.width, self.height - foot])
         scale = float((size / (high - low)).min())  # inches per unit
         centre, half = (low + high) / 2, size / scale / 2
-        self._low, self._high = centre - half - [0, foot / scale], centre + half
-        to_inches = Affine2D().translate(*-self._low).scale(scale)
-        self.transform = to_inches + self._inches
+        low, high = centre - half - [0, foot / scale], centre + half
+        self.transform = Affine2D().translate(*-low).scale(scale) + self._inches
+        (x, y), (right, top) = low, high
+        self._limits = dict(xlim=(x, right), ylim=(y, top), autoscale_on=False)
         if self._overlay is not None:
-            self._set_limits()
-
-    def _set_limits(self) -> None:
-        assert self._overlay is not None and self._low is not None
-        self._overlay.set(
-            xlim=(self._low[0], self._high[0]),
-            ylim=(self._low[1], self._high[1]),
-            autoscale_on=False,
-        )
+            self._overlay.set(**self._limits)
 
     # ---- Things to draw ----
 

@@ -77,7 +77,7 @@ def made(kind):
     with torch.no_grad():
         for weight in policy.output.parameters():
             weight.mul_(20)
-    return policy, env, Step(policy, obs_space, env.reset().get("mask"))
+    return policy, env, Step(policy, env.reset())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -153,7 +153,7 @@ class Odd(torch.nn.Module):
 def test_a_core_that_cannot_be_exported_is_one_sentence(tmp_path):
     policy = Policy(VECTOR, MOVES, width=8, core=f"{__name__}:Odd")
     with pytest.raises(UserError, match=r"^mine cannot be exported: .*; format=safetensors"):
-        runtimes.write_torch(Step(policy, VECTOR), tmp_path / "a.pt2", "mine")
+        runtimes.write_torch(Step(policy, Noise(VECTOR).reset()), tmp_path / "a.pt2", "mine")
     assert not [*tmp_path.iterdir()]
 
 
