@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 FLOAT = torch.float32  # of the floating-point inputs
 #: Version of ONNX's operators.
 OPSET = 18
-#: Largest difference of logits, as a fraction of the largest logit (or of 1), that is no error.
+#: Largest difference of logits, as a fraction of the largest logit (or of 1) that a file may have.
 MAX_DIFFERENCE = 1e-3
 #: Fraction of steps at which a comparison also resets.
 RESETS = 0.02

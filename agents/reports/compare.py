@@ -21,7 +21,7 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
     beside it, a .csv of its lines. Returns the plot's path.
 
     Raises:
-        UserError: a folder is no run, a run has not reported the metric, matplotlib fails, or a
+        UserError: a folder is not a run, a run has not reported the metric, matplotlib fails, or a
             file cannot be written.
     """
     with user_errors("drawing needs matplotlib, which fails: ", (ImportError, ValueError)):
@@ -29,7 +29,7 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         from matplotlib.ticker import EngFormatter
 
     if file.suffix not in FORMATS:
-        raise UserError(f"file={file} is no plot; its name ends with {', '.join(FORMATS)}")
+        raise UserError(f"file={file} is not a plot; its name ends with {', '.join(FORMATS)}")
     every = [*map(runs.read, paths)]
     if metric not in (shared := runs.metrics_of(every)):
         if not shared:

@@ -28,7 +28,7 @@ ORDER = ("episode/return", "episode/", "loss/", "perf/rate", "perf/")
 METHOD = """Of each run, the mean return of its last reports. IQM: the interquartile mean over seeds
 with a bootstrap interval; below, performance profiles: the fraction of seeds whose return is
 above a threshold (Agarwal et al. 2021)."""
-#: Metrics that are no curves to look at.
+#: Metrics that say nothing as curves.
 NOT_DRAWN = ("episode/count", "episode/window", "updates")
 
 
@@ -36,7 +36,7 @@ def write(paths: Sequence[Path], file: Path) -> Path:
     """Writes the report of runs into a file, and returns its path.
 
     Raises:
-        UserError: a folder is no run, runs share no metric, or the file cannot be written.
+        UserError: a folder is not a run, runs share no metric, or the file cannot be written.
     """
     every, charts = [*map(runs.read, paths)], Charts()
     body = _one(every[0], charts, file) if len(every) == 1 else _several(every, charts)

@@ -55,7 +55,7 @@ class Run(NamedTuple):
 
 
 def read(folder: Path) -> Run:
-    """Returns what a run's folder holds. Raises UserError if it is no run."""
+    """Returns what a run's folder holds. Raises UserError if it is not a run."""
     folder = folders.folder_of(folders.find(str(folder)))
     path, config, rows = folder / "config.yaml", None, []
     with contextlib.suppress(ValueError, yaml.YAMLError, RecursionError):

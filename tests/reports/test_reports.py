@@ -136,7 +136,7 @@ def test_comparison_is_a_plot_and_its_numbers(here, capsys):
         (report.main, ["run=a", "fiel=x.html"], "did you mean file?"),
         (report.main, ["run=a", "run=b"], "run: is given twice"),
         (report.main, ["run=a", "file=/proc/x/y.html"], "cannot be written"),
-        (compare.main, ["run=a", "file=x.mp4"], "is no plot; its name ends with .pdf, .svg, .png"),
+        (compare.main, ["run=a", "file=x.mp4"], "is not a plot; its name ends with"),
         (compare.main, ["run=[a,b]", "metric=loss/entropi"], "did you mean loss/entropy?"),
         (compare.main, ["run=a", "metric=x,y"], "metric: takes one value"),
     ],
