@@ -49,7 +49,8 @@ def load(name: str, device: str = "auto") -> "Policy":
         UserError: there is none; or it names modules outside megastep that you have not trained
             with here.
     """
-    where, loaded = _loaded(name, device)
+    where = make_device(device)
+    loaded = folders.load_checkpoint(folders.find(name), False, where)
     return restore.policy_of(loaded, device=where)
 
 
