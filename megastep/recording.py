@@ -204,14 +204,6 @@ def _write(path: Film, content: bytes) -> Film:
     return path
 
 
-def check_path(path: str | os.PathLike) -> None:
-    """Raises ValueError if no film or picture can have this name."""
-    if pathlib.Path(path).suffix not in ENDINGS:
-        raise ValueError(
-            f"'{path}' is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or .pdf"
-        )
-
-
 # ---- Films ----
 
 
@@ -269,7 +261,10 @@ def film_all(
         trail: steps of the agents' trails.
     """
     path = Film(path)
-    check_path(path)
+    if path.suffix not in ENDINGS:
+        raise ValueError(
+            f"'{path}' is neither a film, .mp4 or .gif, nor its last frame, .png, .svg or .pdf"
+        )
     for env in (player.env for player in players):
         if getattr(env, "plot_state", None) is None or not hasattr(env, "state"):
             raise ValueError(
