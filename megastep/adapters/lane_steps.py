@@ -33,40 +33,35 @@ def fresh(tree: Tree) -> Tree:
 
 
 class Copies:
-    """Copies a tree of tensors as it is at each call. On a GPU one kernel copies all that fit, into
-    memory whose views are made for several calls at once, since making a view takes PyTorch as long
-    as copying. It is kept as long as any of these copies is.
+    """Copies a tree of tensors as it is at each call. On a GPU one kernel copies all, if they fit,
+    into memory whose views are made for several calls at once, since making a view takes PyTorch as
+    long as copying. It is kept as long as any of these copies is.
     """
 
     def __init__(self, tree: Tree):
-        self._tree, all_leaves = tree, leaves(tree)
-        self._at = [i for i, leaf in enumerate(all_leaves) if _is_words(leaf)]
-        self._others = [(i, leaf) for i, leaf in enumerate(all_leaves) if i not in self._at]
-        self._leaves = [all_leaves[i] for i in self._at]
-        self._words = [leaf.view(-1).view(torch.int32) for leaf in self._leaves]
+        self._tree, self._leaves = tree, leaves(tree)
+        self._words = None
+        if all(map(_is_words, self._leaves)):
+            self._words = [leaf.view(-1).view(torch.int32) for leaf in self._leaves]
         self._blank: list[tuple[torch.Tensor, ...]] = []
 
     def __call__(self) -> Tree:
         """Returns a copy as of now."""
-        copies: list = [None] * (len(self._at) + len(self._others))
-        if self._at:
-            self._blank = self._blank or self._block()
-            row, *parts = self._blank.pop()
-            torch.cat(self._words, out=row)
-            for i, part in zip(self._at, parts):
-                copies[i] = part
-        for i, leaf in self._others:
-            copies[i] = leaf.clone()
-        rest = iter(copies)
+        if self._words is None:
+            return fresh(self._tree)
+        self._blank = self._blank or self._block(self._words)
+        row, *parts = self._blank.pop()
+        torch.cat(self._words, out=row)
+        rest = iter(parts)
         return mapping(lambda _: next(rest))(self._tree)
 
     @torch.inference_mode(False)  # they may be called in one, whose tensors stay in it
     @torch.no_grad()
-    def _block(self) -> list[tuple[torch.Tensor, ...]]:
+    def _block(self, words) -> list[tuple[torch.Tensor, ...]]:
         """Returns memory for some copies: all words of each, and a view per leaf."""
-        sizes = [*map(len, self._words)]
+        sizes = [*map(len, words)]
         n_rows = min(max(BLOCK_BYTES // (WORD * sum(sizes)), 1), BLOCK_ROWS)
-        block = self._words[0].new_empty(n_rows, sum(sizes))
+        block = words[0].new_empty(n_rows, sum(sizes))
         parts = [
             part.view(leaf.dtype).view(n_rows, *leaf.shape).unbind()
             for part, leaf in zip(block.split(sizes, 1), self._leaves)
