@@ -139,12 +139,12 @@ def masks(
         ValueError: if a wall reaches beyond 200 m.
     """
     walls = np.asarray(walls, np.float64).reshape(-1, 2, 2)
-    extent = np.concatenate([walls.reshape(-1, 2), np.reshape(extent, (1, 2))]).max(0)
-    if not extent.max() <= MAX_EXTENT:
+    reach = np.concatenate([walls.reshape(-1, 2), np.reshape(extent, (1, 2))]).max(0)
+    if not reach.max() <= MAX_EXTENT:
         raise ValueError(
-            f"walls reach {extent.max():g} m, but the limit is {MAX_EXTENT:g} m; check the unit"
+            f"walls reach {reach.max():g} m, but the limit is {MAX_EXTENT:g} m; check the unit"
         )
-    width, height = np.ceil((extent + MARGIN) / res - TOLERANCE).astype(int)
+    width, height = np.ceil((reach + MARGIN) / res - TOLERANCE).astype(int)
 
     result = np.zeros((height, width), np.int16)
     for number, room in enumerate(rooms, 1):

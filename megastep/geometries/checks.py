@@ -30,7 +30,10 @@ def clearance(g: dotdict, cell: float = FINE) -> np.ndarray:
     height, width = (n * ratio for n in g.masks.shape)
     distance = np.full((height, width), LIMIT)
     x, y = (np.arange(width) + 0.5) * cell, (height - np.arange(height) - 0.5) * cell
-    for (ax, ay), (bx, by) in g.walls.astype(float):
+    # long slanted walls in pieces, as the box around each is measured
+    n_pieces = np.ceil(np.abs(g.walls[:, 1] - g.walls[:, 0]).min(1) / 5).astype(int).clip(1)
+    lines = (np.linspace(a, b, n + 1) for (a, b), n in zip(g.walls.astype(float), n_pieces))
+    for (ax, ay), (bx, by) in (piece for line in lines for piece in zip(line, line[1:])):
         columns = slice(*np.searchsorted(x, (min(ax, bx) - LIMIT, max(ax, bx) + LIMIT)))
         rows = slice(*np.searchsorted(-y, (-max(ay, by) - LIMIT, -min(ay, by) + LIMIT)))
         px, py = x[None, columns] - ax, y[rows, None] - ay

@@ -17,6 +17,7 @@ from megastep.geometries.plans.svg import apply, tokens, transform
 
 SUFFIX = ".svg"
 UNITS = 100  # a metre
+MAX_BYTES = 2_000_000  # plans of CubiCasa5k have about 100,000
 TOLERANCE = outlines.GRID / 2  # metres, by which contours are simplified
 SKIPPED = ("defs", "script", "foreignObject", "use", "text", "symbol", "clipPath", "mask")
 
@@ -27,6 +28,8 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
     Raises:
         ValueError: saying what is wrong with the file.
     """
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"it has {len(content):,} bytes, but the limit is {MAX_BYTES:,}")
     root = safe.svg(content)
     floors = []
     for floor, matrix in _floors(root, Matrix()):

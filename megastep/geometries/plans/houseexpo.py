@@ -16,7 +16,7 @@ SUFFIX = ".json"
 TOLERANCE = 0.02  # metres, by which outlines are simplified
 MIN_BOX = 0.3  # m2 of floor that only this box has
 MIN_ROOM = 1.0  # m2 of floor outside all boxes that are a room too
-MAX_CORNERS = 100_000
+MAX_CORNERS, MAX_BOXES = 20_000, 2_000
 ROUGH = 0.06  # metres, by which outlines are simplified to find the ends of walls
 THICK = 0.6  # metres; walls end in edges of up to that length
 WIDTHS = (0.5, 2.0)  # metres; of doorways
@@ -41,6 +41,7 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
     corners = _numbers(plan["verts"], 2, "verts")
     if not 4 <= len(corners) <= MAX_CORNERS:
         raise ValueError(f"its outline has {len(corners):,} corners; 4 to {MAX_CORNERS:,} can be")
+    outlines.check_meetings([shapely.LineString(corners)])
     floor = max(outlines.ring(corners), key=lambda part: part.area, default=None)
     if floor is None or floor.area < outlines.MIN_AREA:
         raise ValueError(f"its floor has less than {outlines.MIN_AREA:g} m2")
@@ -49,6 +50,8 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
     if not isinstance(categories, dict):
         raise ValueError("it has no 'room_category'; is it from HouseExpo?")
     boxes = [row for value in categories.values() for row in _numbers(value, 4, "room_category")]
+    if len(boxes) > MAX_BOXES:
+        raise ValueError(f"it has {len(boxes):,} rooms, but the limit is {MAX_BOXES:,}")
     shapes = [
         shapely.box(*np.minimum(row[:2], row[2:]), *np.maximum(row[:2], row[2:])) for row in boxes
     ]
@@ -67,7 +70,7 @@ def _doorways(floor) -> list[BaseGeometry]:
     """Returns the doorways of a floor, which marks none: the floor between the end of a wall, a
     short edge with floor around both of its corners, and what the wall would meet if it went on.
     """
-    outline, doors, middles = orient(shapely.simplify(floor, ROUGH)), [], []
+    outline, doors, middles = orient(shapely.simplify(floor, ROUGH)), [], np.zeros((0, 2))
     for ring in (outline.exterior, *outline.interiors):
         points = np.array(ring.coords[:-1])
         steps = np.roll(points, -1, 0) - points  # the floor is on their left
@@ -84,10 +87,10 @@ def _doorways(floor) -> list[BaseGeometry]:
             if hit.is_empty:
                 continue
             width = 0.01 + shapely.Point(ray.coords[0]).distance(hit)
-            middle = shapely.Point(start + width / 2 * ahead)
-            is_new = all(middle.distance(other) > THICK for other in middles)
+            middle = start + width / 2 * ahead
+            is_new = (np.hypot(*(middles - middle).T) > THICK).all()
             if width >= WIDTHS[0] and lengths[i] < width and is_new:
-                middles.append(middle)
+                middles = np.concatenate([middles, [middle]])
                 line = shapely.LineString([start, start + width * ahead])
                 doors.append(line.buffer(lengths[i] / 2, **outlines.MITRE))
     return doors

@@ -4,7 +4,7 @@ images, in which white is floor.
 
 import io
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -190,10 +190,10 @@ def _cleaned(free, resolution) -> np.ndarray:
     free = free ^ (_small(same[0] <= 4, BUMP) & (same[1] <= 2))
     n_cells = max(2, round(SPECKLE / resolution**2))
     free = free | _small(~free, n_cells)
-    return free & ~_small(free, n_cells, None)
+    return free & ~_small(free, n_cells, CROSS)
 
 
-def _small(cells, n_cells, touching=ANY) -> np.ndarray:
+def _small(cells, n_cells, touching: np.ndarray = ANY) -> np.ndarray:
     """Returns the components of cells (H, W) that are at most `n_cells` large."""
     labels, _ = ndimage.label(cells, touching)  # pyright: ignore[reportGeneralTypeIssues]
     is_small = np.bincount(labels.ravel()) <= n_cells
@@ -209,9 +209,9 @@ def _area(cells, resolution) -> BaseGeometry:
         raise ValueError(
             f"its walls are too ragged: {n_sides:,} sides of cells, but {MAX_SIDES:,} are allowed"
         )
-    rings_of, offsets_of = contour_generator(z=heights, fill_type="OuterOffset").filled(0.5, 2)
+    areas: Any = contour_generator(z=heights, fill_type="OuterOffset").filled(0.5, 2)
     parts = []
-    for points, offsets in zip(rings_of, offsets_of):
+    for points, offsets in zip(*areas):
         rings = [_with_corners(points[a : b - 1]) for a, b in zip(offsets, offsets[1:])]
         rings = [(ring - 0.5) * (resolution, -resolution) for ring in rings]
         parts += outlines.polygons(shapely.Polygon(rings[0], rings[1:]))

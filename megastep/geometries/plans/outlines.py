@@ -20,7 +20,7 @@ CURVED = 0.02  # metres by which contours of drawings and maps are simplified
 MAX_EXTENT = geometry.MAX_EXTENT - 2 * geometry.MARGIN
 MAX_WALLS = 8_192
 MAX_CORNERS = 200_000  # of a drawing
-MAX_MEETINGS = 1_000_000  # of the boxes around its segments
+MAX_MEETINGS = 400_000  # of the boxes around its segments
 MIN_AREA = 1.0  # m2 of floor that an agent can reach
 LIT = 0.1  # metres; minimum distance of a light from a wall
 JAMB = 0.05  # metres; a doorway is so much wider than its door, on either side
@@ -37,6 +37,7 @@ class Drawing(NamedTuple):
     outdoors: list[BaseGeometry]
     floor: BaseGeometry | None = None  # where agents walk; None: in rooms and doorways
     warnings: tuple[str, ...] = ()  # what was guessed
+    closed: tuple[BaseGeometry, ...] = ()  # lines across openings that lead outside
 
 
 class Notes(NamedTuple):
@@ -50,6 +51,8 @@ class Notes(NamedTuple):
 
 def polygons(shape: BaseGeometry) -> list[Polygon]:
     """Returns the polygons of a shape after repair."""
+    if not shape.is_valid:
+        check_meetings([shape])
     valid = shape if shape.is_valid else shapely.make_valid(shape)
     parts = shapely.get_parts(valid).tolist()
     nested = [one for part in parts for one in shapely.get_parts(part).tolist()]
@@ -296,13 +299,17 @@ def _light(parts, g, distance, cell) -> np.ndarray:
 # ---- Plans whose rooms are not drawn ----
 
 NECK = 0.55  # metres; half the width of the widest passage that separates two rooms
+MAX_ROOMS = 1_000
 WIDEST = 1.3  # metres; the widest gap in the outer walls that is closed
 
 
 def rooms_of(floor: BaseGeometry) -> list[BaseGeometry]:
     """Returns the rooms of a floor: its parts between passages narrower than 1.1 m."""
     rooms, taken = [], Polygon()
-    for part in polygons(floor.buffer(-NECK, **MITRE)):
+    wide = polygons(floor.buffer(-NECK, **MITRE))
+    if len(wide) > MAX_ROOMS:
+        raise ValueError(f"it has {len(wide):,} rooms, but the limit is {MAX_ROOMS:,}")
+    for part in wide:
         room = part.buffer(NECK + GRID, **MITRE).intersection(floor).difference(taken)
         rooms.append(room)
         taken = taken.union(room)
@@ -324,12 +331,13 @@ def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Dr
     hull = filled(closed)
     bridged = closed.buffer(WIDEST / 2, **MITRE).buffer(-WIDEST / 2, **MITRE)
     wide = filled(bridged)
-    warnings = []
+    warnings, lines = [], []
     if wide.difference(hull).area > MIN_AREA:
         hull = shapely.union_all([hull, wide])
-        gaps = [g for g in _lines(hull.boundary.difference(closed.buffer(GRID))) if g.length > 0.2]
-        widths = ", ".join(f"{gap.length:.1f}" for gap in gaps[:8])
-        warnings.append(f"{len(gaps)} openings lead outside, {widths} m wide; they are closed")
+        lines = _lines(hull.boundary.difference(closed.buffer(GRID)))
+        lines = [line for line in lines if line.length > 0.2]
+        widths = ", ".join(f"{line.length:.1f}" for line in lines[:8])
+        warnings.append(f"{len(lines)} openings lead outside, {widths} m wide; they are closed")
     inner = [door for door in doors if hull.covers(door.buffer(2 * JAMB, **MITRE))]
     gaps = shapely.union_all([door.buffer(JAMB, **MITRE) for door in inner])
     floor = hull.difference(solids.difference(gaps))
@@ -345,4 +353,6 @@ def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Dr
         warnings.append(f"{lost} pieces of floor, each under 0.3 m2, are left out")
     if outer := len(doors) - len(inner):
         warnings.append(f"{outer} doors lead outside; they are closed")
-    return Drawing([solids.difference(gaps)], rooms, inner, [], floor, tuple(warnings))
+    return Drawing(
+        [solids.difference(gaps)], rooms, inner, [], floor, tuple(warnings), tuple(lines)
+    )

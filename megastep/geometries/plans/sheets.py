@@ -19,7 +19,7 @@ COLOURS = {"outdoors": "#cfe8cf", "rooms": "#f3e2b8", "walls": "#555555", "doors
 
 
 def _draw(drawing, ax) -> None:
-    """Draws the polygons of a floor plan: rooms yellow, walls grey, doors red."""
+    """Draws a floor plan: rooms yellow, walls grey, doors red, openings that are closed blue."""
     floor = [drawing.floor] if drawing.floor is not None else []
     shapes = drawing._replace(rooms=[*floor, *drawing.rooms])
     for key, colour in COLOURS.items():
@@ -27,6 +27,8 @@ def _draw(drawing, ax) -> None:
             rings = [np.array(r.coords) for r in (part.exterior, *part.interiors)]
             path = Outline.make_compound_path(*(Outline(r, closed=True) for r in rings))
             ax.add_patch(PathPatch(path, facecolor=colour, edgecolor="k", linewidth=0.3))
+    for line in drawing.closed:
+        ax.plot(*np.array(line.coords).T, color="#1f77b4", linewidth=2)
     ax.set_aspect("equal")
     ax.autoscale_view()
 

@@ -219,7 +219,7 @@ class _Reader:
 
         def of(key, default: Any = 0) -> float:
             axis = next((letter for letter in key if letter in "xywh"), "r")
-            whole = size["yh".count(axis)] if axis != "r" else np.hypot(*size) / 2**0.5
+            whole = size["yh".count(axis)] if axis != "r" else np.hypot(size[0], size[1]) / 2**0.5
             return length(str(own.get(key, default)), whole)
 
         if name in ("svg", "symbol"):
@@ -235,7 +235,8 @@ class _Reader:
                     visible = shapely.Polygon(apply(matrix, corners) * self.scale)
                     clip = visible if clip is None else clip & visible
                 aspect = own.get("preserveAspectRatio")
-                moved = Viewbox.viewbox_transform(x, y, width, height, *view, aspect)
+                box_of: Any = (x, y, width, height, *view, aspect)
+                moved = Viewbox.viewbox_transform(*box_of)
                 matrix = transform(moved, matrix)
             size = view[2], view[3]
         place = _Place(matrix, style, opacity, kind, size, clip, chain)
