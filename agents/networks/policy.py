@@ -157,11 +157,6 @@ class Policy(nn.Module):
         Returns:
             arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.
         """
-        n_lanes = len(world["reset"])
-        for name, tree in (("world.obs", world["obs"]), ("state", state)):
-            if any(n != n_lanes for n in map(len, leaves(tree))):
-                n = len(leaves(tree)[0])
-                raise ValueError(f"{name} is of {n} lanes, but world.reset is of {n_lanes}")
         obs, reset = mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None]
         if sample and generator is None:
             generator = self.generator.on(self.device)

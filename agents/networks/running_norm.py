@@ -6,7 +6,7 @@ B lanes; `...` any further axes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -83,38 +83,32 @@ def are_readable(leaves: Iterable[torch.Tensor]) -> bool:
     )
 
 
-def _parts(n) -> Iterator[slice]:
-    return (slice(start, start + MAX_LEAVES) for start in range(0, n, MAX_LEAVES))
-
-
 def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
     device, n_lanes = leaves[0].device, len(leaves[0])
     is_counted = torch.as_tensor(is_counted, device=device).expand(n_lanes).contiguous()
-    moments: list[Moments] = []
-    for part in _parts(len(norms)):
-        sizes = [norm.mean.numel() for norm in norms[part]]
-        results = torch.empty(2 * sum(sizes), device=device)
-        n_counted = torch.empty((), dtype=torch.int64, device=device)
-        flat = [leaf.flatten(1) for leaf in leaves[part]]
-        launch(
-            *(LIBRARY, "moments", device, Blocks(sum(sizes), threads=_THREADS)),
-            leaves=b"".join(map(packed_leaf, norms[part], flat)),
-            **dict(is_counted=is_counted, moments=results, n_counted=n_counted, n_lanes=n_lanes),
-        )
-        pairs = results.split([2 * size for size in sizes])
-        for norm, pair in zip(norms[part], pairs, strict=True):
-            mean, variance = (each.view_as(norm.mean) for each in pair.chunk(2))
-            moments.append((n_counted, mean, variance))
-    return moments
+    sizes = [norm.mean.numel() for norm in norms]
+    results = torch.empty(2 * sum(sizes), device=device)
+    n_counted = torch.empty((), dtype=torch.int64, device=device)
+    flat = [leaf.flatten(1) for leaf in leaves]
+    launch(
+        *(LIBRARY, "moments", device, Blocks(sum(sizes), threads=_THREADS)),
+        leaves=b"".join(map(packed_leaf, norms, flat)),
+        **dict(is_counted=is_counted, moments=results, n_counted=n_counted, n_lanes=n_lanes),
+    )
+    pairs = results.split([2 * size for size in sizes])
+    views = [
+        [each.view_as(norm.mean) for each in pair.chunk(2)] for norm, pair in zip(norms, pairs)
+    ]
+    return [(n_counted, mean, variance) for mean, variance in views]
+
+
+def _fits_moments(norms, leaves, *_) -> bool:
+    are_few = 0 < len(leaves) <= MAX_LEAVES and are_readable(leaves)
+    return are_few and is_plain_on_gpu(*(norm.mean for norm in norms))
 
 
 @torch.no_grad()
-@fused(
-    _moments_on_gpu,
-    lambda norms, leaves, *_: (
-        bool(leaves) and are_readable(leaves) and is_plain_on_gpu(*(norm.mean for norm in norms))
-    ),
-)
+@fused(_moments_on_gpu, _fits_moments)
 def moments_of(
     norms: Sequence[RunningNorm],
     leaves: Sequence[torch.Tensor],
@@ -137,25 +131,24 @@ def moments_of(
 
 
 def _add_on_gpu(norms, moments, is_counted=None) -> None:
-    for part in _parts(len(norms)):
-        rows, kept = [], []
-        for norm, (n_counted, mean, variance) in zip(norms[part], moments[part], strict=True):
-            kept.append((mean.contiguous(), variance.contiguous(), n_counted.long()))
-            names = "new_mean", "new_variance", "n_counted"
-            rows.append(
-                LIBRARY.params.RunningNormParams(
-                    **dict(mean=norm.mean, scale=norm.scale, count=norm.count),
-                    **dict(zip(names, kept[-1], strict=True)),
-                    n=mean.numel(),
-                )
-            )
-        blocks = Blocks(len(rows), threads=_THREADS)
-        fields = dict(norms=b"".join(rows), is_counted=is_counted)
-        launch(LIBRARY, "add_moments", norms[0].mean.device, blocks, **fields)
+    rows, kept = [], []
+    for norm, (n_counted, mean, variance) in zip(norms, moments, strict=True):
+        kept.append((mean.contiguous(), variance.contiguous(), n_counted.long()))
+        new = dict(zip(("new_mean", "new_variance", "n_counted"), kept[-1], strict=True))
+        own = dict(mean=norm.mean, scale=norm.scale, count=norm.count)
+        rows.append(LIBRARY.params.RunningNormParams(**own, **new, n=mean.numel()))
+    blocks = Blocks(len(rows), threads=_THREADS)
+    fields = dict(norms=b"".join(rows), is_counted=is_counted)
+    launch(LIBRARY, "add_moments", norms[0].mean.device, blocks, **fields)
+
+
+def _fits_add(norms, *_) -> bool:
+    are_few = 0 < len(norms) <= MAX_LEAVES
+    return are_few and is_plain_on_gpu(*(norm.mean for norm in norms))
 
 
 @torch.no_grad()
-@fused(_add_on_gpu, lambda norms, *_: is_plain_on_gpu(*(norm.mean for norm in norms)))
+@fused(_add_on_gpu, _fits_add)
 def add_moments(
     norms: Sequence[RunningNorm],
     moments: Sequence[Moments],

@@ -216,11 +216,3 @@ def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, m
         # whose input is near 0 may pass a gradient in one of both forms only
         limit = 0.2 if name in dict(plain.named_parameters()) else 0.03
         assert relative_error(leaf, expected[name]) < limit, name
-
-
-def test_wrong_numbers_of_lanes_are_named():
-    policy, world = Policy(OBS, MOVES, width=16), worlds()[0]
-    with pytest.raises(ValueError, match=f"^state is of {B + 1} lanes, but world.reset is of {B}"):
-        policy(world, policy.initial(B + 1))
-    with pytest.raises(ValueError, match=f"^world.obs is of {B} lanes, .* is of {B - 1}"):
-        policy(arrdict(world, reset=world.reset[1:]), policy.initial(B))
