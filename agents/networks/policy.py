@@ -174,8 +174,9 @@ class Policy(nn.Module):
         policy carries: `world = env.step(policy.act(world))`. For several environments at once use
         `forward`. Takes the most likely or best actions if `greedy`.
         """
-        if self._carried is None or len(leaves(self._carried)[0]) != len(world["reset"]):
-            self._carried = self.initial(len(world["reset"]))
+        n_lanes = len(world["reset"])
+        if self._carried is None or any(len(leaf) != n_lanes for leaf in leaves(self._carried)):
+            self._carried = self.initial(n_lanes)
         decision, self._carried = self(world, self._carried, sample=not greedy)
         return decision
 

@@ -48,6 +48,15 @@ def test_steps_match_unroll_for_every_core(core, layers):
 
 
 @pytest.mark.parametrize("core", CORES)
+def test_act_carries_the_hidden_state(core):
+    policy, world = Policy(OBS, MOVES, width=16, core=core), worlds()
+    decisions = [policy.act(world[t], greedy=True).logits.movement for t in range(T)]
+    expected, _ = act(policy, world, sample=False)
+    assert torch.equal(torch.stack(decisions), expected.logits.movement)
+    assert len(policy.act(world[0].map(lambda leaf: leaf[:2])).actions.fire) == 2
+
+
+@pytest.mark.parametrize("core", CORES)
 def test_burn_in_only_warms_up_the_hidden_state(core, device):
     policy, world = Policy(OBS, MOVES, width=16, core=core).to(device), worlds()
     world = world.map(lambda leaf: leaf.to(device))
