@@ -8,7 +8,7 @@ import torch
 from megastep import spaces
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.collector import Collector, collect, initial_actor_state
+from megastep.agents.storage.collector import collect, initial_actor_state
 from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
 
@@ -127,20 +127,3 @@ def test_nonfinite_privileged_skips_update(value):
     bad, n_skipped = learner.check.read(rollout.floats())
     assert (bad.name, bad.lane, bad.step) == ("privileged.episode", 3, 2) and n_skipped == 1
     assert bad.is_from_env
-
-
-@pytest.mark.cuda
-def test_captured_collector_matches_eager():
-    results = []
-    for is_captured in (False, True):
-        env, policy = PrivilegedEnv("cuda"), policy_of().cuda()
-        rollout = rollout_of(policy, "cuda")
-        collector = Collector(env, policy, rollout)
-        collector.can_capture = is_captured
-        for _ in range(4):
-            collector()
-        assert (collector.graph is not None) == is_captured
-        results.append((rollout.privileged.episode.clone(), rollout.values.clone()))
-    assert torch.equal(results[0][0], results[1][0])
-    # bfloat16 products; the captured graph may use other kernels
-    torch.testing.assert_close(results[0][1], results[1][1], rtol=2e-2, atol=2e-2)

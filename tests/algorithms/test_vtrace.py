@@ -132,14 +132,6 @@ def test_staleness_metric(lag):
     assert all(math.isnan(first[name]) for name in ("staleness", "replayed_rho", "policy"))
 
 
-def test_priorities_follow_errors():
-    learner, _ = replaying(12, replay=dict(alpha=1.0))
-    priorities = learner.replay_buffer.tree.priorities
-    assert len(priorities[priorities > 0].unique()) > B
-    uniform, _ = replaying(12)
-    assert set(uniform.replay_buffer.tree.priorities.tolist()) == {0.0, 1.0}
-
-
 def test_priorities_are_those_of_replayed_lanes():
     """Rewards of fresh lanes do not change them."""
     learner, _ = replaying(12, replay=dict(alpha=1.0))

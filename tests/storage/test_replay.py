@@ -7,7 +7,6 @@ import torch
 from torch import testing
 
 from megastep import spaces
-from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.replay import ReplayBuffer
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout
@@ -273,35 +272,6 @@ def test_uint8_images_round_and_clip(device):
     # half a step of 1/255, and float16's rounding
     testing.assert_close(batch.obs.eye[:4], expected, rtol=0, atol=0.5 / 255 + 5e-4)
     assert torch.equal(batch.obs.raw[:4], raw), "uint8 spaces are stored exactly"
-
-
-def buffer_of_64_pixels(n_steps, width, n_rollouts=2, device="meta", **settings):
-    """Returns a buffer for images of 64 pixels and 3 colours and an LSTM."""
-    obs_space, action_space = spaces.MultiImage(1, 3, 1, 64), spaces.MultiDiscrete(1, 7)
-    state = Policy(obs_space, action_space, width=width, critic=None).initial(100, device)
-    rollout = Rollout(n_steps, 100, obs_space, action_space, state, device, values=False)
-    logprobs = settings.pop("logprobs", True)
-    settings = ReplaySettings(capacity=n_rollouts * n_steps * 100, **settings)
-    return ReplayBuffer(rollout, obs_space, action_space, settings, logprobs)
-
-
-def test_bytes_match_allocated_bytes():
-    tensors = []
-
-    def search(value):
-        if isinstance(value, torch.Tensor):
-            tensors.append(value)
-        elif isinstance(value, dict):
-            [search(child) for child in value.values()]
-        elif isinstance(value, list):
-            [search(child) for child in value]
-        elif hasattr(value, "__dict__"):
-            search(vars(value))
-
-    replay = buffer_of_64_pixels(16, 32, device="cpu")
-    search(replay)
-    assert replay.bytes == sum(tensor.untyped_storage().nbytes() for tensor in tensors)
-    assert replay.bytes == buffer_of_64_pixels(16, 32).bytes, "also on the device meta"
 
 
 def test_priorities_do_not_change_before_start():
