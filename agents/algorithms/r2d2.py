@@ -245,7 +245,7 @@ class R2D2(learner.GradientLearner):
         self.return_steps, self.eta = return_steps, eta
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread
         self.gradient_steps, self.replay_settings = gradient_steps, replay
-        self.length = replay.sequence_steps(n_steps)
+        self.length = n_steps + replay.burn_in
         self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
         self.target = policy.actor()
         weights = policy.state_dict()

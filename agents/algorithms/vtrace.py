@@ -104,12 +104,6 @@ class VTrace(learner.ActorCritic):
     ):
         if buffer == "rollout" and replay != _REPLAY:
             raise ValueError("replay settings need buffer=replay, but buffer=rollout")
-        if replay.sequence_steps(n_steps) != n_steps + replay.burn_in:
-            raise ValueError(
-                f"replay.length={replay.length} does not fit: V-trace joins replayed sequences "
-                f"with rollouts, so after their burn-in they must have n_steps={n_steps} steps; "
-                "leave replay.length out"
-            )
         coefficients = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
         coefficients |= dict(entropy_coef=entropy_coef, value_coef=value_coef)
         coefficients["auxiliary_coef"] = auxiliary_coef

@@ -196,7 +196,7 @@ class ReplayBuffer:
         logprobs: whether to store log-probabilities.
 
     Raises:
-        ValueError: if the capacity is too small for a sequence, or a sequence is all burn-in.
+        ValueError: if the capacity is too small for a sequence.
     """
 
     def __init__(
@@ -208,7 +208,7 @@ class ReplayBuffer:
         logprobs: bool = True,
     ):
         self.settings, self.n_steps, self.n_lanes = settings, rollout.n_steps, rollout.n_lanes
-        self.length = settings.sequence_steps(self.n_steps)
+        self.length = self.n_steps + settings.burn_in
         self.n_rollouts = settings.n_rollouts(self.n_steps, self.n_lanes)
         device = rollout.reward.device
         n_rows = self.n_rollouts * self.n_steps

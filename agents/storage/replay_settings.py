@@ -18,9 +18,8 @@ class ReplaySettings:
         capacity: observations in the buffer, all lanes together. Rounded down to whole rollouts.
         images: storage of images with values from 0 to 1. fp16 stores them as they are; uint8 in
             steps of 1/255, in half the memory, and clips values outside 0 to 1.
-        burn_in: steps at the start of a sequence that only warm up the hidden state.
-        length: steps of a sequence, burn-in included. null: n_steps + burn_in, so that every
-            collected step is learned from in exactly one sequence.
+        burn_in: steps at the start of a sequence that only warm up the hidden state. A sequence
+            has `n_steps` more, so that every collected step is learned from in exactly one.
         ratio: samples replayed per sample collected.
         alpha: exponent of priorities; 0 draws uniformly (Schaul et al. 2016).
         beta: exponent of importance weights; 1 corrects fully for the priorities.
@@ -30,34 +29,14 @@ class ReplaySettings:
     capacity: Annotated[int, Field(ge=1, le=10**12)] = 1_000_000
     images: Literal["fp16", "uint8"] = "fp16"
     burn_in: Annotated[int, Field(ge=0, le=65_536)] = 0
-    length: Annotated[int, Field(ge=1, le=131_072)] | None = None
     ratio: Annotated[float, Field(gt=0, le=1000)] = 1.0
     alpha: Exponent = 0.0
     beta: Exponent = 0.6
     start: Annotated[int, Field(ge=0, le=10**12)] = 0
 
-    def sequence_steps(self, n_steps: int) -> int:
-        """Returns L, the steps of a sequence, for rollouts of `n_steps`.
-
-        Raises:
-            ValueError: if only burn-in is left, or some steps would never be learned from.
-        """
-        length = n_steps + self.burn_in if self.length is None else self.length
-        if length <= self.burn_in:
-            raise ValueError(
-                f"replay.burn_in={self.burn_in} leaves nothing of a sequence of {length} steps to "
-                "learn from: it must be shorter than replay.length"
-            )
-        if length < n_steps:
-            raise ValueError(
-                f"replay.length={length} is less than n_steps={n_steps}: sequences start where "
-                "rollouts start, so later steps would never be learned from"
-            )
-        return length
-
     def rollouts_per_sequence(self, n_steps: int) -> int:
         """Returns how many rollouts a sequence and the observation after it overlap."""
-        return self.sequence_steps(n_steps) // n_steps + 1
+        return (n_steps + self.burn_in) // n_steps + 1
 
     def n_rollouts(self, n_steps: int, n_lanes: int) -> int:
         """Returns how many rollouts (n_steps, n_lanes) fit into the capacity.
@@ -69,7 +48,7 @@ class ReplaySettings:
         if self.capacity < needed:
             raise ValueError(
                 f"replay.capacity={self.capacity:,} is too small for a sequence of "
-                f"{self.sequence_steps(n_steps)} steps of each of {n_lanes:,} lanes, stored "
+                f"{n_steps + self.burn_in} steps of each of {n_lanes:,} lanes, stored "
                 f"{n_steps} steps at a time: use at least {needed:,}, or fewer environments"
             )
         return self.capacity // (n_steps * n_lanes)

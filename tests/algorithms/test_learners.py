@@ -285,8 +285,6 @@ REPLAY = ["learner=vtrace", "learner.buffer=replay"]
         ),
         ([*REPLAY, "learner.replay.capacity=40_000_000_000"], "on cpu may be used: at most"),
         ([*REPLAY, "learner.replay.capacity=40"], "at least 64"),
-        ([*REPLAY, "learner.replay.burn_in=9", "learner.replay.length=9"], "replay.burn_in=9"),
-        ([*REPLAY, "learner.replay.length=40"], "leave replay.length out"),
         ([*REPLAY, "learner.replay.capcity=9"], "did you mean learner.replay.capacity?"),
         (["learner=vtrace", "learner.replay.ratio=2"], "buffer=replay"),
     ],

@@ -252,7 +252,6 @@ def test_train_resume_evaluate_and_init(tmp_path, monkeypatch):
     [
         (["learner=ppo", "agent.output=duelling"], "agent.output=softmax"),
         (["agent.output=softmax"], "agent.output=duelling"),
-        (["learner.replay.burn_in=9", "learner.replay.length=9"], "replay.burn_in=9"),
         (["learner.replay.capacity=30"], "replay.capacity=30"),
         (["learner.gradient_steps=1000"], "fewer gradient_steps"),
     ],

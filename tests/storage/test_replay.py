@@ -124,7 +124,8 @@ def leaf_of(tree, path):
     return tree
 
 
-def buffer_of(world, n_rollouts, **settings):
+def buffer_of(world, n_rollouts, length, **settings):
+    settings["burn_in"] = length - world.n_steps
     settings = ReplaySettings(capacity=n_rollouts * world.n_steps * B + 1, **settings)
     return ReplayBuffer(world.rollout, OBS, ACTIONS, settings)
 
