@@ -166,7 +166,7 @@ def summaries(
 
 
 def worst_summary(duels: Mapping) -> "Row":
-    """A table row of the worst homes, `statistics.worst_homes`, from a result of `play`."""
+    """Returns a table row of the worst homes, `worst_homes`, from a result of `play`."""
     played = numpyify(duels)
     numbers, means = worst_homes({"won": played["score"]}, played["homes"])
     won = means["won"]

@@ -60,9 +60,9 @@ def step_until(
 
 
 def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
-    """Returns whether steps of these may be replayed as a CUDA graph: if the environment is
-    `capturable`, and each policy, too. A policy is, unless it says otherwise, if its class is
-    megastep's, since others may keep a state where no graph sees it.
+    """Returns whether steps of these may be replayed as a CUDA graph: all are `capturable`. Unless
+    it says otherwise, a policy is if its class is megastep's, since others may keep a state where
+    no graph sees it.
     """
     return optional(env, "capturable") and all(
         getattr(policy, "capturable", type(policy).__module__.startswith("megastep."))
@@ -71,7 +71,7 @@ def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
 
 
 def _has_fixed_form(before, after) -> bool:
-    """Returns whether both trees have tensors only, under the same names."""
+    """Whether both trees have tensors only, under the same names."""
     (_, spec), (leaves, other) = map(_pytree.tree_flatten, (before, after))
     return spec == other and all(isinstance(leaf, torch.Tensor) for leaf in leaves)
 

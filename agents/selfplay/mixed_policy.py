@@ -126,7 +126,5 @@ def score_pairs(
 def rotating_slots(
     n_envs: int, n_agents: int, device: torch.device | str | None = None
 ) -> torch.Tensor:
-    """Returns one slot per environment, (N, 1) int64: slot 0 for the first N / A environments, and
-    so on.
-    """
+    """Returns one slot per environment, (N, 1) int64: 0 for the first N / A, and so on."""
     return (torch.arange(n_envs, device=device) * n_agents // n_envs)[:, None]

@@ -161,13 +161,11 @@ class Opponents:
         return self._observed(world)
 
     def _observed(self, world) -> arrdict:
-        """Stores what the opponents see of a world. Returns the world with `learns`."""
         self.opponent_world = self.mixed_policy.select_lanes(world)
         learns = self.learners if "learns" not in world else self.learners & world["learns"]
         return arrdict(world, learns=learns)
 
     def _count_pairs(self, world) -> None:
-        """Adds the pairs that this step decided to `pairs`. On a GPU in one kernel."""
         reward, terminal, truncated = (
             world[key].contiguous().view(-1, self.n_agents)[-self.n_opposed :]
             for key in ("reward", "terminal", "truncated")
@@ -206,7 +204,6 @@ class Opponents:
         self._refresh(len(self.snapshots) + number % len(self.rivals), policy)
 
     def _refresh(self, index: int, policy: Policy) -> None:
-        """Copies a policy into the opponent of an index, which forgets its episodes."""
         snapshot, weights = [*self.snapshots, *self.rivals][index], policy.state_dict()
         snapshot.load_state_dict({name: weights[name] for name in snapshot.state_dict()})
         state = self.hidden_state[str(index)]
@@ -270,7 +267,7 @@ def count_environments(
     env: Env, n_envs: int, past: float, bot: float, snapshots: int, league: float = 0.0
 ) -> tuple[int, int, int]:
     """Returns the number of environments per snapshot, against the bot, and per snapshot of another
-    member, of `n_envs` like `env`. Raises ValueError as `Opponents`.
+    member. Raises ValueError as `Opponents`.
     """
     if optional(env, "n_agents") < 2:
         raise ValueError(

@@ -35,9 +35,7 @@ HEAD, TITLE = 0.42, 0.34  # height of the line of numbers, and of a title above 
 
 
 class Picture(Figure):
-    """A matplotlib figure that shows itself in a notebook, whatever the backend. pyplot does not
-    know it, so it need not be closed.
-    """
+    """A matplotlib figure that notebooks show, and that pyplot does not know."""
 
     def __init__(self, *args, **settings) -> None:
         super().__init__(*args, **settings)
@@ -246,7 +244,7 @@ def _font(size, bold) -> FontProperties:
 
 @functools.lru_cache(1024)
 def _word(word, size, bold, colour, dpi) -> tuple[np.ndarray, float, int]:
-    """Returns a word as an image, lowest row first, its width, and the rows below letters."""
+    """The word as an image, lowest row first, its width, and the rows below letters."""
     font = _font(size, bold)
     width, _, _ = RendererAgg(1, 1, dpi).get_text_width_height_descent(word, font, False)
     letters = size * dpi / 72
@@ -314,7 +312,6 @@ def captioned(image: np.ndarray) -> np.ndarray:
 
 
 def _write_head(picture, height, numbers) -> None:
-    """Writes the title, the line of numbers and the note at the top of a picture."""
     style, width = picture.style, picture.get_figwidth() - 2 * MARGIN
     tall = HEAD + TITLE * (style.title is not None)
     head = Area(picture, MARGIN, height - tall, width, tall)

@@ -61,10 +61,8 @@ def plot_scenery(
 
 
 class Plan:
-    """The parts of a plan that seldom change: floor and walls.
-
-    In pixels they are drawn once, and later only what was seen since. What is drawn is kept in
-    memory for each of the last plans.
+    """Floor and walls of a plan. In pixels they are drawn once, and later only what was seen since;
+    what is drawn is kept in memory for each of the last plans.
     """
 
     def __init__(self, area, lines, colours, lights, seen, views) -> None:
@@ -81,7 +79,6 @@ class Plan:
         self.low, self.high = points.min(0), points.max(0)
 
     def draw(self, renderer) -> None:
-        """Draws floor and walls."""
         from matplotlib.backends.backend_agg import RendererAgg
 
         if not isinstance(renderer, RendererAgg):
@@ -258,11 +255,8 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
 
 def room_outlines(lines: ArrayLike, lights: ArrayLike) -> list[list[list[float]]]:
     """Returns the outlines of the rooms as closed polygons of points x, y in metres, rounded to
-    centimetres. What lies in an odd number of them is floor.
-
-    Args:
-        lines: (L, 2, 2) endpoints of walls in metres.
-        lights: (K, 2 or more), x and y first.
+    centimetres, from walls (L, 2, 2) and lights (K, 2 or more). What lies in an odd number of
+    them is floor.
     """
     lines = np.ascontiguousarray(lines, np.float32)
     path = _rooms(lines.tobytes(), _points(lights).tobytes())

@@ -89,8 +89,8 @@ def page(program: Program, about: Mapping, code: bytes) -> str:
 
 
 def _packed(buffer: Buffer) -> tuple[int, bytes]:
-    """Returns how a buffer's contents are stored, and what is: 0 nothing, 1 the bytes, 2 its
-    floats as fp16, if that loses nothing.
+    """How a buffer's contents are stored, and what is: 0 nothing, 1 the bytes, 2 its floats as fp16
+    if that loses nothing.
     """
     if buffer.contents is None or not any(buffer.contents):
         return 0, b""
@@ -109,7 +109,7 @@ def _leaf(leaf: Leaf) -> list:
 
 
 def _values(launch: Launch) -> list:
-    """Returns the words of a launch: places as [buffer, offset], numbers as their 32 bits."""
+    """The words of a launch: places as [buffer, offset], numbers as their 32 bits."""
     words = launch.library.words[launch.library.cpu_operations[launch.operation]]
     values = []
     for word in words:
@@ -123,7 +123,7 @@ def _values(launch: Launch) -> list:
 
 
 def _plain(value: object) -> object:
-    """Returns what JSON can hold: leaves as lists, ranges as their ends."""
+    """What JSON can hold: leaves as lists, ranges as their ends."""
     if isinstance(value, Leaf):
         return _leaf(value)
     if isinstance(value, range):
@@ -134,7 +134,6 @@ def _plain(value: object) -> object:
 
 
 def _themes() -> str:
-    """Returns the colours of both themes as CSS."""
     rules = []
     for name, theme in THEMES.items():
         colours = {**vars(theme), "wall_low": theme.wall[0], "wall_high": theme.wall[1]}

@@ -92,10 +92,8 @@ class Tape(TorchDispatchMode):
 
 
 class Recorder:
-    """Records an environment on a CPU.
-
-    Keeps the storages of tensors, by address, so that no address is used twice; and has a buffer of
-    each that launches use.
+    """Records an environment on a CPU. Keeps the storages of tensors, by address, so that none is
+    used twice, and has a buffer of each that launches use.
     """
 
     def __init__(self, env: Env):
@@ -311,7 +309,6 @@ def _same(one: torch.Tensor, other: torch.Tensor) -> bool:
 
 
 def _place(program: Program, buffer: int) -> str:
-    """Returns the first field of a launch that lies in a buffer."""
     for launch in program.launches:
         for name, value in launch.values.items():
             if isinstance(value, Ref) and value.buffer == buffer:

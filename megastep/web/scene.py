@@ -35,8 +35,8 @@ PUSH_KEYS = {
 
 
 def controls(env: Env) -> dict[str, object]:
-    """Returns {key of a keyboard: action} of one lane: what the environment's ``controls`` say,
-    movement by arrow keys, or digits.
+    """Returns {key of a keyboard: action} of one lane: the environment's ``controls``, movement by
+    arrow keys, or digits.
     """
     space = env.action_space
     own = optional(env, "controls")

@@ -21,16 +21,10 @@ CHASE = 60  # steps that it goes after an agent lost from sight
 
 
 class Hunter(Explorer):
-    """Explores until it sees another agent, then aims at it and approaches. It searches around
-    where it lost one from sight, and turns to the nearest when it is hit.
+    """Explores until it sees another agent of a Deathmatch, then aims at it and approaches. It
+    searches around where it lost one from sight, and turns to the nearest when it is hit.
 
     It knows what an `Explorer` knows, and the pose and velocity of the agents that it sees.
-
-    Args:
-        env: the environment that it plays in, a Deathmatch.
-
-    Raises:
-        ValueError: it is another kind of environment.
     """
 
     def __init__(self, env: Any):
@@ -41,7 +35,6 @@ class Hunter(Explorer):
     def act(
         self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Explores, fights, or searches."""
         steering, obs = self.steering, world["obs"]
         state = self.explore(world["reset"], state, pose, near)
         other, sees = self._nearest(pose, obs["d"])
@@ -71,9 +64,7 @@ class Hunter(Explorer):
         return decision, state
 
     def _nearest(self, pose: Pose, depth: torch.Tensor) -> tuple[Pose, torch.Tensor]:
-        """Returns the pose of the nearest other agent, first of those in view, and whether it is
-        in view (n,).
-        """
+        """Of those in view first; and whether it is in view (n,)."""
         steering = self.steering
         core, lanes, n_pixels = steering.core, steering.lanes[:, None], depth.shape[-1]
         slots = lanes + torch.arange(1, core.n_agents, device=lanes.device)

@@ -19,11 +19,7 @@ PATIENCE, TURNS = 20, 3  # steps at a place after which a lane turns, and for ho
 
 
 class Oracle(SteeredBot):
-    """Knows the maze and where the object to find is. The most that an agent can find.
-
-    Args:
-        env: a Memory.
-    """
+    """Knows the maze and where the object of a Memory to find is. The most that can be found."""
 
     block = 2  # squares of 0.3 m per side of a landmark's block: a maze's cell has a landmark
 
@@ -34,9 +30,7 @@ class Oracle(SteeredBot):
         self.cue, self.positions = env.cue, env.objects.all.positions
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state: the `place` that it has not left, (n, 2) metres, and for how
-        many steps, `stay` (n,) int64.
-        """
+        """Returns the `place` not left, (n, 2) metres, and for how many steps, `stay` (n,)."""
         return arrdict(
             place=torch.zeros(n_lanes, 2, device=device),
             stay=torch.zeros(n_lanes, dtype=torch.int64, device=device),
@@ -45,7 +39,6 @@ class Oracle(SteeredBot):
     def act(
         self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Walks to the object to find."""
         return self.unstick(self.walk_to(*self.ways(pose, near), pose, near), state, pose)
 
     def unstick(self, decision: arrdict, state: Mapping, pose: Pose) -> tuple[arrdict, arrdict]:
@@ -103,8 +96,6 @@ class Oracle(SteeredBot):
 class Mapper(Oracle, Explorer):
     """Does not know the maze or the objects at first: explores frontiers as `Explorer`, remembers
     without error which objects it has seen, and walks to one that it knows by the shortest path.
-
-    What perfect memory can find.
     """
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
@@ -116,7 +107,6 @@ class Mapper(Oracle, Explorer):
     def act(
         self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Walks to the object to find if it knows it, or explores."""
         at, metres, landmark = self.ways(pose, near)
         known = state["known"] & ~world["reset"][:, None] | self.in_view(pose, at, metres)
         to_object = self.walk_to(at, metres, landmark, pose, near)
@@ -138,7 +128,6 @@ class Wanderer(Oracle, Walker):
     def act(
         self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Walks to the object to find while it sees it, or at random."""
         ways = self.ways(pose, near)
         wandering, walked = Walker.act(self, world, state, pose, near, generator)
         sees = self.in_view(pose, *ways[:2]).gather(1, self.cued())

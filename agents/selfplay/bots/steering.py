@@ -47,9 +47,6 @@ class Steering:
         env: an environment with `core`, `movement` and `spawner`, as megastep's have.
         goals: (D, L, 2) metres, where ways lead. Default: landmarks, see :mod:`plans`.
         block: squares of 0.3 m per side of the block that has a landmark.
-
-    Raises:
-        ValueError: it is another kind of environment.
     """
 
     def __init__(self, env: Any, goals: torch.Tensor | None = None, block: int = BLOCK):
@@ -174,11 +171,7 @@ class Steering:
 
 
 class SteeredBot:
-    """A bot that is steered: a policy, whose subclasses have `act` and `initial`.
-
-    Args:
-        env: the environment that it plays in.
-    """
+    """A bot that is steered: a policy, whose subclasses have `act` and `initial`."""
 
     block = BLOCK
 
@@ -192,9 +185,7 @@ class SteeredBot:
         return bot
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state, (n,) int64 each: the target's number, and steps of `patience`
-        until it is given up.
-        """
+        """Returns, (n,) int64 each, the target, and steps of `patience` until it is given up."""
         target, patience = torch.zeros(2, n_lanes, dtype=torch.int64, device=device).unbind()
         return arrdict(target=target, patience=patience)
 
@@ -212,7 +203,7 @@ class SteeredBot:
     def act(
         self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Returns what a call does, from the poses of its lanes and the nodes near them."""
+        """Returns what a call does, from its lanes' poses and the nodes near them."""
         raise NotImplementedError
 
     def sees(
@@ -220,8 +211,9 @@ class SteeredBot:
     ) -> torch.Tensor:
         """Returns whether places are in view, (n, K) bool: the way there is straight.
 
-        Args:
-            lengths, away, bearing: (n, K), metres of the way there and straight, and degrees.
+        Args, (n, K) each:
+            lengths, away: metres of the way there, and straight.
+            bearing: degrees.
         """
         is_straight = (lengths < BENT[0] * away + BENT[1]) & (away < SIGHT)
         return is_straight & self.steering.are_in_view(bearing)

@@ -33,7 +33,6 @@ class Walker(SteeredBot):
     def act(
         self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Walks on, or to another landmark where it has arrived or run out of patience."""
         steering, patience, target = self.steering, state["patience"] - 1, state["target"]
         if self.goal_index is not None:
             target = self.goal_index[steering.lanes].long()
@@ -61,7 +60,7 @@ class Explorer(SteeredBot):
     """
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the initial state of any bot, and landmarks `seen` (n, L) bool."""
+        """Returns the state of any bot, and landmarks `seen` (n, L) bool."""
         n_landmarks = self.steering.plans.targets.shape[1]
         seen = torch.zeros(n_lanes, n_landmarks, dtype=torch.bool, device=device)
         return arrdict(seen=seen, **super().initial(n_lanes, device))
@@ -69,7 +68,6 @@ class Explorer(SteeredBot):
     def act(
         self, world: Mapping, state: Mapping, pose: Pose, near: tuple, generator: Any
     ) -> tuple[arrdict, arrdict]:
-        """Walks to the nearest frontier."""
         state = self.explore(world["reset"], state, pose, near)
         aim = self.steering.aim(pose, near, state["target"])
         return self.steering.decide(pose, aim, aim), state
