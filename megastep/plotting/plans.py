@@ -79,6 +79,7 @@ class Plan:
         self.low, self.high = points.min(0), points.max(0)
 
     def draw(self, renderer) -> None:
+        """Draws floor and walls."""
         from matplotlib.backends.backend_agg import RendererAgg
 
         if not isinstance(renderer, RendererAgg):

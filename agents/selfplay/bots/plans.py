@@ -220,5 +220,8 @@ def _lengths(graph, goals, points) -> list[torch.Tensor]:
         parts = [part.cpu()[torch.arange(most).clamp(max=len(part) - 1)] for part in parts]
         return torch.stack(parts).numpy() - graph.origins[:, None]
 
-    tables = graph.lengths(of_all(goals), of_all(points))
+    every, points_of_all = of_all(goals), of_all(points)
+    n_searches = -(-every.shape[1] // MAX_GOALS)
+    searched = np.array_split(every, n_searches, axis=1)
+    tables = torch.cat([graph.lengths(part, points_of_all) for part in searched], 1)
     return [table[: len(g), : len(p)].T for table, g, p in zip(tables, goals, points)]
