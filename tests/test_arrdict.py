@@ -29,11 +29,6 @@ def numbers(tree):
     }
 
 
-def test_indexing_with_a_tree_of_indices():
-    tree = arrdict(a=torch.tensor([1, 2]), b=torch.tensor([3, 4]))
-    assert numbers(tree[arrdict(a=0, b=1)]) == {"a": 1, "b": 4}
-
-
 def test_assignment_to_an_index_writes_in_place():
     a, c = torch.zeros(3), torch.zeros(3, 2)
     tree = arrdict(a=a, b=arrdict(c=c))
@@ -107,13 +102,6 @@ def test_stack_makes_a_new_axis_and_cat_extends_one():
     pair = [arrdict(a=torch.full((2, 3), i), b=arrdict(c=np.full((1, 1), i))) for i in range(2)]
     assert cat(pair).a.shape == (4, 3) and cat(pair, dim=1).a.tolist() == [[0, 0, 0, 1, 1, 1]] * 2
     assert cat(pair).b.c.tolist() == [[0], [1]]
-
-
-def test_joining_no_trees_or_different_trees_is_refused():
-    with pytest.raises(ValueError, match="stack .*at least one"):
-        stack([])
-    with pytest.raises(ValueError, match="one has a and the other b"):
-        cat([arrdict(a=torch.zeros(1)), arrdict(b=torch.zeros(1))])
 
 
 def test_torchify_converts_float64_to_float32_only():

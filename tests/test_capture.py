@@ -335,18 +335,6 @@ class TestOnTheGPU:
             env.step(decision)
         assert torch.cuda.memory_stats()["allocation.all.allocated"] == before
 
-    def test_capture_on_a_side_stream(self):
-        results = []
-        for side in (False, True):
-            env = envs.Explorer(16, device="cuda")
-            with torch.cuda.stream(torch.cuda.Stream() if side else torch.cuda.current_stream()):
-                world = env.reset()
-                for _ in range(10):
-                    world = env.step(arrdict.arrdict(actions=torch.full((16, 1), 3, device="cuda")))
-                torch.cuda.current_stream().synchronize()
-            results.append(world.obs.rgb)
-        assert torch.equal(*results)
-
     @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
     def test_capture_on_the_second_device(self):
         pair = [

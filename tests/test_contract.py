@@ -121,16 +121,11 @@ def test_a_missing_attribute_is_named(name):
     "name, value, clause",
     [
         ("fps", 0, "fps .*positive.*not 0"),
-        ("fps", "10", "fps .*not '10'"),
         ("n_agents", 0, "n_agents .*positive integer, not 0"),
         ("check", True, "check must be a method .*not True"),
         ("layout", torch.zeros(3, dtype=torch.int32), r"layout .*integer.*\(2,\)"),
-        ("layout", torch.zeros(2), "layout .*integer"),
         ("roles", ("leader", "follower"), "roles .*one name per agent, 1 in all, not .*'follower'"),
-        ("roles", (), r"roles .*not \(\)"),
-        ("roles", "a", "roles .*not 'a'"),
         ("roles", ("red team",), "roles must be identifiers, such as red_team, .*not .*red team"),
-        ("roles", (1,), r"roles .*not \(1,\)"),
     ],
 )
 def test_a_wrong_attribute_is_named(name, value, clause):
@@ -187,12 +182,3 @@ def test_privileged_is_optional_and_may_be_one_tensor(space):
             return world
 
     contract.rollout(Env(), 9)
-
-
-def test_same_compares_keys_and_bits():
-    tree = arrdict.arrdict(a=torch.tensor([1.0, 2.0]), b=arrdict.arrdict(c=torch.tensor([3])))
-    assert contract.same(tree, tree.clone()) and contract.same(tree.a, tree.a.clone())
-    other = tree.clone()
-    other.b.c[0] = 4
-    assert not contract.same(tree, other)
-    assert not contract.same(tree, arrdict.arrdict(a=tree.a))

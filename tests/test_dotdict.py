@@ -21,12 +21,6 @@ def test_unknown_attributes_are_looked_up_on_leaves():
     assert type(tree.imag.b) is dotdict
 
 
-def test_methods_precede_keys_and_keys_precede_attributes_of_values():
-    tree = dotdict(items=1, imag=2)
-    assert list(tree.items()) == [("items", 1), ("imag", 2)]
-    assert tree.imag == 2
-
-
 def test_an_unknown_attribute_is_named_with_the_nearest_key():
     with pytest.raises(AttributeError, match=r"'rewrd' .*float.* obs, reward .*mean 'reward'"):
         _ = dotdict(obs=1.0, reward=2.0).rewrd
@@ -66,15 +60,6 @@ def test_copies_keep_type_and_values(objs, make_copy):
     copied = make_copy(objs)
     assert type(copied) is type(copied.a) is dotdict
     assert copied == objs and copied is not objs
-
-
-def test_pipe_map_and_starmap(objs):
-    assert objs.pipe(list) == ["a", "d"]
-    assert objs.map(float) == {"a": {"b": 1.0, "c": 2.0}, "d": 3.0}
-    assert objs.starmap(int.__add__, objs) == {"a": {"b": 2, "c": 4}, "d": 6}
-    assert objs.map(float).starmap(float.__add__, objs).pipe(list) == ["a", "d"]
-    assert objs.map(round, -1) == {"a": {"b": 0, "c": 0}, "d": 0}
-    assert objs.starmap(lambda x, y, z: x + y * z, objs, objs).d == 12
 
 
 def test_starmap_refuses_trees_with_other_keys(objs):

@@ -30,14 +30,6 @@ def test_an_index_of_another_type_is_refused(ragged):
         ragged["a"]
 
 
-def test_empty_subarrays_and_further_axes(kind):
-    ragged = Ragged(kind(np.arange(12.0).reshape(3, 2, 2).tolist()), kind([0, 2, 0, 1, 0]))
-    assert ragged[0].shape == (0, 2, 2) and ragged[3].tolist() == [[[8, 9], [10, 11]]]
-    assert ragged.inverse.tolist() == [1, 1, 3]
-    assert [len(subarray) for subarray in ragged[::-1]] == [0, 1, 0, 2, 0]
-    assert len(Ragged(kind([]), [])) == 0 and len(Ragged(kind([]), [])[:]) == 0
-
-
 def test_torchify_and_numpyify():
     ragged = Ragged(np.array(VALS), np.array(WIDTHS))
     converted = ragged.torchify()

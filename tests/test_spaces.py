@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.arrdict import arrdict
 from megastep.dotdict import dotdict
 
 
@@ -49,13 +48,6 @@ def test_leaves_are_named_by_dotted_path():
     assert spaces.leaves(TREE) == {"rgb": RGB, "body.speed": SPEED, "body.hands": HANDS}
     assert list(spaces.leaves(TREE, "obs")) == ["obs.rgb", "obs.body.speed", "obs.body.hands"]
     assert spaces.leaves(RGB, "obs") == {"obs": RGB} and spaces.leaves(RGB) == {"": RGB}
-
-
-def test_map_gives_an_arrdict_with_the_keys_of_the_space():
-    shapes = spaces.map(lambda space: space.shape, TREE)
-    assert spaces.leaves(shapes) == {"rgb": (1, 3, 1, 8), "body.speed": (1, 2), "body.hands": (2,)}
-    assert list(shapes) == list(TREE) and type(shapes) is type(shapes.body) is arrdict
-    assert spaces.map(lambda space: space.shape, RGB) == (1, 3, 1, 8)
 
 
 def test_bounds_of_continuous_actions_are_kept_per_number():

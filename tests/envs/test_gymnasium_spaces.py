@@ -19,7 +19,6 @@ F32, U8 = {"dtype": torch.float32}, {"dtype": torch.uint8}
 OBSERVATIONS = [
     (gym.Box(-np.inf, np.inf, (4,)), vector(1, 4, **F32)),
     (gym.Box(0, 1, ()), vector(1, 1, **F32)),
-    (gym.Box(0, 9, (2, 3), np.int64), vector(1, 6, **F32)),
     (gym.Box(0, 255, (7, 7, 3), np.uint8), vector(1, 147, **F32)),
     (gym.Box(0, 255, (8, 9, 3), np.uint8), image(1, 3, 8, 9, **U8)),
     (gym.Box(0, 255, (4, 8, 9), np.uint8), image(1, 4, 8, 9, **U8)),
@@ -29,15 +28,12 @@ OBSERVATIONS = [
     (gym.Box(0, 1, (8, 17)), vector(1, 136, **F32)),
     (gym.Box(-np.inf, np.inf, (16, 17)), vector(1, 272, **F32)),  # a stack of vectors
     (gym.Box(0, 255, (12, 20, 30), np.uint8), image(1, 12, 20, 30, **U8)),
-    (gym.Box(0, 255, (20, 30, 12), np.uint8), image(1, 12, 20, 30, **U8)),
     (gym.Box(0, 1, (8, 8, 111)), image(1, 111, 8, 8, **F32)),
-    (gym.Box(-np.inf, np.inf, (9, 9, 20)), image(1, 20, 9, 9, **F32)),
     (gym.Box(-np.arange(512, dtype=np.float32).reshape(8, 8, 8), 1), vector(1, 512, **F32)),
     (gym.Box(0, 255, (5, 8, 9, 3), np.uint8), image(1, 15, 8, 9, **U8)),
     (gym.Box(0, 255, (5, 3, 8, 9), np.uint8), image(1, 15, 8, 9, **U8)),
     (gym.Discrete(5, start=-2), discrete(1, 5)),
     (gym.MultiDiscrete([3, 3], start=[1, 4]), discrete(2, 3)),
-    (gym.MultiDiscrete([[3, 3], [3, 3]]), discrete(4, 3)),
     (gym.MultiDiscrete([3, 4]), dotdict(part_0=discrete(1, 3), part_1=discrete(1, 4))),
     (gym.MultiBinary((2, 2)), vector(1, 4, **F32)),
     (
