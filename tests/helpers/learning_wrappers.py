@@ -79,18 +79,3 @@ class Memory:
 class Small(gymnasium.RewardWrapper):
     def reward(self, reward):
         return reward / 10
-
-
-class TinyObservations(gymnasium.ObservationWrapper):
-    def __init__(self, env):
-        super().__init__(env)
-        shape = env.observation_space.shape
-        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float32)
-
-    def observation(self, observation):
-        return (observation * 1e-4).astype(np.float32)
-
-
-class TinyRewards(gymnasium.RewardWrapper):
-    def reward(self, reward):
-        return reward * 1e-5
