@@ -22,39 +22,28 @@ REACH = 25  # cm; a wall this close to the end of another leaves less of it to o
 
 
 def _of_pairs(table) -> dict[frozenset, float]:
-    return {frozenset(pair.split()): value for pair, value in table.items()}
+    return {frozenset(p.split()): value for value, ps in table.items() for p in ps.split(", ")}
 
 
 # Probability that a connection of two kinds of rooms has no door.
 OPEN = _of_pairs(
     {
-        "living kitchen": 0.7,
-        "living entry": 0.6,
-        "kitchen entry": 0.6,
-        "living room": 0.6,
-        "kitchen room": 0.6,
-        "entry room": 0.4,
-        "entry lobby": 0.4,
-        "bedroom closet": 0.2,
-        "entry closet": 0.2,
-        "bedroom room": 0.2,
+        0.7: "living kitchen",
+        0.6: "living entry, kitchen entry, living room, kitchen room",
+        0.4: "entry room, entry lobby",
+        0.2: "bedroom closet, entry closet, bedroom room",
     }
 )
 # Cost of a connection in the spanning tree: cheap ones become doors.
 COSTS = _of_pairs(
     {
-        "living kitchen": 0.05,
-        "bedroom closet": 0.25,
-        "bath living": 0.7,
-        "bedroom": 1.5,
-        "closet": 2.0,
-        "closet storage": 2.0,
-        "storage": 2.0,
-        "closet bath": 2.0,
-        "storage bath": 2.0,
-        "bath": 3.0,
-        "bath kitchen": 3.0,
-        "bath bedroom": 0.8,
+        0.05: "living kitchen",
+        0.25: "bedroom closet",
+        0.7: "bath living",
+        0.8: "bath bedroom",
+        1.5: "bedroom",
+        2.0: "closet, closet storage, storage, closet bath, storage bath",
+        3.0: "bath, bath kitchen",
     }
 )
 COST_ENTRY, COST_LIVING, COST = 0.15, 0.3, 1.0

@@ -34,6 +34,7 @@ FREE, UNKNOWN, WALL = 254, 205, 0
 TO_FLOOR, TO_WALL = (214, 39, 40), (31, 119, 180)
 ANY = np.ones((3, 3), np.uint8)  # cells that touch, also at a corner
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)  # at a side
+TRUE, FALSE = ("true", "yes", "on"), ("false", "no", "off")
 DEFAULTS = {"occupied_thresh": "0.65", "free_thresh": "0.196", "negate": "0", "mode": "trinary"}
 
 
@@ -68,8 +69,8 @@ def load(path: Path, metres_per_pixel: float | None = None) -> Map:
     if not isinstance(given, dict) or not isinstance(given.get("image"), str):
         raise ValueError("it has no 'image'; a map of ROS has image, resolution and origin")
     given = DEFAULTS | given
-    negate = {"true": 1.0, "false": 0.0}.get(str(given["negate"]).lower())
-    is_negative = _number(given, "negate") != 0 if negate is None else negate != 0
+    word = str(given["negate"]).lower()
+    is_negative = word in TRUE or word not in FALSE and _number(given, "negate") != 0
     free_below, wall_above = _number(given, "free_thresh"), _number(given, "occupied_thresh")
     mode = str(given["mode"]).lower()
     if mode not in ("trinary", "scale", "raw"):

@@ -37,7 +37,10 @@ OWN = {
     "overflow": "hidden",
 }
 #: Pixels of a unit, of which 96 are an inch.
-UNITS = {"px": 1, "pt": 4 / 3, "pc": 16, "mm": 96 / 25.4, "cm": 96 / 2.54, "in": 96, "em": 16}
+UNITS = {
+    **{"px": 1, "in": 96, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 4 / 3, "pc": 16},
+    **{"em": 16, "rem": 16},
+}
 LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(%|[a-z]*)", re.I)
 RULE = re.compile(r"([^{}]+)\{([^{}]*)\}")
 #: What is ignored: fonts, other files, and styles of print and other media.
@@ -224,12 +227,14 @@ class _Reader:
 
         if name in ("svg", "symbol"):
             own |= box or {}
-            x, y = (of(key) if name == "svg" else 0.0 for key in "xy")
-            width, height = (of(key, "100%") for key in ("width", "height"))
-            view = safe.numbers(own.get("viewBox", "")) or [0.0, 0.0, width, height]
+            view = safe.numbers(own.get("viewBox", ""))
+            if place.chain or not view:
+                width, height = (of(key, "100%") for key in ("width", "height"))
+                view = view or [0.0, 0.0, width, height]
             if len(view) != 4 or place.chain and min(width, height, *view[2:]) <= 0:
                 return
             if place.chain:  # the root's own units are the drawing's
+                x, y = (of(key) if name == "svg" else 0.0 for key in "xy")
                 if once["overflow"] in ("hidden", "scroll", "clip"):
                     corners = shapely.get_coordinates(shapely.box(x, y, x + width, y + height))
                     visible = shapely.Polygon(apply(matrix, corners) * self.scale)
