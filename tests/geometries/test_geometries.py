@@ -285,7 +285,7 @@ BAD = {
     "holds '../../escaped.npy', .*only": {"../../escaped.npy": npy(np.ones(3))},
     "holds 'readme/x.txt', .*only": {"readme/x.txt": b"hello"},
     "numbers? .*1 is missing": {"2/walls.npy": npy(np.ones(3))},
-    "its arrays have 300,00.,... bytes, but the limit": {"masks": bytes(300_000_000)},
+    "its arrays have 101,00.,... bytes, but the limit": {"masks": bytes(101_000_000)},
 }
 
 

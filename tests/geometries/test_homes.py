@@ -192,11 +192,11 @@ def blocked(plans, wider):
     """Returns the fraction of pairs of points, 1 to 15 m apart, between which a body that is wider
     than an agent by so many metres on each side finds no path.
     """
-    ways, cpu = [], torch.device("cpu")
+    ways, cpu, n = [], torch.device("cpu"), geodesics.MAX_GOALS
     for i, home in enumerate(plans):
         graph = PathGraph([home], AGENT_RADIUS, cpu)
-        points = geodesics.draw_points(graph, 72, [np.random.default_rng(i)])
-        pairs = geodesics.largest_part(graph, points, 24, 24)
+        points = geodesics.draw_points(graph, 3 * n, [np.random.default_rng(i)])
+        pairs = geodesics.largest_part(graph, points, n, n)
         lengths = graph.lengths(*pairs)
         wide = PathGraph([home], AGENT_RADIUS + wider, cpu).lengths(*pairs)
         ways.append(wide[(lengths >= 1) & (lengths <= 15)])

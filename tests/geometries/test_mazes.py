@@ -174,7 +174,7 @@ def test_bytes_of_mazes_are_unchanged():
 
 def test_every_cell_or_a_neighbour_is_lit(kind):
     size, corridor, thickness, _, samples = kind
-    for g in samples[:3]:
+    for g in samples[:1]:
         opened = graph(g, size, corridor, thickness)
         lit = {
             cell

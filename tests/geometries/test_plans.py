@@ -516,7 +516,8 @@ SCRIBBLE = " ".join(map(str, np.random.default_rng(0).uniform(0, 99, 20_000).rou
     ],
     ids=["cycle", "uses", "arcs", "scribble"],
 )
-def test_drawings_that_would_take_minutes_are_refused(shapes, words):
+def test_drawings_that_would_take_minutes_are_refused(shapes, words, monkeypatch):
+    monkeypatch.setattr(imports.svg, "MAX_WORK", 100_000)
     with pytest.raises(ValueError, match=words):
         imports.svg.read(SVG.format(shapes).encode(), 1.0)
 
