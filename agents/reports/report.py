@@ -15,8 +15,8 @@ import numpy as np
 from megastep.agents import console
 from megastep.agents.errors import user_errors
 from megastep.agents.evaluation import tables
-from megastep.agents.reports import homes, populations, runs, seeds
-from megastep.agents.runs import checkpoint
+from megastep.agents.reports import homes, runs, seeds
+from megastep.agents.runs import checkpoint, populations
 from megastep.atomic_files import write_atomically
 
 HERE = Path(__file__).parent
@@ -28,6 +28,8 @@ ORDER = ("episode/return", "episode/", "loss/", "perf/rate", "perf/")
 METHOD = """Of each run, the mean return of its last reports. IQM: the interquartile mean over seeds
 with a bootstrap interval; below, performance profiles: the fraction of seeds whose return is
 above a threshold (Agarwal et al. 2021)."""
+#: A line of the chart of a population's scores, and what it is of the members' scores.
+SUMMARIES = {"best": np.nanmax, "median": np.nanmedian}
 #: Metrics that say nothing as curves.
 NOT_DRAWN = ("episode/count", "episode/window", "updates")
 
@@ -123,7 +125,7 @@ def _several(every: list[runs.Run], charts: "Charts") -> str:
     if keys := runs.differing(every):
         values = [[key, *(str(g[0].settings().get(key)) for g in groups.values())] for key in keys]
         parts += ["<h2>Settings that differ</h2>", _table(["setting", *groups], values)]
-    parts += populations.section(every, charts.add, _table)
+    parts += _population(every, charts)
     named = [(group, name) for name, group in groups.items()]
     parts += ["<h2>Curves</h2>", _curves(every, named, charts)]
     if scored:
@@ -133,6 +135,47 @@ def _several(every: list[runs.Run], charts: "Charts") -> str:
         place = charts.add("seeds above a return", limits, lines, "return")
         parts += ["<h2>Performance profiles</h2>", f'<div class="grid">{place}</div>']
     return "\n".join(parts)
+
+
+def _population(every: Sequence[runs.Run], charts: "Charts") -> list[str]:
+    """Returns the HTML about the population whose members the runs are, if they are: lineage,
+    settings over time, best and median score. Adds its charts.
+    """
+    path = min(run.folder.parent for run in every) / populations.FILE
+    if len({run.folder.parent for run in every}) > 1 or not path.is_file():
+        return []
+    generations = populations.read(path)
+    n = len(every)
+    generations = [rows for rows in generations if len(rows) == n]
+    if n < 2 or not generations:
+        return []
+    lines = []
+    for member in range(n):
+        own = [rows[member] for rows in generations]
+        copied = [f"{r['generation']} from {r['from']}" for r in own if r["from"] != member]
+        line = populations.lineage(generations, member)
+        ancestors = [str(n) for i, n in enumerate(line) if i == 0 or n != line[i - 1]]
+        n_diverged = str(sum(int(row.get("diverged", 0)) for row in own))
+        lines.append([str(member), " → ".join(ancestors), ", ".join(copied) or "never", n_diverged])
+    x, shown = [int(rows[0]["samples"]) for rows in generations], {}
+    scores = np.array([[row.get("score") for row in rows] for rows in generations], float)
+    if not np.isnan(scores).all():
+        shown["score of the population"] = {
+            name: [np.nan if np.isnan(row).all() else float(of(row)) for row in scores]
+            for name, of in SUMMARIES.items()
+        }
+    for key in populations.settings_of(generations[0][0]):
+        shown[key] = {
+            f"member {member}": [populations.settings_of(rows[member])[key] for rows in generations]
+            for member in range(n)
+        }
+    places = [charts.add(title, x, series) for title, series in shown.items()]
+    head = ["member", "descends from", "copied at generation", "diverged"]
+    return [
+        "<h2>Population</h2>",
+        _table(head, lines),
+        f'<div class="grid">{"".join(places)}</div>',
+    ]
 
 
 # ---- Charts and tables ----
