@@ -8,6 +8,8 @@ if an agent fits there. Ways lead from nodes to targets: landmarks, the nodes of
 that are furthest from walls, or the goals of PointGoal.
 """
 
+from typing import Any, cast
+
 import numpy as np
 import torch
 from torch.nn.functional import pad
@@ -67,7 +69,7 @@ class Plans:
         goals: torch.Tensor | None = None,
         block: int = BLOCK,
     ):
-        device, lines = scenery.device, scenery.layouts.lines
+        device, lines = scenery.device, cast(Any, scenery.layouts.lines)
         walls = [lines[d].cpu().numpy() for d in range(len(lines))]
         if not all(map(len, walls)):
             raise ValueError("it walks in homes with walls, and a geometry here has none")
