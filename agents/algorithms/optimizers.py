@@ -29,6 +29,11 @@ class _Optimizer:
         self.parameters, self.lr = list(parameters), lr
         self.n_steps: torch.Tensor = torch.zeros((), device=lr.device)
 
+    @torch.no_grad()
+    @fused(
+        lambda self: squared_norms(self).sum().sqrt(),
+        lambda self: isinstance(self, Adam) and has_kernels(self),
+    )
     def grad_norm(self) -> torch.Tensor:
         """Returns the norm () of all gradients together."""
         gradients = [p.grad for p in self.parameters if p.grad is not None]
@@ -75,12 +80,6 @@ class Adam(_Optimizer):
         for row in zip(self.parameters, self.means, self.squares, strict=True):
             key = lr_factors.get(row[0], 1.0), weight_decays.get(row[0], 0.0)
             self.groups.setdefault(key, []).append(row)
-
-    @torch.no_grad()
-    @fused(lambda self: squared_norms(self).sum().sqrt(), lambda self: has_kernels(self))
-    def grad_norm(self) -> torch.Tensor:
-        """Returns the norm () of all gradients together."""
-        return super().grad_norm()
 
     def step(
         self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0

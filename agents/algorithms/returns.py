@@ -24,10 +24,6 @@ def _following(value, last_value) -> torch.Tensor:
     return torch.cat([value[1:], last_value[None]])
 
 
-def _are_floats_on_gpu(*tensors) -> bool:
-    return all(x.is_cuda and x.dtype == torch.float32 for x in tensors)
-
-
 def _gae_on_gpu(
     reward, value, last_value, reset, terminal, truncated, learns=None, *, gamma, lambda_
 ) -> arrdict.arrdict:
@@ -47,7 +43,10 @@ def _gae_on_gpu(
     return arrdict.arrdict(advantages=advantages, targets=targets, valid=valid)
 
 
-@fused(_gae_on_gpu, lambda reward, value, *_, **__: _are_floats_on_gpu(reward, value))
+@fused(
+    _gae_on_gpu,
+    lambda reward, value, *_, **__: value.is_cuda and reward.dtype == value.dtype == torch.float32,
+)
 def gae(
     reward: torch.Tensor,
     value: torch.Tensor,
@@ -99,7 +98,9 @@ def _vtrace_on_gpu(
 
 @fused(
     _vtrace_on_gpu,
-    lambda log_ratio, reward, value, *_, **__: _are_floats_on_gpu(log_ratio, reward, value),
+    lambda log_ratio, reward, value, *_, **__: (
+        value.is_cuda and log_ratio.dtype == reward.dtype == value.dtype == torch.float32
+    ),
 )
 def vtrace(
     log_ratio: torch.Tensor,

@@ -272,12 +272,14 @@ def _by(form) -> Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     return lambda *inputs: _Sequence.apply(form, torch.is_grad_enabled(), *inputs)
 
 
-def _fits_cpu(x, *_) -> bool:
-    is_float = x.device.type == "cpu" and x.dtype == torch.float32
-    return is_float and x.shape[-1] % 16 == 0 and is_built_for_cpu()
-
-
-@fused(_by(ON_CPU), _fits_cpu)
+@fused(
+    _by(ON_CPU),
+    lambda x, *_: (
+        (x.device.type, x.dtype) == ("cpu", torch.float32)
+        and x.shape[-1] % 16 == 0
+        and is_built_for_cpu()
+    ),
+)
 @fused(_by(ON_CLUSTERS), _fits_clusters)
 @fused(_by(IN_STEPS), lambda x, *_: x.is_cuda and x.dtype in DTYPES)
 def lstm_sequence(

@@ -102,13 +102,15 @@ def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
     return [(n_counted, mean, variance) for mean, variance in views]
 
 
-def _fits_moments(norms, leaves, *_) -> bool:
-    are_few = 0 < len(leaves) <= MAX_LEAVES and are_readable(leaves)
-    return are_few and is_plain_on_gpu(*(norm.mean for norm in norms))
-
-
 @torch.no_grad()
-@fused(_moments_on_gpu, _fits_moments)
+@fused(
+    _moments_on_gpu,
+    lambda norms, leaves, *_: (
+        0 < len(leaves) <= MAX_LEAVES
+        and are_readable(leaves)
+        and is_plain_on_gpu(*(norm.mean for norm in norms))
+    ),
+)
 def moments_of(
     norms: Sequence[RunningNorm],
     leaves: Sequence[torch.Tensor],
@@ -142,13 +144,13 @@ def _add_on_gpu(norms, moments, is_counted=None) -> None:
     launch(LIBRARY, "add_moments", norms[0].mean.device, blocks, **fields)
 
 
-def _fits_add(norms, *_) -> bool:
-    are_few = 0 < len(norms) <= MAX_LEAVES
-    return are_few and is_plain_on_gpu(*(norm.mean for norm in norms))
-
-
 @torch.no_grad()
-@fused(_add_on_gpu, _fits_add)
+@fused(
+    _add_on_gpu,
+    lambda norms, *_: (
+        0 < len(norms) <= MAX_LEAVES and is_plain_on_gpu(*(norm.mean for norm in norms))
+    ),
+)
 def add_moments(
     norms: Sequence[RunningNorm],
     moments: Sequence[Moments],
