@@ -1,9 +1,10 @@
 """Wrappers around any environment, on its device: `env.wrappers=[sticky_actions]`."""
 
-from megastep.wrappers.actions import ActionRepeat, StickyActions, TimeLimit
+from megastep.wrappers.actions import ActionRepeat, NoisyActions, StickyActions, TimeLimit
 from megastep.wrappers.base import Wrapper
 from megastep.wrappers.worlds import (
     ClipReward,
+    DropSensor,
     FrameStack,
     NoisySensor,
     ScaleReward,
@@ -14,7 +15,9 @@ __all__ = [
     "WRAPPERS",
     "ActionRepeat",
     "ClipReward",
+    "DropSensor",
     "FrameStack",
+    "NoisyActions",
     "NoisySensor",
     "ScaleReward",
     "ShapeReward",
@@ -27,7 +30,9 @@ __all__ = [
 WRAPPERS = {
     "action_repeat": ActionRepeat,
     "clip_reward": ClipReward,
+    "drop_sensor": DropSensor,
     "frame_stack": FrameStack,
+    "noisy_actions": NoisyActions,
     "noisy_sensor": NoisySensor,
     "scale_reward": ScaleReward,
     "shape_reward": ShapeReward,

@@ -12,10 +12,23 @@ from megastep.settings import checked
 from megastep.types import Env, Tree, n_lanes, optional
 from megastep.wrappers.base import Draws, Wrapper, along
 
-__all__ = ["ActionRepeat", "StickyActions", "TimeLimit"]
+__all__ = ["ActionRepeat", "NoisyActions", "StickyActions", "TimeLimit"]
+
+Probability = Annotated[float, Field(ge=0, le=1)]
 
 
-class StickyActions(Wrapper):
+class _Random(Wrapper):
+    """Base of the two below, which know no masks."""
+
+    def after(self, world: arrdict) -> arrdict:
+        if "mask" in world:
+            raise ValueError(
+                f"{type(self).__name__} would take actions that the environment's mask forbids"
+            )
+        return world
+
+
+class StickyActions(_Random):
     """Repeats a lane's last action with a probability, whatever the policy chose (Machado et al.
     2018). The first action of an episode is always the policy's.
 
@@ -26,9 +39,7 @@ class StickyActions(Wrapper):
     """
 
     @checked
-    def __init__(
-        self, env: Env, *, probability: Annotated[float, Field(ge=0, le=1)] = 0.25, seed: int = 1
-    ):
+    def __init__(self, env: Env, *, probability: Probability = 0.25, seed: int = 1):
         super().__init__(env)
         self.probability, self.draws = probability, Draws(env, (), seed)
         self.is_first = torch.ones(n_lanes(env), dtype=torch.bool, device=env.device)
@@ -50,10 +61,59 @@ class StickyActions(Wrapper):
 
     def after(self, world: arrdict) -> arrdict:
         """Notes where episodes begin."""
-        if "mask" in world:
-            raise ValueError("StickyActions would take actions that the environment's mask forbids")
         self.is_first.copy_(world.reset)
-        return world
+        return super().after(world)
+
+
+class NoisyActions(_Random):
+    """Replaces discrete actions by random ones with a probability, and adds noise to continuous
+    ones.
+
+    Args:
+        env: the environment inside, without action masks.
+        probability: of a random action, in each step, per agent of a lane.
+        std: standard deviation of the noise, in units of half the range of an action. Actions stay
+            within their bounds.
+        seed: of the draws.
+    """
+
+    @checked
+    def __init__(
+        self,
+        env: Env,
+        *,
+        probability: Probability = 0.1,
+        std: Annotated[float, Field(ge=0, le=10)] = 0.1,
+        seed: int = 1,
+    ):
+        super().__init__(env)
+        self.probability, self.std = probability, std
+        leaves = spaces.leaves(env.action_space).values()
+        self.draws = [Draws(env, space.shape, seed + (i << 40)) for i, space in enumerate(leaves)]
+
+    def before(self, actions: Tree) -> Tree:
+        """Returns the actions with noise."""
+        draws = iter(self.draws)
+
+        def disturb(space, leaf) -> torch.Tensor:
+            numbers = next(draws)()
+            if isinstance(space, spaces.MultiDiscrete):
+                n = space.n_actions
+                others = (numbers[..., 1] * n).to(leaf.dtype).clamp(max=n - 1)
+                return torch.where(numbers[..., 0] < self.probability, others, leaf)
+            low, high = space.tensors(leaf.device)
+            noise = self.std * (high - low) / 2 * normal(numbers)
+            return torch.minimum(torch.maximum(leaf + noise, low), high)
+
+        return spaces.map(disturb, self.action_space, actions)
+
+
+def normal(numbers: torch.Tensor) -> torch.Tensor:
+    """Returns numbers of mean 0 and standard deviation 1 from four uniform ones each, (..., 4) ->
+    (...): their sum, which is nearly Gaussian, and has the same bits on CPU and GPU.
+    """
+    a, b, c, d = numbers.unbind(-1)
+    return ((a + b) + (c + d) - 2.0) * 3**0.5
 
 
 class ActionRepeat(Wrapper):

@@ -14,9 +14,10 @@ from megastep.imports import import_object
 from megastep.schedules import Number, Scheduled
 from megastep.settings import checked, closest
 from megastep.types import Env, Space, Tree, n_lanes
+from megastep.wrappers.actions import Probability, normal
 from megastep.wrappers.base import Draws, Wrapper, along
 
-__all__ = ["ClipReward", "FrameStack", "NoisySensor", "ScaleReward", "ShapeReward"]
+__all__ = ["ClipReward", "DropSensor", "FrameStack", "NoisySensor", "ScaleReward", "ShapeReward"]
 
 NUMBERS = spaces.MultiImage, spaces.MultiVector
 Reward = Annotated[float, Field(ge=-(10**6), le=10**6)]
@@ -94,6 +95,31 @@ def _stacked(space, n) -> "spaces.MultiImage | spaces.MultiVector":
     return dataclasses.replace(space, **size, **bounds)
 
 
+class DropSensor(Wrapper):
+    """Sets a sensor's values to 0 with a probability, as if it failed.
+
+    Args:
+        env: the environment inside.
+        sensor: its dotted path in observations, such as `rgb`.
+        probability: in each step, per lane.
+        seed: of the draws.
+    """
+
+    @checked
+    def __init__(
+        self, env: Env, *, sensor: str = "", probability: Probability = 1.0, seed: int = 1
+    ):
+        super().__init__(env)
+        _sensor(self, sensor)
+        self.sensor, self.probability, self.draws = sensor, probability, Draws(env, (), seed)
+
+    def after(self, world: arrdict) -> arrdict:
+        """Returns the world without the sensor in some lanes."""
+        leaf = spaces.leaves(world.obs)[self.sensor]
+        fails = along(self.draws()[:, 0] < self.probability, leaf)
+        return arrdict(world, obs=_replaced(world.obs, self.sensor, leaf.masked_fill(fails, 0)))
+
+
 class NoisySensor(Wrapper):
     """Adds nearly Gaussian noise to a sensor's values.
 
@@ -126,10 +152,7 @@ class NoisySensor(Wrapper):
     def after(self, world: arrdict) -> arrdict:
         """Returns the world with noise."""
         leaf = spaces.leaves(world.obs)[self.sensor]
-        # the sum of four uniform numbers, which has the same bits on CPU and GPU
-        a, b, c, d = self.draws().unbind(-1)
-        normal = ((a + b) + (c + d) - 2.0) * 3**0.5
-        noisy = (leaf.float() + self.std * normal).to(leaf.dtype)
+        noisy = (leaf.float() + self.std * normal(self.draws())).to(leaf.dtype)
         return arrdict(world, obs=_replaced(world.obs, self.sensor, noisy))
 
 

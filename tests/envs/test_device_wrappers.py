@@ -13,7 +13,9 @@ from megastep.wrappers import (
     WRAPPERS,
     ActionRepeat,
     ClipReward,
+    DropSensor,
     FrameStack,
+    NoisyActions,
     NoisySensor,
     ScaleReward,
     ShapeReward,
@@ -77,7 +79,9 @@ def minimal(device="cpu", **settings):
 SETTINGS = {
     "action_repeat": dict(n=3),
     "clip_reward": {},
+    "drop_sensor": dict(sensor="rgb", probability=0.5),
     "frame_stack": dict(n=3),
+    "noisy_actions": dict(probability=0.5),
     "noisy_sensor": dict(sensor="rgb"),
     "scale_reward": dict(factor=0.5),
     "shape_reward": dict(function="tests.envs.test_device_wrappers:length"),
@@ -122,6 +126,30 @@ def test_sticky_actions_repeat_a_quarter_but_never_across_episodes():
     assert n_repeats / n == pytest.approx(0.25, abs=0.02)
 
 
+def test_noisy_actions_are_uniform_or_nearly_gaussian_within_bounds():
+    env = NoisyActions(Counting(4000), probability=0.4)
+    env.reset()
+    did = env.step(ones(env)).obs.did.flatten()
+    rates = [(did == k).float().mean() for k in range(4)]
+    assert rates == pytest.approx([0.1, 0.7, 0.1, 0.1], abs=0.02)
+
+    class Steered(Counting):
+        action_space = spaces.MultiContinuous(1, 1, low=-2.0, high=4.0)
+
+        def step(self, decision):
+            return self._resets.keep(
+                self._world(self.ended.clone(), decision["actions"][..., 0, 0])
+            )
+
+    env = NoisyActions(Steered(4000), std=0.1)
+    env.reset()
+    did = env.step(arrdict(actions=torch.ones(4000, 1, 1))).obs.did.flatten()
+    assert float(did.mean()) == pytest.approx(1, abs=0.02)
+    assert float(did.std()) == pytest.approx(0.3, abs=0.02)
+    did = env.step(arrdict(actions=torch.full((4000, 1, 1), 4.0))).obs.did
+    assert float(did.max()) == 4
+
+
 def test_frames_are_stacked_from_the_oldest_and_begin_anew_with_an_episode():
     env = FrameStack(Counting(2), n=3, sensors=("age",))
     assert env.obs_space["age"] == spaces.MultiVector(1, 3)
@@ -158,7 +186,12 @@ def test_an_action_is_repeated_until_an_episode_ends():
     assert env.fps == pytest.approx(10 / 3)
 
 
-def test_sensors_are_noisy():
+def test_sensors_fail_and_are_noisy():
+    env = DropSensor(Counting(4000), sensor="did", probability=0.3)
+    env.reset()
+    world = env.step(ones(env))
+    assert float((world.obs.did == 0).float().mean()) == pytest.approx(0.3, abs=0.03)
+    assert bool((world.obs.age == 1).all())
     env = NoisySensor(Counting(4000), sensor="did", std=0.5)
     env.reset()
     did = env.step(ones(env)).obs.did
@@ -188,7 +221,7 @@ def test_rewards_are_scaled_clipped_and_shaped():
         ("[time_limit]", "time_limit: n: is missing"),
         ("[{name:time_limit,n:0}]", "time_limit: n: 0 is out of range: allowed is from 1"),
         ("[{name:frame_stack,m:3}]", "frame_stack has no setting 'm'; there are n, sensors"),
-        ("[{name:noisy_sensor,sensor:rgb}]", "there is no sensor 'rgb'; leave sensor out"),
+        ("[{name:drop_sensor,sensor:rgb}]", "there is no sensor 'rgb'; leave sensor out"),
         ("[{n:3}]", "a wrapper is a name or {name: ..., setting: ...}"),
         ("[os:getcwd]", "os:getcwd is not a megastep.wrappers.Wrapper, and minimal takes"),
         ("[{name:clip_reward,min:1}]", "0 must be between min=1 and max=1"),
