@@ -89,6 +89,12 @@ FAST = (
     "hooks",
     "wrappers",
 )
+#: What shares its state with a case of the other tiers.
+NIGHTLY = ("lag2", "gru", "none", "memory", "pointgoal", "sfl", "pong")
+
+
+def tiers(case):
+    return [pytest.mark.nightly] if case in NIGHTLY else [slow] * (case not in FAST)
 
 
 class Drifting:
@@ -186,7 +192,7 @@ def run(*words):
 @pytest.mark.parametrize(
     "case, device",
     [
-        *(pytest.param(name, "cpu", marks=[slow] * (name not in FAST)) for name in CASES),
+        *(pytest.param(name, "cpu", marks=tiers(name)) for name in CASES),
         *(
             pytest.param(name, "cuda", marks=pytest.mark.cuda)
             for name in CASES

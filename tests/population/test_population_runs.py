@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("here")
 SMALL = [
     "env=tests.cli.test_exact_resume:Steered",
     *tiny.TINY[2:],
-    *("env.n_envs=16", "logging.every=2", "logger=none"),
+    *("env.n_envs=32", "logging.every=2", "logger=none"),
 ]
 VARY = (
     "population.vary={learner.lr: {min: 1e-4, max: 3e-2, log: true}, "

@@ -41,8 +41,6 @@ def test_commands_and_code_of_the_page_work(here, monkeypatch, capsys):
     exec(walker, {})
     assert float(re.search(r"[0-9.]+", capsys.readouterr().out)[0]) > 0.9
     with pages.inside(here, monkeypatch):
-        against = "against=tracker:Tracker,random"
-        assert evaluate.main([f"run={folder}", against, "episodes=40", "device=cpu"]) == 0
         first = ["ratings=true", "against=tracker:Tracker,random", "episodes=40", "device=cpu"]
         assert evaluate.main([f"run={folder}", *first]) == 0
     ratings = (folder / "ratings.csv").read_text().splitlines()[-2:]
