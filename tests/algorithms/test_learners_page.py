@@ -34,7 +34,7 @@ def test_python_code_of_page_trains(folder):
     assert all(bool(value.isfinite()) for value in names["losses"].values())
     check_learner(names["learner"])
     options = with_defaults(names["learner"], LearnerOptions)
-    assert options.set_lr is options.check is options.replay_buffer is options.lambda_ is None
+    assert options.set_lr is options.check is options.replay_buffer is None
     assert options.replay_size(names["env"]) == (0, 0) and options.bytes_per_env(names["env"]) == 0
 
 
