@@ -8,7 +8,7 @@ from megastep import core, engine, scene, toys
 from megastep.dotdict import dotdict
 from megastep.geometries import sample
 
-STEPS, N_ENVS = 300, 256
+STEPS, N_ENVS = 120, 256
 SUNK = 1e-4  # metres that rounding may put a disc into a wall
 
 

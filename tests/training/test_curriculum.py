@@ -208,8 +208,7 @@ def test_run_logs_outcomes_by_source(here):
 @pytest.mark.parametrize(
     "words",
     [
-        [*POINTGOAL, "learner=vtrace", "learner.lag=1"],
-        [*POINTGOAL, "env.resample=false", "env.n_envs=2"],
+        [*POINTGOAL, "learner=vtrace", "learner.lag=1", "env.resample=false", "env.n_envs=2"],
         ["env=deathmatch", "env.n_agents=2", "env.limit=5", "opponents.bot=0.5"],
     ],
     ids=["lag", "fewer environments than homes", "opponents"],
