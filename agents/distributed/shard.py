@@ -35,12 +35,9 @@ class Shard:
         return cls(n_envs, n_homes, rank(), n_ranks()) if is_shared else cls(n_envs, n_homes)
 
     def with_others(self, values: arrdict) -> arrdict:
-        """Gathers the values of all N environments, in order. Waits for the other ranks.
-
-        Args:
-            values: tensors (n, ...) of this rank's n environments, or (n A, ...) of their lanes.
-                Leaves called `envs` and `homes` hold indices within the shard, which become indices
-                among all.
+        """Gathers the values of all N environments, in order, from tensors (n, ...) of this rank's
+        n, or (n A, ...) of their lanes. Indices within the shard, in leaves called `envs` and
+        `homes`, become indices among all. Waits for the other ranks.
         """
         if self.n_ranks == 1:
             return values

@@ -90,10 +90,8 @@ def handled(
 
 @contextlib.contextmanager
 def interrupting(on_first: Callable[[int], None] = interrupt) -> Iterator[None]:
-    """Like `handled`, for an `on_first` that raises Interrupted.
-
-    After a signal the block always ends with Interrupted, even if a library swallows the exception,
-    or raises another one while it cleans up or because a module was imported only in part.
+    """Like `handled`, for an `on_first` that raises Interrupted, with which the block then always
+    ends, even if a library swallows it, or raises another error while it cleans up.
     """
     with handled(on_first) as numbers:
         try:

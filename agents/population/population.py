@@ -305,9 +305,7 @@ class Population:
         return self.trainers[self.members.index(member)]
 
     def _of(self, source: int, target: int) -> AgentParts | None:
-        """Returns what a member has learnt where another is hosted, None elsewhere. All ranks call
-        it.
-        """
+        """Returns what a member has learnt where another is hosted. All ranks call it."""
         learnt = state = None
         if source in self.members:
             trainer = self._trainer(source)

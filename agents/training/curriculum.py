@@ -36,13 +36,9 @@ class SFL:
     the outcomes of its episodes. A class of your own has the four methods below.
 
     Of a success with probability p that is the paper's learnability p (1 - p): 0 in homes that are
-    always solved or never, most where half of the episodes succeed. Of a coverage c from 0 to 1 it
-    is E[c^2] - E[c]^2. There c (1 - c) would only say how large the coverage is: a home of which
-    every episode covers 80 % would look as learnable as a coin flip of p = 0.8, though its episodes
-    differ in nothing that could be learnt from.
-
-    The paper samples from the most learnable of homes that it rolls out apart; here the episodes
-    that train tell the learnability of all homes. An unseen home has the largest score, 1/4.
+    always solved or never, most where half of the episodes succeed. The paper samples from the most
+    learnable of homes that it rolls out apart; here the episodes that train tell the learnability
+    of all homes. An unseen home has the largest score, 1/4.
 
     Args:
         env: environment that draws a layout for each episode.

@@ -79,7 +79,7 @@ class EpisodeStats:
         metrics: Mapping[str, torch.Tensor] | None = None,
         layouts: torch.Tensor | None = None,
     ) -> None:
-        """Adds T transitions of B lanes.
+        """Adds T transitions.
 
         Args:
             reward: (T, B). NaN, infinity and values beyond `nonfinite.LIMIT` count as 0.

@@ -29,9 +29,7 @@ class NonFiniteGuard:
     updates are all skipped. All ranks call it at the same updates; they exchange what they found.
 
     Args:
-        env: the environment.
         learner: its `check` is read. Without one, only metrics are checked.
-        ranks: those that train the policy.
 
     Attributes:
         make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,

@@ -29,7 +29,6 @@ class Profiler:
     Args:
         folder: the run folder.
         n_updates: number of updates, after the first `N_SKIPPED`.
-        device: where the work is done.
     """
 
     def __init__(self, folder: Path, n_updates: int, device: torch.device):

@@ -23,13 +23,7 @@ def hint(
 ) -> str:
     """Returns how to reproduce the first NaN or infinity of a run, as the rest of a sentence: by
     resuming from the last checkpoint, which is kept in a run folder of its own, or, if there is
-    none yet, by repeating the run.
-
-    Args:
-        trainer: rank 0's trainer, before it saves another checkpoint.
-        record: the run's.
-        is_resumed: this process resumed the run.
-        value: the first NaN or infinity.
+    none yet, by repeating the run. For rank 0's trainer, before it saves another checkpoint.
     """
     saver = trainer.saver
     saver.wait()

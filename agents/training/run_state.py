@@ -35,12 +35,8 @@ class RunState:
         self.has_named_unreachable = False
 
     def state_dict(self, has_episodes: bool = True) -> StateDict:
-        """Returns the state as dicts of tensors and plain values, once no collector steps.
-
-        Most tensors are not copies, so copy them before the environment or the learner steps.
-
-        Args:
-            has_episodes: includes the environment, if it is `resumable`, and the actor state.
+        """Returns the state as dicts of tensors, most of them no copies, and plain values, once no
+        collector steps; with episodes, that is the environment and the actor state.
         """
         trainer = self.trainer
         trainer.wait_for_collector()
@@ -71,12 +67,8 @@ class RunState:
 
     def load_state_dict(self, state: StateDict, is_new_rank: bool = False) -> None:
         """Restores a `state_dict`. `trainer.lost` gets a clause for each part that could not be
-        restored and starts anew.
-
-        Args:
-            state: from `state_dict`.
-            is_new_rank: True if the saved run did not have this rank: `state` is rank 0's, without
-                episodes, and this rank keeps its own generators.
+        restored and starts anew. For a rank that the saved run did not have, the state is rank
+        0's, without episodes, and this rank keeps its own generators.
         """
         trainer = self.trainer
         trainer.samples, trainer.updates = state["samples"], state["updates"]

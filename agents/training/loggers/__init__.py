@@ -67,10 +67,8 @@ class Loggers:
         self.write(trainer.samples, metrics)
 
     def write(self, step: int, metrics: Mapping[str, float | str]) -> None:
-        """Writes one report after `step` environment steps.
-
-        Args:
-            metrics: name -> number or string. The seed determines all but those of `perf/`.
+        """Writes one report after `step` environment steps. The seed determines all metrics but
+        those of `perf/`.
         """
         values = {name: x for name, x in metrics.items() if name != "samples"}
         perf = {name: x for name, x in values.items() if name.startswith("perf/")}

@@ -1,5 +1,6 @@
 """TensorBoard event files."""
 
+import functools
 import importlib
 import threading
 from pathlib import Path
@@ -31,22 +32,17 @@ class TensorBoard:
 
     def __init__(self, folder: Path, step: int, config: dict | None = None):
         self.folder, self.step, self.config = folder / "tensorboard", step, config or {}
-        self._writer: SummaryWriter | None = None
         # which takes a second, while the first updates compile
         self._import = threading.Thread(target=importlib.import_module, args=(WRITER,), daemon=True)
         self._import.start()
 
-    @property
+    @functools.cached_property
     def writer(self) -> "SummaryWriter":
         """The writer, whose own thread writes."""
-        if self._writer is None:
-            self._import.join()
-            # which drops the events of that step, too
-            purge_step = self.step + 1
-            module = importlib.import_module(WRITER)
-            self._writer = module.SummaryWriter(str(self.folder), purge_step=purge_step)
-        assert self._writer is not None
-        return self._writer
+        self._import.join()
+        module = importlib.import_module(WRITER)
+        # which drops the events of that step, too
+        return module.SummaryWriter(str(self.folder), purge_step=self.step + 1)
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
         """Writes one report."""
@@ -78,5 +74,5 @@ class TensorBoard:
 
     def close(self) -> None:
         """Waits until everything is written."""
-        if self._writer is not None:
-            self._writer.close()
+        if "writer" in vars(self):
+            self.writer.close()
