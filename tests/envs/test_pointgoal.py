@@ -157,7 +157,7 @@ def test_distance_is_kept_where_the_field_is_infinite():
     env = make_env()
     env.reset()
     before = env.progress[2].clone()
-    env.goals._tensors["fields"].fill_(torch.inf)
+    env.goals.fields.fill_(torch.inf)
     world = env.step(decision(env, 0))
     assert torch.equal(env.progress[2], before)
     torch.testing.assert_close(world.reward, torch.full((4,), -0.02))
