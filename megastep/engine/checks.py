@@ -97,8 +97,13 @@ def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) 
         ValueError: unless it is an array of that shape, in which a string stands for any size, and
             its numbers are below 1e9.
     """
-    tensor = _converted(value, device, torch.float32)
-    if tensor is None or not _fits(tensor, shape):
+    try:
+        tensor = torch.as_tensor(value)
+        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
+        tensor = tensor.to(device=device, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError, NotImplementedError):
+        tensor = None
+    if tensor is None or not _fits(tensor.shape, shape):
         _refuse(name, f"an array of numbers of shape ({_sizes(shape)})", value)
     if not bool((tensor.abs() < LIMIT).all()):
         raise ValueError(
@@ -107,36 +112,9 @@ def floats(name: str, value: Any, shape: Sequence, device: torch.device | None) 
     return tensor.contiguous()
 
 
-def integers(
-    name: str, value: Any, size: int | str, min: int, max: int, device: torch.device
-) -> torch.Tensor:
-    """Returns ``value`` as an int64 tensor of shape (size,) on ``device``. ValueError unless all
-    are integers from ``min`` to ``max``. A string stands for any size.
-    """
-    tensor = _converted(value, device, None)
-    is_integer = tensor is not None and (tensor.dtype in _INTEGERS or not tensor.numel())
-    if tensor is None or not is_integer or not _fits(tensor, (size,)):
-        _refuse(name, f"an array of integers of shape ({size},)", value)
-    outside = tensor[(tensor < min) | (tensor > max)]
-    if len(outside):
-        raise ValueError(
-            f"{name} must hold integers from {min} to {max}, but one is {int(outside[0])}"
-        )
-    return tensor.long()
-
-
-def _converted(value, device, dtype) -> torch.Tensor | None:
-    try:
-        tensor = torch.as_tensor(value)
-        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
-        return tensor.to(device=device, dtype=dtype)
-    except (TypeError, ValueError, RuntimeError, NotImplementedError):
-        return None
-
-
-def _fits(tensor, shape) -> bool:
-    return tensor.ndim == len(shape) and all(
-        isinstance(size, str) or size == n for size, n in zip(shape, tensor.shape)
+def _fits(sizes, shape) -> bool:
+    return len(sizes) == len(shape) and all(
+        isinstance(size, str) or size == n for size, n in zip(shape, sizes)
     )
 
 

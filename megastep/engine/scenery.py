@@ -154,12 +154,13 @@ class Scenery(SetOnce):
         n_agents = checks.integer("n_agents", n_agents, 0)
         device = layouts.texels.device
         model = checks.floats("model", model, ("M", 2, 2), device)
+        widths, layout = (
+            torch.as_tensor(integers, dtype=torch.int64, device=device)
+            for integers in (model_widths, layout)
+        )
         n_lines, n_texels = n_agents * len(model), layouts.agent_textures.shape[1]
-        widths = checks.integers("model_widths", model_widths, n_lines, 1, 2**31 - 1, device)
-        layout = checks.integers("layout", layout, "N", 0, len(layouts) - 1, device)
+        _same("model_widths", "a number per line of agents", n_lines, len(widths))
         _same("model_widths", "widths that add up to agent_textures'", n_texels, int(widths.sum()))
-        if not len(layout):
-            raise ValueError("layout must have one entry per environment, but it is empty")
         self.n_envs, self.n_agents, self.n_agent_texels = len(layout), n_agents, n_texels
         self.layouts, self.device = layouts, device
         self.model = _fixed("model", model.clone())

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import torch
 
 from megastep import core, cuda, engine, modules, scene, toys
-from megastep.engine.scenery import Layouts, Scenery
+from megastep.engine.scenery import Layouts
 from megastep.ragged import Ragged
 
 ALLOWED = (ValueError, TypeError, AttributeError, IndexError, engine.EngineError)
@@ -137,12 +137,6 @@ def objects(good):
     yield from [("None", None), ("a number", 3), ("a string", "x"), ("another", SimpleNamespace())]
 
 
-def ids(good):
-    yield from [("None", None), ("a string", "text"), ("floats", good.float()), ("2d", good[None])]
-    yield from [("bools", good.bool()), ("negative", good - 9), ("too large", good + 10**6)]
-    yield from [("none", good[:0]), ("huge", good.long() + 2**40)]
-
-
 # ---- The calls: function, right arguments, and the wrong values of each ----
 
 OPERANDS = dict(scenery=objects, agents=objects)
@@ -200,23 +194,11 @@ def operations(f):
 
 
 def constructors(f):
-    model, widths = f.scenery.model.clone(), f.scenery.model_texels.diff()
     names = "lines", "textures", "lights", "agent_textures"
     layouts = {name: getattr(f.layouts, name) for name in names} | dict(device=f.device)
     device = lambda good: [("a string", "tpu"), ("a half", 0.5), ("a list", [])]  # noqa: E731
     parts = dict(lines=raggeds, textures=raggeds, lights=raggeds, device=device)
     yield Layouts, layouts, dict(parts, agent_textures=arrays)
-    yield (
-        Scenery,
-        dict(
-            n_agents=A, layouts=f.layouts, model=model, model_widths=widths,
-            layout=f.scenery.layout.clone(),
-        ),
-        dict(
-            n_agents=integers(0), layouts=objects, model=arrays, model_widths=ids,
-            layout=lambda good: [*ids(good), ("the next", good + D)],
-        ),
-    )  # fmt: skip
     yield (
         engine.Agents,
         dict(
