@@ -121,7 +121,7 @@ def test_episodes_match_twin(settings, device):
     env = explorer(device, **settings)
     life, generator, n_ends = env, torch.Generator().manual_seed(1), 0
     world, before = env.reset(), None
-    for _ in range(50):
+    for _ in range(20):
         if before is not None:
             newly_seen = (64 * world.reward).int()
             # the reward of a first observation is 0, whatever it shows
@@ -141,7 +141,7 @@ def test_episodes_match_twin(settings, device):
             n_ends += int(world.truncated.sum())
         before = {name: getattr(life, name).clone() for name in STATE}
         world = env.step(arrdict(actions=contract.random_actions(env, generator)))
-    assert n_ends > 9
+    assert n_ends > 3
 
 
 # ---- The privileged observation by hand ----

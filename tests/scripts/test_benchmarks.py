@@ -1,12 +1,8 @@
 """The benchmarks: timing, measurements, records, and a tiny run of each on both devices."""
 
-import subprocess
-import sys
-
 import benchmark
 import engine_operations
 import env_steps
-import paths
 import pytest
 import random_walks
 import records
@@ -62,23 +58,9 @@ def test_benchmark_appends_json_lines(name, n_records, device, tiny_benchmarks, 
     assert len(capsys.readouterr().out.splitlines()) == 2 + len(rows)
 
 
-def test_benchmarks_start_without_what_only_importing_floor_plans_needs():
-    code = "import sys; sys.modules.update(shapely=None, svgelements=None); import catalogue"
-    folder = paths.ROOT / "scripts" / "benchmarks"
-    subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
-
-
 def test_cpu_benchmark_restores_number_of_threads(tiny_benchmarks):
     n_threads = torch.get_num_threads()
     rows = list(benchmark.measure("cpu", torch.device("cpu"), "abc"))
     assert [row["unit"] for row in rows] == ["k/s", "times", "times"]
     assert all(row["on"].startswith("CPU, ") for row in rows)
     assert torch.get_num_threads() == n_threads
-
-
-def test_unknown_benchmark_names_closest():
-    command = [sys.executable, "scripts/benchmarks/benchmark.py", "stpe"]
-    completed = subprocess.run(command, cwd=paths.ROOT, capture_output=True, text=True)
-    assert completed.returncode == 2 and not completed.stdout
-    assert completed.stderr.count("\n") == 1
-    assert "'stpe'" in completed.stderr and "'step'" in completed.stderr
