@@ -224,11 +224,8 @@ def validate_geometry(g: G) -> G:
 
 
 def mirror_image(g: dotdict) -> dotdict:
-    """Returns a geometry with left and right swapped, and with the keys alone that the head of this
-    file lists.
-
-    Raises:
-        ValueError: if `validate_geometry` refuses it, or a wall or light lies beyond its masks.
+    """Returns a geometry with left and right swapped, with no keys but those of the head of this
+    file. Raises ValueError if it is not valid, or a wall or light lies beyond its masks.
     """
     g = validate_geometry(dotdict(g))
     width = g.masks.shape[1] * g.res
@@ -272,8 +269,8 @@ def display(g: dotdict, ax: "Axes | None" = None) -> "Axes":
 
 
 def components(free: np.ndarray) -> tuple[np.ndarray, int]:
-    """Labels the 4-connected components of cells, (H, W) bool. Returns the labels, (H, W) integers
-    with 0 where not free, and the number of components.
+    """Returns the 4-connected components of cells, (H, W) bool: labels (H, W), 0 where not free,
+    and their number.
     """
     from scipy import ndimage  # which takes a while to import
 

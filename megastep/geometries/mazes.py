@@ -29,10 +29,8 @@ BYTES_PER_METRE = 2_000
 
 
 def validate_lengths(size: int, corridor: float, thickness: float) -> tuple[int, int]:
-    """Returns (corridor, thickness) in mm, given in metres.
-
-    Raises:
-        ValueError: if the maze would be too large, or a corridor too narrow.
+    """Returns (corridor, thickness) in mm, given in metres. Raises ValueError if the maze would be
+    too large, or a corridor too narrow.
     """
     if corridor < MIN_CORRIDOR:
         raise ValueError(
@@ -130,17 +128,8 @@ def generate(
 
     Walls are the faces that are visible from inside, each as long as it is straight. A cell of the
     masks is at most 0.2 m wide. One row or column of cells runs along the middle of each corridor,
-    so the masks of corridors of any width are connected.
-
-    Args:
-        seed: any integer.
-        size: cells per side.
-        corridor: width in metres, rounded to a millimetre.
-        thickness: of the walls in metres, rounded to a millimetre.
-        braid: fraction of the dead ends that is opened.
-
-    Raises:
-        ValueError: naming the length that is out of range.
+    so the masks of corridors of any width are connected. Arguments are those of the source `maze`;
+    lengths are rounded to a millimetre. Raises ValueError, naming a length that is out of range.
     """
     wide, thick = validate_lengths(size, corridor, thickness)
     pitch = wide + thick

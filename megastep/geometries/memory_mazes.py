@@ -130,9 +130,7 @@ def _around(floor, i, j) -> list[tuple[int, int]]:
 
 
 def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, int, int]]]:
-    """Returns the floor (size, size) bool of the maze of a seed, and its rooms, of each the first
-    row and column and the number of both.
-    """
+    """Returns the floor (size, size) bool of the maze of a seed, and its `_rooms`."""
     generator = PortableGenerator(seed * len(KINDS) + sorted(KINDS).index(size))
     rooms = []
     while len(rooms) < KINDS[size].objects:
@@ -149,15 +147,8 @@ def floor_plan(seed: int, size: int) -> tuple[np.ndarray, list[tuple[int, int, i
 
 def generate(seed: int, size: int = 9, cell: float = 0.6) -> dotdict:
     """Returns the maze of a seed: a geometry whose rooms are the maze's, without corridors. So
-    agents spawn in rooms.
-
-    Args:
-        seed: any integer.
-        size: cells per side, one of `KINDS`.
-        cell: side of a cell in metres, rounded to a millimetre.
-
-    Raises:
-        ValueError: naming the argument that is out of range.
+    agents spawn in rooms. The size is one of `KINDS`, a cell is rounded to a millimetre. Raises
+    ValueError, naming the argument that is out of range.
     """
     side = validate(size, cell)
     floor, rooms = floor_plan(seed, size)

@@ -73,10 +73,8 @@ def paint(
     envelope: int,
     furniture: Sequence[regions.Rectangle] = (),
 ) -> Grid:
-    """Paints the grid of a home from rectangles of floor, inner walls, gaps and furniture, which is
-    wall too, with an envelope of so many cm.
-
-    Returns the coordinates of the lines, xs and ys, and the states of the cells,
+    """Returns the grid of a home from rectangles, furniture being wall, too, with an envelope of so
+    many cm: the coordinates of its lines, xs and ys, and the states of its cells,
     (len(ys) - 1, len(xs) - 1) with row 0 at the bottom.
     """
     grown = [
@@ -159,12 +157,9 @@ def slanted(
     thickness: int,
     generator: PortableGenerator,
 ) -> tuple[np.ndarray, np.ndarray, list]:
-    """Cuts off one outer corner of a home at 45 degrees. Returns the new segments inside and
-    outside, and the triangle that was cut off.
-
-    Both faces of the envelope are cut, so it stays `thickness` thick to a centimetre. The first
-    corner of the triangle is the old corner. The triangle is empty, and nothing is cut, if the
-    walls there are too short.
+    """Cuts off one outer corner of a home at 45 degrees, from both faces of the envelope. Returns
+    the new segments inside and outside, and the triangle that was cut off, from the old corner on;
+    it is empty, and nothing is cut, if the walls there are too short.
     """
     xs, ys, cells = grid
     outdoors = np.pad(cells == OUTDOORS, 1, constant_values=True).astype(int)

@@ -23,10 +23,8 @@ SKIPPED = ("defs", "script", "foreignObject", "use", "text", "symbol", "clipPath
 
 
 def read(content: bytes, per: str = "floor") -> list[Drawing]:
-    """Returns the drawings of a file, one per floor, or one of all floors with `per="file"`.
-
-    Raises:
-        ValueError: saying what is wrong with the file.
+    """Returns the drawings of a file, one per floor, or one of all floors with `per="file"`. Raises
+    ValueError.
     """
     if len(content) > MAX_BYTES:
         raise ValueError(f"it has {len(content):,} bytes, but the limit is {MAX_BYTES:,}")
@@ -38,11 +36,8 @@ def read(content: bytes, per: str = "floor") -> list[Drawing]:
     if not floors:
         raise ValueError("it has no group of class Floorplan; is it from CubiCasa5k?")
     if per == "file":
-        first, *others = floors
-        for floor in others:
-            for shapes, more in zip(first[:4], floor[:4]):
-                shapes.extend(more)
-        floors = [first]
+        walls, rooms, doors, outdoors = (sum(parts, []) for parts in zip(*(f[:4] for f in floors)))
+        floors = [Drawing(walls, rooms, doors, outdoors)]
     floors = [floor for floor in floors if any(floor[:4])]
     if not floors:
         raise ValueError("its floor plan is empty")

@@ -27,11 +27,7 @@ def _refuse(text) -> float:
 
 
 def read(content: bytes, per: str = "floor") -> list[Drawing]:
-    """Returns the drawing of a file, in a list.
-
-    Raises:
-        ValueError: saying what is wrong with the file.
-    """
+    """Returns the drawing of a file, in a list. Raises ValueError."""
     try:
         plan = json.loads(content, parse_constant=_refuse)
     except (json.JSONDecodeError, RecursionError, UnicodeDecodeError) as error:

@@ -49,10 +49,7 @@ class Map(NamedTuple):
 
 def load(path: Path, metres_per_pixel: float | None = None) -> Map:
     """Returns the map of a ROS `.yaml`, as map_server reads it, or of an image if
-    `metres_per_pixel` is given.
-
-    Raises:
-        ValueError: saying what is wrong with the file.
+    `metres_per_pixel` is given. Raises ValueError.
     """
     if path.suffix.lower() not in (".yaml", ".yml"):
         if metres_per_pixel is None:
@@ -130,10 +127,7 @@ def _image(path) -> tuple[np.ndarray, np.ndarray]:
 
 def read(grid: Map) -> tuple[Drawing, np.ndarray, list[str]]:
     """Returns the drawing of a map, straightened and without speckles, a picture (H, W, 3) of what
-    was changed, and warnings.
-
-    Raises:
-        ValueError: saying what is wrong with the map.
+    was changed, and warnings. Raises ValueError.
     """
     resolution = grid.resolution
     if not np.isfinite(resolution) or resolution <= 0:

@@ -115,18 +115,11 @@ def check_extent(shapes: Sequence[BaseGeometry]) -> None:
 def geometry_of(
     drawing: Drawing, sealed: bool = True, tolerance: float = GRID / 2
 ) -> tuple[dotdict, Notes]:
-    """Returns the geometry of a drawing, and notes.
+    """Returns the geometry of a drawing, with contours simplified by `tolerance` metres, and notes.
 
-    Doors to the outside are closed if `sealed`, and rooms outdoors are no rooms. Rooms that no
-    agent can reach keep their walls; agents do not spawn in them.
-
-    Args:
-        drawing: the floor plan.
-        sealed: False: outer doors are open, rooms outdoors are rooms, as in the original megastep.
-        tolerance: metres by which contours are simplified.
-
-    Raises:
-        ValueError: saying what is wrong with the plan.
+    If `sealed`, doors to the outside are closed and rooms outdoors are no rooms; else they are, as
+    in the original megastep. Rooms that no agent can reach keep their walls; agents do not spawn
+    in them. Raises ValueError.
     """
     shapes = [*drawing.walls, *drawing.rooms, *drawing.doors, *drawing.outdoors]
     n_corners = int(shapely.get_num_coordinates(shapes).sum())
@@ -242,9 +235,7 @@ def _lines(shape) -> list:
 
 
 def _across(door, floor) -> np.ndarray | None:
-    """Returns the segment (2, 2) that closes a doorway: the middle of the door along its wall, as
-    wide as the gap; None if the gap is no floor.
-    """
+    """Returns the segment (2, 2) that closes a doorway, along its wall; None if it is no floor."""
     corners = np.array(door.minimum_rotated_rectangle.exterior.coords[:4])
     sides = np.roll(corners, -1, 0) - corners
     along = sides[0] if np.hypot(*sides[0]) >= np.hypot(*sides[1]) else sides[1]
@@ -285,8 +276,8 @@ def _reachable(g, rooms, n_sealed, warnings) -> tuple[dotdict, Notes]:
 
 
 def _light(parts, g, distance, cell) -> np.ndarray:
-    """Returns the place of a room's light: its centroid if that is indoors and clear of walls, else
-    the middle of its largest disc.
+    """Returns a room's centroid if that is indoors and clear of walls, else the middle of its
+    largest disc.
     """
     part = max(parts, key=lambda part: part.area)
     at = np.array(part.centroid.coords[0])
@@ -319,10 +310,7 @@ def rooms_of(floor: BaseGeometry) -> list[BaseGeometry]:
 
 def enclosed(walls: Sequence[BaseGeometry], doors: Sequence[BaseGeometry]) -> Drawing:
     """Returns the drawing of walls and doors alone: the floor is what they enclose. Gaps of up to
-    1.3 m in the outer walls are closed if the floor leaks through them.
-
-    Raises:
-        ValueError: if they enclose nothing.
+    1.3 m in the outer walls are closed if the floor leaks through them. Raises ValueError.
     """
     check_meetings([*walls, *doors])
     solids = shapely.union_all(walls)

@@ -39,9 +39,7 @@ class Member(NamedTuple):
 
 def members(path: Path, suffix: str) -> Iterator[Member]:
     """Yields the files whose names end in `suffix`, of a zip, a tar, a folder, or the file itself.
-
-    Raises:
-        ValueError: there is no such file, or it is damaged or cut short.
+    Raises ValueError if there is no such file, or it is damaged or cut short.
     """
     if path.is_dir():
         files = (file for file in sorted(path.rglob(f"*{suffix}")) if file.is_file())
