@@ -211,7 +211,7 @@ def test_run_logs_outcomes_by_source(here):
         [*POINTGOAL, "learner=vtrace", "learner.lag=1", "env.resample=false", "env.n_envs=2"],
         ["env=deathmatch", "env.n_agents=2", "env.limit=5", "opponents.bot=0.5"],
     ],
-    ids=["lag", "fewer environments than homes", "opponents"],
+    ids=["lag, fewer environments than homes", "opponents"],
 )
 def test_run_in_a_mix_logs_episodes_by_source(words, here):
     """Also without a curriculum. Every episode is one of its source's."""
