@@ -14,7 +14,7 @@ TINY = "experiment=deathmatch geometry=box env.n_envs=8 seconds=null finish.reco
 def test_an_unknown_part_is_refused(capsys):
     assert train_plain.main(["lstm,head"]) == 2
     assert "unknown part 'head'. Available: " in capsys.readouterr().err
-    assert len(train_plain.chosen("all")) > 30 and train_plain.chosen("none") == []
+    assert train_plain.chosen("all") and train_plain.chosen("none") == []
 
 
 @pytest.mark.nightly
