@@ -191,6 +191,8 @@ class PathGraph:
         centres of all cells, ``counts`` (D,) in each home, to goals (D, G <= MAX_GOALS, 2).
         """
         n_goals = goals.shape[1]
+        if n_goals > MAX_GOALS:
+            raise ValueError(f"{n_goals} goals per home: at most {MAX_GOALS} in one call")
         goals = self.tensor(goals, np.float32)
         distances = torch.empty((len(self.corner_homes), MAX_GOALS), device=self.device)
         launch(

@@ -207,6 +207,11 @@ def test_path_in_an_empty_room_is_straight():
     assert (distances(result.goals.astype(float), toys.box(5).walls) > RADIUS + 0.05).all()
 
 
+def test_more_goals_than_one_call_takes_are_refused():
+    with pytest.raises(ValueError, match="17 goals per home: at most 16 in one call"):
+        geodesics_of(toys.box(5), n_goals=17)
+
+
 def test_fields_do_not_leak_through_walls():
     """A thin wall across the room, open at one end: distances on its two sides differ by metres,
     and a body that touches it reads those of its own side.
