@@ -192,14 +192,6 @@ class PPO(learner.ActorCritic):
         self.policy.clear_stats()
         return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps))
 
-    gamma = property(
-        lambda self: self.coefficients["gamma"],
-        doc="The present discount; on a GPU a tensor () that a graph may read.",
-    )
-    lambda_ = property(
-        lambda self: self.coefficients["lambda_"], doc="The present lambda of GAE, likewise."
-    )
-
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""
         # A minibatch holds its part of the rollout and of the activations. Values are computed from
@@ -211,7 +203,7 @@ class PPO(learner.ActorCritic):
 
     def _update(self, rollout) -> "dict[str, torch.Tensor]":
         transitions = rollout.transitions()
-        numbers = dict(gamma=self.gamma, lambda_=self.lambda_)
+        numbers = {name: self.coefficients[name] for name in ("gamma", "lambda_")}
         estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **numbers)
         advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
         moments = masked_moments(valid, targets, advantages)
