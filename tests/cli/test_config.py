@@ -1,6 +1,7 @@
 """Composing and checking configurations. No test starts a run."""
 
 import dataclasses
+import logging
 import operator
 import re
 
@@ -361,7 +362,17 @@ def test_help_lists_groups_and_members(capsys):
     assert "quickstart" in text and "--multirun" in text
 
 
-def test_cfg_prints_composed_config(capsys):
+@pytest.fixture
+def logging_as_it_was():
+    """Restores what Hydra's own main changes."""
+    root = logging.getLogger()
+    handlers, level = [*root.handlers], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+def test_cfg_prints_composed_config(capsys, logging_as_it_was):
     def printed(*words):
         assert train.main([*words]) == 0
         return capsys.readouterr().out
