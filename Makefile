@@ -22,7 +22,7 @@ KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -na
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
 
-test: $(SETUP)             ## run the fast tests: 3 to 10 minutes on two cores
+test: $(SETUP)             ## run the fast tests: 4 to 5 minutes on two cores
 	$(PYTEST)
 
 test-slow: $(SETUP)        ## run the thorough tests: 5 to 11 minutes; .ci/run runs them as well

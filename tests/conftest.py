@@ -8,6 +8,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")  # each worker imports torch, in seconds
 
 import functools
+import logging
 import pickle
 
 import pytest
@@ -47,6 +48,18 @@ def pytest_ignore_collect(collection_path, config):
 def device(request):
     """Each device in turn, for tests that hold on both."""
     return request.param
+
+
+@pytest.fixture(autouse=True)
+def logs():
+    """Takes away what Hydra adds to Python's logging, which would write to a closed stream."""
+    root = logging.getLogger()
+    level = root.level
+    yield
+    root.setLevel(level)
+    for handler in [*root.handlers]:
+        if type(handler) in (logging.StreamHandler, logging.FileHandler):
+            root.removeHandler(handler)
 
 
 @pytest.fixture

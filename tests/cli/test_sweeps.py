@@ -4,7 +4,6 @@ job and a signal do. Jobs run an environment that pays a known return in millise
 
 import csv
 import json
-import logging
 import os
 import pathlib
 import signal
@@ -62,16 +61,12 @@ SHORT = [*SMALL, f"samples={2 * UPDATE}"]
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """Changes to an empty folder with the environment; restores what Hydra changes."""
+    """Changes to an empty folder with the environment."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     (tmp_path / "payer.py").write_text(PAYER)
     yield tmp_path
-    root = logging.getLogger()
-    for handler in list(root.handlers):
-        if type(handler) in (logging.StreamHandler, logging.FileHandler):
-            root.removeHandler(handler)
     sys.modules.pop("payer", None)
     kind_of.cache_clear()
 
