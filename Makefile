@@ -25,7 +25,7 @@ train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen hom
 test: $(SETUP)             ## run the fast tests: 4 to 5 minutes on two cores
 	$(PYTEST)
 
-test-slow: $(SETUP)        ## run the thorough tests: 5 to 11 minutes; .ci/run runs them as well
+test-slow: $(SETUP)        ## run the thorough tests: 3 to 4 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 
 test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour; SEED=2 makes others
