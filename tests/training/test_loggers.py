@@ -220,8 +220,10 @@ def test_wandb_has_the_result_of_a_run(tmp_path, monkeypatch):
 
 def test_tensorboard_has_the_result_of_a_run(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
-    film, config = tmp_path / "video.mp4", {"seed": 1, "learner": {"lr": 0.1, "names": [1, 2]}}
+    config = {"seed": 1, "learner": {"lr": 0.1, "names": [1, 2]}, "desync": False, "seconds": None}
+    film = tmp_path / "video.mp4"
     writer = Mp4Writer(10)
     for number in range(8):
         writer.add(np.full((720, 640, 3), 30 * number, np.uint8))
@@ -244,8 +246,15 @@ def test_tensorboard_has_the_result_of_a_run(tmp_path):
     assert (image.height, image.width) == (360, 320)
     with Image.open(io.BytesIO(image.encoded_image_string)) as gif:
         assert gif.n_frames == 8 and gif.size == (320, 360)
-    hparams = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
-    assert b"learner.lr" in hparams and b"learner.names" in hparams
+    data = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    values = HParamsPluginData.FromString(data).session_start_info.hparams
+    kinds = {name: value.WhichOneof("kind") for name, value in values.items()}
+    assert kinds == {
+        "seed": "number_value",
+        "learner.lr": "number_value",
+        "learner.names": "string_value",
+        "desync": "bool_value",
+    }
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 #: Of the film in TensorBoard, which shows GIFs: pixels, and frames.
 HEIGHT, N_FRAMES = 360, 100
-WRITER = "torch.utils.tensorboard"
+WRITER, PLUGIN = "torch.utils.tensorboard", "tensorboard.plugins.hparams"
 
 
 class TensorBoard:
@@ -55,13 +55,18 @@ class TensorBoard:
         from tensorboard.compat.proto import summary_pb2
 
         Summary = summary_pb2.Summary  # pyright: ignore[reportAttributeAccessIssue]
-        plain = bool, int, float, str
+        plain = bool, int, float, str, type(None)  # None is left out
         settings = {
             name: value if isinstance(value, plain) else str(value)
             for name, value in spaces.leaves(self.config).items()
         }
         numbers = {f"final/{name}": value for name, value in result.numbers.items()}
-        self.writer.add_hparams(settings, numbers, run_name=".", global_step=step)
+        writer = self.writer.file_writer
+        assert writer is not None
+        for summary in hparams(settings, numbers):
+            writer.add_summary(summary, step)
+        for name, value in numbers.items():
+            self.writer.add_scalar(name, value, step)
         if result.table:
             head, rows = [*result.table[0]], [[*row.values()] for row in result.table]
             self.writer.add_text("evaluation", console.table(head, rows, is_markdown=True), step)
@@ -69,10 +74,32 @@ class TensorBoard:
             gif, (height, width) = video.small_gif(result.film, HEIGHT, N_FRAMES)
             shown = dict(height=height, width=width, colorspace=3, encoded_image_string=gif)
             value = Summary.Value(tag="film", image=Summary.Image(**shown))
-            assert self.writer.file_writer is not None
-            self.writer.file_writer.add_summary(Summary(value=[value]), step)
+            writer.add_summary(Summary(value=[value]), step)
 
     def close(self) -> None:
         """Waits until everything is written."""
         if "writer" in vars(self):
             self.writer.close()
+
+
+def hparams(settings: dict, numbers: dict) -> tuple:
+    """Returns the summaries of settings and final numbers, in which true and false stay what they
+    are: PyTorch writes them as numbers.
+    """
+    from torch.utils.tensorboard import summary
+
+    kinds = importlib.import_module(f"{PLUGIN}.api_pb2")
+    plugin = importlib.import_module(f"{PLUGIN}.plugin_data_pb2")
+    written = experiment, start, _ = summary.hparams(settings, numbers)
+    flags = {name: value for name, value in settings.items() if isinstance(value, bool)}
+    about_all, of_run = (one.value[0].metadata.plugin_data for one in (experiment, start))
+    data = plugin.HParamsPluginData.FromString(about_all.content)
+    for info in data.experiment.hparam_infos:
+        if info.name in flags:
+            info.type = kinds.DATA_TYPE_BOOL
+    about_all.content = data.SerializeToString()
+    data = plugin.HParamsPluginData.FromString(of_run.content)
+    for name, value in flags.items():
+        data.session_start_info.hparams[name].bool_value = value
+    of_run.content = data.SerializeToString()
+    return written
