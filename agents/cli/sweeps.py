@@ -139,7 +139,11 @@ def sweep(composer: Composer, words: list[str]) -> int:
                 folders.SWEEPS.rmdir()
     if not rows:
         raise UserError(f"The sweep cannot start: {problem}")
-    if problem and all(row["state"] in (DONE, LOST) for row in rows):
+    scored = [row["score"] for row in rows if row["state"] == DONE and "score" in row]
+    if scored and all(score is None for score in scored):
+        text = "No job has a score, so none is the best, as no episode finished; train longer"
+        console.say(text, sys.stderr)
+    elif problem and all(row["state"] in (DONE, LOST) for row in rows):
         console.say(f"The launcher failed: {problem}", sys.stderr)
     return 1 if problem or any(row["state"] != DONE for row in rows) else 0
 

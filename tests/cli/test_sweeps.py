@@ -127,6 +127,18 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
         assert not {name for name in left if not name.startswith("payer.")}, words
 
 
+@pytest.mark.parametrize("sweeper", ["basic", "optuna"])
+def test_sweep_without_a_score_ends_with_the_reason(here, capsys, sweeper):
+    words = ["env=minimal", *SHORT[1:], "env.shortest=1000", "env.longest=1000"]
+    words += ["hydra.sweeper.n_trials=2"] * (sweeper == "optuna")
+    if sweeper == "optuna":
+        pytest.importorskip("optuna")
+    code = train.main([*words, "-m", f"hydra/sweeper={sweeper}", "env.res=8,16"])
+    err = capsys.readouterr().err
+    assert code == (sweeper == "optuna") and "The launcher failed" not in err
+    assert "No job has a score, so none is the best, as no episode finished" in err
+
+
 def test_table_stands_while_jobs_run(here, monkeypatch):
     """Even if a job of the basic launcher ends this process, with `os._exit` or worse."""
     states = []
