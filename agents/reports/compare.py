@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,7 +36,8 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         if not shared:
             raise UserError("these runs share no metric, so they cannot be compared")
         raise UserError(f"not all of these runs report {metric!r}; {closest(metric, shared)}")
-    groups, table, scores = runs.groups_of(every), [], {}
+    groups, left_out = runs.without_interrupted(runs.groups_of(every))
+    table, scores = [], {}
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     axes = figure.subplots()
     for name, group in groups.items():
@@ -43,12 +45,14 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         (line,) = axes.plot(one["x"], one["mean"], label=f"{name} ({len(group)})")
         axes.fill_between(one["x"], one["lower"], one["upper"], alpha=0.2, color=line.get_color())
         columns = zip(*(one[key].tolist() for key in ("x", "mean", "lower", "upper")), strict=True)
-        table += [[name, *row] for row in columns]
+        table += [[name, *("" if math.isnan(value) else value for value in row)] for row in columns]
         scores[name] = [value for run in group if (value := run.score(metric)) is not None]
-    axes.set(xlabel="samples", ylabel=metric)
+    axes.set_xlabel("samples")
+    axes.set_ylabel(metric, parse_math=False)  # a $ is a $
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    for text in axes.legend(fontsize="small").get_texts():
+        text.set_parse_math(False)
     plot, text = io.BytesIO(), io.StringIO()
     figure.savefig(plot, format=file.suffix[1:], dpi=200)
     writer = csv.writer(text, lineterminator="\n")
@@ -59,5 +63,5 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
         write_atomically(file, plot.getvalue())
     head = [text.format(metric) for text in seeds.POOLED]
     rows = seeds.pooled(scores)
-    console.say(console.table(head, rows, width=console.terminal_width()))
+    console.say("\n".join([console.table(head, rows, width=console.terminal_width()), *left_out]))
     return file

@@ -75,7 +75,9 @@ def _one(run: runs.Run, charts: "Charts", file: Path) -> str:
         shown = "command", "time", "commit", "megastep", "torch", "python", "device"
         facts = {name: row[name] for name in shown if row.get(name)}
     if len(run.provenance) > 1:
-        facts["resumed"] = f"{len(run.provenance) - 1} times"
+        times = f"{len(run.provenance) - 1} times, last after {row['samples']:,} samples"
+        facts |= {"command": str(run.provenance[0].get("command", "")), "resumed": times}
+        facts["last command"] = str(row.get("command", ""))
     # the settings that the command of the first start named, as the run has them
     words = str(run.provenance[0].get("command", "")).split() if run.provenance else []
     keys = {word.lstrip("-+").partition("=")[0] for word in words if "=" in word}
@@ -109,7 +111,7 @@ def _one(run: runs.Run, charts: "Charts", file: Path) -> str:
 
 def _several(every: list[runs.Run], charts: "Charts") -> str:
     """Returns the body of a report that compares runs. Adds its charts."""
-    groups = runs.groups_of(every)
+    groups, left_out = runs.without_interrupted(runs.groups_of(every))
     tasks = "; ".join(dict.fromkeys(run.task for run in every))
     parts = [f"<h1>{len(every)} runs</h1>", f"<p>{_text(tasks)}</p>"]
     all_scores = {
@@ -122,6 +124,7 @@ def _several(every: list[runs.Run], charts: "Charts") -> str:
         row.append(f"{max(run.metrics[-1]['samples'] for run in group):,}")
     head = [*(text.format("the return") for text in seeds.POOLED), "samples"]
     parts += ["<h2>Results</h2>", _table(head, rows), f"<p>{METHOD}</p>"]
+    parts += [f"<p>{_text(sentence)}</p>" for sentence in left_out]
     if keys := runs.differing(every):
         values = [[key, *(str(g[0].settings().get(key)) for g in groups.values())] for key in keys]
         parts += ["<h2>Settings that differ</h2>", _table(["setting", *groups], values)]

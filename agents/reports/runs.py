@@ -47,6 +47,19 @@ class Run(NamedTuple):
         values = [row[metric] for row in self.metrics if row.get(metric) is not None][-10:]
         return sum(values) / len(values) if values else None
 
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether less than 90 % of each budget was spent, and no `evaluation.stop` can have ended
+        the run.
+        """
+        done = []
+        for name, rows in {"samples": self.metrics, "perf/seconds": self.perf}.items():
+            budget, spent = self.config.get(name.removeprefix("perf/")), rows and rows[-1].get(name)
+            if isinstance(budget, (int, float)) and budget > 0 and isinstance(spent, (int, float)):
+                done.append(spent / budget)
+        has_stop = any(key.startswith("evaluation.stop.") for key, _ in leaves(self.config))
+        return bool(done) and max(done) < 0.9 and not has_stop
+
     def curve(self, metric: str) -> tuple[list[float], list[float]]:
         """Returns the samples and values of a metric of `metrics.jsonl` or `perf.jsonl`."""
         rows = self.perf if metric.startswith("perf/") else self.metrics
@@ -104,6 +117,20 @@ def groups_of(runs: Sequence[Run]) -> dict[str, list[Run]]:
             text = f"{text} {group[0].folder.name}".strip()
         named[text] = group
     return named
+
+
+def without_interrupted(groups: dict[str, list[Run]]) -> tuple[dict[str, list[Run]], list[str]]:
+    """Returns groups without their interrupted runs, unless all of a group are, and a sentence for
+    each that is left out.
+    """
+    kept, sentences = {}, []
+    for name, group in groups.items():
+        kept[name] = [run for run in group if not run.is_interrupted] or group
+        for run in group[: len(group) * (len(kept[name]) < len(group))]:
+            if run.is_interrupted:
+                text = f"interrupted after {run.metrics[-1]['samples']:,} samples"
+                sentences.append(f"{run.folder} is left out: it was {text}")
+    return kept, sentences
 
 
 def differing(runs: Iterable[Run]) -> list[str]:

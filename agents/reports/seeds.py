@@ -4,6 +4,7 @@ As Agarwal et al. define them (Deep Reinforcement Learning at the Edge of the St
 NeurIPS 2021), whose library is rliable. A task is an environment in its homes.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -32,9 +33,11 @@ def interval(
     `(value, lower, upper)`. The runs of each task are resampled by themselves.
 
     Args:
-        scores: of each task, those of its runs.
+        scores: of each task, those of its runs. The bounds are NaN if each task has only one.
     """
     tasks = [np.asarray(task, float) for task in scores]
+    if max(map(len, tasks)) < 2:
+        return statistic(np.concatenate(tasks)), math.nan, math.nan
     draw = np.random.default_rng(seed)
     resampled = []
     for _ in range(n_resamples):
@@ -53,7 +56,8 @@ def pooled(scores: Mapping[str, Sequence[float]]) -> list[list[str]]:
     rows = []
     for name, values in scores.items():
         middle, lower, upper = interval([values]) if len(values) else 3 * (float("nan"),)
-        rows.append([name, str(len(values)), f"{middle:.4g}", f"{lower:.4g} to {upper:.4g}"])
+        bounds_text = "none" if math.isnan(lower) else f"{lower:.4g} to {upper:.4g}"
+        rows.append([name, str(len(values)), f"{middle:.4g}", bounds_text])
     return rows
 
 
@@ -73,12 +77,19 @@ def band(
     seed: int = 1,
 ) -> dict[str, np.ndarray]:
     """Returns the mean curve of several seeds with its bootstrap interval: {x, mean, lower, upper},
-    (n_points,) each. Curves, `(x, y)` of each seed, are interpolated where all have points.
+    (n_points,) each. Curves, `(x, y)` of each seed, are interpolated from where all have points to
+    the end of the longest, a point over the curves that reach it; of one alone the bounds are NaN.
     """
+    curves = sorted(curves, key=lambda curve: -np.max(curve[0]))
     start = max(np.min(x) for x, _ in curves)
-    end = max(start, min(np.max(x) for x, _ in curves))
-    x = np.linspace(start, end, n_points)
+    x = np.linspace(start, max(start, np.max(curves[0][0])), n_points)
     values = np.stack([np.interp(x, np.asarray(at), np.asarray(y)) for at, y in curves])
-    means = values[resamples(len(curves), n_resamples, seed)].mean(1)
-    lower, upper = bounds(means, level, axis=0)
-    return {"x": x, "mean": values.mean(0), "lower": lower, "upper": upper}
+    n_there = np.maximum(1, np.sum([x <= np.max(at) for at, _ in curves], 0))
+    mean, lower, upper = np.full((3, n_points), np.nan)
+    for n in {*n_there.tolist()}:  # the longest n
+        of_n, at = values[:n, n_there == n], n_there == n
+        mean[at] = of_n.mean(0)
+        if n > 1:
+            means = of_n[resamples(n, n_resamples, seed)].mean(1)
+            lower[at], upper[at] = bounds(means, level, axis=0)
+    return {"x": x, "mean": mean, "lower": lower, "upper": upper}

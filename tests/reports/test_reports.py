@@ -6,11 +6,13 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 
 from megastep.agents.cli import compare, evaluate, report, train
 from megastep.agents.reports import homes, runs
+from megastep.agents.reports.compare import write as write_plot
 from megastep.agents.runs import json_lines
 from tests.helpers import tiny
 
@@ -125,6 +127,33 @@ def test_comparison_is_a_plot_and_its_numbers(here, capsys):
     first = [float(row["mean"]) for row in rows if row["runs"] == "learner.lr=0.0001"]
     values = [row["loss/entropy"] for row in json_lines.read(here / "c/metrics.jsonl")]
     assert (first[0], first[-1]) == pytest.approx((values[0], values[-1]))
+
+
+def test_an_interrupted_seed_is_left_out_and_named(here, tmp_path, capsys):
+    for name in "ab":
+        shutil.copytree(here / name, tmp_path / f"${name}$_")
+    path = tmp_path / "$b$_/metrics.jsonl"
+    path.write_text(path.read_text().splitlines(keepends=True)[0])
+    samples = json_lines.read(path)[0]["samples"]
+    names = [str(tmp_path / f"${name}$_") for name in "ab"]
+    plot = write_plot([*map(Path, names)], tmp_path / "plot.svg", "loss/entropy")
+    assert f"b$_ is left out: it was interrupted after {samples} samples" in capsys.readouterr().out
+    with open(plot.with_suffix(".csv"), newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert float(rows[-1]["samples"]) >= 800 and rows[-1]["lower"] == rows[-1]["upper"] == ""
+    assert "Oblique" not in plot.read_text()  # as in a formula
+
+
+def test_page_of_a_resumed_run_names_the_command_that_made_it(here, tmp_path):
+    run = shutil.copytree(here / "e", tmp_path / "e")
+    row = {"samples": 512, "command": "train.py resume=e more_samples=88"}
+    with open(run / "provenance.jsonl", "a") as file:
+        file.write(json.dumps(row) + "\n")
+    assert report.main([f"run={run}"]) == 0
+    facts = {row[0]: row[1] for row in Page(run / "report.html").rows if len(row) == 2}
+    assert facts["command"] == "train.py env=explorer geometry.n=4"
+    assert facts["resumed"] == "1 times, last after 512 samples"
+    assert facts["last command"] == row["command"]
 
 
 @pytest.mark.parametrize(
