@@ -32,6 +32,7 @@ from megastep.agents.population import decisions
 from megastep.agents.runs import json_lines, populations
 from megastep.agents.training.callbacks import Evaluations
 from megastep.agents.training.episode_stats import MIN_EPISODES
+from megastep.agents.training.loggers import call_lines
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
 
@@ -172,7 +173,7 @@ class Population:
 
     def _earlier(self) -> list[list[Row]]:
         """Returns the generations so far, and removes those after the checkpoints."""
-        json_lines.truncate_after(self.path, self.samples)
+        json_lines.truncate_after(self.path, self.samples or -1)
         return populations.read(self.path) if self.path.exists() else []
 
     @property
@@ -206,6 +207,7 @@ class Population:
                     each(lambda i: trainers[i].start_clock())
                     self.saved_at = time.monotonic()
                 self._after_round()
+            from_rank_0(self._are_written)
             each(lambda i: trainers[i].finish())
         finally:
             for one in trainers:
@@ -213,7 +215,7 @@ class Population:
                     one.wait_for_collector()
                 one.saver.wait()
             if self.lines is not None:
-                self.lines.close()
+                call_lines(self.lines, "close")
 
     def _after_round(self) -> None:
         leader, before, is_due = self.leader, self.samples_at_round, False
@@ -224,11 +226,11 @@ class Population:
         if self.repeated is not None:  # when a budget was spent, the clock may have decided
             is_due, is_left = self.samples in self.repeated, True
         seconds = time.monotonic() - self.saved_at
-        goes_on, saves = exchange([is_left, seconds >= self.checkpoint_seconds])[0]
+        goes_on, is_time = exchange([is_left, seconds >= self.checkpoint_seconds])[0]
         if is_due and goes_on:
             self.take_over()
         self.meet()
-        if saves:
+        if is_time and from_rank_0(self._are_written):
             self.save()
 
     def meet(self) -> None:
@@ -339,9 +341,13 @@ class Population:
             of_settings = self.settings[member].items()
             row |= {f"{populations.KEY}{key}": value for key, value in of_settings}
             if self.lines is not None:
-                self.lines.write(self.samples, row)
-        if self.lines is not None:
-            self.lines.file.sync()
+                call_lines(self.lines, "write", self.samples, row)
+
+    def _are_written(self) -> bool:
+        """Flushes the generations to disk, which a checkpoint must not reach beyond. Returns
+        whether they are there.
+        """
+        return self.lines is None or call_lines(self.lines, "sync")
 
     def close(self) -> None:
         """Closes the members' environments and files."""

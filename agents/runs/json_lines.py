@@ -22,9 +22,9 @@ class JsonLines:
     """
 
     def __init__(self, path: Path | str):
-        self.path = Path(path)
+        self.path, self.has_warned = Path(path), False
         self.file = AppendedFile(self.path)
-        self.close = self.file.close
+        self.close, self.sync = self.file.close, self.file.sync
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
         """Appends a line. NaN and infinity become null."""
