@@ -102,11 +102,13 @@ def prepare(tree: Tree, typed: list[str]) -> Tree:
     # a run in use is refused before its checkpoints are read, which come and go, by rank 0
     is_locked = how == "resume" and environment.rank() == 0
     with folders.locked(folders.folder_of(path)) if is_locked else contextlib.nullcontext():
-        if whole and how == "resume":
-            path = populations.common_checkpoints(path)[0]
-        elif whole:
-            path = populations.folder_of(path, 0)
-        loaded = folders.load_checkpoint(path, tree.get("trust") is True)
+        is_trusted = tree.get("trust") is True
+        if whole and how == "resume" and not (common := populations.common_checkpoints(path)):
+            loaded = folders.trusted(populations.beginning(path), is_trusted)
+        else:
+            if whole:
+                path = common[0] if how == "resume" else populations.folder_of(path, 0)
+            loaded = folders.load_checkpoint(path, is_trusted)
     saved = loaded.config["train"]
     if whole:  # the first member's settings, but for what it is itself
         saved["population"]["member"] = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,8 +22,9 @@ from megastep.agents.launch import again, finishing
 from megastep.agents.launch.run import Run, evaluator, record
 from megastep.agents.population import decisions
 from megastep.agents.population.population import AgentParts, Population, Streams, hosted
-from megastep.agents.runs import folders, populations
+from megastep.agents.runs import checkpoint, folders, populations
 from megastep.agents.training.callbacks import Progress
+from megastep.agents.training.episode_stats import MIN_EPISODES
 from megastep.settings import closest
 
 if TYPE_CHECKING:
@@ -31,6 +33,10 @@ if TYPE_CHECKING:
 #: Checkpoints that a member keeps at least: while one is being written, and the one before may be
 #: unfinished elsewhere, all members have the one before that.
 KEPT = 3
+UNSCORED = (
+    f"No member had a score when others could copy it, as fewer than {MIN_EPISODES} of its "
+    "episodes had ended or it had not been evaluated, so nobody was copied; train longer."
+)
 
 
 class PopulationRun(Run):
@@ -56,16 +62,24 @@ class PopulationRun(Run):
     def make(self, source: Any, token: str) -> None:
         """Makes the members of this rank, new or as their checkpoints have them."""
         cfg, chosen, self.trainers = self.cfg, self.cfg.population, []
-        members = hosted(chosen.size)
+        members, is_new = hosted(chosen.size), not source
+        if cfg.resume and is_new:
+            console.say("Not all members have a checkpoint yet, so all begin again")
+            totals = {
+                k: getattr(cfg, f"more_{k}") or getattr(cfg, k) for k in ("samples", "seconds")
+            }
+            cfg = settings.changed(cfg, resume=None, more_samples=None, more_seconds=None, **totals)
         self.streams, homes = Streams(len(members), self.device), None
         if cfg.geometry.name.startswith("megastep."):  # another's may draw from global generators
             homes = factory.homes(cfg.env, cfg.geometry, "training")
         for i, member in enumerate(members):
             own = member_settings(cfg, member)
-            if source:
+            if not is_new:
                 own = again.with_more(settings.changed(own, resume=str(source[member])))
             folder = populations.folder_of(self.folder, member)
             folder.mkdir(exist_ok=True)
+            if is_new:  # what a kill left of the first checkpoint
+                checkpoint.set_aside_after(folder / "checkpoints", -1)
             with self.streams.of(i), alone():
                 trainer = make_trainer(
                     *(own, folder, self.device),
@@ -122,15 +136,21 @@ class PopulationRun(Run):
         """Shows the members, and does with the best one what `cfg.finish` asks for."""
         cfg, root, samples = self.cfg, self.folder, self.training.samples
         console.say(table(self.training, root))
+        n_generations = self.training.generation
         del self.training, self.trainers  # frees GPU memory for the evaluation
-        best = from_rank_0(lambda: populations.member(root))
-        finishing.finish(cfg, best, samples)
+        generations = from_rank_0(lambda: populations.read(root / populations.FILE))
+        if n_generations and not any("score" in row for row in itertools.chain(*generations)):
+            console.say(UNSCORED)
+        number = from_rank_0(lambda: populations.best(root))
+        text = "No member has a score, so none is the best"
+        if number is not None:
+            best = populations.folder_of(root, number)
+            finishing.finish(cfg, best, samples)
+            command = folders.command_of("evaluate", "run", root)
+            text = f"The best is in {best}\nTo evaluate it: {command}"
         if cfg.rerun and self.is_first:
             finishing.compare_population(root, Path(cfg.rerun))
-        console.say(
-            f"Trained {samples:,} samples of each member. The best is in {best}\n"
-            f"To evaluate it: {folders.command_of('evaluate', 'run', root)}"
-        )
+        console.say(f"Trained {samples:,} samples of each member. {text}")
         process_group.exchange([0])  # the others wait for what follows on rank 0
 
 

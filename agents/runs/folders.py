@@ -202,6 +202,11 @@ def load_checkpoint(
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
     with user_errors(f"The configuration in {loaded.path} is not a run's: "):
         typed_json.check(typed_json.Config, loaded.config)
+    return trusted(loaded, is_trusted)
+
+
+def trusted(loaded: checkpoint.Checkpoint, is_trusted: bool) -> checkpoint.Checkpoint:
+    """Returns a checkpoint whose import paths may be imported. Raises UserError for others."""
     names = trust.untrusted(trust.foreign_names(loaded.config))
     if names and not is_trusted:
         raise UserError(

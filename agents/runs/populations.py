@@ -48,8 +48,10 @@ def score_of(folder: Path, ranked_by: str = RUNNING) -> float | None:
     return evaluated[-1] if evaluated else scores.mean(rows)
 
 
-def best(root: Path) -> int:
-    """Returns the number of the member with the highest score, the first of equal ones."""
+def best(root: Path) -> int | None:
+    """Returns the number of the member with the highest score, the first of equal ones; None if no
+    member has one.
+    """
     ranked_by = RUNNING
     with contextlib.suppress(OSError, yaml.YAMLError, KeyError, TypeError):
         config = yaml.safe_load((folder_of(root, 0) / "config.yaml").read_text("utf-8"))
@@ -57,15 +59,19 @@ def best(root: Path) -> int:
     return _highest([score_of(folder, ranked_by) for folder in members(root)])
 
 
-def _highest(scores_of) -> int:
+def _highest(scores_of) -> int | None:
     values = [-1e400 if score is None else score for score in scores_of]
-    return values.index(max(values))
+    return None if all(score is None for score in scores_of) else values.index(max(values))
 
 
 def member(root: Path, which: "int | str" = "best") -> Path:
-    """Returns the run folder of a member, by its number or `best`. Raises UserError for others."""
+    """Returns the run folder of a member, by its number or `best`. Raises UserError for others, and
+    if no member has a score.
+    """
     n = len(members(root))
-    number = best(root) if which == "best" else int(which)
+    if (number := best(root) if which == "best" else int(which)) is None:
+        text = f"No member of {root} has a score, so none is the best"
+        raise UserError(f"{text}; choose one with member=, 0 to {n - 1}")
     if not 0 <= number < n:
         raise UserError(
             f"{root} has no member {which}; its members are 0 to {n - 1}, and member=best"
@@ -75,13 +81,17 @@ def member(root: Path, which: "int | str" = "best") -> Path:
 
 def common_checkpoints(root: Path) -> list[Path]:
     """Returns the newest checkpoint of each member after one number of samples, that all of them
-    have saved whole. Raises UserError if there is none.
+    have saved whole; none if a kill left the first one to some. Raises UserError if there is none
+    for another reason.
     """
     by_step = []
     for folder in members(root):
         paths = checkpoint.list_checkpoints(folder / "checkpoints")
         by_step.append({checkpoint.step_of(path): path for path in paths})
-    for step in sorted(set.intersection(*map(set, by_step)), reverse=True):
+    common = set.intersection(*map(set, by_step))
+    if not common and len(set.union(*map(set, by_step))) <= 1:
+        return []
+    for step in sorted(common, reverse=True):
         paths = [paths[step] for paths in by_step]
         if all(map(checkpoint.is_intact, paths)):
             return paths
@@ -91,6 +101,20 @@ def common_checkpoints(root: Path) -> list[Path]:
     )
 
 
+def beginning(root: Path) -> checkpoint.Checkpoint:
+    """Returns what the first member of a population begins with, as a checkpoint without a state.
+    Raises UserError if its settings cannot be read.
+    """
+    path = folder_of(root, 0) / "config.yaml"
+    with user_errors(
+        f"{path} cannot be read: ", (OSError, ValueError, RecursionError, yaml.YAMLError)
+    ):
+        config = {"train": yaml.safe_load(path.read_bytes()), "spaces": {}}
+        typed_json.check(typed_json.Config, config)
+    numbers: dict[str, float] = dict(samples=0, seconds=0, updates=0)
+    return checkpoint.Checkpoint(path, 0, numbers, config, {})
+
+
 def read(path: Path) -> "list[list[Row]]":
     """Returns the rows of `population.jsonl`, a list for each generation, each in the order of
     members. Raises UserError if the file cannot be read, or holds something else.
@@ -98,7 +122,8 @@ def read(path: Path) -> "list[list[Row]]":
     with user_errors(f"{path} does not hold the generations of a population; {INIT}: "):
         rows = json_lines.read(path)
         typed_json.check(list[typed_json.Generation], rows)
-        return [[*group] for _, group in itertools.groupby(rows, lambda row: row["generation"])]
+        groups = [[*g] for _, g in itertools.groupby(rows, lambda row: row["generation"])]
+        return [group for group in groups if len(group) == len(groups[0])]  # a kill cuts the last
 
 
 def samples_of_generations(path: Path) -> set[int]:
@@ -138,6 +163,9 @@ def schedule(path: Path) -> list[tuple[int, dict[str, float]]]:
         raise UserError(f"{path} has no generation; give the {FILE} of a population")
     last = generations[-1]
     # who copies at the last generation is judged by the one that it copies
-    line = lineage(generations, _highest([last[row["from"]].get("score") for row in last]))
+    number = _highest([last[row["from"]].get("score") for row in last])
+    if number is None:
+        raise UserError(f"{path} names no best member, as none had a score in its last generation")
+    line = lineage(generations, number)
     rows = [rows[n] for rows, n in zip(generations, line)]
     return [(row["samples"], settings_of(row)) for row in rows]

@@ -1,5 +1,6 @@
 """Populations, from the command line."""
 
+import contextlib
 import itertools
 import json
 import random
@@ -20,7 +21,7 @@ from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations, scores
 from megastep.agents.training.trainer import Trainer
 from tests.cli.test_exact_resume import CASES, differences
-from tests.helpers import tiny
+from tests.helpers import faults, tiny
 from tests.helpers.processes import HUNG, forked
 
 pytestmark = pytest.mark.usefixtures("here")
@@ -172,6 +173,62 @@ def test_killed_and_interrupted_population_has_the_same_bits(here, monkeypatch, 
     run("resume=P")
     assert_equal(here / "P", here / "left-alone")
     assert "bit for bit" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("n_saved", [0, 1, 2])
+def test_population_killed_in_its_first_checkpoint_begins_again(here, monkeypatch, capsys, n_saved):
+    """Some members have one then, and others none."""
+    words = [*POPULATION, "samples=1536"]
+    run(*words)
+    shutil.move("P", "left-alone")
+
+    def killed(self):
+        for trainer in self.trainers[:n_saved]:
+            trainer.save()
+            trainer.saver.wait()
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Population, "save", killed)
+        train.main([*words, "checkpoints.seconds=1e-9"])
+    run("resume=P")
+    assert "so all begin again" in capsys.readouterr().out
+    assert_equal(here / "P", here / "left-alone")
+    for path in checkpoint.list_checkpoints(here / "P/member-1/checkpoints"):
+        shutil.rmtree(path)  # later, this is an error
+    assert "no intact checkpoint after the same" in refused(capsys, "resume=P", "more_samples=512")
+
+
+def test_population_without_scores_copies_nobody_and_names_no_best(here, capsys):
+    world = *tiny.TINY, "env.shortest=1000", "env.longest=1000"
+    run(*world, *POPULATION[len(SMALL) - 3 :], "samples=1536")
+    out = capsys.readouterr().out
+    assert "No member had a score when others could copy it" in out
+    assert "No member has a score, so none is the best" in out and "evaluate it" not in out
+    rows = [row for rows in populations.read(here / "P" / populations.FILE) for row in rows]
+    assert len(rows) == 9 and all(row["from"] == row["member"] for row in rows)
+    assert entry.run_command("evaluate", ["run=P", "device=cpu"]) == 2
+    assert "choose one with member=, 0 to 2" in capsys.readouterr().err
+    err = refused(capsys, *SMALL, "samples=64", f"population.schedule=P/{populations.FILE}")
+    assert "names no best member" in err
+
+
+def test_full_disk_is_a_warning_and_loses_no_generation(here, monkeypatch, capsys):
+    words = [*POPULATION, "samples=1536"]
+    run(*words)
+    shutil.move("P", "left-alone")
+    write = Population._write
+
+    def written(self, *arguments):
+        with faults.full_disk() if self.generation == 1 else contextlib.nullcontext():
+            write(self, *arguments)
+            assert self._are_written() == (self.generation != 1)  # else no checkpoint follows
+
+    monkeypatch.setattr(Population, "_write", written)
+    run(*words)
+    text = "population.jsonl cannot be written ([Errno 27] File too large); the run goes on"
+    assert capsys.readouterr().err.count(text) == 1
+    assert files(here / "P") == files(here / "left-alone")
 
 
 def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
