@@ -64,8 +64,10 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
 
     def step(self, actions: Mapping[str, Tree]) -> tuple[dict, dict, dict, dict, dict]:
         """Steps all agents. Returns (observations, rewards, terminations, truncations, infos) by
-        agent.
+        agent, empty dicts once the game is over.
         """
+        if not self.agents:
+            return {}, {}, {}, {}, {}
         chosen = stacked([actions[agent] for agent in self.possible_agents])
         obs, rewards, *flags, facts = self.vector.step(chosen)
         over = optional(self.env, "game_over")

@@ -209,6 +209,7 @@ def test_an_agent_that_dies_plays_on_until_its_round_is_over():
         n_steps += 1
     assert n_steps == 50 and deaths >= 2
     assert all(truncated[a] or terminated[a] for a in env.possible_agents)
+    assert env.step({}) == ({}, {}, {}, {}, {})
 
 
 # ---- Masks of actions ----
