@@ -104,7 +104,8 @@ class Lanes:
         """Returns the first world, or with a mask the last one with new rows.
 
         Args:
-            seed: of lane 0; the next has the next seed. Or one seed per lane.
+            seed: of lane 0; the next has the next seed. Or one seed per lane. An episode depends
+                on the seed and the lane.
             mask: (B,) bool, a tensor or an array, lanes that begin.
         """
         if not self.takes_masks and seed is None and mask is None:

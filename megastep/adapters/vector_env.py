@@ -64,7 +64,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         purpose = f"autoreset_mode={mode.name}" if needs_masks else None
         self.lanes = Lanes(env, mode is AutoresetMode.SAME_STEP, purpose)
         self.env, self.num_envs, self.device = env, self.lanes.n_lanes, self.lanes.device
-        self.mode, self.to_numpy, self.copy = mode, to_numpy, copy
+        self.autoreset_mode, self.to_numpy, self.copy = mode, to_numpy, copy
         self.dtype = dtype or (torch.float32 if to_numpy else torch.float16)
         self.single_observation_space = gymnasium_space(env.obs_space, self.dtype)
         self.single_action_space = gymnasium_space(env.action_space, torch.float32)
@@ -84,7 +84,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Begins episodes in all lanes, or in those of a mask. Returns (observations, infos).
 
         Args:
-            seed: an integer s, for seeds s, s + 1, ... of the lanes, or one seed per lane.
+            seed: an integer s, for seeds s, s + 1, ... of the lanes, or one seed per lane. An
+                episode depends on the seed and the lane: lanes with equal seeds differ.
             options: ``reset_mask``: (B,) bool, lanes that begin; the others stay as they are.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
@@ -102,7 +103,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def step(self, actions: Tree) -> tuple[Tree, Tree, Tree, Tree, dict[str, Tree]]:
         """Steps all lanes. Returns (observations, rewards, terminations, truncations, infos)."""
-        if self.to_numpy and self.mode is AutoresetMode.DISABLED and self._ended.any():
+        if self.to_numpy and self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
             raise ValueError(
                 f"lane {int(self._ended.argmax())} has ended its episode: in DISABLED, begin the "
                 'next by reset(options={"reset_mask": mask}) before the next step'
@@ -120,7 +121,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         parts: dict[str, Tree] = {name: final[name] for name in OUTCOMES}
         parts |= dict(over=over, metrics=dict(final.get("metrics", {})), mask=self._mask(world))
         parts["obs"] = without_agents(self.env.obs_space, world["obs"])
-        if self.mode is AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
             parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
         return parts
 
@@ -168,7 +169,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Returns Gymnasium's infos: each key with a mask of the lanes that have it."""
         pairs = ({name: values, f"_{name}": over} for name, values in metrics.items())
         own = {key: part for pair in pairs for key, part in pair.items()}
-        if self.mode is AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
             return dict(final_obs=final_obs, _final_obs=over, final_info=own, _final_info=over)
         return own
 

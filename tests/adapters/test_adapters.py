@@ -128,6 +128,12 @@ def test_numpys_wrappers_run_over_it():
         assert n_episodes or name != "RecordEpisodeStatistics"
 
 
+def test_lanes_with_equal_seeds_differ_and_repeat():
+    env = adapters.VectorEnv(pong(3))
+    obs, again = (env.reset(seed=[5, 5, 7])[0] for _ in range(2))
+    assert np.array_equal(obs, again) and not np.array_equal(obs[0], obs[1])
+
+
 def test_what_does_not_fit_is_named_in_gymnasium():
     for mode in ("same_step", "disabled"):
         name = mode.upper()
@@ -329,6 +335,17 @@ def test_torchrl(make):
         assert torch.equal(rollout["next", "truncated"][:, t, 0], world.truncated)
         world = twin.reset(mask=world.terminal | world.truncated)
     assert rollout["next", "done"].any()
+
+
+@pytest.mark.parametrize("mode", (SAME, OFF))
+def test_torchrls_own_wrapper_reads_the_mode(mode):
+    libs = pytest.importorskip("torchrl.envs.libs.gym")
+    assert adapters.VectorEnv(pong()).autoreset_mode is NEXT
+    env = libs.GymWrapper(adapters.VectorEnv(pong(), mode))
+    rollout = env.rollout(70, break_when_any_done=False)
+    ends = rollout["next", "done"][:, :-1, 0]
+    last, first = rollout["next", "observation"][:, :-1][ends], rollout["observation"][:, 1:][ends]
+    assert ends.any() and (last != first).any(-1).all()
 
 
 def test_stable_baselines_get_the_last_observation():
