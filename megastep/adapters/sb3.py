@@ -3,9 +3,11 @@
 
 from collections.abc import Iterable, Sequence
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from megastep.adapters.vector_env import VectorEnv
 from megastep.types import Env, Tree, optional
@@ -23,17 +25,26 @@ class SB3VecEnv(VecEnv):
     A lane begins its next episode in the step that ends one, by a masked reset; the last
     observation is ``infos[lane]["terminal_observation"]``. Where the environment allows some
     actions only, ``env_method("action_masks")`` says which, as sb3-contrib's ``MaskablePPO`` asks.
+    The metric ``success`` is also ``is_success``, for success rates.
+
+    SB3 keeps a network per observation in a `torch.nn.ModuleDict`. Observations with the name of an
+    attribute of that class get an underscore: ``keys`` of Keys is ``keys_``.
 
     Args:
         env: the environment, whose resets take masks.
+        render_mode: None, or ``rgb_array``, drawings for ``VecVideoRecorder``.
     """
 
-    def __init__(self, env: Env):
-        self.vector = VectorEnv(env, AutoresetMode.SAME_STEP)
-        self.env, self.render_mode = env, None
-        self._actions, self._infos = None, {}
-        spaces = self.vector.single_observation_space, self.vector.single_action_space
-        super().__init__(self.vector.num_envs, *spaces)
+    def __init__(self, env: Env, render_mode: str | None = None):
+        self.vector = VectorEnv(env, AutoresetMode.SAME_STEP, render_mode=render_mode)
+        self.env, self.render_mode = env, render_mode
+        self._actions, self._infos, self._names = None, {}, {}
+        space = self.vector.single_observation_space
+        if isinstance(space, gymnasium.spaces.Dict):
+            self._names = _module_names(space)
+            space = gymnasium.spaces.Dict(self._renamed(space))
+        super().__init__(self.vector.num_envs, space, self.vector.single_action_space)
+        self.metadata["render_fps"] = self.fps
 
     def reset(self) -> Tree:
         """Begins episodes in all lanes, with the seeds of ``seed``, if it was called. Returns
@@ -43,7 +54,7 @@ class SB3VecEnv(VecEnv):
         obs, self._infos = self.vector.reset(seed=None if None in seeds else seeds)
         self._reset_seeds()
         self._reset_options()
-        return obs
+        return self._renamed(obs)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keeps the actions (B, ...) for ``step_wait``."""
@@ -58,9 +69,15 @@ class SB3VecEnv(VecEnv):
         for lane in np.flatnonzero(over):
             metrics = last["final_info"].items()
             infos[lane] = {k: float(v[lane]) for k, v in metrics if not k.startswith("_")}
-            infos[lane]["terminal_observation"] = last["final_obs"][lane]
+            success = infos[lane].get("success", np.nan)
+            if not np.isnan(success):
+                infos[lane]["is_success"] = success
+            infos[lane]["terminal_observation"] = self._renamed(last["final_obs"][lane])
             infos[lane]["TimeLimit.truncated"] = bool(truncated[lane])
-        return obs, rewards, over, infos
+        return self._renamed(obs), rewards, over, infos
+
+    def _renamed(self, parts) -> Tree:
+        return {self._names[key]: parts[key] for key in parts} if self._names else parts
 
     def close(self) -> None:
         """Closes the environment."""
@@ -104,10 +121,23 @@ class SB3VecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Returns None for each lane: use ``megastep.recording.film``."""
-        return [None] * self.num_envs
+        """Returns a drawing (H, W, 3) uint8 of each environment if ``render_mode`` is
+        ``rgb_array``; otherwise None for each lane.
+        """
+        return self.vector.render() or [None] * self.num_envs
 
     @property
     def fps(self) -> float:
         """Steps per second of simulated time."""
         return optional(self.env, "fps")
+
+
+def _module_names(space) -> dict[str, str]:
+    """Returns the name of each observation that a ModuleDict can have, by the environment's."""
+    modules, names = nn.ModuleDict(), {}
+    for key in space:
+        name = key.replace(".", "_")
+        while hasattr(modules, name) or (name != key and name in {*space, *names.values()}):
+            name += "_"
+        names[key] = name
+    return names

@@ -378,6 +378,23 @@ def test_stable_baselines_get_the_last_observation():
         adapters.SB3VecEnv(Numbers())
 
 
+def test_stable_baselines_train_films_and_success_rates():
+    ppo = pytest.importorskip("stable_baselines3").PPO
+    keys = envs.Keys(4, geometries.sample("homes", 4, seed=7), limit=20, device="cpu")
+    env = adapters.SB3VecEnv(keys, render_mode="rgb_array")
+    assert {"keys_", "rgb"} <= {*env.observation_space.spaces}
+    model = ppo("MultiInputPolicy", env, n_steps=32, batch_size=64, n_epochs=1, device="cpu")
+    model.learn(128)
+    assert len(model.ep_success_buffer) >= 4
+    assert model.env.render().ndim == 3 and env.metadata["render_fps"] == 10
+    env.step(np.zeros(4, int))
+    for _ in range(20):
+        _, _, done, infos = env.step(np.zeros(4, int))
+        for info in (infos[lane] for lane in np.flatnonzero(done)):
+            assert info["is_success"] == info["success"]
+            assert info["terminal_observation"].keys() == env.observation_space.spaces.keys()
+
+
 def test_rsl_rl_groups_and_time_outs():
     pytest.importorskip("rsl_rl.env")
     settings = dict(limit=20, control="continuous", privileged=True, device="cpu")
