@@ -92,6 +92,7 @@ class Lanes:
                 f"{type(env).__name__} does not have: see megastep.types.Env"
             )
         self.env, self.n_lanes, self.device = env, n_lanes(env), torch.device(env.device)
+        self.roots: tuple = (env,)  # what a step changes
         self.takes_masks, self._is_same_step = takes_masks(env), same_step
         on_gpu = self.device.type == "cuda" and optional(env, "capturable")
         self._on_gpu, self._reset = on_gpu, cast(Callable, env.reset)
@@ -127,7 +128,7 @@ class Lanes:
             def masked(mask, seeds=None) -> World:
                 return self._reset(seed=seeds, mask=mask)
 
-            self._resets[len(arguments)] = capture(masked, arguments, (self.env,))
+            self._resets[len(arguments)] = capture(masked, arguments, self.roots)
         return self._resets[len(arguments)](*arguments)
 
     def _seeds(self, seed) -> torch.Tensor | None:
@@ -181,7 +182,7 @@ class Lanes:
         decision = self._decision(actions)
         if self._step is None:
             step = self._same_step if self._is_same_step else self._next_step
-            self._step = capture(step, (decision,), (self.env,)) if self._on_gpu else step
+            self._step = capture(step, (decision,), self.roots) if self._on_gpu else step
         return self._step(decision)
 
     def _next_step(self, decision) -> tuple[World, World, torch.Tensor]:

@@ -395,6 +395,18 @@ def test_stable_baselines_train_films_and_success_rates():
             assert info["terminal_observation"].keys() == env.observation_space.spaces.keys()
 
 
+def test_written_lengths_end_episodes_of_rsl_rl():
+    pytest.importorskip("rsl_rl.env")
+    env = adapters.RslRlVecEnv(envs.PointGoal(64, HOMES, control="continuous", device="cpu"))
+    n = torch.arange(64) % 8 + 1  # steps that are left
+    assert env.max_episode_length == 500
+    env.episode_length_buf = 500 - n
+    for t in range(1, 9):
+        _, _, dones, extras = env.step(torch.zeros(64, 3))
+        assert torch.equal(dones, n == t) and torch.equal(extras["time_outs"], dones)
+        assert torch.equal(env.episode_length_buf == 0, dones)
+
+
 def test_rsl_rl_groups_and_time_outs():
     pytest.importorskip("rsl_rl.env")
     settings = dict(limit=20, control="continuous", privileged=True, device="cpu")
