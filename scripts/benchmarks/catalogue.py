@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator
 from adapter_steps import adapters
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, mazes, memory, objects, pong, step
-from populations import copies, members, small_members
+from populations import members, small_members
 from scaling import scaling
-from shortest_paths import paths
 from startup_times import startup
 from training import train
 
@@ -25,12 +24,10 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "memory": memory,
     "adapters": adapters,
     "pong": pong,
-    "paths": paths,
     "startup": startup,
     "cpu": cpu,
     "train": train,
     "scaling": scaling,
     "members": members,
     "small_members": small_members,
-    "copies": copies,
 }

@@ -1,18 +1,11 @@
-"""Benchmarks of populations: `members`, `small_members`, `copies`."""
+"""Benchmarks of populations: `members`, `small_members`."""
 
-import functools
 import statistics
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
-from timing import measurement, seconds_per_call
+from timing import measurement
 from training import rates, trained
-
-from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.train import COMMAND
-from megastep.agents.factory.trainer import make_trainer
 
 #: (members, lanes of each, lanes of the run beside them)
 MEMBERS = {"cuda": (8, 4096, 4096), "cpu": (2, 64, 64)}
@@ -29,29 +22,6 @@ def members(device: torch.device, seconds: int = 30) -> Iterator[dict]:
 def small_members(device: torch.device, seconds: int = 30) -> Iterator[dict]:
     """The same of 64 members with 256 lanes each, and of one run with 16,384 lanes."""
     yield from _rates(device, seconds, *SMALL_MEMBERS[device.type])
-
-
-def copies(device: torch.device) -> Iterator[dict]:
-    """Milliseconds in which a member takes over what another has learnt: weights, optimizer and
-    statistics, of Explorer's policies with LSTMs of 128 and 256 units.
-    """
-    for width in (128, 256):
-        trainers = []
-        with tempfile.TemporaryDirectory() as parent:
-            for name in ("source", "target"):
-                words = "env=explorer", "env.n_envs=64", f"agent.width={width}", f"device={device}"
-                cfg = Composer(COMMAND).settings([*words, "samples=1e12"])
-                folder = Path(parent, name)
-                folder.mkdir()
-                trainer = make_trainer(cfg, folder, device)
-                trainer.update()  # the optimizer has a state from here on
-                trainers.append(trainer)
-            source, target = (trainer.learner for trainer in trainers)
-            seconds = seconds_per_call(functools.partial(target.copy_from, source), device)
-            for trainer in trainers:
-                trainer.close()
-        what = f"Explorer, LSTM-{width}, a member takes over from another"
-        yield measurement(what, "ms", [1e3 * one for one in seconds])
 
 
 def _rates(device, seconds, n, n_lanes, n_lanes_of_one) -> Iterator[dict]:
