@@ -97,9 +97,9 @@ class Run:
             token = check_shared(self.folder)
             if self.team:
                 self.team.set_folder(self.folder)
-            told = env_failures.caught(self.cfg.env, self.folder, rank=process_group.rank())
+            caught = env_failures.caught(self.cfg.env, self.folder, rank=process_group.rank())
             try:
-                together(told(lambda: self.make(source, token)))
+                together(caught(lambda: self.make(source, token)))
             except EnvFailed:
                 undo.pop_all()  # the folder has the traceback
                 raise
