@@ -14,7 +14,7 @@ HELP = """Writes a trained agent for use elsewhere.
 
   megastep export run=RUN format=onnx           one step for ONNX runtimes: policy.onnx
   megastep export run=RUN format=torch          the same for torch.export.load: policy.pt2
-  megastep export run=RUN format=safetensors    an agent file: agent.safetensors
+  megastep export run=RUN format=safetensors    an agent file, and its card: agent.md
   ... file=my_agent.onnx                        this file instead of one in RUN
   ... member=3                                  an agent of a population; without it, the best
 
@@ -43,7 +43,7 @@ def run(cfg: Export) -> Path:
 
     if kind == "safetensors":
         agent.write(run, path)
-        console.say(f"Wrote {path}")
+        console.say(f"Wrote {path} and its card, {path.with_suffix('.md')}")
         return path
     policy, env = pretrained.load_with_env(run, "cpu")
     with user_errors(f"{path} cannot be written: "):

@@ -1,29 +1,38 @@
-"""Turns a run into an agent file with its acting weights.
+"""Turns a run, or a policy, into an agent file with its acting weights, and a card beside it.
 
-Evaluate the run first, for the file's tables: `megastep evaluate run=RUN geometry=suite
-episodes=8000`, and with against=bot for duels.
+Evaluate the run first, for the tables: `megastep evaluate run=RUN geometry=suite episodes=8000`,
+and with against=bot for duels. What follows "What it is for" in a card is written by hand, and kept
+when the agent is exported again.
 """
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
-from megastep.agents import console, factory
+from megastep.agents import console, factory, package
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.factory import components, settings
+from megastep.agents.evaluation import tables
+from megastep.agents.factory import check, components, settings
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import (
     agent_file,
+    checkpoint,
     folders,
     json_lines,
     provenance,
     restore,
     trust,
 )
+from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves
 from megastep.types import n_lanes
+
+if TYPE_CHECKING:
+    from megastep.agents.types import Config, Row
 
 #: Bound of `rounding_error`. Float16 changes a weight by at most 1 part in 2,048.
 MAX_ERROR = 0.005
@@ -33,6 +42,8 @@ N_ENVS, N_STEPS = 64, 256
 PRIVATE = dict(
     folder=None, resume=None, rerun=None, init=None, more_samples=None, more_seconds=None
 )
+#: The part of a card that people write begins here.
+BY_HAND = "## What it is for"
 
 
 def rounded(policy: Policy) -> dict[str, torch.Tensor]:
@@ -86,7 +97,8 @@ def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
         how = table.get("evaluation", {})
         geometry = how.get("geometry") or {}
         is_suite = geometry.get("name") == components.SUITE
-        if table.get("step") != step or (has_homes and geometry and not is_suite):
+        is_other = how.get("env") is not None or (has_homes and geometry and not is_suite)
+        if table.get("step") != step or is_other:
             continue
         words = ["geometry=suite"] * is_suite
         for key, value in geometry.items() if is_suite else ():
@@ -94,6 +106,8 @@ def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
                 words.append("'geometry.{}={}'".format(key, json.dumps(value).replace('"', "")))
         words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed")]
         words += ["greedy=true"] * how["greedy"]
+        words += [f"max_steps={how['max_steps']}"] * (how.get("max_steps") is not None)
+        words += ["baseline=none"] * (how.get("baseline") == [] and not how.get("against"))
         for key in ("baseline", "against"):
             if how.get(key) and how[key] != ["random"]:  # the default
                 words.append(f"{key}={','.join(how[key])}")
@@ -104,7 +118,7 @@ def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
 
 
 def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
-    """Writes an agent's file.
+    """Writes an agent's file and its card.
 
     Args:
         run: a run's folder, or one of its checkpoints.
@@ -114,16 +128,49 @@ def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
     Raises:
         UserError: the run acts otherwise once it is rounded, or cannot be written.
     """
+    loaded = folders.load_checkpoint(folders.find(run), False, factory.make_device("cpu"))
+    if not loaded.numbers:
+        raise UserError(f"{loaded.path} has weights only; export a run or its checkpoint")
+    folder = folders.folder_of(loaded.path)
+    has_homes = components.takes_geometries(factory.config_of(loaded).env.name)
+    if not (rows := tables_of(folder, loaded.step, has_homes)):
+        words = " geometry=suite episodes=8000" if has_homes else ""
+        command = f"{folders.command_of('evaluate', 'run', loaded.path)}{words}"
+        console.warn(f"the card has no results, for {command} was not run")
+    path = folder / provenance.FILE
+    lines = json_lines.read(path) if path.exists() else []
+    lines = [line for line in lines if line["samples"] < loaded.step]
+    commits = dict.fromkeys(line.get("commit", "unknown") for line in lines)
+    made_with = {"device": "unknown", "torch": "unknown", "ranks": 1, **loaded.made_with}
+    facts = {
+        "commands": [command_of(line["command"]) for line in lines if "command" in line],
+        "commit": ", ".join(commits) or "unknown",
+        "samples": loaded.step,
+        "seconds": round(loaded.numbers["seconds"], 1),
+        "device": made_with["device"].removeprefix("cuda "),
+        "torch": made_with["torch"],
+        "ranks": made_with["ranks"],
+    }
+    write_loaded(loaded, file, facts, rows, max_error)
+
+
+def write_loaded(
+    loaded: checkpoint.Checkpoint,
+    file: Path,
+    facts: "Row",
+    rows: "Sequence[Row]" = (),
+    max_error: float = MAX_ERROR,
+) -> None:
+    """Writes a loaded checkpoint as an agent's file with a card, as `write` does. `facts` say how
+    it was trained; `rows` are its evaluations, see `tables_of`.
+    """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", file.stem):
         raise UserError(
             f"{file.stem!r} is not a name for an agent; use small letters, digits and _"
         )
-    loaded = folders.load_checkpoint(folders.find(run), False, factory.make_device("cpu"))
-    if not loaded.numbers:
-        raise UserError(f"{loaded.path} has weights only; export a run or its checkpoint")
     assert loaded.state is not None
     config = {**loaded.config, "train": loaded.config["train"] | PRIVATE}
-    trained, folder = factory.config_of(loaded), folders.folder_of(loaded.path)
+    trained = factory.config_of(loaded)
     homes = factory.spread(factory.homes(trained.env, trained.geometry, "test"), N_ENVS)
     env = factory.construct(
         settings.changed(trained.env, n_envs=N_ENVS), geometries=homes, seed=1, device="cpu"
@@ -140,26 +187,93 @@ def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
         )
     if names := trust.foreign_names(config):
         console.warn(f"{file} needs {', '.join(names)}, and of others who load it trust=true")
-    if not (rows := tables_of(folder, loaded.step, bool(homes))):
-        words = " geometry=suite episodes=8000" if homes else ""
-        command = f"{folders.command_of('evaluate', 'run', loaded.path)}{words}"
-        console.warn(f"the file has no results, for {command} was not run")
-    lines = json_lines.read(folder / provenance.FILE)
-    lines = [line for line in lines if line["samples"] < loaded.step]
-    commits = dict.fromkeys(line.get("commit", "unknown") for line in lines)
-    made_with = {"device": "unknown", "torch": "unknown", "ranks": 1, **loaded.made_with}
-    facts = {
-        "environment": config["train"]["env"]["name"],
-        "commands": [command_of(line["command"]) for line in lines],
-        "commit": ", ".join(commits) or "unknown",
-        "samples": loaded.step,
-        "seconds": round(loaded.numbers["seconds"], 1),
-        "device": made_with["device"].removeprefix("cuda "),
-        "torch": made_with["torch"],
-        "ranks": made_with["ranks"],
-        "parameters": sum(v.numel() for v in state.values()),
-        "rounding": error,
-    }
+    facts = {"environment": config["train"]["env"]["name"], **facts, "rounding": error}
+    facts |= {"parameters": sum(v.numel() for v in state.values())}
     with user_errors(f"{file} cannot be written: "):
         file.parent.mkdir(parents=True, exist_ok=True)
         agent_file.write(file, state, config, facts, rows, loaded.state.get("wrappers"))
+        write_card(file, config, facts, rows)
+
+
+# ---- The card ----
+
+
+def write_card(file: Path, config: "Config", facts: "Row", rows: "Sequence[Row]") -> None:
+    """Writes the card beside an agent's file, NAME.md. Keeps what its author wrote; warns and does
+    nothing if this file is something else.
+    """
+    path, title = file.with_suffix(".md"), f"# {file.stem}\n"
+    text = path.read_text() if path.exists() else title
+    if not text.startswith(title):
+        console.warn(f"{path} is not a card of {file.stem} and stays as it is")
+        return
+    _, found, by_hand = text.partition(f"\n{BY_HAND}\n")
+    by_hand = f"{BY_HAND}\n{by_hand}" if found else default_words(config)
+    write_atomically(path, f"{title}\n{card(file.name, config, facts, rows)}\n\n{by_hand}".encode())
+
+
+def card(name: str, config: "Config", facts: "Row", rows: "Sequence[Row]") -> str:
+    """Returns the part of a card that follows from the agent's file of a name."""
+    train, env = config["train"], config["train"]["env"]
+    labels = {path: label for label, path in components.members("env").items()}
+    words = f"env={labels.get(env['name'], env['name'])}"
+    words += f" env.id={env['id']}" if env.get("id") else ""
+    trusted = " trust=true" * bool(trust.foreign_names(config))
+    commands, has_homes = (
+        [table["command"] for table in rows],
+        components.takes_geometries(env["name"]),
+    )
+    # in place of files that only the author has
+    files = [v for k, v in check.leaves(train["geometry"]) if k.rpartition(".")[2] == "path" and v]
+    homes = " geometry=homes" * bool(files and has_homes)
+    suite = " geometry=suite" if any("geometry=suite" in words for words in commands) else homes
+    duels = " against=bot" * any(re.search(r" against=(\S+,)?bot\b", words) for words in commands)
+    learner = " agent.critic=plain" * (train["agent"].get("critic") is None)
+    learner = " learner=r2d2" if train["agent"].get("output") == "duelling" else learner
+    learner += " env.n_envs=16" * (env.get("n_envs", 16) < 16)  # for the learner's minibatches
+    parts = [
+        f"A trained agent of megastep (`pip install {package.DISTRIBUTION}`) for `{words}`. In the "
+        f"folder of `{name}`:",
+        f"```\nmegastep evaluate run={name}{suite}{duels}{trusted}\n"
+        f"megastep record run={name}{homes}{duels}{trusted}\n"
+        f"megastep train init={name}{homes}{learner} seconds=60{trusted}\n```",
+    ]
+    played = {key: train.get(key) for key in settings.Trained.__dataclass_fields__}
+    if foreign := trust.foreign_names({"train": played}):
+        parts.append(
+            f"It needs `{'`, `'.join(foreign)}`: modules that can be imported, such as files in "
+            "the current folder. `trust=true` runs their code, so read it before."
+        )
+    ranks, device = facts.get("ranks", 1), facts.get("device", "unknown")
+    lines = {
+        "command": "; then ".join(f"`{command}`" for command in facts.get("commands", ())),
+        "commit": facts.get("commit", "unknown"),
+        "samples": f"{facts['samples']:,}",
+        "seconds of training": f"{facts.get('seconds', 0):,}",
+        "device": f"{ranks} x {device}" if ranks > 1 else device,
+        "PyTorch": facts.get("torch", "unknown"),
+        "size": f"{facts['parameters']:,} numbers: weights in float16, no critic",
+        "error of rounding": f"{100 * facts['rounding']:.2g} % of its logits' root mean square",
+    }
+    lines = [f"- {key}: {text}" for key, text in lines.items() if text not in ("", "0", "unknown")]
+    parts += ["## Training", "\n".join(lines), "## Evaluations" if rows else "Not evaluated."]
+    for table in rows:
+        head, cells = tables.grid(table["rows"])
+        parts += [
+            f"`megastep evaluate run={name} {table['command']}{trusted}`, measured before the "
+            f"weights were rounded. {table['title']}:",
+            console.table(head, cells, is_markdown=True),
+        ]
+    return "\n\n".join(parts)
+
+
+def default_words(config: "Config") -> str:
+    """Returns what a new card says where people write."""
+    train = config["train"]
+    spaces = "; ".join(f"`{name}` {space}" for name, space in config["spaces"].items())
+    where = f"It was trained in `geometry={components.label(train['geometry']['name'])}`. "
+    where *= components.takes_geometries(train["env"]["name"])
+    return (
+        f"{BY_HAND}\n\nA baseline, an opponent, or a start for training.\n\n## Limits\n\n"
+        f"{where}Its observations and actions must be {spaces}.\n"
+    )

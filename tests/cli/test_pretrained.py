@@ -137,7 +137,8 @@ def test_evaluates_into_a_folder_of_its_own(folder, capsys):
     assert evaluate.main([f"run={NAME}", *SUITE, "baseline=false"]) == 0
     table = json.loads(Path(f"runs/pretrained-{NAME}/evaluations/suite-test-512.json").read_text())
     assert {row["source"] for row in table["rows"]} == {"bench", "braided"}
-    assert [path.name for path in (folder / "package").iterdir()] == [f"{NAME}.safetensors"]
+    names = {path.name for path in (folder / "package").iterdir()}
+    assert names == {f"{NAME}.md", f"{NAME}.safetensors"}
     assert folders.known() == [], "its folder is not a run"
 
 
