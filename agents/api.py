@@ -1,4 +1,4 @@
-"""megastep from Python: `megastep.make`, `train`, `evaluate`, `record`, `load` and `runs`.
+"""megastep from Python: `megastep.make`, `train`, `evaluate`, `record`, `save`, `load`, `runs`.
 
 Keyword arguments are the words of the command line, checked in the same way: `seconds=60`,
 `env="explorer"`, `learner={"lr": 3e-4}` or `**{"learner.lr": 3e-4}`. A class or a function stands
@@ -13,6 +13,7 @@ import json
 import numbers
 import os
 import signal
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -32,10 +33,12 @@ if TYPE_CHECKING:
     from megastep.recording import Film
     from megastep.types import Env, PolicyLike
 
-__all__ = ["Run", "evaluate", "load", "make", "record", "runs", "train"]
+__all__ = ["Run", "evaluate", "load", "make", "record", "runs", "save", "train"]
 
 #: Settings of `make` that are not the environment's.
 OF_MAKE = ("env", "geometry", "split", "seed", "device")
+#: The settings of the environments that `make` has returned: of each, its geometry, and its seed.
+_made: "weakref.WeakKeyDictionary[Env, tuple[Any, Any, int]]" = weakref.WeakKeyDictionary()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +152,10 @@ def make(env: object, privileged: bool = False, **settings_of_env: object) -> "E
     if device.type == "cpu":
         factory.share_threads(1)
     where = dict(seed=cfg.seed, device=device, privileged=privileged)
-    return factory.construct(cfg.env, geometries=homes, **where)
+    made = factory.construct(cfg.env, geometries=homes, **where)
+    with contextlib.suppress(TypeError):  # of a class without weak references
+        _made[made] = cfg.env, geometry, cfg.seed
+    return made
 
 
 def train(**settings: object) -> Run | None:
@@ -217,6 +223,47 @@ def record(
     cfg = _settings("record", _given(run=run, env=env) | settings)
     with _interrupts():
         return recording.Film(filming.run(cfg))
+
+
+def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
+    """Writes a policy that a loop of your own has trained as an agent's file, with a card beside
+    it. Returns it as a run: `evaluate`, `record`, `init=` and `against=` take the file.
+
+    Args:
+        policy: a `megastep.agents.networks.policy.Policy`; its weights are rounded to float16.
+        env: from `make`, in which it acts. Its settings are kept, and what wrappers have learnt.
+        file: NAME.safetensors.
+
+    Raises:
+        UserError: the policy is of another class or acts in other spaces, `make` did not return the
+            environment, the policy acts otherwise once it is rounded, or the file cannot be
+            written.
+    """
+    from megastep.agents.export import agent  # with PyTorch
+    from megastep.agents.networks.policy import Policy
+    from megastep.agents.runs import agent_file, checkpoint, restore, trust
+
+    if type(policy) is not Policy:
+        raise UserError(
+            f"save takes a megastep.agents.networks.policy.Policy, got {type(policy).__name__}; a "
+            "network of your own becomes one as Policy(env, core='my_module:Class')"
+        )
+    if (made := next((v for k, v in _made.items() if k is env), None)) is None:
+        raise UserError(
+            f"save takes the environment that megastep.make returned, got {type(env).__name__}; "
+            "make one of the same settings, not what wraps it"
+        )
+    if not agent_file.is_agent_file(path := Path(file)):
+        raise UserError(f"{path} must end with .safetensors")
+    of_env, geometry, seed = made
+    train = dict(env=check.as_tree(of_env), geometry=check.as_tree(geometry), seed=seed)
+    train |= dict(agent=_plain(policy.settings, "agent"), learner={"name": "unknown"})
+    config = {"train": train, "spaces": restore.spaces_of(policy)}
+    state = {"policy": policy.state_dict(), "wrappers": optional(env, "wrapper_state")()}
+    loaded = checkpoint.Checkpoint(Path("The policy"), 0, {}, config, {}, state)
+    agent.write_loaded(loaded, path, {"samples": 0})
+    trust.remember(trust.foreign_names(config))
+    return Run(path)
 
 
 def load(run: "Run | str | os.PathLike") -> Run:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from megastep.agents.api import make as make
     from megastep.agents.api import record as record
     from megastep.agents.api import runs as runs
+    from megastep.agents.api import save as save
     from megastep.agents.api import train as train
     from megastep.agents.errors import UserError as UserError
 
@@ -60,7 +61,9 @@ _MODULES = (
 )
 #: What the package has from its modules.
 _NAMES = {
-    **dict.fromkeys(("Run", "evaluate", "load", "make", "record", "runs", "train"), "agents.api"),
+    **dict.fromkeys(
+        ("Run", "evaluate", "load", "make", "record", "runs", "save", "train"), "agents.api"
+    ),
     "UserError": "agents.errors",
 }
 

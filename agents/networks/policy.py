@@ -63,6 +63,7 @@ class Policy(nn.Module):
 
     Attributes:
         generator: the `SeededGenerator` of the actions. A learner saves its state.
+        obs_space, action_space, settings: what it was made of, `settings` from `width` to `bf16`.
 
     Weights used in training only are under `TRAINING_ONLY` in `state_dict()`.
 
@@ -98,6 +99,10 @@ class Policy(nn.Module):
             privileged_space = optional(env, "privileged_space")
         elif action_space is None:
             raise ValueError("a policy needs an action space too: Policy(env), or both spaces")
+        self.obs_space, self.action_space = obs_space, action_space
+        self.settings = dict(width=width, core=core, layers=layers, encoder=encoder)
+        self.settings |= dict(activation=activation, output=output, continuous=continuous)
+        self.settings |= dict(critic=critic, bf16=bf16)
         critic, self.seed = None if output == "duelling" else critic, seed
         self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None

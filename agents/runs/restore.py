@@ -79,8 +79,8 @@ def load_wrappers(env: Env, loaded: "Checkpoint", is_frozen: bool = True) -> Non
             load(state, is_frozen)
 
 
-def spaces_of(env: Env) -> dict[str, str]:
-    """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
+def spaces_of(env: Env | Policy) -> dict[str, str]:
+    """Returns the spaces of an environment or policy: {'obs.rgb': 'MultiImage(...)', ...}."""
     tree = {"obs": env.obs_space, "actions": env.action_space}
     return {name: repr(space) for name, space in spaces.leaves(tree).items()}
 

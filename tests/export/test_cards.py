@@ -1,9 +1,15 @@
-"""Cards of agents."""
+"""Cards of agents, and agent files of policies that a loop of one's own has trained."""
 
 import re
 import shlex
 
+import pytest
+import torch
+
+import megastep
 from megastep.agents.cli import evaluate, export, record, train
+from megastep.agents.networks.policy import Policy
+from megastep.agents.selfplay.bots.random import RandomActions
 from tests.helpers import tiny
 
 MAINS = {"evaluate": evaluate.main, "record": record.main, "train": train.main}
@@ -46,3 +52,38 @@ def test_export_writes_a_card_whose_commands_work_for_a_colleague(here, monkeypa
     path.write_text("Notes\n")
     assert export.main(words) == 0
     assert path.read_text() == "Notes\n"
+
+
+MINIMAL: dict = dict(n_envs=3, geometry="box", device="cpu", shortest=5, longest=9)
+
+
+def test_a_saved_policy_acts_as_before(here):
+    env = megastep.make("minimal", res=8, **MINIMAL)
+    policy = Policy(env, width=16, core="gru", layers=2, critic=None)
+    policy.update_stats(env.reset().obs)
+    for weight in policy.parameters():
+        weight.data = weight.data.half().float()  # so that the file holds the same numbers
+    run = megastep.save(policy, env, "mine.safetensors")
+    loaded, world = megastep.load("mine.safetensors").policy, env.reset()
+    for _ in range(12):
+        decision = policy.act(world, greedy=True)
+        assert torch.equal(decision.actions, loaded.act(world, greedy=True).actions)
+        world = env.step(decision)
+    first, second = (run.make(n_envs=3, seed=1) for _ in range(2))
+    assert megastep.evaluate(policy, env=first) == megastep.evaluate(loaded, env=second)
+    assert run.config["env"]["res"] == 8 and len(typed((here / "mine.md").read_text())) == 3
+
+
+def test_what_cannot_be_saved_says_what_can(here):
+    env = megastep.make("minimal", res=8, **MINIMAL)
+    other = megastep.make("minimal", res=16, **MINIMAL)
+    for policy, where, text in [
+        (RandomActions(None), env, r"a megastep.*Policy, got RandomActions; .*Policy\(env, core="),
+        (Policy(env, width=8), object(), "that megastep.make returned, got object; make one"),
+        (Policy(other, width=8), env, "The policy was trained in another .* W=16.* W=8"),
+    ]:
+        with pytest.raises(megastep.UserError, match=text):
+            megastep.save(policy, where, "mine.safetensors")
+    with pytest.raises(megastep.UserError, match="must end with .safetensors"):
+        megastep.save(Policy(env, width=8), env, "mine.pt")
+    assert not [*here.iterdir()]
