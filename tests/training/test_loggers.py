@@ -57,7 +57,11 @@ def test_resumed_run_replaces_lines_after_its_checkpoint(tmp_path):
     assert [row["x"] for row in json_lines.read(tmp_path / "metrics.jsonl")] == [10, 20, -1]
 
 
-def test_tensorboard_has_the_points_of_the_lines_after_two_resumes(tmp_path):
+def test_tensorboard_has_the_points_of_the_lines_after_two_resumes(tmp_path, monkeypatch):
+    from tensorboard.summary.writer import event_file_writer as files
+
+    # files of one second are read in the order of a counter's text, in which 10 is before 9
+    monkeypatch.setattr(files, "_global_uid", files.AtomicCounter(0))
     for first, saved, last in ((0, 0, 40), (3, 30, 60), (6, 60, 70)):
         others = {"tensorboard": lambda saved=saved: TensorBoard(tmp_path, saved)}
         run_loggers = Loggers(tmp_path, saved, others)
