@@ -437,37 +437,6 @@ def test_a_planted_cycle_is_named(graph):
     assert "megastep.arrdict" in sentence and "megastep.dotdict" in sentence
 
 
-@pytest.mark.parametrize(
-    "rule, name",
-    [
-        (simulator_rows, "megastep.new"),
-        (engine_rows, "megastep.engine.new"),
-        (agents_rows, "megastep.agents.new.part"),
-    ],
-)
-def test_a_module_without_a_row_is_named(rule, name, graph):
-    assert list(rule({**graph, name: set()})) == [f"{name} has no row in the rules"]
-
-
-def test_imports_are_read_from_anywhere_in_a_file(tmp_path, monkeypatch):
-    path = tmp_path / "megastep" / "envs" / "sample.py"
-    path.parent.mkdir(parents=True)
-    path.write_text(
-        '"""Two\nlines."""\nimport os  # why\n\n# nothing\nfrom .. import engine\n'
-        "from ..core import (\n"
-        '    Core)\n\n\ndef f():\n    """One."""\n    import importlib\n'
-        '    return importlib.import_module("wandb"), """a\n    b"""\n'
-    )
-    monkeypatch.setitem(globals(), "ROOT", tmp_path)
-    assert imports(path) == {"os", "megastep.engine", "megastep.core", "importlib", "wandb"}
-
-
-def test_each_file_of_agents_is_read_once():
-    paths = [path.resolve() for path in SOURCES]
-    assert len(paths) == len(set(paths)) == len(MODULES)
-    assert MODULES["megastep.agents.types"] == ROOT / "agents" / "types.py"
-
-
 def test_configs_holds_yaml_only():
     files = [path for path in (ROOT / "configs").rglob("*") if path.is_file()]
     not_yaml = [path for path in files if path.suffix != ".yaml"]
