@@ -1,5 +1,6 @@
 """How a script ends, an exit code and one sentence, and how the ranks of a run say so."""
 
+import errno
 import json
 import os
 import sys
@@ -9,7 +10,7 @@ from typing import NamedTuple, cast
 
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
-from megastep.agents.errors import UserError, memory_problem
+from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.launch import signals
 from megastep.agents.runs import checkpoint, folders, populations
 from megastep.atomic_files import write_atomically
@@ -57,6 +58,10 @@ def ending_of(work: Callable[[], int | None]) -> Ending:
             raise
         cure = "choose fewer environments or episodes, or a smaller network"
         return Ending(UserError.code, f"{problem}; {cure}")
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        return Ending(UserError.code, f"A path is too long: {shortened(error.filename)}")
     except signals.Interrupted as stop:
         return Ending(128 + stop.args[0], stop.args[1])
 
