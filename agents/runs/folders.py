@@ -207,12 +207,8 @@ def load_checkpoint(
 
 def trusted(loaded: checkpoint.Checkpoint, is_trusted: bool) -> checkpoint.Checkpoint:
     """Returns a checkpoint whose import paths may be imported. Raises UserError for others."""
-    names = trust.untrusted(trust.foreign_names(loaded.config))
-    if names and not is_trusted:
-        raise UserError(
-            f"{loaded.path} would import {shortened(', '.join(names))}, which runs code outside "
-            "megastep that you have not trained with here; if you trust it, add trust=true"
-        )
+    if not is_trusted:
+        trust.check(loaded.config, loaded.path, "; if you trust it, add trust=true")
     return loaded
 
 

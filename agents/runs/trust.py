@@ -13,6 +13,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from megastep.agents.errors import UserError, shortened
+
 if TYPE_CHECKING:
     from megastep.agents.types import Config
 
@@ -55,6 +57,19 @@ def untrusted(names: Iterable[str]) -> list[str]:
     with contextlib.suppress(OSError):
         known = _file().read_text().splitlines()
     return [name for name in names if name not in known]
+
+
+def check(config: "Config", source: object, cure: str = "") -> None:
+    """Raises UserError if a configuration, which `source` holds, names what may not be imported.
+
+    Args:
+        cure: the end of the sentence.
+    """
+    if names := untrusted(foreign_names(config)):
+        raise UserError(
+            f"{source} would import {shortened(', '.join(names))}, which runs code outside "
+            f"megastep that you have not trained with here{cure}"
+        )
 
 
 def _file() -> Path:

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli import evaluate, export, record, train, web
 from megastep.agents.errors import ConfigErrors
 from megastep.agents.factory import check
 from megastep.agents.factory.components import kind_of
@@ -63,6 +63,9 @@ COMMANDS = [
     (evaluate.main, ["run=run"]),
     (evaluate.main, ["run=run", "against=bot"]),
     (record.main, ["run=run"]),
+    (export.main, ["run=run", "format=safetensors"]),
+    (export.main, ["run=run", "format=torch"]),
+    (web.main, ["run=run"]),
 ]
 
 
