@@ -25,7 +25,9 @@ from megastep.agents.runs import (
     json_lines,
     provenance,
     restore,
+    scores,
     trust,
+    typed_json,
 )
 from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves
@@ -93,7 +95,7 @@ def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
     own = vars(components.settings_for("geometry", components.SUITE))
     files = sorted((folder / "evaluations").glob("*.json"), key=lambda path: path.stat().st_mtime)
     for path in files:
-        table = json.loads(path.read_text())
+        table = scores.evaluation(path)
         how = table.get("evaluation", {})
         geometry = how.get("geometry") or {}
         is_suite = geometry.get("name") == components.SUITE
@@ -102,10 +104,10 @@ def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
             continue
         words = ["geometry=suite"] * is_suite
         for key, value in geometry.items() if is_suite else ():
-            if value != own[key]:
+            if value != own.get(key):
                 words.append("'geometry.{}={}'".format(key, json.dumps(value).replace('"', "")))
-        words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed")]
-        words += ["greedy=true"] * how["greedy"]
+        words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed") if key in how]
+        words += ["greedy=true"] * how.get("greedy", False)
         words += [f"max_steps={how['max_steps']}"] * (how.get("max_steps") is not None)
         words += ["baseline=none"] * (how.get("baseline") == [] and not how.get("against"))
         for key in ("baseline", "against"):
@@ -137,8 +139,7 @@ def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
         words = " geometry=suite episodes=8000" if has_homes else ""
         command = f"{folders.command_of('evaluate', 'run', loaded.path)}{words}"
         console.warn(f"the card has no results, for {command} was not run")
-    path = folder / provenance.FILE
-    lines = json_lines.read(path) if path.exists() else []
+    lines = json_lines.read(folder / provenance.FILE, typed_json.Start)
     lines = [line for line in lines if line["samples"] < loaded.step]
     commits = dict.fromkeys(line.get("commit", "unknown") for line in lines)
     made_with = {"device": "unknown", "torch": "unknown", "ranks": 1, **loaded.made_with}

@@ -1,7 +1,6 @@
 """The homes of an evaluation, drawn from above and coloured by what was earned in them."""
 
 import html
-import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
@@ -12,11 +11,12 @@ from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.evaluation.statistics import SCORES
 from megastep.agents.factory import check, components
 from megastep.agents.reports import runs
-from megastep.agents.runs import folders
-from megastep.agents.runs.typed_json import loads
+from megastep.agents.runs import folders, trust
 
 #: Homes that are drawn: so many of the worst, and of the best.
 N_WORST, N_BEST = 36, 12
+#: What an evaluation of another version, or of a stranger, may raise.
+ODD = ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError
 
 
 def section(run: runs.Run) -> list[str]:
@@ -30,7 +30,7 @@ def section(run: runs.Run) -> list[str]:
             worst = sorted(by_home, key=by_home.__getitem__)
             if len(worst) < 2 or not all(0 <= home < len(plans) for home in worst):
                 continue
-        except (UserError, ConfigErrors, KeyError, TypeError, ValueError, IndexError) as error:
+        except (UserError, ConfigErrors, *ODD) as error:
             return [f"<p>Homes are not drawn: {html.escape(str(error))}</p>"]
         best = worst[max(N_WORST, len(worst) - N_BEST) :]
         span = by_home[worst[0]], by_home[worst[-1]]
@@ -63,8 +63,9 @@ def plans_of(run: runs.Run, table: Mapping) -> list:
     """Returns the geometries of the split that a table is about."""
     loaded = folders.load_checkpoint(folders.find(str(run.folder)), False, "cpu")
     trained = factory.config_of(loaded)
-    chosen, geometry = loads(json.dumps(table["evaluation"])), trained.geometry
+    chosen, geometry = table["evaluation"], trained.geometry
     if typed := chosen.get("geometry"):
+        trust.check({"train": {"geometry": typed}}, "An evaluation")
         geometry = check.check(components.kind_of("geometry", str(typed["name"])), typed)
     return factory.homes(trained.env, geometry, str(chosen["split"]))
 

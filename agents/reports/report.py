@@ -89,7 +89,7 @@ def _one(run: runs.Run, charts: "Charts", file: Path) -> str:
     for table in run.evaluations:
         try:
             head, rows = tables.grid(table["rows"])
-        except (KeyError, TypeError, ValueError, AttributeError):
+        except homes.ODD:
             continue  # of another version, or a stranger's
         evaluations += [f"<p>{_text(str(table.get('title', '')))}</p>", _table(head, rows)]
     parts += ["<h2>Evaluations</h2>", *evaluations] if evaluations else []

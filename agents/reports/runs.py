@@ -1,17 +1,13 @@
 """What is known of runs that have been trained: read from their folders, nothing imported."""
 
-import contextlib
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import yaml
-
 from megastep.agents.errors import UserError
 from megastep.agents.factory.check import leaves
 from megastep.agents.factory.settings import label
-from megastep.agents.runs import folders, json_lines, scores
+from megastep.agents.runs import config_yaml, folders, json_lines, scores, typed_json
 
 if TYPE_CHECKING:
     from megastep.agents.types import Config, Row
@@ -68,28 +64,20 @@ class Run(NamedTuple):
 
 
 def read(folder: Path) -> Run:
-    """Returns what a run's folder holds. Raises UserError if it is not a run."""
+    """Returns what a run's folder holds. Raises UserError if it is not a run, or odd."""
     folder = folders.folder_of(folders.find(str(folder)))
-    path, config, rows = folder / "config.yaml", None, []
-    with contextlib.suppress(ValueError, yaml.YAMLError, RecursionError):
-        try:
-            config = yaml.safe_load(path.read_bytes())
-        except FileNotFoundError:
-            raise UserError(f"{folder} is not a run: it has no config.yaml") from None
-    if not isinstance(config, dict) or not isinstance(config.get("env"), dict):
-        raise UserError(f"{path} does not hold the settings of a run")
-    for name in ("metrics.jsonl", "perf.jsonl", "provenance.jsonl"):
-        is_there = (folder / name).exists()
-        rows.append(json_lines.read(folder / name) if is_there else [])
-    if not rows[0]:
+    if not (folder / "config.yaml").exists():
+        raise UserError(f"{folder} is not a run: it has no config.yaml")
+    config = config_yaml.read(folder / "config.yaml")
+    metrics, perf = (
+        json_lines.read(folder / name, typed_json.Metrics)
+        for name in ("metrics.jsonl", "perf.jsonl")
+    )
+    if not metrics:
         raise UserError(f"{folder} has no metrics yet; its first report writes metrics.jsonl")
-    tables = []
-    for path in sorted((folder / "evaluations").glob("*.json")):
-        with contextlib.suppress(OSError, ValueError, RecursionError):
-            table = json.loads(path.read_bytes())
-            if isinstance(table, dict) and isinstance(table.get("rows"), list) and table["rows"]:
-                tables.append(table)
-    return Run(folder, config, *rows, evaluations=tables)
+    starts = json_lines.read(folder / "provenance.jsonl", typed_json.Start)
+    tables = [*map(scores.evaluation, sorted((folder / "evaluations").glob("*.json")))]
+    return Run(folder, config, metrics, perf, starts, evaluations=tables)
 
 
 def expanded(names: Sequence[str]) -> list[Path]:
@@ -144,7 +132,8 @@ def metrics_of(runs: Sequence[Run]) -> list[str]:
     """Returns the names of numbers that all runs report, in the order of the first run."""
     names = []
     for run in runs:
-        last = {key: value for row in run.metrics + run.perf for key, value in row.items()}
-        names.append([key for key, x in last.items() if isinstance(x, (int, float, type(None)))])
+        cells = [cell for row in run.metrics + run.perf for cell in row.items()]
+        texts = {key for key, value in cells if isinstance(value, str)}
+        names.append([key for key in dict(cells) if key not in texts])
     shared = [name for name in names[0] if all(name in other for other in names[1:])]
     return [name for name in shared if name != "samples"]

@@ -5,10 +5,12 @@ A killed run loses no complete line, and a damaged line does not affect others.
 
 import json
 import math
+import os
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from megastep.agents.errors import user_errors
 from megastep.agents.runs import typed_json
 from megastep.atomic_files import AppendedFile, write_atomically
 
@@ -35,11 +37,19 @@ class JsonLines:
         self.file.write((json.dumps({"samples": step, **json_values}) + "\n").encode())
 
 
-def read(path: Path | str) -> "list[Row]":
+def read(path: Path | str, kind: object = None) -> "list[Row]":
     """Returns the objects in a file. Skips damaged lines with a warning, and silently a last line
     that a crash cut short.
+
+    Args:
+        kind: of a line, from `typed_json`. UserError for others; a file that is not there has none.
     """
-    return [row for row, _ in _intact_lines(Path(path))]
+    if kind is None:
+        return [row for row, _ in _intact_lines(Path(path))]
+    with user_errors(f"{path} cannot be used: "):
+        rows = [row for row, _ in _intact_lines(Path(path))] if os.path.exists(path) else []
+        typed_json.check(list[kind], rows)
+        return rows
 
 
 def truncate_after(path: Path | str, step: int) -> None:

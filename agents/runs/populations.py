@@ -7,10 +7,8 @@ import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
-
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.runs import checkpoint, json_lines, scores, typed_json
+from megastep.agents.runs import checkpoint, config_yaml, json_lines, scores, typed_json
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -41,7 +39,7 @@ def score_of(folder: Path, ranked_by: str = RUNNING) -> float | None:
     """Returns a member's last evaluated return, else the mean return of its last reports; if its
     population ranks by another episode statistic, the mean of that.
     """
-    rows = json_lines.read(folder / "metrics.jsonl") if (folder / "metrics.jsonl").exists() else []
+    rows = json_lines.read(folder / "metrics.jsonl", typed_json.Metrics)
     if ranked_by not in (RUNNING, EVALUATED):
         return scores.mean(rows, ranked_by)
     evaluated = [row["eval/return"] for row in rows if row.get("eval/return") is not None]
@@ -52,10 +50,9 @@ def best(root: Path) -> int | None:
     """Returns the number of the member with the highest score, the first of equal ones; None if no
     member has one.
     """
-    ranked_by = RUNNING
-    with contextlib.suppress(OSError, yaml.YAMLError, KeyError, TypeError):
-        config = yaml.safe_load((folder_of(root, 0) / "config.yaml").read_text("utf-8"))
-        ranked_by = config["population"]["score"]
+    ranked_by, path = RUNNING, folder_of(root, 0) / "config.yaml"
+    with contextlib.suppress(KeyError, TypeError):
+        ranked_by = config_yaml.read(path)["population"]["score"] if path.exists() else RUNNING
     return _highest([score_of(folder, ranked_by) for folder in members(root)])
 
 
@@ -106,10 +103,8 @@ def beginning(root: Path) -> checkpoint.Checkpoint:
     Raises UserError if its settings cannot be read.
     """
     path = folder_of(root, 0) / "config.yaml"
-    with user_errors(
-        f"{path} cannot be read: ", (OSError, ValueError, RecursionError, yaml.YAMLError)
-    ):
-        config = {"train": yaml.safe_load(path.read_bytes()), "spaces": {}}
+    config = {"train": config_yaml.read(path), "spaces": {}}
+    with user_errors(f"{path} cannot be read: "):
         typed_json.check(typed_json.Config, config)
     numbers: dict[str, float] = dict(samples=0, seconds=0, updates=0)
     return checkpoint.Checkpoint(path, 0, numbers, config, {})
@@ -123,7 +118,16 @@ def read(path: Path) -> "list[list[Row]]":
         rows = json_lines.read(path)
         typed_json.check(list[typed_json.Generation], rows)
         groups = [[*g] for _, g in itertools.groupby(rows, lambda row: row["generation"])]
-        return [group for group in groups if len(group) == len(groups[0])]  # a kill cuts the last
+        groups = [group for group in groups if len(group) == len(groups[0])]  # a kill cuts the last
+        for group in groups:
+            n, keys = len(groups[0]), settings_of(groups[0][0]).keys()
+            are_right = (
+                row["member"] == i and row["from"] < n and settings_of(row).keys() == keys
+                for i, row in enumerate(group)
+            )
+            if not all(are_right):
+                raise ValueError(f"generation {group[0]['generation']} is not like the first")
+        return groups
 
 
 def samples_of_generations(path: Path) -> set[int]:

@@ -1,11 +1,10 @@
 """Scores of runs and evaluations."""
 
-import contextlib
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from megastep.agents.runs import json_lines
+from megastep.agents.errors import user_errors
+from megastep.agents.runs import json_lines, typed_json
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -31,6 +30,12 @@ def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float 
     return total / n_episodes if n_episodes else None
 
 
+def evaluation(file: Path) -> "Row":
+    """Returns the contents of one of `evaluations/*.json`. Raises UserError if it is another."""
+    with user_errors(f"{file} is not an evaluation: "):
+        return typed_json.loads(file.read_bytes(), typed_json.Evaluation)
+
+
 def outcome(result: Path) -> dict[str, float | None]:
     """Returns the scores of a run folder, or of the .json file of an evaluation.
 
@@ -41,9 +46,8 @@ def outcome(result: Path) -> dict[str, float | None]:
     files, rows = [result], []
     if is_run := result.is_dir():
         files = sorted(result.glob("evaluations/*.json"), key=lambda file: -file.stat().st_mtime)
-        with contextlib.suppress(OSError):
-            rows = json_lines.read(result / "metrics.jsonl")
-    tables = [json.loads(file.read_text())["rows"][0] for file in files if file.suffix == ".json"]
+        rows = json_lines.read(result / "metrics.jsonl", typed_json.Metrics)
+    tables = [evaluation(file)["rows"][0] for file in files if file.suffix == ".json"]
     row = next((row for row in tables if not is_run or "return" in row), {})
     evaluated = row.get("return", row.get("won"))
     score = mean(rows) if is_run else evaluated

@@ -12,8 +12,8 @@ import math
 from typing import Annotated, Any, cast
 
 import pydantic
-from pydantic import Field
-from typing_extensions import TypedDict
+from pydantic import BeforeValidator, Field
+from typing_extensions import NotRequired, TypedDict
 
 from megastep.agents.errors import shortened
 
@@ -46,11 +46,50 @@ Config = _object(
     train=_object(env=_member, geometry=_member, learner=_member, agent=dict[str, Any]),
     spaces=dict[str, str],
 )
+#: config.yaml of a run, which is drawn and not used.
+ConfigYaml = _object(env=dict, geometry=NotRequired[dict])
 #: How the agent in an agent file was trained, and one of its evaluations.
 Facts = _object(samples=_Count)
 Table = _object(title=str, command=str, rows=list[dict[str, Any]])
-#: A line about a member of a population.
-Generation = _object(samples=_Count, generation=_Count, member=_Count, **{"from": _Count})
+#: Keys of numbers in the lines of a run begin with these; others, as of a curriculum, may be text.
+_NUMBERS = "episode/", "eval/", "loss/", "perf/", "settings/", "score", "diverged", "updates"
+#: Of them, those that are never null, as others are that were not finite.
+_FINITE = "episode/window", "episode/count", "perf/seconds", "settings/", "diverged"
+
+
+def _numbers(row: dict[str, Any]) -> dict[str, Any]:
+    for key, value in row.items():
+        is_right = not key.startswith(_FINITE if value is None else _NUMBERS)
+        if isinstance(value, (int, float)):
+            is_right = abs(value) < 1e300
+        if not is_right:
+            raise ValueError(f"{key} cannot be {shortened(repr(value), 40)}")
+    return row
+
+
+#: A line of metrics.jsonl or perf.jsonl, of population.jsonl, of provenance.jsonl.
+Metrics = Annotated[_object(samples=_Count), BeforeValidator(_numbers)]
+Generation = Annotated[
+    _object(samples=_Count, generation=_Count, member=_Count, **{"from": _Count}),
+    BeforeValidator(_numbers),
+]
+Start = _object(samples=_Count, command=NotRequired[str], commit=NotRequired[str])
+_Means = dict[str, dict[str, float | None]]
+_result = dict.fromkeys(("return", "won", "lower", "upper", "length"), NotRequired[float | None])
+_result |= dict.fromkeys(("agent", "against", "role", "source"), NotRequired[str])
+_result |= dict(homes=NotRequired[_Count | None], tail=NotRequired[float])
+_result |= dict.fromkeys(("lanes", "unfinished", "duels"), NotRequired[_Count])
+_result |= dict(metrics=NotRequired[_Means])
+_how = dict(split=NotRequired[str], greedy=NotRequired[bool])
+_how |= dict(geometry=NotRequired[dict[str, Any] | None])
+_how |= dict.fromkeys(("baseline", "against"), NotRequired[list[str] | None])
+#: evaluations/*.json.
+Evaluation = _object(
+    title=str,
+    rows=Annotated[list[_object(**_result)], Field(min_length=1)],
+    evaluation=NotRequired[_object(**_how)],
+    episodes=NotRequired[dict[str, list]],
+)
 
 
 def dumps(value: Any, indent: int | None = None) -> str:
@@ -78,7 +117,8 @@ def check(kind: object, value: object) -> None:
     except pydantic.ValidationError as error:
         line = error.errors(include_url=False, include_input=False)[0]
         name = shortened(".".join(map(str, line["loc"])) or "it", 60)
-        raise ValueError(f"{name}: {shortened(line['msg'])}") from None
+        text = shortened(line["msg"].removeprefix("Value error, "))
+        raise ValueError(f"{name}: {text}") from None
 
 
 _adapter = functools.cache(pydantic.TypeAdapter)
