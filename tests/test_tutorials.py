@@ -31,7 +31,6 @@ LONG |= {
 }
 BLOCK = re.compile(r"(?:<!-- not run: (.+) -->\n)?```(\S*)[^\n]*\n(.*?)```", re.S)
 FILE = re.compile(r"(?:#|//|<!--) (\S+\.(?:py|h|cpp|cu|svg))(?: -->)?\n")
-PICTURES = ".png", ".svg", ".mp4", ".gif", ".html"
 TIERS = {True: pytest.mark.nightly, False: pytest.mark.slow}
 
 

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
@@ -127,16 +126,6 @@ def _run(argv, folder, environment, outputs, holder):
 def forked(script, *words, cwd=None, **environment):
     """Starts a script as `start` does, in a `Forked` process."""
     return Forked([ROOT / f"{script}.py", *words], cwd, {**os.environ, **environment})
-
-
-def in_threads(function, n=8):
-    """Calls a function in n threads at once."""
-    barrier = threading.Barrier(n)
-    threads = [threading.Thread(target=lambda: (barrier.wait(), function())) for _ in range(n)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
 
 
 def wait_until(condition, process):
