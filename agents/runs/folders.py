@@ -208,7 +208,8 @@ def load_checkpoint(
 def trusted(loaded: checkpoint.Checkpoint, is_trusted: bool) -> checkpoint.Checkpoint:
     """Returns a checkpoint whose import paths may be imported. Raises UserError for others."""
     if not is_trusted:
-        trust.check(loaded.config, loaded.path, "; if you trust it, add trust=true")
+        cure = "; if you trust it, train, evaluate and record take trust=true"
+        trust.check(loaded.config, loaded.path, cure)
     return loaded
 
 
