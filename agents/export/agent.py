@@ -81,9 +81,8 @@ def rounding_error(exported: Policy, original: Policy, env, n_steps: int = N_STE
 
 def command_of(words: str) -> str:
     """Returns a command without where Python and the script are on the machine."""
-    return re.sub(r"^.*?(\S*/)?((train\.py|megastep train)\b.*)$", r"python \2", words).replace(
-        "python megastep", "megastep"
-    )
+    words = re.sub(r"^.*?(\S*/)?((train\.py|megastep train)\b.*)$", r"python \2", words)
+    return re.sub(r"(?<!\S)/\S*/", "", words).replace("python megastep", "megastep")
 
 
 def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:

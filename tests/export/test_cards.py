@@ -8,6 +8,7 @@ import torch
 
 import megastep
 from megastep.agents.cli import evaluate, export, record, train
+from megastep.agents.export import agent
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.bots.random import RandomActions
 from tests.helpers import tiny
@@ -24,6 +25,11 @@ def typed(card):
         short = ["steps=2", "file=a.png"] if name == "record" else []
         assert MAINS[name]([*words, *short, "device=cpu"]) == 0, line
     return commands
+
+
+def test_a_command_on_a_card_has_no_folder_of_the_machine():
+    commands = [f"/here/bin/python /home/me/{file} a=1" for file in ("train.py", "tune.py")]
+    assert [*map(agent.command_of, commands)] == ["python train.py a=1", "python tune.py a=1"]
 
 
 def test_export_writes_a_card_whose_commands_work_for_a_colleague(here, monkeypatch):
