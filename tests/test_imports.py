@@ -429,9 +429,3 @@ def test_a_planted_import_is_named(rule, name, target, graph):
     (sentence,) = rule(planted)
     assert name in sentence
     assert target in sentence or f"import {top_level(target)}" in sentence
-
-
-def test_configs_holds_yaml_only():
-    files = [path for path in (ROOT / "configs").rglob("*") if path.is_file()]
-    not_yaml = [path for path in files if path.suffix != ".yaml"]
-    assert not [path for path in not_yaml if "__pycache__" not in path.parts]
