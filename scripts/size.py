@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+#: Not `.venv`, which lies in the root too.
+OURS = tuple(str(ROOT / name) for name in ("agents/", "megastep/", "train.py"))
 KERNELS = "*.h", "*.cu", "*.cpp"
 #: Commands whose way from the settings to the first rollout is measured.
 COMMANDS = {
@@ -85,7 +87,7 @@ class Way:
 
     def _profile(self, frame, event, argument) -> None:
         code = frame.f_code
-        if event != "call" or not code.co_filename.startswith(str(ROOT)):
+        if event != "call" or not code.co_filename.startswith(OURS):
             return
         if f"{Path(code.co_filename).stem}.{code.co_name}" == self.until:
             self.end()
