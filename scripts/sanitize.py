@@ -25,7 +25,7 @@ from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.r2d2 import R2D2
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.replay_settings import ReplaySettings
+from megastep.agents.storage.replay import ReplaySettings
 from megastep.engine import operations, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns

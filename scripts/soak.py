@@ -38,7 +38,7 @@ PONG = "env=pong env.self_play=true opponents.past=0.5 opponents.snapshots=2 opp
 REPLAY = "learner.gradient_steps=2 learner.replay.capacity=400 learner.replay.burn_in=4"
 CONFIGURATIONS = {
     "PPO": f"{MINIMAL} learner=ppo learner.n_minibatches=2",
-    "V-trace, an update behind": f"{MINIMAL} learner=vtrace learner.n_minibatches=2 learner.lag=1",
+    "V-trace": f"{MINIMAL} learner=vtrace learner.n_minibatches=2",
     "R2D2": f"{MINIMAL} learner=r2d2 {REPLAY}",
     "PPO, against its past": f"{PONG} learner=ppo learner.n_minibatches=2",
 }

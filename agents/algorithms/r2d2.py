@@ -19,8 +19,12 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
-from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
-from megastep.agents.storage.replay_settings import ReplaySettings, defaults_from
+from megastep.agents.storage.replay import (
+    ReplayBuffer,
+    ReplaySettings,
+    bytes_per_observation,
+    defaults_from,
+)
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
@@ -274,10 +278,9 @@ class R2D2(learner.GradientLearner):
                 f"{self.gradient_steps:,} gradient steps: use fewer gradient_steps or more lanes"
             )
         epsilon = epsilons(n_lanes, self.epsilon, self.epsilon_spread).to(self.device)
-        collect = Collector(env, EpsilonGreedy(self.policy, epsilon), rollout)
-        self.replay_buffer = ReplayBuffer(  # which knows the rollout's optional parts
-            rollout, env.obs_space, env.action_space, self.replay_settings, logprobs=False
-        )
+        policy = EpsilonGreedy(self.policy, epsilon)
+        collect = Collector(env, policy, rollout)  # allocates the rollout's optional parts
+        self.replay_buffer = ReplayBuffer(rollout, self.replay_settings, logprobs=False)
         return collect
 
     def bytes_per_env(self, env: Env) -> float:

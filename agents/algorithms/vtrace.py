@@ -1,6 +1,6 @@
 """V-trace actor-critic (IMPALA, Espeholt et al. 2018) for recurrent policies.
 
-Off-policy: the acting policy may be a few updates old or, with a replay buffer, many.
+Off-policy: with a replay buffer, the policy that acted may be many updates old.
 
 T time, B lanes, M lanes of a minibatch. A minibatch holds whole sequences of some lanes, then
 replayed sequences if there is a replay buffer. Means are over valid steps: those that the
@@ -22,10 +22,8 @@ from megastep.agents.algorithms.masked_stats import (
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments
-from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
-from megastep.agents.storage.replay_settings import ReplaySettings
+from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings, bytes_per_observation
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.arrdict import arrdict, cat
 from megastep.dotdict import mapping
@@ -41,7 +39,7 @@ _METRICS = "policy", "value", "entropy", "kl", "rho", "advantage", "clip_fractio
 
 
 class VTrace(learner.ActorCritic):
-    """Improves a policy, in place, from rollouts that it or an older version of it collected.
+    """Improves a policy, in place, from rollouts that it collected, and from replayed ones.
 
     Each minibatch is evaluated anew by the current policy, and V-trace corrects with truncated
     importance ratios. Advantages are divided by their root mean square, but by no less than
@@ -55,8 +53,6 @@ class VTrace(learner.ActorCritic):
         c_clip: truncation of the ratios in the traces.
         advantage_floor: smallest divisor of advantages, in standard deviations of the return. Use
             about 0.3 for small batches.
-        lag: how many updates old the acting weights are. With 1 or 2, a GPU collects on a second
-            stream while the learner updates (`storage.async_collector`).
         buffer: "rollout" learns from each rollout once; "replay" adds sequences of a replay buffer
             to each minibatch.
         replay: settings of the replay buffer.
@@ -96,7 +92,6 @@ class VTrace(learner.ActorCritic):
         optimizer: learner.OptimizerName = "adam",
         warmup: learner.Warmup = 0,
         desired_kl: learner.Positive | None = None,
-        lag: Annotated[int, Field(ge=0, le=2)] = 0,
         buffer: Literal["rollout", "replay"] = "rollout",
         replay: ReplaySettings = _REPLAY,
         graph: bool = False,
@@ -111,36 +106,28 @@ class VTrace(learner.ActorCritic):
         settings |= dict(weight_decay=weight_decay, optimizer=optimizer, desired_kl=desired_kl)
         settings |= dict(graph=graph, seed=seed, coefficients=coefficients)
         super().__init__(policy, n_steps, n_epochs, n_minibatches, **settings)
-        self.advantage_floor, self.lag = advantage_floor, lag
+        self.advantage_floor = advantage_floor
         self.replay_settings = replay if buffer == "replay" else None
         self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
 
-    def collector(self, env: Env) -> Collector | AsyncCollector:
+    def collector(self, env: Env) -> Collector:
         """Returns a collector of rollouts of `n_steps` steps, and allocates the replay buffer.
-
-        Raises:
-            ValueError: if the replay buffer is too small, or the environment has opponents and
-                `lag` > 0.
+        ValueError if that is too small.
         """
         self.policy.clear_stats()
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
-        if self.lag:
-            collect = AsyncCollector(env, self.policy, rollout, self.lag)
-        else:
-            collect = Collector(env, self.policy, rollout)
-        if self.replay_settings:  # which knows the rollout's optional parts
-            env_spaces = env.obs_space, env.action_space
-            self.replay_buffer = ReplayBuffer(rollout, *env_spaces, self.replay_settings)
+        collect = Collector(env, self.policy, rollout)  # allocates the rollout's optional parts
+        if self.replay_settings:
+            self.replay_buffer = ReplayBuffer(rollout, self.replay_settings)
         return collect
 
     def bytes_per_env(self, env: Env) -> float:
-        """Returns about how many bytes the rollouts and a minibatch take per environment."""
-        # One rollout, one more per update of lag, and a minibatch: its share of fresh and replayed
-        # steps, with their activations.
+        """Returns about how many bytes the rollout and a minibatch take per environment."""
+        # A minibatch has its share of fresh and replayed steps, with their activations.
         fraction = 1 / self.n_minibatches
         if self.replay_settings:
             fraction *= 1 + self.replay_settings.ratio
-        per_step = bytes_per_step(env, self.policy) * (1 + self.lag + fraction)
+        per_step = bytes_per_step(env, self.policy) * (1 + fraction)
         per_step += self.policy.activation_bytes * fraction
         return optional(env, "n_agents") * (self.n_steps + 1) * per_step
 
@@ -240,7 +227,7 @@ class VTrace(learner.ActorCritic):
         if self.replay_buffer is not None:
             replayed = self._ratio_metrics(log_ratio[:, n_fresh:], valid[:, n_fresh:])
             metrics |= {f"replayed_{name}": value for name, value in replayed.items()}
-            age = batch.age[n_fresh:].float().mean() + self.lag
+            age = batch.age[n_fresh:].float().mean()
             metrics["staleness"] = age * self.replay_buffer.is_ready
             mean_error = masked_mean(error.detach().abs(), valid, 0)[n_fresh:]
             self.replay_buffer.set_priorities(batch.index, mean_error)

@@ -22,8 +22,7 @@ The most common words:
                                Ctrl-C stops too, and saves
   env.n_envs=256 device=cpu    another size, another device
   learner.lr=3e-4 seed=2       any key that --cfg job prints
-  learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
-                               learner.buffer=replay also learns from old experience
+  learner=vtrace               instead of ppo: learner.buffer=replay also learns from old experience
   evaluation.every=60s evaluation.stop.return=475
                                evaluate while training, also every 1M samples, and end the run when
                                one reaches this return, or evaluation.stop.success=0.95

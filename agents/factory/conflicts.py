@@ -20,13 +20,9 @@ FILMS = ".mp4", ".gif", ".png", ".svg", ".pdf"
 def of_training(cfg: "Train") -> Iterator[tuple[str, str]]:
     """Yields what is wrong with the settings of a training."""
     env, learner, over = cfg.env, cfg.learner, cfg.learner.anneal
-    lag = getattr(learner, "lag", 0)
     # classes of users are asked when they are made
     draws = getattr(env, "resample", not env.name.startswith("megastep."))
-    if cfg.curriculum.name != "none" and lag:
-        text = "the homes to draw change with every update, so nothing can be collected ahead"
-        yield "curriculum", f"{text} of it; use learner.lag=0"
-    elif cfg.curriculum.name != "none" and not draws:
+    if cfg.curriculum.name != "none" and not draws:
         cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
         yield "curriculum", f"env={env_name(env)} draws no home for each episode; {cure}"
     for key, field, value in _fields(cfg):
@@ -36,9 +32,6 @@ def of_training(cfg: "Train") -> Iterator[tuple[str, str]]:
     if cfg.opponents.league and cfg.population.size == 1:
         text = "are other members of a population, which needs population.size=2 or more"
         yield "opponents.league", text
-    if lag and (cfg.opponents.past or cfg.opponents.bot or cfg.opponents.league):
-        text = "opponents change with every update, so nothing can be collected ahead of it"
-        yield "learner.lag", f"{text}; use learner.lag=0, or no opponents"
     if over in ("samples", "seconds") and getattr(cfg, over) is None:
         text = f"is {over}, and no {over}= is given for the learning rate to fall over"
         yield "learner.anneal", text

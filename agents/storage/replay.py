@@ -9,22 +9,25 @@ the following rollouts. Its last row is the observation to bootstrap from. A seq
 once its last row has been stored, and until its first row is overwritten.
 """
 
+import dataclasses
 import math
+from typing import Annotated
 
 import torch
-from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
+from pydantic import BeforeValidator, Field
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.copies import LIBRARY
-from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.storage.sum_tree import SET_THREADS, SumTree, has_kernels, packed
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.kernels.build.launch import Blocks, launch
-from megastep.types import Env, Space, Tree
+from megastep.settings import frozen
+from megastep.types import Env, Tree
 
 #: Bool tensors of a row, stored as one bit each.
 _FLAGS = "starts", "learns", "terminal", "truncated"
@@ -35,144 +38,109 @@ _MIN_PRIORITY = 1e-6
 _MAX_TENSORS = LIBRARY.constants["MAX_SELECTED"]
 _READ_THREADS = LIBRARY.constants["READ_THREADS"]
 _MAX_ENTRIES = 2**31  # kernels count lanes, rows and words in 32 bits
-_COPIES = {size: LIBRARY.constants[f"COPY_{size}"] for size in (16, 8, 4, 2, 1)}
-#: How a stored dtype is read as another.
-_CONVERSIONS = {
-    (torch.uint8, torch.int64): LIBRARY.constants["BYTE_TO_LONG"],
-    (torch.int16, torch.int64): LIBRARY.constants["SHORT_TO_LONG"],
-    (torch.int32, torch.int64): LIBRARY.constants["INT_TO_LONG"],
-    (torch.uint8, torch.float16): LIBRARY.constants["BYTE_TO_HALF"],
-    (torch.uint8, torch.float32): LIBRARY.constants["BYTE_TO_FLOAT"],
-    (torch.float16, torch.float32): LIBRARY.constants["HALF_TO_FLOAT"],
-}
+_LARGEST_HALF = torch.finfo(torch.float16).max
+Exponent = Annotated[float, Field(ge=0, le=10)]
 
 
-class Column:
-    """Rows (R, ...) of one tensor of the experience, stored in another dtype than that which `read`
-    returns, unless `stored` is None.
+@frozen
+class ReplaySettings:
+    """Settings of learners that have a replay buffer.
+
+    Args:
+        capacity: observations in the buffer, all lanes together. Rounded down to whole rollouts.
+        burn_in: steps at the start of a sequence that only warm up the hidden state. A sequence
+            has `n_steps` more, so that every collected step is learned from in exactly one.
+        ratio: samples replayed per sample collected.
+        alpha: exponent of priorities; 0 draws uniformly (Schaul et al. 2016).
+        beta: exponent of importance weights; 1 corrects fully for the priorities.
+        start: samples to collect before the first is replayed.
     """
 
-    def __init__(
-        self,
-        n_rows: int,
-        shape: tuple[int, ...],
-        dtype: torch.dtype,
-        stored: torch.dtype | None,
-        device: torch.device,
-    ):
-        self.dtype = dtype
-        self.rows = torch.zeros(n_rows, *shape, dtype=stored or dtype, device=device)
-
-    def write(self, index: torch.Tensor, values: torch.Tensor) -> None:
-        """Stores the first m of values (>= m, ...) at rows index (m,)."""
-        values = cast(values[: len(index)], self.rows.dtype)
-        self.rows.index_copy_(0, index, values)
-
-    def read(self, index: torch.Tensor) -> torch.Tensor:
-        """Returns entries (..., *) of rows (R, B, *). Entry r B + b is lane b of row r."""
-        rows = self.rows.flatten(0, 1).index_select(0, index.flatten())
-        return cast(rows, self.dtype).unflatten(0, index.shape)
+    capacity: Annotated[int, Field(ge=1, le=10**12)] = 1_000_000
+    burn_in: Annotated[int, Field(ge=0, le=65_536)] = 0
+    ratio: Annotated[float, Field(gt=0, le=1000)] = 1.0
+    alpha: Exponent = 0.0
+    beta: Exponent = 0.6
+    start: Annotated[int, Field(ge=0, le=10**12)] = 0
 
 
-def stored_dtype(space: Space, images: str) -> torch.dtype | None:
-    """Returns the dtype in which values of a leaf space are stored; None if it does not change.
-    Integers are stored in the smallest dtype that holds them.
+def defaults_from(settings: ReplaySettings) -> BeforeValidator:
+    """Returns a validator for annotations: a dict of some settings takes the others from `settings`
+    instead of from the class.
     """
-    if isinstance(space, spaces.MultiDiscrete):
-        dtypes = torch.uint8, torch.int16, torch.int32
-        return next(dtype for dtype in dtypes if space.n_actions - 1 <= torch.iinfo(dtype).max)
-    if isinstance(space, spaces.MultiImage) and images == "uint8":
-        return torch.uint8
-    return None
+
+    def complete(value) -> object:
+        return dataclasses.asdict(settings) | value if isinstance(value, dict) else value
+
+    return BeforeValidator(complete)
 
 
-def cast(values: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """Returns values in another dtype. Fractions from 0 to 1 become integers from 0 to 255 and
-    back; float16 is clipped to its range.
-    """
-    source = values.dtype
-    if source.is_floating_point and dtype == torch.uint8:
-        return (values * 255).round_().clamp_(0, 255).to(dtype)
-    if source == torch.uint8 and dtype.is_floating_point:
-        return values.to(dtype) / 255
-    if dtype == torch.float16 and source != dtype:
-        largest = torch.finfo(dtype).max
-        return values.clamp(-largest, largest).to(dtype)
-    return values.to(dtype)
+def _read_entries(rows, index) -> torch.Tensor:
+    """Returns entries (..., *) of rows (R, B, *). Entry r B + b is lane b of row r."""
+    return rows.flatten(0, 1).index_select(0, index.flatten()).unflatten(0, index.shape)
 
 
 # ---- On a GPU ----
 
 
-def _parts(replay) -> tuple[list[Column], list[int], TreeSpec]:
-    """Returns the columns of a sequence's tensors, how many rows it has of each, and their tree."""
-    columns, n_rows = [], []
-    tree = arrdict(replay.columns, state=replay.state)
-    for name, part in tree.items():
-        of_part, _ = tree_flatten(part)
-        length = 1 if name == "state" else replay.length + (name in _WITH_LAST)
-        columns += of_part
-        n_rows += [length] * len(of_part)
-    return columns, n_rows, tree_flatten(tree)[1]
-
-
 def _can_read(replay, index, probability) -> bool:
-    columns, *_ = _parts(replay)
-    n_words = (replay.length + 1) * len(index)
-    return len(columns) <= _MAX_TENSORS and all(
-        column.rows.is_cuda
-        and column.rows.is_contiguous()
-        and (column.rows.dtype == column.dtype or (column.rows.dtype, column.dtype) in _CONVERSIONS)
-        and column.rows.shape[0] * column.rows.shape[1] < _MAX_ENTRIES
-        and n_words * math.prod(column.rows.shape[2:]) * column.rows.element_size() < _MAX_ENTRIES
-        for column in columns
+    tensors = leaves(arrdict(replay.rows, state=replay.state))
+    n_rows = (replay.length + 1) * len(index)
+    return len(tensors) <= _MAX_TENSORS and all(
+        rows.is_cuda
+        and rows.is_contiguous()
+        and rows.shape[0] * rows.shape[1] < _MAX_ENTRIES
+        and n_rows * math.prod(rows.shape[2:]) * rows.element_size() < _MAX_ENTRIES
+        for rows in tensors
     )
 
 
 def _read_on_gpu(replay, index, probability) -> arrdict:
-    columns, n_rows, spec = _parts(replay)
-    n_sequences, n_steps, device, packed_rows = len(index), replay.length, index.device, []
-    results, n_blocks = [], 1 + -(-(n_steps + 1) * n_sequences // _READ_THREADS)
-    for column, n in zip(columns, n_rows, strict=True):
-        rows, dtype = column.rows, column.dtype
-        result = torch.empty(n, n_sequences, *rows.shape[2:], dtype=dtype, device=device)
-        n_words, kind = math.prod(rows.shape[2:]), _CONVERSIONS.get((rows.dtype, dtype))
+    n_sequences, n_steps, device = len(index), replay.length, index.device
+    n_blocks = 1 + -(-(n_steps + 1) * n_sequences // _READ_THREADS)
+    packed_tensors = []
+
+    def read(rows, n_rows, dtype) -> torch.Tensor:
+        nonlocal n_blocks
+        result = torch.empty(n_rows, n_sequences, *rows.shape[2:], dtype=dtype, device=device)
+        word_size, n_words = 0, math.prod(rows.shape[2:])  # 0: float16 to float32
         if rows.dtype == dtype:
             n_bytes = n_words * rows.element_size()
             addresses = n_bytes | rows.data_ptr() | result.data_ptr()
-            word_size = next(size for size in _COPIES if not addresses % size)
-            n_words, kind = n_bytes // word_size, _COPIES[word_size]
-        packed_rows.append(
-            LIBRARY.params.ReadTensorParams(
-                **dict(target=result, source=rows, n_rows=n, n_words=n_words, kind=kind),
-                **dict(rows_per_rollout=len(rows) // replay.n_rollouts, first_block=n_blocks),
-            )
-        )
-        results.append(result)
-        n_blocks += -(-n * n_sequences * n_words // _READ_THREADS)
+            word_size = next(size for size in (16, 8, 4, 2, 1) if not addresses % size)
+            n_words = n_bytes // word_size
+        sizes = dict(n_rows=n_rows, n_words=n_words, word_size=word_size, first_block=n_blocks)
+        sizes["rows_per_rollout"] = len(rows) // replay.n_rollouts
+        packed_tensors.append(LIBRARY.params.ReadTensorParams(target=result, source=rows, **sizes))
+        n_blocks += -(-n_rows * n_sequences * n_words // _READ_THREADS)
+        return result
+
+    n_rows = {name: n_steps + (name in _WITH_LAST) for name in (*replay.rows, *_FLAGS)}
+    batch = arrdict()
+    for name, part in replay.rows.items():
+        tensors, spec = tree_flatten(part)
+        results = [read(rows, n_rows[name], rows.dtype) for rows in tensors]
+        batch[name] = tree_unflatten(results, spec)
+    batch["state"] = replay.state.map(lambda rows: read(rows, 1, torch.float32)[0])
     flags = {
-        name: torch.empty(
-            n_steps + (name in _WITH_LAST), n_sequences, dtype=torch.bool, device=device
-        )
+        name: torch.empty(n_rows[name], n_sequences, dtype=torch.bool, device=device)
         for name in _FLAGS
     }
     weights, age = torch.empty_like(probability), torch.empty_like(index)
     weight = torch.empty_like(probability, dtype=torch.float32)
     launch(
         *(LIBRARY, "read_sequences", device, Blocks(n_blocks, threads=_READ_THREADS)),
-        **dict(tensors=b"".join(packed_rows), flags=replay.flags.rows, **flags),
+        **dict(tensors=b"".join(packed_tensors), flags=replay.flags, **flags),
         **dict(index=index, probability=probability, weights=weights, weight=weight, age=age),
         **dict(n_added=replay.n_added, n_available=replay.n_available),
-        **dict(n_tensors=len(columns), n_sequences=n_sequences, n_steps=n_steps),
+        **dict(n_tensors=len(packed_tensors), n_sequences=n_sequences, n_steps=n_steps),
         **dict(n_lanes=replay.n_lanes, n_rollouts=replay.n_rollouts),
         **dict(rows_per_rollout=replay.n_steps, beta=replay.settings.beta),
     )
-    batch = arrdict(tree_unflatten(results, spec), weight=weight, age=age, **flags)
-    batch["state"] = mapping(lambda leaf: leaf[0])(batch.state)
-    return batch
+    return arrdict(batch, weight=weight, age=age, **flags)
 
 
-def _store_priorities_on_gpu(replay, index, errors) -> None:
+def _set_priorities_on_gpu(replay, index, errors) -> None:
     settings, values = replay.settings, torch.empty_like(errors, dtype=torch.float64)
     first_rollouts = -(-settings.start // (replay.n_steps * replay.n_lanes))
     launch(
@@ -191,48 +159,36 @@ class ReplayBuffer:
 
     Args:
         rollout: an example of the rollouts to store; only its shapes, dtypes and device are used.
-        obs_space, action_space: the environment's.
         settings: capacity, sequence length, priorities.
         logprobs: whether to store log-probabilities.
 
     Raises:
-        ValueError: if the capacity is too small for a sequence.
+        ValueError: if the capacity is too small for a sequence per lane.
     """
 
-    def __init__(
-        self,
-        rollout: Rollout,
-        obs_space: Space,
-        action_space: Space,
-        settings: ReplaySettings,
-        logprobs: bool = True,
-    ):
+    def __init__(self, rollout: Rollout, settings: ReplaySettings, logprobs: bool = True):
         self.settings, self.n_steps, self.n_lanes = settings, rollout.n_steps, rollout.n_lanes
         self.length = self.n_steps + settings.burn_in
-        self.n_rollouts = settings.n_rollouts(self.n_steps, self.n_lanes)
+        # of a sequence and the observation after it
+        self.rollouts_per_sequence = self.length // self.n_steps + 1
+        per_rollout = self.n_steps * self.n_lanes
+        if settings.capacity < (needed := self.rollouts_per_sequence * per_rollout):
+            raise ValueError(
+                f"replay.capacity={settings.capacity:,} is too small for a sequence of "
+                f"{self.length} steps of each of {self.n_lanes:,} lanes, stored {self.n_steps} "
+                f"steps at a time: use at least {needed:,}, or fewer environments"
+            )
+        self.n_rollouts = settings.capacity // per_rollout
         device = rollout.reward.device
         n_rows = self.n_rollouts * self.n_steps
-
-        def column(leaf, space=None) -> Column:  # for a leaf (T, B, ...) of the rollout
-            stored = None if space is None else stored_dtype(space, settings.images)
-            return Column(n_rows, leaf.shape[1:], leaf.dtype, stored, device)
-
-        def column_of_state(leaf) -> Column:
-            return Column(self.n_rollouts, leaf.shape, leaf.dtype, torch.float16, device)
-
-        self.columns = arrdict(
-            obs=spaces.map(column, rollout.obs, obs_space),
-            actions=spaces.map(column, rollout.actions, action_space),
-            reward=column(rollout.reward),
+        zeros = mapping(lambda leaf: leaf.new_zeros(n_rows, *leaf.shape[1:]))
+        names = "obs", "actions", "reward", *["logprobs"] * logprobs, "privileged", "mask"
+        parts = {name: getattr(rollout, name) for name in names}
+        self.rows = arrdict({name: zeros(x) for name, x in parts.items() if x is not None})
+        self.flags = torch.zeros(n_rows, self.n_lanes, dtype=torch.uint8, device=device)
+        self.state = rollout.state.map(
+            lambda leaf: leaf.new_zeros(self.n_rollouts, *leaf.shape, dtype=torch.float16)
         )
-        parts = dict(privileged=rollout.privileged, mask=rollout.mask)
-        if logprobs:
-            parts = dict(logprobs=rollout.logprobs) | parts
-        for name, part in parts.items():
-            if part is not None:
-                self.columns[name] = mapping(column)(part)
-        self.flags = Column(n_rows, (self.n_lanes,), torch.uint8, None, device)
-        self.state = mapping(column_of_state)(rollout.state)
         self.tree = SumTree(self.n_rollouts * self.n_lanes, device)
         self.is_finite = torch.zeros(self.n_rollouts, dtype=torch.bool, device=device)
         self.n_added = torch.zeros(1, dtype=torch.int64, device=device)  # rollouts, in total
@@ -248,9 +204,8 @@ class ReplayBuffer:
     @property
     def bytes(self) -> int:
         """Size in bytes."""
-        columns = [*leaves(self.columns), *leaves(self.state), self.flags]
-        tensors = [self.is_finite, self.n_added, self.n_available, self.new_priority]
-        tensors += [column.rows for column in columns] + self.tree.levels
+        tensors = [self.is_finite, self.n_added, self.n_available, self.new_priority, self.flags]
+        tensors += [*leaves(self.rows), *leaves(self.state), *self.tree.levels]
         return sum(tensor.nbytes for tensor in tensors)
 
     @property
@@ -267,27 +222,27 @@ class ReplayBuffer:
         sequence can be drawn.
         """
         is_finite = torch.ones_like(self.is_finite[:1]) & is_finite
-        steps = torch.arange(self.n_steps, device=self.n_added.device)
         lanes = torch.arange(self.n_lanes, device=self.n_added.device)
         slot = self.n_added % self.n_rollouts
-        rows = slot * self.n_steps + steps
+        index = slot * self.n_steps + torch.arange(self.n_steps, device=self.n_added.device)
 
-        def write(column, leaf) -> None:
-            column.write(rows, torch.where(is_finite, leaf, leaf.new_zeros(())))
+        def store(rows, leaf) -> None:
+            leaf = torch.where(is_finite, leaf[: self.n_steps], leaf.new_zeros(()))
+            rows.index_copy_(0, index, leaf)
 
-        for name, columns in self.columns.items():
-            spaces.map(write, columns, getattr(rollout, name))
+        for name, rows in self.rows.items():
+            spaces.map(store, rows, getattr(rollout, name))
         bits = [getattr(rollout, name)[: self.n_steps].byte() << i for i, name in enumerate(_FLAGS)]
-        self.flags.write(rows, torch.as_tensor(sum(bits)))
-        spaces.map(lambda column, leaf: column.write(slot, leaf[None]), self.state, rollout.state)
+        self.flags.index_copy_(0, index, torch.as_tensor(sum(bits)))
+        limited = rollout.state.map(lambda leaf: leaf.clamp(-_LARGEST_HALF, _LARGEST_HALF).half())
+        spaces.map(lambda rows, leaf: rows.index_copy_(0, slot, leaf[None]), self.state, limited)
         self.is_finite.index_copy_(0, slot, is_finite)
         self.n_added += 1
 
         self.tree.set(slot * self.n_lanes + lanes, torch.zeros_like(lanes))
         # The latest sequences that are complete: their last row has just been stored
-        n_touched = self.settings.rollouts_per_sequence(self.n_steps)
-        offsets = torch.arange(n_touched, device=slot.device)
-        first = self.n_added - n_touched
+        offsets = torch.arange(self.rollouts_per_sequence, device=slot.device)
+        first = self.n_added - self.rollouts_per_sequence
         is_whole = (first >= 0) & self.is_finite[(first + offsets) % self.n_rollouts].all()
         slot = first % self.n_rollouts
         priorities = (self.new_priority * is_whole).expand(self.n_lanes)
@@ -304,9 +259,7 @@ class ReplayBuffer:
         al. 2016, sec. 3.4); and `age`, number of rollouts added since the one in which it starts.
         """
         index, probability = self.tree.draw(n, generator)
-        batch = self._read(index, probability)
-        batch["index"], batch["probability"] = index, probability
-        return batch
+        return arrdict(self._read(index, probability), index=index, probability=probability)
 
     @fused(_read_on_gpu, _can_read)
     def _read(self, index, probability) -> arrdict:
@@ -314,35 +267,33 @@ class ReplayBuffer:
         slot, lane = index // self.n_lanes, index % self.n_lanes
         window = torch.arange(self.length + 1, device=index.device)[:, None]
         rows = (slot * self.n_steps + window) % (self.n_rollouts * self.n_steps)
-        rows = rows * self.n_lanes + lane  # (L+1, M), among rows (K T B, ...)
+        entries = rows * self.n_lanes + lane  # (L+1, M), among (K T B, ...)
         batch = arrdict()
-        for name, columns in self.columns.items():
-            batch[name] = mapping(Column.read)(columns, rows if name in _WITH_LAST else rows[:-1])
-        flags = self.flags.read(rows)
+        for name, stored in self.rows.items():
+            its_entries = entries if name in _WITH_LAST else entries[:-1]
+            batch[name] = mapping(lambda leaf, at=its_entries: _read_entries(leaf, at))(stored)
+        flags = _read_entries(self.flags, entries)
         for i, name in enumerate(_FLAGS):
             flag = (flags >> i & 1).bool()
             batch[name] = flag if name in _WITH_LAST else flag[:-1]
-        batch["state"] = mapping(Column.read)(self.state, index)
+        batch["state"] = self.state.map(lambda leaf: _read_entries(leaf, index).float())
         weight = (self.n_available * probability).clamp(min=1e-30) ** -self.settings.beta
         batch["weight"] = (weight / weight.amax()).float()
         batch["age"] = (self.n_added - 1 - slot) % self.n_rollouts
         return batch
 
     @torch.no_grad()
-    def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
-        """Sets the priorities of the last sample's sequences to `values`, (M,), to the power alpha.
-        Skips non-finite values. Does nothing if alpha is 0, or before `is_ready`.
+    def set_priorities(self, index: torch.Tensor, errors: torch.Tensor) -> None:
+        """Sets the priorities of the last sample's sequences to `errors`, (M,), to the power alpha.
+        Skips non-finite ones. Does nothing if alpha is 0, or before `is_ready`.
         """
         if self.settings.alpha:
-            self._store_priorities(index, values)
+            self._set_priorities(index, errors)
 
-    @fused(
-        _store_priorities_on_gpu,
-        lambda self, index, errors: has_kernels(self.tree, len(index)),
-    )
-    def _store_priorities(self, index, values) -> None:
+    @fused(_set_priorities_on_gpu, lambda self, index, _: has_kernels(self.tree, len(index)))
+    def _set_priorities(self, index, errors) -> None:
         old = self.tree.priorities.index_select(0, index)
-        new = values.double().clamp(min=_MIN_PRIORITY) ** self.settings.alpha
+        new = errors.double().clamp(min=_MIN_PRIORITY) ** self.settings.alpha
         # old is 0 where the sequence cannot be drawn
         is_set = self.is_ready & (old > 0) & new.isfinite()
         self.tree.set(index, torch.where(is_set, new, old))
@@ -351,8 +302,10 @@ class ReplayBuffer:
 
     def state_dict(self) -> dict[str, Tree]:
         """Returns the stored rollouts, priorities and counts. Synchronises."""
-        n_filled = min(int(self.n_added), self.n_rollouts)
-        stored = self._rows(n_filled)
+        n_rollouts = min(int(self.n_added), self.n_rollouts)
+        first = mapping(lambda rows: rows[: n_rollouts * self.n_steps])
+        stored = dict(first(self.rows), flags=first(self.flags))
+        stored["state"] = self.state.map(lambda rows: rows[:n_rollouts])
         levels = {str(i): level for i, level in enumerate(self.tree.levels)}
         names = "is_finite", "n_added", "n_available", "new_priority"
         return dict(stored=stored, tree=levels, **{name: getattr(self, name) for name in names})
@@ -362,20 +315,13 @@ class ReplayBuffer:
         self.n_added.copy_(state["n_added"])
         copy_tree(self.state_dict(), state)
 
-    def _rows(self, n_rollouts) -> dict[str, object]:
-        """Returns the first `n_rollouts` rollouts of every column, as views."""
-        rows = mapping(lambda column: column.rows[: n_rollouts * self.n_steps])
-        state = mapping(lambda column: column.rows[:n_rollouts])(self.state)
-        return dict(rows(self.columns), flags=rows(self.flags), state=state)
-
 
 def bytes_per_observation(
     env: Env, policy: Policy, n_steps: int, settings: ReplaySettings, logprobs: bool = True
 ) -> float:
     """Returns the size in bytes of a replay buffer per observation, everything included."""
     meta = torch.device("meta")
-    env_spaces = env.obs_space, env.action_space
-    state = policy.initial(1, meta)
-    rollout = Rollout(n_steps, 1, *env_spaces, state, meta, policy.privileged_space, values=False)
-    replay_buffer = ReplayBuffer(rollout, *env_spaces, settings, logprobs)
+    state, of_env = policy.initial(1, meta), (env.obs_space, env.action_space)
+    rollout = Rollout(n_steps, 1, *of_env, state, meta, policy.privileged_space, values=False)
+    replay_buffer = ReplayBuffer(rollout, settings, logprobs)
     return replay_buffer.bytes / replay_buffer.capacity

@@ -111,8 +111,7 @@ class Timing:
             perf/rate: samples per second since the last report.
             perf/seconds: seconds of training so far.
             perf/seconds_to_stop: seconds of training at which an evaluation reached `stop`.
-            perf/collect: seconds of collecting since the last report, on a GPU of the GPU; with
-                `learner.lag`, as far as the learner waits for it.
+            perf/collect: seconds of collecting since the last report, on a GPU of the GPU.
             perf/update: seconds of updates, in the same way.
             perf/rest: seconds of everything else: statistics, logging, checkpoints, evaluations.
             perf/memory_allocated: on a GPU, bytes of tensors.

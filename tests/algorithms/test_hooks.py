@@ -14,7 +14,7 @@ from megastep.agents.cli import evaluate, export, record, train
 from megastep.agents.errors import UserError
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import json_lines
-from megastep.agents.storage.replay_settings import ReplaySettings
+from megastep.agents.storage.replay import ReplaySettings
 from tests.helpers import headed, pages
 from tests.helpers.made_up import PRIVILEGED, Numbers, made_up, weights
 from tests.helpers.tiny import ON_GPU, TINY

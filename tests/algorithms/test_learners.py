@@ -245,7 +245,7 @@ def test_init_from_other_learner(tmp_path, monkeypatch, capsys):
     assert train.main([*TINY, f"samples={UPDATE}", "folder=first"]) == 0
     words = [word for word in TINY if not word.startswith("agent.width")]
     words += ["learner=vtrace", "init=first", "learner.lr=1e-30", f"samples={UPDATE}"]
-    assert train.main([*words, "learner.lag=1", "folder=second"]) == 0
+    assert train.main([*words, "folder=second"]) == 0
     first, second = (
         checkpoint.load_latest(tmp_path / run / "checkpoints") for run in ("first", "second")
     )
@@ -279,10 +279,6 @@ REPLAY = ["learner=vtrace", "learner.buffer=replay"]
 @pytest.mark.parametrize(
     "words, cure",
     [
-        (
-            ["learner=vtrace", "learner.lag=1", "opponents.past=0.5"],
-            "learner.lag=0",
-        ),
         ([*REPLAY, "learner.replay.capacity=40_000_000_000"], "on cpu may be used: at most"),
         ([*REPLAY, "learner.replay.capacity=40"], "at least 64"),
         ([*REPLAY, "learner.replay.capcity=9"], "did you mean learner.replay.capacity?"),

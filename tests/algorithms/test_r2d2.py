@@ -9,7 +9,7 @@ from megastep.agents.algorithms import r2d2, returns
 from megastep.agents.cli import evaluate, train
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import checkpoint
-from megastep.agents.storage.replay_settings import ReplaySettings
+from megastep.agents.storage.replay import ReplaySettings
 from megastep.arrdict import arrdict
 from tests.helpers.tiny import TINY, UPDATE
 
@@ -129,7 +129,7 @@ def by_hand(learner, batch, m, gamma, n, eta):
 def test_errors_and_priorities_match_hand_calculation(burn_in):
     learner, collect = make(burn_in=burn_in, gamma=0.9, return_steps=3, eta=0.7, lr=1e-2)
     update(learner, collect, 6)  # after which the target differs from the policy
-    learner.replay_buffer.flags.rows[5::7, ::2] &= ~2  # some steps do not learn
+    learner.replay_buffer.flags[5::7, ::2] &= ~2  # some steps do not learn
     batch = learner.replay_buffer.sample(5, torch.Generator().manual_seed(0))
     assert not batch.learns[burn_in:-1].all()
     with torch.no_grad():

@@ -28,11 +28,9 @@ slow = pytest.mark.slow
 CASES = {
     "ppo": [*tiny.TINY, *tiny.SHORT_EPISODES],
     "vtrace": [*tiny.TINY, "learner=vtrace"],
-    "lag": [*tiny.TINY, "learner=vtrace", "learner.lag=1"],
-    "lag2": [*tiny.TINY, "learner=vtrace", "learner.lag=2"],
     "priorities": [
         *(*tiny.TINY, "learner=vtrace", "learner.buffer=replay", *REPLAY),
-        *("learner.replay.alpha=0.6", "learner.lag=1"),
+        "learner.replay.alpha=0.6",
     ],
     "r2d2": [
         *("env=minimal", "env.res=8", *SMALL, "learner=r2d2", "learner.gradient_steps=2"),
@@ -80,7 +78,6 @@ CASES = {
 }
 FAST = (
     "explorer",
-    "lag",
     "priorities",
     "r2d2",
     "opponents",
@@ -90,7 +87,7 @@ FAST = (
     "wrappers",
 )
 #: What shares its state with a case of the other tiers.
-NIGHTLY = ("lag2", "gru", "none", "memory", "pointgoal", "sfl", "pong")
+NIGHTLY = ("gru", "none", "memory", "pointgoal", "sfl", "pong")
 
 
 def tiers(case):

@@ -9,7 +9,7 @@ from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.r2d2 import R2D2
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.replay_settings import ReplaySettings
+from megastep.agents.storage.replay import ReplaySettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,6 @@ _R2D2 = dict(
 LEARNERS = {
     "ppo": Kind(PPO, _PPO),
     "vtrace": Kind(VTrace, _VTRACE),
-    "vtrace-lag": Kind(VTrace, dict(_VTRACE, lag=1)),
     "vtrace-replay": Kind(VTrace, dict(_VTRACE, buffer="replay", replay=_VTRACE_REPLAY)),
     "r2d2": Kind(R2D2, _R2D2, dict(output="duelling")),
 }

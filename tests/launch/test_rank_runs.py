@@ -17,7 +17,7 @@ from tests.cli.test_exact_resume import CASES, EVERY_UPDATE, differences
 from tests.helpers import ranks, tiny
 
 pytestmark = pytest.mark.slow
-LEARNERS = "ppo", "lag", "r2d2", "opponents"
+LEARNERS = "ppo", "vtrace", "r2d2", "opponents"
 NO_FINISH = "finish.evaluate=false", "finish.record=false"
 PPO = [*tiny.TINY, *tiny.SHORT_EPISODES]
 

@@ -502,7 +502,7 @@ def newest(folder):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("case", ("r2d2", "vtrace", "lag", "wrappers"))
+@pytest.mark.parametrize("case", ("r2d2", "vtrace", "wrappers"))
 def test_copies_of_every_learner_resume_with_the_same_bits(here, monkeypatch, case):
     """What a copy leaves out would come back from the checkpoint, or not."""
 

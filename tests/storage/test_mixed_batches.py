@@ -6,8 +6,7 @@ import torch
 from megastep import spaces
 from megastep.agents.algorithms import vtrace
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.replay import ReplayBuffer
-from megastep.agents.storage.replay_settings import ReplaySettings
+from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings
 from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
 
@@ -36,7 +35,7 @@ def batch_of(n_rollouts, n=5, burn_in=0, **settings):
     settings = ReplaySettings(capacity=4 * T * B, burn_in=burn_in, **settings)
     for i, rollout in enumerate(rollouts(policy, n_rollouts)):
         if i == 0:
-            replay = ReplayBuffer(rollout, OBS, MOVES, settings)
+            replay = ReplayBuffer(rollout, settings)
         replay.add(rollout)
     generator = torch.Generator().manual_seed(1)
     batch = rollout.sequences(LANES)

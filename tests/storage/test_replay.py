@@ -7,8 +7,7 @@ import torch
 from torch import testing
 
 from megastep import spaces
-from megastep.agents.storage.replay import ReplayBuffer
-from megastep.agents.storage.replay_settings import ReplaySettings
+from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings
 from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
 from megastep.capture import Graph
@@ -127,7 +126,7 @@ def leaf_of(tree, path):
 def buffer_of(world, n_rollouts, length, **settings):
     settings["burn_in"] = length - world.n_steps
     settings = ReplaySettings(capacity=n_rollouts * world.n_steps * B + 1, **settings)
-    return ReplayBuffer(world.rollout, OBS, ACTIONS, settings)
+    return ReplayBuffer(world.rollout, settings)
 
 
 def compare(replay, lists, n=20):
@@ -191,8 +190,8 @@ def test_nonfinite_rollouts_are_never_drawn():
 def test_unwritten_rows_are_never_drawn(length):
     world, poison = World(4, privileged=False), -77
     replay = buffer_of(world, 5, length=length)
-    for column in [*leaves(replay.columns), *leaves(replay.state)]:
-        column.rows.fill_(poison if column.rows.dtype != torch.uint8 else 177)
+    for rows in [*leaves(replay.rows), *leaves(replay.state)]:
+        rows.fill_(poison if rows.dtype != torch.uint8 else 177)
     lists = Lists(5, 4, length)
     for _ in range(7):
         rollout = world.next()
@@ -258,23 +257,6 @@ def test_alpha_zero_ignores_priorities():
     assert torch.equal(batch.weight, torch.ones(900))
 
 
-def test_uint8_images_round_and_clip(device):
-    world = World(4, device)
-    replay = buffer_of(world, 2, length=4, images="uint8")
-    assert replay.columns.obs.eye.rows.dtype == torch.uint8
-    rollout = world.next()
-    rollout.obs.eye[1, :, 0, 0, 0, 0], rollout.obs.eye[1, :, 0, 0, 0, 1] = -3.0, 9.0
-    expected = rollout.obs.eye[:4].clamp(0, 1)
-    raw = rollout.obs.raw[:4].clone()
-    replay.add(rollout)
-    replay.add(world.next())
-    batch = replay.sample(B, torch.Generator(device).manual_seed(0))  # each lane once
-    assert batch.obs.eye.dtype == torch.float16
-    # half a step of 1/255, and float16's rounding
-    testing.assert_close(batch.obs.eye[:4], expected, rtol=0, atol=0.5 / 255 + 5e-4)
-    assert torch.equal(batch.obs.raw[:4], raw), "uint8 spaces are stored exactly"
-
-
 def test_priorities_do_not_change_before_start():
     world, steps = World(4), []
     replay = buffer_of(world, 5, length=4, start=4 * 4 * B, alpha=1.0)
@@ -338,19 +320,18 @@ def moved(replay, to):
     return replay
 
 
-@pytest.mark.parametrize("images", ["fp16", "uint8"])
 @pytest.mark.parametrize("n_steps, length, n", [(4, 6, 32), (3, 3, 1), (5, 10, 300)])
-def test_kernels_match_pytorch(n_steps, length, n, images, to_gpu):
+def test_kernels_match_pytorch(n_steps, length, n, to_gpu):
     world = World(n_steps)
     # exponents that float32 has
-    plain = buffer_of(world, 4, length=length, alpha=0.5, beta=0.75, images=images)
+    plain = buffer_of(world, 4, length=length, alpha=0.5, beta=0.75)
     for _ in range(9):
         plain.add(world.next())
     first = torch.arange(plain.tree.n)
     plain.set_priorities(first, torch.rand(len(first), generator=world.generator) + 0.1)
     fused = moved(plain, to_gpu)
 
-    device = fused.flags.rows.device
+    device = fused.flags.device
     batch = fused.sample(n, torch.Generator(device).manual_seed(1))
     expected = plain._read(batch.index.cpu(), batch.probability.cpu())
     assert plain.tree.priorities[batch.index.cpu()].all()

@@ -208,10 +208,10 @@ def test_run_logs_outcomes_by_source(here):
 @pytest.mark.parametrize(
     "words",
     [
-        [*POINTGOAL, "learner=vtrace", "learner.lag=1", "env.resample=false", "env.n_envs=2"],
+        [*POINTGOAL, "learner=vtrace", "env.resample=false", "env.n_envs=2"],
         ["env=deathmatch", "env.n_agents=2", "env.limit=5", "opponents.bot=0.5"],
     ],
-    ids=["lag, fewer environments than homes", "opponents"],
+    ids=["fewer environments than homes", "opponents"],
 )
 def test_run_in_a_mix_logs_episodes_by_source(words, here):
     """Also without a curriculum. Every episode is one of its source's."""
@@ -252,7 +252,6 @@ def test_without_a_curriculum_nothing_is_stored_or_logged(here, trainers):
         (["env=pointgoal", "env.resample=false"], "use env.resample=true"),
         (["env=pointgoal", "geometry=box"], "there is one home only"),
         (["env=explorer", "env.metrics=false"], "none of the metrics that tell the outcome"),
-        (["env=explorer", "learner=vtrace", "learner.lag=1"], "use learner.lag=0"),
         (["env=tests.cli.test_exact_resume:Steered"], "Steered has no homes to draw"),
     ],
     ids=lambda value: value if isinstance(value, str) else None,

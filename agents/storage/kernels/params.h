@@ -80,7 +80,7 @@ struct ReadTensorParams {
     unsigned int n_words;           // per entry
     unsigned int rows_per_rollout;  // T, or 1 for hidden states
     unsigned int first_block;       // of the launch that reads it
-    int kind;
+    int word_size;                  // 1, 2, 4, 8 or 16 bytes; 0: float16 becomes float32
 };
 
 struct ReadSequencesParams {

@@ -34,41 +34,24 @@ DEVICE void read_word(const ReadSequencesParams& p, const ReadTensorParams& tens
     long long from = entry(p, sequence, t, tensor.rows_per_rollout) * tensor.n_words + word;
     const void* source = tensor.source;
     void* target = tensor.target;
-    switch (tensor.kind) {
-        case COPY_16:
+    switch (tensor.word_size) {
+        case 16:
             ((uint4*)target)[at] = ((const uint4*)source)[from];
             break;
-        case COPY_8:
+        case 8:
             ((uint2*)target)[at] = ((const uint2*)source)[from];
             break;
-        case COPY_4:
+        case 4:
             ((unsigned int*)target)[at] = ((const unsigned int*)source)[from];
             break;
-        case COPY_2:
+        case 2:
             ((unsigned short*)target)[at] = ((const unsigned short*)source)[from];
             break;
-        case COPY_1:
+        case 1:
             ((unsigned char*)target)[at] = ((const unsigned char*)source)[from];
             break;
-        case BYTE_TO_LONG:
-            ((long long*)target)[at] = ((const unsigned char*)source)[from];
-            break;
-        case SHORT_TO_LONG:
-            ((long long*)target)[at] = ((const short*)source)[from];
-            break;
-        case INT_TO_LONG:
-            ((long long*)target)[at] = ((const int*)source)[from];
-            break;
-        case BYTE_TO_HALF:
-            ((unsigned short*)target)[at] =
-                HALF_BITS((float)((const unsigned char*)source)[from] / 255.f);
-            break;
-        case BYTE_TO_FLOAT:
-            ((float*)target)[at] = (float)((const unsigned char*)source)[from] / 255.f;
-            break;
-        case HALF_TO_FLOAT:
+        default:
             ((float*)target)[at] = HALF_VALUE(((const unsigned short*)source)[from]);
-            break;
     }
 }
 
