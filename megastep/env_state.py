@@ -3,12 +3,13 @@ what the environments of users keep besides tensors.
 """
 
 import collections
+import copy
 import enum
 import pathlib
 import random
 import re
 import types as python_types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from megastep.engine.state_tree import OPAQUE, children, is_expanded, node_at, r
 from megastep.read_only import ReadOnlyTensor
 from megastep.types import Env
 
-__all__ = ["EnvState"]
+__all__ = ["EnvState", "way_back"]
 
 _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
@@ -236,6 +237,14 @@ class EnvState:
             if hasattr(node, "__dict__"):
                 is_users = node is not self.root and not _is_ours(node)
             stack += [(path + step, child, is_users) for step, child in reversed(children(node))]
+
+
+def way_back(env: Env) -> Callable[[], None]:
+    """Returns a function that sets an environment back to where it is now."""
+    state = EnvState(env)
+    state._first_values, state._first_digests = {}, {}  # nothing is left out
+    first = copy.deepcopy(state.state_dict())
+    return lambda: state.load_state_dict(first)
 
 
 def record_of(node, is_users) -> tuple | None:

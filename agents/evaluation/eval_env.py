@@ -1,7 +1,8 @@
 """Where an evaluation plays, and who: agents of runs, packaged agents, and bots."""
 
+import collections
+import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -10,10 +11,14 @@ from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.shard import Shard
 from megastep.agents.errors import UserError
+from megastep.agents.evaluation import playing
 from megastep.agents.factory import settings
 from megastep.agents.generator import rank_seed
 from megastep.agents.runs import checkpoint, folders, restore
 from megastep.agents.selfplay.bots import BOTS
+from megastep.agents.selfplay.mixed_policy import rotating_slots
+from megastep.arrdict import arrdict
+from megastep.env_state import way_back
 from megastep.types import Env, PolicyLike, optional
 
 #: Settings of an environment for duels, where it has them: two agents, each environment in one
@@ -26,7 +31,12 @@ class Player(NamedTuple):
 
     name: str
     policy: PolicyLike
-    step: int | None = None  # the number of samples it has learnt from
+    loaded: checkpoint.Checkpoint | None = None  # an agent's
+
+    @property
+    def step(self) -> int | None:
+        """The number of samples it has learnt from."""
+        return self.loaded and self.loaded.step
 
 
 class EvalEnv:
@@ -44,8 +54,9 @@ class EvalEnv:
     Attributes:
         env, sample: the environment, with this rank's share of all lanes, and a small one.
         settings: those of `env`.
-        homes, numbers: the geometries played in, and the index of each in the list given.
+        homes: the geometries played in.
         shard: this rank's share.
+        slots: (n_envs, 1) int64, the slot of the agent that is evaluated, in duels.
     """
 
     def __init__(
@@ -64,24 +75,70 @@ class EvalEnv:
         n_agents = optional(self.sample, "n_agents")
         if is_duel:
             check_duels(self.sample)
-            n_each = max(1, episodes // n_agents)  # from each slot
-            n_each -= n_each % min(n_each, max(1, len(homes)))
-            n_envs, n_homes = n_each * n_agents, n_each
+            n_homes = max(1, episodes // n_agents)  # from each slot
+            n_homes -= n_homes % min(n_homes, max(1, len(homes)))
+            n_envs = n_homes * n_agents
         else:
             n_envs = -(-episodes // n_agents)
             n_envs += -n_envs % len(homes) if n_envs > len(homes) > 0 else 0
             n_homes = n_envs
         self.homes = factory.spread([*homes], n_homes)
-        self.numbers = factory.spread([*range(len(homes))], n_homes)
         self.shard = (Shard.of_this_rank if is_shared else Shard)(n_envs, len(self.homes))
         self.settings = settings.changed(env, n_envs=len(self.shard.envs))
-        where = dict(geometries=[self.homes[home] for home in self.shard.homes], device=device)
-        self.env: Env = factory.construct(self.settings, seed=self.seed, **where)
+        self.device, self._go_back, self._is_used = device, None, False
+        self.env: Env = self._made()
+        self.slots = rotating_slots(n_envs, n_agents, self.env.device)[[*self.shard.envs]]
 
-    def find_player(self, name: str, run: checkpoint.Checkpoint, trust: bool) -> Player:
-        """Returns who is to play in the environment, see `find_player`."""
-        player = find_player(name, run, self.settings, self.sample, trust)
-        return player._replace(policy=factory.in_env(player.policy, self.settings, self.env))
+    def _made(self) -> Env:
+        where = dict(geometries=[self.homes[home] for home in self.shard.homes], device=self.device)
+        return factory.construct(self.settings, seed=self.seed, **where)
+
+    def players(
+        self, names: Sequence[str], run: checkpoint.Checkpoint, trust: bool
+    ) -> list[Player]:
+        """Returns who is to play in the environment, see `find_player`. Those of equal names have
+        what was given for them beside it.
+        """
+        names = [*dict.fromkeys(names)]
+        found = [find_player(name, run, self.settings, self.sample, trust) for name in names]
+        counts = collections.Counter(player.name for player in found)
+        return [
+            Player(
+                f"{one.name} ({name})" if counts[one.name] > 1 else one.name,
+                factory.in_env(one.policy, self.settings, self.env),
+                one.loaded,
+            )
+            for one, name in zip(found, names, strict=True)
+        ]
+
+    def begin(self, run: checkpoint.Checkpoint, *players: Player) -> list[PolicyLike]:
+        """Returns the policies of players in the environment, which is as it was when it was made,
+        and whose wrappers know what those of the first player's run had learnt, of a bot those of
+        `run`.
+        """
+        policies = [player.policy for player in players]
+        if self._go_back is not None:
+            self._go_back()
+        elif optional(self.env, "resumable"):
+            self._go_back = way_back(self.env)
+        elif self._is_used:
+            optional(self.env, "close")()
+            self.env = self._made()
+            policies = [factory.in_env(policy, self.settings, self.env) for policy in policies]
+        self._is_used = True
+        restore.load_wrappers(self.env, players[0].loaded or run)
+        return policies
+
+    def duel(
+        self, cfg: settings.Evaluate, run: checkpoint.Checkpoint, player: Player, opponent: Player
+    ) -> arrdict:
+        """Returns the duels of two players, those of all ranks."""
+        policies, limit = self.begin(run, player, opponent), cfg.max_steps or playing.MAX_STEPS
+        with factory.errors():
+            played = playing.first_duels(
+                self.env, *policies, self.seed, cfg.greedy, limit, slots=self.slots
+            )
+        return self.shard.with_others(played)
 
     def warn_without_layout(self) -> None:
         """Warns if environments share homes and it is unknown which."""
@@ -102,18 +159,22 @@ def check_duels(env: Env) -> None:
         )
 
 
+def name_of(loaded: checkpoint.Checkpoint) -> str:
+    """Returns how tables name an agent."""
+    return f"{folders.name_of(loaded.path)}, {loaded.step:,} samples"
+
+
 def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpoint) -> Player:
     """Returns the player of a checkpoint, to meet the agent of `run` in `env`. Raises UserError if
     one was trained in another environment.
     """
-    trained, own = factory.config_of(loaded), factory.config_of(run)
-    if trained.env.name != own.env.name:
+    trained, own = (settings.label(factory.config_of(one).env.name) for one in (loaded, run))
+    if trained != own:
         raise UserError(
-            f"{loaded.path} was trained in {settings.label(trained.env.name)} and {run.path} in "
-            f"{settings.label(own.env.name)}; choose a run in the same environment"
+            f"{loaded.path} was trained in {trained} and {run.path} in {own}; choose a run in the "
+            "same environment"
         )
-    name = f"{folders.name_of(loaded.path)}, {loaded.step:,} samples"
-    return Player(name, restore.policy_of(loaded, env), loaded.step)
+    return Player(name_of(loaded), restore.policy_of(loaded, env), loaded)
 
 
 def find_player(
@@ -123,15 +184,17 @@ def find_player(
 
     Args:
         name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
-            import path, one of `BOTS`, or `bot`, which is the run's `opponents.bot_class`, or else
-            the environment's own bot.
+            import path, one of `BOTS`, or `bot`, the environment's own.
         trust: import what a run that another user made names.
 
     Raises:
         UserError: if this player cannot play there.
     """
-    if name == "bot":
-        name = factory.config_of(run).opponents.bot_class or name
-    if name in ("bot", *BOTS) or (":" in name and not Path(name).exists()):
+    if name in ("bot", *BOTS) or (":" in name and not os.path.exists(name)):
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
-    return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
+    try:
+        path = folders.find(name)
+    except UserError as error:
+        bots = "" if os.path.exists(name) else f" (bots are bot, {', '.join(BOTS)})"
+        raise UserError(f"{error}{bots}") from None
+    return load_player(folders.load_checkpoint(path, trust, env.device), env, run)

@@ -1,18 +1,15 @@
 """Measures a trained policy on unseen homes, or against others in duels."""
 
-import copy
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents import console, factory
 from megastep.agents.distributed import process_group
-from megastep.agents.evaluation import playing, ratings, statistics, tables
-from megastep.agents.evaluation.duels import Duels
-from megastep.agents.evaluation.eval_env import EvalEnv
+from megastep.agents.evaluation import eval_env, playing, ratings, statistics, tables
+from megastep.agents.evaluation.eval_env import EvalEnv, Player
 from megastep.agents.factory import env_failures, settings
 from megastep.agents.runs import checkpoint, folders, restore
-from megastep.env_state import EnvState
 from megastep.types import optional
 
 if TYPE_CHECKING:
@@ -39,32 +36,30 @@ def run(cfg: settings.Evaluate) -> Path:
     geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
     homes = factory.homes(env_settings, geometry, cfg.split)
     folder, rank = folders.folder_of(loaded.path), process_group.rank()
+    options = dict(episodes=cfg.episodes, seed=cfg.seed, device=device)
+    options["is_duel"] = cfg.ratings or cfg.against is not None
     with env_failures.caught(env_settings, folder, rank=rank):
         if cfg.ratings:
-            duels = Duels(cfg, loaded, env_settings, homes, device)
-            path = ratings.write(duels, tables.labels(duels.where, geometry, cfg.split))
+            where = EvalEnv(env_settings, homes, **options)
+            path = ratings.write(cfg, loaded, where, tables.labels(where, geometry, cfg.split))
         else:
-            path = _measure(cfg, loaded, env_settings, geometry, homes, device)
+            path = _measure(cfg, loaded, env_settings, geometry, homes, options)
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
 
 
-def _measure(cfg, loaded, env_settings, geometry, homes, device) -> Path:
-    rows, single = [], []
+def _measure(cfg, loaded, env_settings, geometry, homes, options) -> Path:
+    rows, differences, episodes = [], [], []
     numbers = {id(home): number for number, home in enumerate(homes)}
     for source, part in tables.parts_of(geometry, homes):
-        if cfg.against is not None:
-            duels = Duels(cfg, loaded, env_settings, part, device)
-            where, of_part = duels.where, duels.rows(source)
-        else:
-            where = EvalEnv(env_settings, part, cfg.episodes, cfg.seed, device)
-            of_part, each = play(cfg, loaded, where, source)
-            if source:  # the number among all homes, not among those of the source
-                for row in each:
-                    if "home" in row:
-                        row["home"] = numbers[id(part[row["home"]])]
-            single += each
-        rows += [row | ({"source": source} if source else {}) for row in of_part]
+        where = EvalEnv(env_settings, part, **options)
+        play = _play if cfg.against is None else _duel
+        of_part = play(cfg, loaded, where, source, [numbers[id(home)] for home in where.homes])
+        for one, found in zip((rows, differences), of_part, strict=False):
+            one += [row | ({"source": source} if source else {}) for row in found]
+        episodes += of_part[2]
+        if process_group.rank() == 0:
+            where.warn_without_layout()
     if process_group.rank() > 0:
         return folders.folder_of(loaded.path)
     labels = tables.labels(where, geometry, cfg.split)
@@ -72,57 +67,74 @@ def _measure(cfg, loaded, env_settings, geometry, homes, device) -> Path:
     names = [labels.source, "env" if cfg.env else "", cfg.split, str(loaded.step)]
     if cfg.against is not None:
         names = ["duels", labels.source, cfg.split, str(loaded.step), "against", *cfg.against]
-        title = f"{duels.agent.name}, in {title}, seed {cfg.seed}"
+        title = f"{eval_env.name_of(loaded)}, in {title}, seed {cfg.seed}"
     else:
         title += f", after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}"
-    return tables.write_table(cfg, loaded, names, title, rows, single)
+    return tables.write_table(cfg, loaded, names, title, rows, differences, episodes)
 
 
-def play(
-    cfg: settings.Evaluate, loaded: checkpoint.Checkpoint, where: EvalEnv, source: str | None
-) -> "tuple[list[Row], list[Row]]":
-    """Plays `cfg.episodes` with the run's agent and each of `cfg.baseline`, in homes of a `source`
-    or of several. Returns the rows of the table, and those of the episodes.
-
-    If the bot `oracle` is among them, all play the same episodes, and have a further metric,
-    `oracle_fraction`: what they found divided by what the oracle found in the same episode.
+def _duel(cfg, loaded, where, source, _) -> "tuple[list[Row], list[Row], list[Row]]":
+    """Plays the run's agent against each of `cfg.against`, all from the same places with the same
+    draws, in homes of a `source` or of several. Returns the rows of the table.
     """
-    env, policy = where.env, restore.policy_of(loaded, where.env)
-    restore.load_wrappers(env, loaded)
-    all_play: list = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
-    for name in cfg.baseline:
-        player = where.find_player(name, loaded, cfg.trust)
-        all_play.append((player.name, player.policy, cfg.greedy and player.step is not None))
-    names = [name for name, *_ in all_play]
-    state = EnvState(env) if ORACLE in names else None
-    # a copy, as the state's tensors are the environment's own
-    first = {} if state is None else copy.deepcopy(state.state_dict())
-    all_played = []
-    for _, policy, greedy in all_play:
-        if state is not None:
-            state.load_state_dict(first)
-        played = playing.first_episodes(env, policy, where.seed, greedy, cfg.max_steps)
-        all_played.append(where.shard.with_others(played))
-    if state is not None:
-        found = all_played[names.index(ORACLE)]["metrics"]["found"]
-        for played in all_played:
-            played["metrics"]["oracle_fraction"] = played["metrics"]["found"] / found.clamp(min=1)
-    roles, sources, rows, single = optional(env, "roles"), factory.sources_of(where.homes), [], []
-    is_first = process_group.rank() == 0
-    for name, played in zip(names, all_played, strict=True):
-        n_cut = int((~played["done"]).sum())
-        if n_cut and is_first:
-            limit = cfg.max_steps or optional(env, "max_episode_steps")
+    agent, rows = eval_env.load_player(loaded, where.sample, loaded), []
+    for opponent in where.players(cfg.against, loaded, cfg.trust):
+        played = where.duel(cfg, loaded, agent, opponent)
+        rows += [{"against": opponent.name, **row} for row in _rows(where, played, source)]
+    return rows, [], []
+
+
+def _play(
+    cfg: settings.Evaluate,
+    loaded: checkpoint.Checkpoint,
+    where: EvalEnv,
+    source: str | None,
+    numbers: list[int],
+) -> "tuple[list[Row], list[Row], list[Row]]":
+    """Plays `cfg.episodes` with the run's agent and each of `cfg.baseline`, all from the same
+    places with the same draws, in homes of a `source` or of several, which have `numbers`. Returns
+    the rows of the table, those of the agent less each other, and those of the episodes.
+
+    If the bot `oracle` is among them, all have a further metric, `oracle_fraction`: what they found
+    divided by what the oracle found in the same episode.
+    """
+    policy = restore.policy_of(loaded, where.env)
+    players = [Player("trained, greedy" if cfg.greedy else "trained", policy, loaded)]
+    players += where.players(cfg.baseline, loaded, cfg.trust)
+    played = {}
+    for player in players:
+        (policy,) = where.begin(loaded, player)
+        greedy = cfg.greedy and player.loaded is not None
+        one = playing.first_episodes(where.env, policy, where.seed, greedy, cfg.max_steps)
+        played[player.name] = where.shard.with_others(one)
+    if ORACLE in played:
+        found = played[ORACLE]["metrics"]["found"]
+        for one in played.values():
+            one["metrics"]["oracle_fraction"] = one["metrics"]["found"] / found.clamp(min=1)
+    rows, differences, episodes = [], [], []
+    roles, sources = optional(where.env, "roles"), factory.sources_of(where.homes)
+    (own_name, own), *_ = played.items()
+    for name, one in played.items():
+        n_cut = int((~one["done"]).sum())
+        if n_cut and process_group.rank() == 0:
+            limit = cfg.max_steps or optional(where.env, "max_episode_steps")
             console.warn(
-                f"{name}: {n_cut:,} of {len(played['done']):,} episodes had not ended after "
+                f"{name}: {n_cut:,} of {len(one['done']):,} episodes had not ended after "
                 f"{limit:,} steps and are counted as truncated there; max_steps= sets the limit"
             )
-        summaries = statistics.summaries(played, roles, None if source else sources)
-        if source == tables.DENSE and "homes" in played:
-            summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(played)})
-        rows += [{"agent": name, **row} for row in summaries]
-        each = statistics.rows_of(played, cfg.seed, where.numbers, sources, roles)
-        single += [{"agent": name, **row} for row in each]
-    if is_first:
-        where.warn_without_layout()
-    return rows, single
+        rows += [{"agent": name, **row} for row in _rows(where, one, source)]
+        if one is not own:
+            less = statistics.difference(own, one)
+            found = _rows(where, less, None if source is None else "")
+            differences += [{"agent": f"{own_name} - {name}", **row} for row in found]
+        each = statistics.rows_of(one, cfg.seed, numbers, sources, roles)
+        episodes += [{"agent": name, **row} for row in each]
+    return rows, differences, episodes
+
+
+def _rows(where, played, source) -> "list[Row]":
+    sources = factory.sources_of(where.homes) if source is None else None
+    rows = statistics.summaries(played, optional(where.env, "roles"), sources)
+    if source == tables.DENSE and "homes" in played:
+        rows.append({"tail": statistics.TAIL, **statistics.worst_summary(played)})
+    return rows

@@ -10,7 +10,7 @@ import torch
 from megastep import recording
 from megastep.agents import console, factory
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import duels, eval_env
+from megastep.agents.evaluation import eval_env, playing
 from megastep.agents.factory import components, env_failures, settings
 from megastep.agents.runs import folders, restore
 from megastep.agents.selfplay.bots.random import RandomActions
@@ -81,7 +81,7 @@ def _player(cfg, loaded, first, env_settings, env) -> PolicyLike:
     opponent = eval_env.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
     console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
     slot = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
-    return duels.duel_policy(policy, opponent.policy, slot, optional(env, "n_agents"))
+    return playing.duel_policy(policy, opponent.policy, slot, optional(env, "n_agents"))
 
 
 def take_free_name(path: Path) -> Path:

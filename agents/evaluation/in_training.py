@@ -1,6 +1,5 @@
 """Evaluations of a policy while it trains."""
 
-import contextlib
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,8 +11,7 @@ from megastep.agents.evaluation import playing
 from megastep.agents.evaluation.eval_env import EvalEnv
 from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
-from megastep.arrdict import clone
-from megastep.env_state import EnvState
+from megastep.env_state import way_back
 from megastep.settings import closest
 from megastep.types import Env, optional
 
@@ -36,16 +34,14 @@ class Evaluator:
     """
 
     def __init__(self, cfg: settings.Train, trained_in: Env, device: torch.device, ranks: "Ranks"):
-        homes = factory.homes(cfg.env, cfg.geometry, "test")
-        self.trained_in, self.state, self.start = trained_in, None, None
-        with _generators_kept(device):
-            self.where = EvalEnv(
-                cfg.env, homes, cfg.evaluation.episodes, cfg.seed, device, ranks.n > 1
-            )
-            names = ["return", "length", *self.where.env.reset().get("metrics", {})]
-            if optional(self.where.env, "resumable"):
-                self.state = EnvState(self.where.env)
-                self.start = clone(self.state.state_dict())
+        homes, n = factory.homes(cfg.env, cfg.geometry, "test"), cfg.evaluation.episodes
+        self.trained_in = trained_in
+        self.gpus = [device] if torch.device(device).type == "cuda" else []
+        with global_generators.kept(), torch.random.fork_rng(self.gpus):
+            self.where = EvalEnv(cfg.env, homes, n, cfg.seed, device, ranks.n > 1)
+            env = self.where.env
+            names = ["return", "length", *env.reset().get("metrics", {})]
+            self.go_back = way_back(env) if optional(env, "resumable") else None
         for name in cfg.evaluation.stop:
             if name not in names:
                 text = f"no evaluation here measures it; {closest(name, names)}"
@@ -56,9 +52,9 @@ class Evaluator:
         finished episodes of the lanes that learn, or of all if none does; NaN without one.
         """
         env = self.where.env
-        with _generators_kept(env.device):
-            if self.state is not None:
-                self.state.load_state_dict(clone(self.start))
+        with global_generators.kept(), torch.random.fork_rng(self.gpus):
+            if self.go_back is not None:
+                self.go_back()
             if learnt := optional(self.trained_in, "wrapper_state")():
                 optional(env, "load_wrapper_state")(learnt, True)
             played = playing.first_episodes(env, policy.actor(), self.where.seed)
@@ -67,11 +63,3 @@ class Evaluator:
         columns = {"return": played["returns"], "length": played["lengths"], **played["metrics"]}
         values = {name: column[counted].double() for name, column in columns.items()}
         return {name: float(x[x.isfinite()].mean()) for name, x in values.items()}
-
-
-def _generators_kept(device: torch.device) -> contextlib.ExitStack:
-    stack = contextlib.ExitStack()
-    stack.enter_context(global_generators.kept())
-    if torch.device(device).type == "cuda":
-        stack.enter_context(torch.random.fork_rng([device]))
-    return stack

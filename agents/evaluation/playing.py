@@ -1,4 +1,7 @@
-"""Plays episodes with a policy."""
+"""Plays episodes with a policy, and duels of two.
+
+N environments of A agents, B = N A lanes. A slot is the index of an agent in its environment.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -6,6 +9,7 @@ import torch
 from torch.utils import _pytree
 
 from megastep.agents.generator import SeededGenerator
+from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_slots, score_pairs
 from megastep.agents.storage.collector import capture_with
 from megastep.arrdict import arrdict
 from megastep.types import Env, PolicyLike, Tree, World, n_lanes, optional
@@ -13,6 +17,8 @@ from megastep.types import Env, PolicyLike, Tree, World, n_lanes, optional
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
 #: costs more than a few superfluous steps.
 CHECK_EVERY = 64
+#: A duel is a draw after this many steps.
+MAX_STEPS = 500
 #: Steps of a CUDA graph, a divisor of `CHECK_EVERY`.
 STEPS_PER_GRAPH = 16
 
@@ -142,3 +148,71 @@ def first_episodes(
     step_until(done, step, world, state, env, (policy,), changed, most)
     played = arrdict(returns=returns, lengths=lengths, done=done, terminal=terminal)
     return arrdict(played, learns=learns, metrics=metrics, envs=envs, **homes, **starts)
+
+
+# ---- Duels ----
+
+
+def duel_policy(
+    policy: PolicyLike, opponent: PolicyLike, slots: torch.Tensor, n_agents: int
+) -> MixedPolicy:
+    """Returns a policy that is `policy` in one slot per environment, of (N, 1) int64, and
+    `opponent` in the others.
+    """
+    in_slot = torch.zeros(len(slots), n_agents, dtype=torch.bool, device=slots.device)
+    in_slot = in_slot.scatter(1, slots, True).flatten()
+    lanes = torch.arange(len(in_slot), device=slots.device)
+    return MixedPolicy([policy, opponent], [lanes[in_slot], lanes[~in_slot]])
+
+
+@torch.no_grad()
+def first_duels(
+    env: Env,
+    policy: PolicyLike,
+    opponent: PolicyLike,
+    seed: int = 1,
+    greedy: bool = False,
+    max_steps: int = MAX_STEPS,
+    slots: torch.Tensor | None = None,
+) -> arrdict:
+    """Plays one duel per environment, from a reset.
+
+    A duel ends at the first step that is terminal for any of its agents; `score_pairs` decides who
+    won. It is a draw if the episode is truncated or `max_steps` is reached first. With more than
+    two agents, `opponent` controls all the others, and the score is the mean over decided pairs.
+
+    Args:
+        seed: of the action sampling.
+        greedy: takes the most likely actions instead of sampling.
+        slots: (N, 1) int64, the agent that `policy` controls; by default `rotating_slots`.
+
+    Returns:
+        An arrdict of `score`, float32: 1 if `policy` won, 0 if it lost, 0.5 for a draw; `lengths`,
+        float32 steps; `slots`, int64, the agent that `policy` controlled; and, if `env.layout`
+        exists, `homes`, int32, the layouts after the reset: (N,) each.
+    """
+    device, shape = torch.device(env.device), (env.n_envs, optional(env, "n_agents"))
+    draws = SeededGenerator(seed)
+    slots = rotating_slots(*shape, device) if slots is None else slots
+    both = duel_policy(policy, opponent, slots, shape[1])
+    world, state = env.reset(), both.initial(n_lanes(env), device)
+    layout = optional(env, "layout")
+    homes = {} if layout is None else {"homes": layout.clone()}
+    returns, lengths = torch.zeros(shape, device=device), torch.zeros(env.n_envs, device=device)
+    score, is_over = torch.full_like(lengths, 0.5), torch.zeros_like(lengths, dtype=torch.bool)
+
+    def step(world, state) -> tuple[World, Tree]:
+        decision, state = both(world, state, sample=not greedy, generator=draws.on(is_over.device))
+        world = env.step(decision)
+        terminal, truncated = world.terminal.view(shape), world.truncated.view(shape)
+        returns.add_(world.reward.view(shape))
+        lengths.add_(~is_over)
+        won, decided = score_pairs(terminal, returns, slots)
+        score.copy_(torch.where((decided > 0) & ~is_over, won / decided, score))
+        is_over.logical_or_((terminal | truncated).any(1))
+        return world, state
+
+    changed = both, draws, returns, lengths, score
+    step_until(is_over, step, world, state, env, (policy, opponent), changed, max_steps)
+    optional(env, "check")()
+    return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)

@@ -15,7 +15,8 @@ from megastep.agents import console
 from megastep.agents.distributed import process_group
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.evaluation import tables
-from megastep.agents.evaluation.duels import Duels
+from megastep.agents.evaluation.eval_env import EvalEnv
+from megastep.agents.factory import settings
 from megastep.agents.runs import checkpoint, folders
 from megastep.atomic_files import write_atomically
 
@@ -35,48 +36,51 @@ COLUMNS = {
 }
 
 
-def write(duels: Duels, labels: tables.Labels) -> Path:
-    """Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels of
+def write(
+    cfg: settings.Evaluate, run: checkpoint.Checkpoint, where: EvalEnv, labels: tables.Labels
+) -> Path:
+    """Rates a run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels of
     each with each. Prints a table, writes ratings.csv into the run's folder, and returns its path.
     """
-    folder, players = folders.folder_of(duels.run.path), []
+    folder, players = folders.folder_of(run.path), []
     for path in (
         checkpoint.list_checkpoints(folder / "snapshots")
         or checkpoint.list_checkpoints(folder / "checkpoints")
-        or [duels.run.path]  # the file of an agent
+        or [run.path]  # the file of an agent
     ):
         try:
-            player = duels.player(str(path))
+            (player,) = where.players([str(path)], run, cfg.trust)
         except UserError:
             if path.exists():
                 raise
             continue  # its run, which is training, has deleted it
         players.append(player._replace(name=f"{player.step:,} samples"))
-    players += duels.others
+    players += where.players(cfg.against or (), run, cfg.trust)
     if len(players) < 2:
         raise UserError(
             f"{folder} has one checkpoint and nothing to compare it with: train with "
             "checkpoints.snapshots=8, or name others with against="
         )
+    where.warn_without_layout()
     pairs = [*itertools.combinations(range(len(players)), 2)]
-    played = {(i, j): duels.play(players[i], players[j]) for i, j in pairs}
+    played = {(i, j): where.duel(cfg, run, players[i], players[j]) for i, j in pairs}
     if process_group.rank() > 0:
         return folder
     scores = {pair: one["score"].tolist() for pair, one in played.items()}
     table = []
-    for k, (mean, sigma) in enumerate(rate(len(players), scores, duels.cfg.seed)):
+    for k, (mean, sigma) in enumerate(rate(len(players), scores, cfg.seed)):
         results = [score for (i, _), values in scores.items() if i == k for score in values]
         results += [1 - score for (_, j), values in scores.items() if j == k for score in values]
         about = dict(player=players[k].name, samples=players[k].step, rating=mean, sigma=sigma)
         table.append(about | dict(won=sum(results) / len(results), duels=len(results)))
-    layouts, what = played[0, 1].get("homes"), f"{duels.where.shard.n_envs:,} duels of each pair"
+    layouts, what = played[0, 1].get("homes"), f"{where.shard.n_envs:,} duels of each pair"
     n_homes = None if layouts is None else len(layouts.unique())
-    title = f"Ratings in {labels.title(what, n_homes)}, seed {duels.cfg.seed}"
+    title = f"Ratings in {labels.title(what, n_homes)}, seed {cfg.seed}"
     cells = [[form.format_map(row) for form in COLUMNS.values()] for row in table]
     console.say(f"{title}\n{console.table([*COLUMNS], cells)}")
     with user_errors(f"{folder} cannot be written: "):
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / "ratings.csv", tables.as_csv(table, [*table[0]]).encode())
+        write_atomically(folder / "ratings.csv", tables.as_csv(table).encode())
     return folder / "ratings.csv"
 
 

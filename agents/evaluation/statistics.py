@@ -1,13 +1,13 @@
 """Means of episodes with their confidence intervals, overall and in the worst homes."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from megastep.arrdict import numpyify
+from megastep.arrdict import arrdict, numpyify
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -62,33 +62,6 @@ def interval(
     return float(values.mean()), float(lower), float(upper)
 
 
-def by_part(
-    summary: Callable[[np.ndarray], "Row"],
-    counted: np.ndarray,
-    role_of: np.ndarray | None,
-    roles: Sequence[str] | None,
-    homes: np.ndarray | None,
-    sources: Sequence[str] | None,
-) -> "list[Row]":
-    """Returns table rows: one overall, then one per role and one per source of homes.
-
-    Args:
-        summary: makes the row of some lanes, (B,) bool.
-        counted: (B,) bool, all lanes that count.
-        role_of, homes: (B,), the role of each lane, one of `roles`, and its home.
-        sources: the source of each home.
-    """
-    rows = [summary(counted)]
-    parts: list[tuple] = [("role", role_of, roles)]
-    if homes is not None and sources is not None:
-        parts.append(("source", np.array(sources)[homes], sources))
-    for key, part_of, names in parts:
-        for name in dict.fromkeys(names or ()):
-            if (lanes := counted & (part_of == name)).any():
-                rows.append({key: name, **summary(lanes)})
-    return rows
-
-
 def score_of(row: Mapping) -> float:
     """Returns the mean of the first of `SCORES` that a table row has."""
     values = {k: row[k] for k in ("won", "return") if k in row}
@@ -138,84 +111,114 @@ def _divided(sums, counts) -> np.ndarray:
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
-def worst_summary(episodes: Mapping) -> "Row":
-    """Returns a table row of the worst homes, `worst_homes`, from the result of `first_episodes`,
-    without unfinished episodes and metrics without a number.
+def worst_summary(played: Mapping) -> "Row":
+    """Returns a table row of the worst homes, `worst_homes`, from the result of `first_episodes`
+    or `first_duels`, without unfinished episodes and metrics without a number.
     """
-    played = numpyify(episodes)
-    lanes, homes = _counted(played["learns"]) & played["done"], played["homes"]
-    columns = {**played["metrics"], "length": played["lengths"], "return": played["returns"]}
+    played = numpyify(played)
+    lanes, score = _counted(played), "return"
+    if "score" in played:
+        score, columns = "won", {"won": played["score"]}
+    else:
+        lanes, columns = lanes & played["done"], {**played["metrics"], "return": played["returns"]}
     columns = {name: values[lanes] for name, values in columns.items()}
     columns = {name: values for name, values in columns.items() if np.isfinite(values).any()}
-    numbers, means = worst_homes(columns, homes[lanes])
-    length, of_return = means.pop("length")["mean"], means.pop("return")
-    return {
-        "return": of_return["mean"],
-        "lower": of_return["lower"],
-        "upper": of_return["upper"],
-        "length": length,
-        "lanes": int(np.isin(homes[lanes], numbers).sum()),
-        "homes": len(numbers),
-        "unfinished": 0,
-        "metrics": means,
-    }
+    numbers, means = worst_homes(columns, played["homes"][lanes])
+    row = _summary(played, lanes & np.isin(played["homes"], numbers))
+    row |= dict(zip((score, *BOUNDS[1:]), means.pop(score).values(), strict=True))
+    return row | ({"metrics": means} if "metrics" in row else {})
 
 
-def _counted(learns) -> np.ndarray:
-    """Returns the lanes that learn, or all lanes if none does."""
-    return learns if learns.any() else ~learns
+def _counted(played) -> np.ndarray:
+    """Returns the lanes that learn, or all lanes if none does; all duels."""
+    if "score" in played:
+        return np.ones(len(played["score"]), bool)
+    return played["learns"] if played["learns"].any() else ~played["learns"]
 
 
 def summaries(
-    episodes: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
+    played: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
 ) -> "list[Row]":
-    """Returns the table rows, `by_part`, of the result of `first_episodes`.
+    """Returns the table rows of the result of `first_episodes` or `first_duels`: one overall, then
+    one per role and one per source of homes.
 
-    Only lanes that learn are counted, or all lanes if none learns. An episode whose metric is not
-    finite is left out of that metric; a warning names the metric.
+    Of episodes only lanes that learn are counted, or all lanes if none learns. An episode whose
+    metric is not finite is left out of that metric; a warning names the metric. Of duels, `won` is
+    the fraction won, a draw counting half, and a role's row has those in which `policy` played it.
+    Intervals, `lower` to `upper`, are over homes, or over environments if there are no homes.
 
     Args:
         roles: the role of each agent slot, repeated over environments.
         sources: the source of each home.
     """
-    played = numpyify(episodes)
-    learns = _counted(played["learns"])
-    is_counted = learns & played["done"]
-    for name, values in played["metrics"].items():
-        if n_left_out := int((~np.isfinite(values[is_counted])).sum()):
+    played = numpyify(played)
+    counted, homes = _counted(played), played.get("homes")
+    for name, values in played.get("metrics", {}).items():
+        finished = values[counted & played["done"]]
+        if n_left_out := int((~np.isfinite(finished)).sum()):
             warnings.warn(
                 f"metrics.{name} was not finite at the end of {n_left_out:,} of "
-                f"{is_counted.sum():,} episodes, which are left out of its mean",
+                f"{len(finished):,} episodes, which are left out of its mean",
                 stacklevel=2,
             )
-    role_of, homes = np.resize(np.array(roles or ()), len(learns)), played.get("homes")
-    return by_part(lambda lanes: _summary(played, lanes), learns, role_of, roles, homes, sources)
+    rows, slots = [_summary(played, counted)], played.get("slots", np.arange(len(counted)))
+    parts: list[tuple] = []
+    if roles:
+        parts.append(("role", np.array(roles)[slots % len(roles)], roles))
+    if homes is not None and sources is not None:
+        parts.append(("source", np.array(sources)[homes], sources))
+    for key, part_of, names in parts:
+        for name in dict.fromkeys(names):
+            if (lanes := counted & (part_of == name)).any():
+                rows.append({key: name, **_summary(played, lanes)})
+    return rows
 
 
 def _summary(played, lanes) -> "Row":
-    """Intervals are over homes, or over environments if there are no homes or only one."""
-    homes, done = played["homes"][lanes] if "homes" in played else None, played["done"][lanes]
-    n_homes = None if homes is None else len(np.unique(homes))
-    groups = played["envs"][lanes] if homes is None or n_homes == 1 else homes
+    homes, length = played.get("homes"), float(played["lengths"][lanes].mean())
+    n_homes = None if homes is None else len(np.unique(homes[lanes]))
+    if "score" in played:
+        score = played["score"][lanes]
+        return {
+            **_interval("won", score, None if homes is None else homes[lanes]),
+            "wins": int((score == 1).sum()),
+            "losses": int((score == 0).sum()),
+            "draws": int(((score != 1) & (score != 0)).sum()),
+            "length": length,
+            "duels": len(score),
+            "homes": n_homes,
+        }
+    done = played["done"][lanes]
+    # agents of one environment are one sample
+    groups = (played["envs"] if n_homes in (None, 1) else homes)[lanes]
     metrics = {}
     for name, values in played["metrics"].items():
         values = values[lanes][done]
-        is_finite = np.isfinite(values)
-        numbers = (None,) * 3
+        is_finite, metrics[name] = np.isfinite(values), dict.fromkeys(BOUNDS)
         if is_finite.any():
-            numbers = interval(values[is_finite], groups[done][is_finite])
-        metrics[name] = dict(zip(BOUNDS, numbers, strict=True))
-    mean, lower, upper = interval(played["returns"][lanes], groups)
+            metrics[name] = _interval("mean", values[is_finite], groups[done][is_finite])
     return {
-        "return": mean,
-        "lower": lower,
-        "upper": upper,
-        "length": float(played["lengths"][lanes].mean()),
+        **_interval("return", played["returns"][lanes], groups),
+        "length": length,
         "lanes": int(lanes.sum()),
         "homes": n_homes,
         "unfinished": int((~done).sum()),
         "metrics": metrics,
     }
+
+
+def _interval(name, values, groups) -> dict[str, float]:
+    return dict(zip((name, *BOUNDS[1:]), interval(values, groups), strict=True))
+
+
+def difference(played: Mapping, other: Mapping) -> arrdict:
+    """Returns the episodes of one player less those of another that began alike, as `summaries`
+    takes them: the interval of the mean difference is that of pairs.
+    """
+    pairs = arrdict(played, done=played["done"] & other["done"])
+    for name in ("returns", "lengths", "metrics"):
+        pairs[name] = played[name] - other[name]
+    return pairs
 
 
 def rows_of(
@@ -239,7 +242,7 @@ def rows_of(
         sources, roles: as for `summaries`.
     """
     played = numpyify(episodes)
-    lanes = np.flatnonzero(_counted(played["learns"]))
+    lanes = np.flatnonzero(_counted(played))
     columns = {"episode": lanes.tolist(), "seed": [seed] * len(lanes)}
     if "homes" in played:
         homes = played["homes"][lanes].tolist()

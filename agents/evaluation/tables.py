@@ -55,6 +55,7 @@ def write_table(
     names: list[str],
     title: str,
     rows: list,
+    differences: list,
     episodes: Sequence[Mapping],
 ) -> Path:
     """Prints a table, and writes it into the run's folder `evaluations`: as .md, for people, and
@@ -62,26 +63,22 @@ def write_table(
 
     Args:
         names: parts of the files' name.
+        differences: rows of the agent less others, which end the table.
         episodes: a row per episode, for the .csv and, by column, the .json.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
     path = folder_of(loaded.path) / "evaluations" / f"{for_file('-'.join(names))[:200]}.json"
-    head, lines = grid(rows)
-    result = dict(
-        title=title,
-        checkpoint=str(loaded.path),
-        step=loaded.step,
-        evaluation=encoded(as_tree(cfg)),
-        rows=rows,
-    )
-    files = {"md": f"{title}\n\n{console.table(head, lines, is_markdown=True)}\n"}
+    result = dict(title=title, checkpoint=str(loaded.path), step=loaded.step)
+    result |= dict(evaluation=encoded(as_tree(cfg)), rows=rows)
+    result |= {"differences": differences} if differences else {}
     text = json.dumps(result, indent=2)
+    shown = grid([*rows, *differences])
+    files = {"md": f"{title}\n\n{console.table(*shown, is_markdown=True)}\n"}
     if episodes:
-        columns = {key: None for row in episodes for key in row}
-        columns = {key: [row.get(key) for row in episodes] for key in columns}
-        text = f'{text[:-2]},\n  "episodes": {json.dumps(columns)}\n}}'
-        files["csv"] = as_csv(episodes, [*columns])
-    console.say(f"{title}\n{console.table(head, lines, width=console.terminal_width())}")
+        columns = {key: [row.get(key) for row in episodes] for key in keys_of(episodes)}
+        text = f'{text[:-2]},\n  "episodes": {json.dumps(columns)}\n}}'  # on one line
+        files["csv"] = as_csv(episodes)
+    console.say(f"{title}\n{console.table(*shown, width=console.terminal_width())}")
     with user_errors(f"{path.parent} cannot be written: "):
         path.parent.mkdir(parents=True, exist_ok=True)
         for ending, content in {**files, "json": text}.items():
@@ -89,10 +86,15 @@ def write_table(
     return path
 
 
-def as_csv(rows: Sequence[Mapping], columns: list[str]) -> str:
+def keys_of(rows: Sequence[Mapping]) -> list[str]:
+    """Returns the keys of any of the rows."""
+    return [*dict.fromkeys(key for row in rows for key in row)]
+
+
+def as_csv(rows: Sequence[Mapping]) -> str:
     """Returns rows as CSV; what is None is empty."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer = csv.DictWriter(text, keys_of(rows), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()

@@ -275,8 +275,8 @@ def make_bot(name: str | None, settings: Env, env: types.Env) -> PolicyLike:
         constructor = import_object(BOTS.get(name, name)) if name else optional(env, "bot")
     if constructor is None:
         raise UserError(
-            f"{where} has no bot of its own; name a policy, in training with "
-            "opponents.bot_class=module:Class and in duels with against=module:Class"
+            f"{where} has no bot of its own; name one, such as {', '.join(BOTS)} or module:Class: "
+            "opponents.bot_class= in training, against= or baseline= in an evaluation"
         )
     name = name or f"{where}.bot"
 

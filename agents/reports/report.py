@@ -88,7 +88,7 @@ def _one(run: runs.Run, charts: "Charts", file: Path) -> str:
     evaluations = []
     for table in run.evaluations:
         try:
-            head, rows = tables.grid(table["rows"])
+            head, rows = tables.grid([*table["rows"], *table.get("differences", ())])
         except homes.ODD:
             continue  # of another version, or a stranger's
         evaluations += [f"<p>{_text(str(table.get('title', '')))}</p>", _table(head, rows)]

@@ -11,7 +11,7 @@ import torch
 
 from megastep import recording
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.evaluation import duels, ratings
+from megastep.agents.evaluation import playing, ratings, statistics
 from megastep.agents.evaluation.statistics import interval
 from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
@@ -23,9 +23,9 @@ from tests.helpers.games import Always, Matrix
 
 
 def test_stronger_player_wins_from_every_slot():
-    played = duels.play(Matrix(64), Always(2), Always(0))
+    played = playing.first_duels(Matrix(64), Always(2), Always(0))
     assert (played.score == 1).all() and (played.lengths == 1).all()
-    assert duels.play(Matrix(64), Always(0), Always(2)).score.sum() == 0
+    assert playing.first_duels(Matrix(64), Always(0), Always(2)).score.sum() == 0
     assert played.slots.tolist() == [0] * 32 + [1] * 32
 
 
@@ -33,7 +33,7 @@ def test_stronger_player_wins_from_every_slot():
 def test_win_share_matches_independent_count(mortal):
     """Each player chooses its own number with probability 1/2, else any of three."""
     env = Matrix(2000, mortal=mortal)
-    played = duels.play(env, Always(2, chance=0.5), Always(0, chance=0.5))
+    played = playing.first_duels(env, Always(2, chance=0.5), Always(0, chance=0.5))
     # the first step with different numbers decides
     actions = torch.stack(env.played)  # (T, E, 2)
     first = (actions[:, :, 0] != actions[:, :, 1]).int().argmax(0)
@@ -48,7 +48,7 @@ def test_win_share_matches_independent_count(mortal):
     )
     mean, lower, upper = interval(played.score.numpy())
     assert lower < win / (win + lose) < upper and upper - lower < 0.04
-    (row,) = duels.summaries(played)
+    (row,) = statistics.summaries(played)
     assert row["won"] == mean and row["wins"] + row["losses"] == row["duels"] == 2000
 
 
@@ -61,30 +61,30 @@ def test_only_first_duel_counts():
             self.action = 0
             return decision, state
 
-    played = duels.play(Matrix(4), Turning(2), Always(1), max_steps=200)
+    played = playing.first_duels(Matrix(4), Turning(2), Always(1), max_steps=200)
     assert (played.score == 1).all() and (played.lengths == 1).all()
 
 
 def test_first_death_loses():
     """Four agents; those below the highest number die."""
     env = Matrix(16, 4, mortal=True)
-    assert (duels.play(env, Always(2), Always(1)).score == 1).all()
-    assert (duels.play(env, Always(1), Always(2)).score == 0).all()
-    played = duels.play(env, Always(2), Always(1))
+    assert (playing.first_duels(env, Always(2), Always(1)).score == 1).all()
+    assert (playing.first_duels(env, Always(1), Always(2)).score == 0).all()
+    played = playing.first_duels(env, Always(2), Always(1))
     assert played.slots.bincount().tolist() == [4, 4, 4, 4]
 
 
 def test_intervals_are_over_homes():
     env = Matrix(8)
     env.layout = torch.arange(4, dtype=torch.int32).repeat(2)
-    played = duels.play(env, Always(2), Always(0))
+    played = playing.first_duels(env, Always(2), Always(0))
     assert played.homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
     # each home was played in from both slots
     pairs = set(zip(played.homes.tolist(), played.slots.tolist(), strict=True))
     assert len(pairs) == 8
-    assert duels.summaries(played)[0]["homes"] == 4
+    assert statistics.summaries(played)[0]["homes"] == 4
     score = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0])
-    (row,) = duels.summaries(arrdict(played, score=score))
+    (row,) = statistics.summaries(arrdict(played, score=score))
     assert (row["won"], row["lower"], row["upper"]) == interval(score.numpy(), played.homes.numpy())
 
 
@@ -96,7 +96,7 @@ def test_rows_by_role():
         slots=torch.tensor([0, 0, 1, 1, 2, 2]),
         homes=torch.tensor([0, 1, 0, 1, 0, 1]),
     )
-    every, prey, hunter = duels.summaries(played, ("prey", "hunter", "hunter"))
+    every, prey, hunter = statistics.summaries(played, ("prey", "hunter", "hunter"))
     assert (prey["role"], hunter["role"]) == ("prey", "hunter") and "role" not in every
     assert (every["duels"], prey["duels"], hunter["duels"]) == (6, 2, 4)
     assert (every["won"], prey["won"], hunter["won"]) == (2.5 / 6, 1, 0.125)
@@ -280,13 +280,13 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     """Three agents learn, two duel. Of 40 duels, each of 7 homes gets two from each slot."""
     monkeypatch.chdir(tmp_path)
     train.run(configured("env.n_agents=3", "geometry=homes", "geometry.n=7", tiny=MATRIX))
-    played, real = [], duels.play
+    played, real = [], playing.first_duels
 
     def play(env, *rest, **options):
         played.append((env, real(env, *rest, **options)))
         return played[-1][1]
 
-    monkeypatch.setattr(duels, "play", play)
+    monkeypatch.setattr(playing, "first_duels", play)
     words = f"against={HIGH}", "episodes=40", "device=cpu"
     assert evaluate.main(["run=run", *words]) == 0
     ((env, result),) = played
@@ -305,6 +305,6 @@ def test_worst_homes_of_duels():
     score = torch.where(homes == 7, 0.0, 1.0)
     score[3] = 0
     played = arrdict(score=score, lengths=score + 5, slots=torch.zeros(40), homes=homes)
-    row = duels.worst_summary(played)
+    row = statistics.worst_summary(played)
     assert (row["won"], row["losses"], row["duels"], row["homes"]) == (0, 2, 2, 1)
     assert row["length"] == 5 and row["lower"] == 0 < row["upper"]

@@ -447,3 +447,45 @@ def test_episodes_are_written_one_by_one(explorer):
     columns = result["episodes"]
     assert columns["return"] == [float(row["return"]) for row in rows]
     assert columns["source"] == ["homes"] * 24 if "source" in columns else True
+
+
+def test_evaluations_are_paired(explorer):
+    """Everybody starts from the same places, the random row is the same beside any agent, and the
+    interval of a difference is that of the pairs, by home.
+    """
+    words = [*EXPLORER, "geometry=box", "seed=2", "learner.lr=0.01", "folder=other/run"]
+    others = [str(explorer), str(train.run(settings(*words)))]
+    homes = settings("run=x", "geometry=homes", "geometry.n=4", script="evaluate").geometry
+    found = []
+    for run, other in (others, others[::-1]):
+        baseline = ["explorer", other, "random"]
+        written = evaluate.run(configured(run=run, geometry=homes, baseline=baseline))
+        found.append(json.loads(written.read_text()))
+    first, second = (result["episodes"] for result in found)
+    starts = np.array([first[key] for key in ("home", "start_x", "start_y", "start_angle")])
+    starts = starts.reshape(4, 4, 8)
+    assert (starts == starts[:, :1]).all() and len(np.unique(starts[1, 0])) == 8
+    assert found[0]["rows"][3] == found[1]["rows"][3], "the random row"
+    assert first["return"][:8] == second["return"][16:24] != first["return"][16:24]
+    returns = np.array(first["return"]).reshape(4, 8)
+    row = found[0]["differences"][2]
+    assert row["agent"] == "trained - random"
+    expected = statistics.interval(returns[0] - returns[3], starts[0, 0])
+    assert (row["return"], row["lower"], row["upper"]) == pytest.approx(expected)
+    assert "trained - random" in written.with_suffix(".md").read_text()
+
+
+def test_rows_of_different_runs_have_different_names(explorer):
+    names = [str(shutil.copytree(explorer, name)) for name in ("a/run", "b/run")]
+    written = evaluate.run(configured(run=names[0], baseline=[*names, "random"]))
+    agents = [row["agent"] for row in json.loads(written.read_text())["rows"]]
+    assert agents == ["trained", *(f"run, 32 samples ({name})" for name in names), "random"]
+
+
+def test_a_name_of_nobody_names_the_bots(explorer):
+    for name, sentence in {
+        "explorerr": r"neither a run folder .*\(bots are bot, explorer, hunter, mapper, ",
+        "bot": "Explorer has no bot of its own; name one, such as explorer, hunter, mapper, ",
+    }.items():
+        with pytest.raises(UserError, match=sentence):
+            evaluate.run(configured(run=str(explorer), baseline=[name]))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from megastep import envs, spaces
-from megastep.agents.evaluation import duels
+from megastep.agents.evaluation import playing
 from megastep.agents.evaluation.playing import first_episodes
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.envs.pong import Tracker
@@ -30,7 +30,7 @@ def test_plays_as_well_as_the_tracker_of_the_environment(speed, pixels, n):
     env, random = envs.Pong(1000, device="cpu", tracker_speed=speed), RandomActions(ACTIONS)
     theirs = 1 - first_episodes(env, random).metrics.points_won.mean()
     env = envs.Pong(n, device="cpu", self_play=True, pixels=pixels)
-    ours = duels.play(env, Tracker(speed), random).score.mean()
+    ours = playing.first_duels(env, Tracker(speed), random).score.mean()
     assert 0.6 < theirs < 0.9 and abs(ours - theirs) < 3 * (0.25 / n + 0.25 / 1000) ** 0.5
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from megastep import envs, spaces
-from megastep.agents.evaluation import duels, playing
+from megastep.agents.evaluation import playing
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.bots.random import RandomActions
 from megastep.arrdict import arrdict
@@ -68,7 +68,7 @@ def episodes(greedy=False, wrapper=lambda policy: policy):
 def duel(greedy=False):
     env = deathmatch()
     both = policy_of(env), envs.deathmatch.Bot()
-    played = duels.play(env, *both, seed=3, greedy=greedy, max_steps=MAX_STEPS)
+    played = playing.first_duels(env, *both, seed=3, greedy=greedy, max_steps=MAX_STEPS)
     assert played.lengths.max() > playing.CHECK_EVERY
     return played
 
@@ -218,7 +218,7 @@ def on_cpu(monkeypatch):
     def with_tensor_on_gpu(is_over, *rest):
         real(CudaOnCpu.tensor(is_over), *rest)
 
-    for module in playing, duels:
+    for module in (playing,):
         monkeypatch.setattr(module, "step_until", with_tensor_on_gpu)
 
 
@@ -266,11 +266,11 @@ def test_evaluations_of_megastep_are_captured(make, on_cpu, monkeypatch, recorde
 def test_duels_of_megastep_are_captured(on_cpu, monkeypatch, recorded, recwarn):
     graphs_on_cpu.install(monkeypatch, may_wait=True)
     env = envs.Deathmatch(4, sample("homes", 4), n_agents=2, device="cpu", res=16)
-    duels.play(env, small_policy(env), envs.deathmatch.Bot(), max_steps=70)
+    playing.first_duels(env, small_policy(env), envs.deathmatch.Bot(), max_steps=70)
     assert isinstance(recorded[0], Graph) and not recwarn.list
     del recorded[:]
     theirs = type("Theirs", (envs.deathmatch.Bot,), {"__module__": "theirs"})
-    duels.play(env, small_policy(env), theirs(), max_steps=70)
+    playing.first_duels(env, small_policy(env), theirs(), max_steps=70)
     assert not recorded
 
 
