@@ -1,6 +1,7 @@
 """Where an evaluation plays, and who: agents of runs, packaged agents, and bots."""
 
 import collections
+import contextlib
 import os
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -117,27 +118,31 @@ class EvalEnv:
         `run`.
         """
         policies = [player.policy for player in players]
-        if self._go_back is not None:
-            self._go_back()
-        elif optional(self.env, "resumable"):
-            self._go_back = way_back(self.env)
-        elif self._is_used:
+        if not self._is_used:
+            self._go_back = way_back(self.env) if optional(self.env, "resumable") else None
+        elif not self._went_back():
             optional(self.env, "close")()
-            self.env = self._made()
+            self.env, self._go_back = self._made(), None
             policies = [factory.in_env(policy, self.settings, self.env) for policy in policies]
         self._is_used = True
         restore.load_wrappers(self.env, players[0].loaded or run)
         return policies
 
+    def _went_back(self) -> bool:
+        with contextlib.suppress(ValueError):  # of what a reset has made of others' environments
+            if self._go_back is not None:
+                self._go_back()
+                return True
+        return False
+
     def duel(
         self, cfg: settings.Evaluate, run: checkpoint.Checkpoint, player: Player, opponent: Player
     ) -> arrdict:
         """Returns the duels of two players, those of all ranks."""
-        policies, limit = self.begin(run, player, opponent), cfg.max_steps or playing.MAX_STEPS
+        policy, other = self.begin(run, player, opponent)
+        how = self.seed, cfg.greedy, cfg.max_steps or playing.MAX_STEPS, self.slots
         with factory.errors():
-            played = playing.first_duels(
-                self.env, *policies, self.seed, cfg.greedy, limit, slots=self.slots
-            )
+            played = playing.first_duels(self.env, policy, other, *how)
         return self.shard.with_others(played)
 
     def warn_without_layout(self) -> None:

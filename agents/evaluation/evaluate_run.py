@@ -36,7 +36,7 @@ def run(cfg: settings.Evaluate) -> Path:
     geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
     homes = factory.homes(env_settings, geometry, cfg.split)
     folder, rank = folders.folder_of(loaded.path), process_group.rank()
-    options = dict(episodes=cfg.episodes, seed=cfg.seed, device=device)
+    options: dict = dict(episodes=cfg.episodes, seed=cfg.seed, device=device)
     options["is_duel"] = cfg.ratings or cfg.against is not None
     with env_failures.caught(env_settings, folder, rank=rank):
         if cfg.ratings:

@@ -204,7 +204,8 @@ def first_duels(
     def step(world, state) -> tuple[World, Tree]:
         decision, state = both(world, state, sample=not greedy, generator=draws.on(is_over.device))
         world = env.step(decision)
-        terminal, truncated = world.terminal.view(shape), world.truncated.view(shape)
+        terminal: torch.Tensor = world.terminal.view(shape)
+        truncated: torch.Tensor = world.truncated.view(shape)
         returns.add_(world.reward.view(shape))
         lengths.add_(~is_over)
         won, decided = score_pairs(terminal, returns, slots)

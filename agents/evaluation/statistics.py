@@ -190,7 +190,7 @@ def _summary(played, lanes) -> "Row":
         }
     done = played["done"][lanes]
     # agents of one environment are one sample
-    groups = (played["envs"] if n_homes in (None, 1) else homes)[lanes]
+    groups = played["envs" if n_homes in (None, 1) else "homes"][lanes]
     metrics = {}
     for name, values in played["metrics"].items():
         values = values[lanes][done]

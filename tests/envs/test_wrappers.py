@@ -110,7 +110,7 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     assert train.main(["init=run", *PENDULUM, "samples=128", "folder=next"]) == 0
     assert train.main(["resume=run", "more_samples=64"]) == 0
     states, frozen = zip(*loads, strict=True)
-    assert frozen == (True, False, False)
+    assert frozen == (True, True, False, False)
     assert all(s["1.NormalizeObservation.obs_rms.count"] == count for s in states)
     for run in ("run", "next"):
         later = checkpoint.load_latest(f"{run}/checkpoints").state["wrappers"]
