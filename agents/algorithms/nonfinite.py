@@ -18,8 +18,9 @@ from megastep.types import Tree
 #: Largest magnitude allowed in a rollout. With such rewards, squared returns summed over millions
 #: of steps still fit into float32 (3e38). float16 overflows to inf, which is above the limit, too.
 LIMIT = 1e12
-#: Number of lanes that a message names at most.
-MAX_NAMED = 8
+_MAX_TENSORS, _THREADS, _WORDS = (
+    LIBRARY.constants[f"CHECKED_{name}"] for name in ("TENSORS", "THREADS", "WORDS")
+)
 
 
 class NonFiniteError(RuntimeError):
@@ -34,7 +35,7 @@ class NonFiniteError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class NonFiniteValue:
-    """The first number of a lane that is NaN, infinite or beyond `LIMIT`.
+    """The first number of a rollout that is NaN, infinite or beyond `LIMIT`.
 
     Attributes:
         name: name of the tensor, such as `obs.rgb` or `reward`.
@@ -43,7 +44,6 @@ class NonFiniteValue:
             policy produced it, the one that it chose an action for. 0 if `reset` returned it.
         size: magnitude of the number.
         rollout: number of the rollout, from 1.
-        others: the same for up to `MAX_NAMED - 1` other lanes of the rollout.
         n_lanes: number of lanes of the rollout with such numbers.
         n_agents: lanes per environment.
     """
@@ -53,14 +53,8 @@ class NonFiniteValue:
     step: int
     size: float
     rollout: int = 1
-    others: tuple["NonFiniteValue", ...] = ()
     n_lanes: int = 1
     n_agents: int = 1
-
-    @property
-    def env(self) -> int:
-        """The lane's environment."""
-        return self.lane // self.n_agents
 
     @property
     def is_from_env(self) -> bool:
@@ -68,20 +62,55 @@ class NonFiniteValue:
         return self.name.split(".")[0] in ("obs", "privileged", "reward")
 
     def in_env(self, lanes: Sequence[int], n_agents: int) -> "NonFiniteValue":
-        """Returns a copy with the environment's lane for each lane of the rollout."""
-        others = tuple(other.in_env(lanes, n_agents) for other in self.others)
-        lane = int(lanes[self.lane])
-        return dataclasses.replace(self, lane=lane, others=others, n_agents=n_agents)
+        """Returns a copy with the environment's lane for the lane of the rollout."""
+        return dataclasses.replace(self, lane=int(lanes[self.lane]), n_agents=n_agents)
 
     def __str__(self) -> str:
-        texts = [
-            f"{one.name} of {lane_name(one.lane, one.n_agents)} was {one.size:.3g} at step "
-            f"{one.step:,}"
-            for one in (self, *self.others)
-        ]
-        if (n_unnamed := self.n_lanes - len(texts)) > 0:
-            texts.append(f"and so for {n_unnamed:,} more lane{'s' * (n_unnamed > 1)}")
-        return "; ".join(texts)
+        lane = lane_name(self.lane, self.n_agents)
+        text = f"{self.name} of {lane} was {self.size:.3g} at step {self.step:,}"
+        if (n_others := self.n_lanes - 1) > 0:
+            text += f"; and so for {n_others:,} more lane{'s' * (n_others > 1)}"
+        return text
+
+
+def _check_on_gpu(check, floats) -> torch.Tensor:
+    """Finds the first row of each lane with a bad number, then records the first lane."""
+    tensors = list(floats.values())
+    n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
+    device = tensors[0].device
+    first_rows = torch.full((n_lanes,), 2**31 - 1, dtype=torch.int32, device=device)
+    is_finite = torch.empty((), dtype=torch.bool, device=device)
+    packed, n_blocks = [], 0
+    for tensor in tensors:
+        packed.append(
+            LIBRARY.params.CheckedTensorParams(
+                **dict(values=tensor, first_block=n_blocks, n_steps=len(tensor)),
+                n_features=math.prod(tensor.shape[2:]),
+                is_half=int(tensor.dtype == torch.float16),
+            )
+        )
+        # one more block than full ones, for the numbers after the last whole word
+        n_blocks += tensor.numel() * tensor.element_size() // (16 * _THREADS * _WORDS) + 1
+    fields = dict(tensors=b"".join(packed), first_rows=first_rows, n_tensors=len(tensors))
+    fields |= dict(n_steps=n_steps, n_lanes=n_lanes)
+    blocks = Blocks(n_blocks, threads=_THREADS)
+    launch(LIBRARY, "find_bad", device, blocks, **fields, limit=LIMIT)
+    fields |= dict(record=check.record, is_finite=is_finite)
+    blocks = Blocks(1, threads=LIBRARY.constants["RECORD_THREADS"])
+    launch(LIBRARY, "record", device, blocks, **fields)
+    return is_finite
+
+
+def _are_readable(floats) -> bool:
+    tensors = list(floats.values())
+    return len(tensors) <= _MAX_TENSORS and all(
+        tensor.is_cuda
+        and tensor.dtype in (torch.float16, torch.float32)
+        and tensor.is_contiguous()
+        and tensor.data_ptr() % 16 == 0
+        and len(tensor) - min(map(len, tensors)) <= 1
+        for tensor in tensors
+    )
 
 
 class NonFiniteCheck:
@@ -96,14 +125,14 @@ class NonFiniteCheck:
         # The rest describes the first rollout with non-finite numbers:
         # [2] its number, from 1; 0 if there is none
         # [3] how many of its lanes have a non-finite number
-        # [4:12] of the first `MAX_NAMED` such lanes, the index in `_sizes` of the lane's first one
-        # [12:] the magnitudes of these: -1 for NaN, 1.8e308 for infinity
-        self.record = torch.zeros(4 + 2 * MAX_NAMED, dtype=torch.float64, device=device)
+        # [4] the index in `_sizes` of the first such number
+        # [5] its magnitude: -1 for NaN, 1.8e308 for infinity
+        self.record = torch.zeros(6, dtype=torch.float64, device=device)
 
-    @fused(lambda *inputs: _check_on_gpu(*inputs), lambda self, floats: _are_readable(floats))
+    @fused(_check_on_gpu, lambda self, floats: _are_readable(floats))
     def __call__(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
         """Returns whether all numbers of a rollout are finite and within `LIMIT`, () bool. Keeps
-        the first other one of each lane until `read`.
+        the first other one until `read`.
 
         Args:
             floats: tensors by name, each (T, B, ...) or (T+1, B, ...), at least one of T.
@@ -111,16 +140,11 @@ class NonFiniteCheck:
         count, first = self.record[:1], self.record[2:]
         count += 1
         sizes = _sizes(floats)
-        is_finite, row = (sizes <= LIMIT).byte().min(0)  # of each lane
-        lanes = torch.arange(len(row), device=row.device)
-        index = torch.where(is_finite.bool(), sizes.numel(), row * len(row) + lanes)
-        index = index.topk(min(MAX_NAMED, len(row)), largest=False).values
-        n_bad = len(row) - is_finite.sum(dtype=torch.float64)
-        latest = torch.zeros_like(first)
-        latest[0], latest[1] = count[0], n_bad
-        latest[2 : 2 + len(index)] = index
-        worst = sizes.flatten()[index.clamp(max=sizes.numel() - 1)].double()
-        latest[-MAX_NAMED:][: len(index)] = worst.nan_to_num(nan=-1.0)
+        is_bad = ~(sizes <= LIMIT)
+        n_bad = is_bad.any(0).sum(dtype=torch.float64)
+        index = is_bad.flatten().byte().argmax()
+        size = sizes.flatten()[index].double().nan_to_num(nan=-1.0)
+        latest = torch.stack([count[0], n_bad, index.double(), size])
         first.copy_(torch.where((n_bad == 0) | (self.record[2] > 0), first, latest))
         return n_bad == 0
 
@@ -137,61 +161,21 @@ class NonFiniteCheck:
         self.record[1].add_(1).mul_(is_skipped)
 
     def read(self, floats: dict[str, torch.Tensor]) -> tuple[NonFiniteValue | None, int]:
-        """Returns and clears the first non-finite number since the last call, with those of other
-        lanes, or None; and the number of updates skipped in a row. Synchronises. Only names and
-        shapes of `floats` are used, those of any rollout.
+        """Returns and clears the first non-finite number since the last call, or None; and the
+        number of updates skipped in a row. Synchronises. Only names and shapes of `floats` are
+        used, those of any rollout.
         """
-        _, n_skipped, rollout, n_bad, *numbers = self.record.tolist()
+        _, n_skipped, rollout, n_bad, index, size = self.record.tolist()
         self.record[2:].zero_()
-        n_named = min(int(n_bad), MAX_NAMED)
-        values = [
-            _value_at(floats, int(rollout), int(index), size)
-            for index, size in zip(numbers[:n_named], numbers[MAX_NAMED:], strict=False)
-        ]
-        if not values:
+        if not rollout:
             return None, int(n_skipped)
-        others = tuple(values[1:])
-        return dataclasses.replace(values[0], others=others, n_lanes=int(n_bad)), int(n_skipped)
-
-
-def _are_readable(floats) -> bool:
-    tensors = list(floats.values())
-    return len(tensors) <= LIBRARY.constants["CHECKED_TENSORS"] and all(
-        tensor.is_cuda
-        and tensor.dtype in (torch.float16, torch.float32)
-        and tensor.is_contiguous()
-        and tensor.data_ptr() % 16 == 0
-        and len(tensor) - min(map(len, tensors)) <= 1
-        for tensor in tensors
-    )
-
-
-def _check_on_gpu(check, floats) -> torch.Tensor:
-    """Finds the first row of each lane with a bad number, then records the lanes."""
-    tensors = list(floats.values())
-    n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
-    device, constants = tensors[0].device, LIBRARY.constants
-    first_rows = torch.full((n_lanes,), 2**31 - 1, dtype=torch.int32, device=device)
-    is_finite = torch.empty((), dtype=torch.bool, device=device)
-    block_bytes = 16 * constants["CHECKED_THREADS"] * constants["CHECKED_WORDS"]
-    packed, n_blocks = [], 0
-    for tensor in tensors:
-        packed.append(
-            LIBRARY.params.CheckedTensorParams(
-                **dict(values=tensor, first_block=n_blocks, n_steps=len(tensor)),
-                n_features=math.prod(tensor.shape[2:]),
-                is_half=int(tensor.dtype == torch.float16),
-            )
-        )
-        # one more block than full ones, for the numbers after the last whole word
-        n_blocks += tensor.numel() * tensor.element_size() // block_bytes + 1
-    fields = dict(tensors=b"".join(packed), first_rows=first_rows, n_tensors=len(tensors))
-    fields |= dict(n_steps=n_steps, n_lanes=n_lanes)
-    blocks = Blocks(n_blocks, threads=constants["CHECKED_THREADS"])
-    launch(LIBRARY, "find_bad", device, blocks, **fields, limit=LIMIT)
-    fields |= dict(record=check.record, is_finite=is_finite, n_named=MAX_NAMED)
-    launch(LIBRARY, "record", device, Blocks(1, threads=constants["RECORD_THREADS"]), **fields)
-    return is_finite
+        n_steps, n_lanes = min(map(len, floats.values())), next(iter(floats.values())).shape[1]
+        row, lane = divmod(int(index), n_lanes)
+        row, i = divmod(row, len(floats))
+        size = math.nan if size < 0 else math.inf if size > torch.finfo(torch.float32).max else size
+        step = (int(rollout) - 1) * n_steps + row
+        value = NonFiniteValue(list(floats)[i], lane, step, size, int(rollout), int(n_bad))
+        return value, int(n_skipped)
 
 
 def _sizes(floats) -> torch.Tensor:
@@ -214,15 +198,6 @@ def _sizes(floats) -> torch.Tensor:
                 numbers = torch.maximum(numbers.amax(-1), -numbers.amin(-1))
         sizes[-len(values) :, i] = numbers.abs()
     return sizes.flatten(0, 1)
-
-
-def _value_at(floats, rollout, index, size) -> NonFiniteValue:
-    """Describes the number at an index of `_sizes`."""
-    n_steps, n_lanes = min(map(len, floats.values())), next(iter(floats.values())).shape[1]
-    row, lane = divmod(index, n_lanes)
-    row, i = divmod(row, len(floats))
-    size = math.nan if size < 0 else math.inf if size > torch.finfo(torch.float32).max else size
-    return NonFiniteValue(list(floats)[i], lane, (rollout - 1) * n_steps + row, size, rollout)
 
 
 def lane_name(lane: int, n_agents: int) -> str:

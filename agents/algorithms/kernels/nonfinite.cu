@@ -92,65 +92,36 @@ DEVICE int sum_of_block(int x) {
     return __reduce_add_sync(~0u, of_warps[threadIdx.x % WARP]);
 }
 
-// The smallest number of a block, in every thread.
-DEVICE long long least_of_block(long long x) {
-    __shared__ long long least;
-    for (int mask = WARP / 2; mask; mask /= 2)
-        x = min(x, __shfl_xor_sync(~0u, x, mask));
-    __syncthreads();
-    if (!threadIdx.x)
-        least = x;
-    __syncthreads();
-    if (threadIdx.x % WARP == 0)
-        atomicMin(&least, x);
-    __syncthreads();
-    return least;
-}
-
-// One block. Counts the rollout, and keeps the first numbers of up to n_named lanes, those of the
-// smallest row and lane, unless an earlier rollout's are still there.
+// One block. Counts the rollout, and keeps its first bad number, that of the smallest row and lane,
+// unless an earlier rollout's is still there.
 KERNEL BOUNDS(1024) record(RecordParams p) {
     wait_for_previous();
+    __shared__ unsigned long long first;
+    if (!threadIdx.x)
+        first = ~0ull;
     int n_rows = p.n_steps * p.n_tensors, n_bad = 0;
+    unsigned long long index = ~0ull;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += RECORD_THREADS)
-        n_bad += p.first_rows[lane] < n_rows;
+        if (p.first_rows[lane] < n_rows) {
+            n_bad++;
+            index = min(index, (unsigned long long)p.first_rows[lane] * p.n_lanes + lane);
+        }
     n_bad = sum_of_block(n_bad);
-    double count = p.record[0] + 1.;
-    bool is_first = n_bad && !(p.record[2] > 0.);
+    if (index != ~0ull)
+        atomicMin(&first, index);
     __syncthreads();
-    if (!threadIdx.x) {
-        *p.is_finite = !n_bad;
-        p.record[0] = count;
-        if (is_first) {
-            p.record[2] = count;
-            p.record[3] = n_bad;
-        }
-    }
-    if (!is_first)
+    if (threadIdx.x)
         return;
-    long long last = -1, none = (long long)n_rows * p.n_lanes;
-    for (int i = 0; i < min(p.n_named, p.n_lanes); i++) {
-        long long index = none;
-        for (int lane = threadIdx.x; lane < p.n_lanes; lane += RECORD_THREADS) {
-            long long candidate = (long long)p.first_rows[lane] * p.n_lanes + lane;
-            if (p.first_rows[lane] < n_rows && candidate > last)
-                index = min(index, candidate);
-        }
-        index = last = least_of_block(index);
-        if (!threadIdx.x) {
-            float size = 0.f;
-            if (index < none) {
-                int row = index / p.n_lanes, lane = index % p.n_lanes;
-                const CheckedTensorParams& tensor = p.tensors[row % p.n_tensors];
-                long long t = row / p.n_tensors - (p.n_steps - tensor.n_steps);
-                size = size_of(tensor, t * p.n_lanes + lane);
-            }
-            p.record[4 + i] = (double)index;
-            p.record[4 + p.n_named + i] = isnan(size)   ? -1.
-                                          : isinf(size) ? 1.7976931348623157e308
-                                                        : (double)size;
-        }
-        if (index == none)
-            break;
-    }
+    *p.is_finite = !n_bad;
+    p.record[0] += 1.;
+    if (!n_bad || p.record[2] > 0.)
+        return;
+    int row = first / p.n_lanes, lane = first % p.n_lanes;
+    const CheckedTensorParams& tensor = p.tensors[row % p.n_tensors];
+    long long t = row / p.n_tensors - (p.n_steps - tensor.n_steps);
+    float size = size_of(tensor, t * p.n_lanes + lane);
+    p.record[2] = p.record[0];
+    p.record[3] = n_bad;
+    p.record[4] = (double)first;
+    p.record[5] = isnan(size) ? -1. : isinf(size) ? 1.7976931348623157e308 : (double)size;
 }

@@ -177,5 +177,4 @@ struct RecordParams {
     int n_tensors;
     int n_steps;  // T + 1
     int n_lanes;
-    int n_named;
 };
