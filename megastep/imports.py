@@ -4,7 +4,7 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
@@ -46,14 +46,12 @@ def search_current_folder() -> None:
         sys.path.insert([*installed, True].index(True), here)
 
 
-def resolve(name: str, table: dict[str, type], base: type) -> type:
-    """Returns the entry of `table` called `name`, or the class at this import path. Raises
+def resolve(name: str, table: Mapping[str, str], base: type) -> type:
+    """Returns the class at the import path `name`, or at that of this name in `table`. Raises
     ValueError if it is neither, or no class derived from `base` that takes one argument.
     """
     known_name(name, [*table])
-    if name in table:
-        return table[name]
-    imported = import_object(name)
+    imported = import_object(table.get(name, name))
     if not (isinstance(imported, type) and issubclass(imported, base)):
         package = base.__module__.partition(".")[0]
         raise ValueError(f"{name} must be a class derived from {package}'s {base.__name__}")

@@ -77,9 +77,7 @@ ADDED = {
             """,
         "agents/networks/cores.py": """
 
-            from megastep.agents.networks.leaky import Leaky
-
-            CORES["leaky"] = Leaky
+            CORES["leaky"] = "megastep.agents.networks.leaky:Leaky"
             """,
     },
     "logger": {

@@ -14,7 +14,7 @@ from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.kernels import LIBRARY
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
 from megastep.agents.networks.fused import fused
-from megastep.agents.networks.outputs import Output
+from megastep.agents.networks.heads import Output
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.collector import Collector

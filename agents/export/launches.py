@@ -12,12 +12,14 @@ from torch import nn
 
 from megastep.agents.errors import UserError
 from megastep.agents.networks.continuous_outputs import BetaOutput, GaussianOutput
-from megastep.agents.networks.cores import CORES, GRU, Feedforward, Stack
+from megastep.agents.networks.convolutions import Cnn, Conv
+from megastep.agents.networks.cores import CORES, Stack
 from megastep.agents.networks.duelling_output import DuellingOutput
-from megastep.agents.networks.intakes import ENCODERS, Cnn, Conv, Flat, OneHot
+from megastep.agents.networks.heads import MultiDiscreteOutput
+from megastep.agents.networks.intakes import ENCODERS, Flat, OneHot
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
-from megastep.agents.networks.outputs import MultiDiscreteOutput
+from megastep.agents.networks.plain_cores import GRU, Feedforward
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.web import LIBRARY

@@ -24,7 +24,7 @@ from megastep import spaces
 from megastep.agents import package
 from megastep.agents.errors import UserError, shortened
 from megastep.agents.networks.fused import plain_operations
-from megastep.agents.networks.outputs import FORBIDDEN
+from megastep.agents.networks.heads import FORBIDDEN
 from megastep.arrdict import arrdict
 from megastep.atomic_files import write_atomically
 from megastep.dotdict import leaves, mapping

@@ -14,8 +14,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from megastep import spaces
+from megastep.agents.networks.heads import Output
 from megastep.agents.networks.linear import linear
-from megastep.agents.networks.outputs import Output
 
 # Actions closer to a bound count as this far from it: atanh would be infinite.
 _MAX_X = 1 - 2**-20
@@ -151,10 +151,6 @@ class BetaOutput(_BoundedOutput):
             + (alpha + beta - 2) * (alpha + beta).digamma()
         )
         return (entropy + math.log(2)).sum((-1, -2))
-
-
-#: Outputs of continuous actions by name.
-CONTINUOUS_OUTPUTS = {"gaussian": GaussianOutput, "beta": BetaOutput}
 
 
 def _log_slope(u) -> torch.Tensor:

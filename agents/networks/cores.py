@@ -6,7 +6,9 @@ A core is a module `Core(width)` with two methods:
   (B, ...) float32 tensors.
 - `forward(x, reset, state)` unrolls over x (T, B, W) from a hidden state. It clears a lane's state
   before each step where reset (T, B) is true, and returns outputs (T, B, W) and the state after the
-  last step. With `is_residual`, LSTM and minGRU add x to the outputs.
+  last step.
+
+One with an attribute `adds_input` that is true adds x to its outputs if `is_residual=True`.
 
 T time, B lanes, W width.
 """
@@ -18,13 +20,16 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks.intakes import ACTIVATIONS
-from megastep.agents.networks.linear import linear
-from megastep.agents.networks.lstm import LSTM
-from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 from megastep.imports import resolve
+
+CORES = {
+    "lstm": "megastep.agents.networks.lstm:LSTM",
+    "gru": "megastep.agents.networks.plain_cores:GRU",
+    "mingru": "megastep.agents.networks.mingru:MinGRU",
+    "none": "megastep.agents.networks.plain_cores:Feedforward",
+}
 
 
 class RecurrentCore(Protocol):
@@ -39,74 +44,14 @@ class RecurrentCore(Protocol):
     ) -> tuple[torch.Tensor, arrdict]: ...
 
 
-class GRU(nn.Module):
-    """A gated recurrent unit (Cho et al. 2014) with PyTorch's equations: the reset gate comes after
-    the matrix product. Its hidden state is arrdict(output (B, W)).
-
-    Gates are laid out (..., 3 W): reset, update, candidate. Matrix products run in the compute
-    dtype (autocast's), the rest in float32.
-    """
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.width = width
-        self.input, self.recurrent = nn.Linear(width, 3 * width), nn.Linear(width, 3 * width)
-        for layer in (self.input, self.recurrent):
-            nn.init.zeros_(layer.bias)
-            for block in layer.weight.split(width):
-                nn.init.orthogonal_(block)
-
-    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns the hidden state of B lanes at the start of an episode."""
-        return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
-
-    def forward(
-        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
-    ) -> tuple[torch.Tensor, arrdict]:
-        """Unrolls over a sequence, as the head of this file says."""
-        from_input, output, outputs = self.input(x), state["output"], []
-        for t in range(len(x)):
-            output = output.masked_fill(reset[t, :, None], 0.0)
-            r_in, z_in, n_in = from_input[t].float().chunk(3, -1)
-            r, z, n = self.recurrent(output).float().chunk(3, -1)
-            candidate = (n_in + (r_in + r).sigmoid() * n).tanh()
-            output = candidate.lerp(output, (z_in + z).sigmoid())
-            outputs.append(output)
-        return torch.stack(outputs).to(from_input.dtype), arrdict(output=output)
-
-
-class Feedforward(nn.Module):
-    """A hidden layer instead of a recurrent core: only the current observation counts. The
-    activation is a name in `intakes.ACTIVATIONS`.
-    """
-
-    def __init__(self, width: int, activation: str = "relu"):
-        super().__init__()
-        self.activation = ACTIVATIONS[activation]
-        self.hidden = nn.Linear(width, width)
-        nn.init.orthogonal_(self.hidden.weight, gain=2**0.5)
-        nn.init.zeros_(self.hidden.bias)
-
-    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """Returns an empty hidden state."""
-        return arrdict()
-
-    def forward(
-        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
-    ) -> tuple[torch.Tensor, arrdict]:
-        """Applies the layer to every step. `reset` and `state` have no effect."""
-        return linear(x, self.hidden, self.activation), state
-
-
-CORES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}
-
-
 class Stack(nn.ModuleList):
     """Several cores with residual connections (He et al. 2016), which together are a core.
 
     The input of each is x plus the outputs of those below, and the output is the sum of all
     outputs. The hidden state holds theirs under "0", "1", ...
     """
+
+    adds_input = True
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the hidden state of B lanes at the start of an episode."""
@@ -137,7 +82,7 @@ def with_residual(
     core: RecurrentCore, x: torch.Tensor, reset: torch.Tensor, state: arrdict
 ) -> tuple[torch.Tensor, arrdict]:
     """Returns x plus the outputs of a core, and its state after the last step."""
-    if isinstance(core, (LSTM, MinGRU, Stack)):
+    if getattr(core, "adds_input", False):
         return core(x, reset, state, is_residual=True)
     outputs, state = core(x, reset, state)
     return x + outputs, state
@@ -149,7 +94,7 @@ def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") 
     contract at the head of this file.
     """
     kind = resolve(name, CORES, nn.Module)
-    options = {"activation": activation} if kind is Feedforward else {}
+    options = {"activation": activation} if name == "none" else {}
     cores = [kind(width, **options) for _ in range(layers)]
     if ":" in name:
         _check(name, cores[0], width)

@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.fused import LIBRARY, aligned, fused, is_plain_on_gpu
+from megastep.agents.networks.heads import MultiDiscreteOutput, Output
 from megastep.agents.networks.intakes import ConcatIntake
 from megastep.agents.networks.linear import (
     gradient_of_inputs,
@@ -24,7 +25,6 @@ from megastep.agents.networks.linear import (
     product,
     sum_rows,
 )
-from megastep.agents.networks.outputs import MultiDiscreteOutput, Output
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.agents.networks.running_norm import (
     RESOLUTION,

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, aligned, fused
+from megastep.agents.networks.heads import FORBIDDEN, Output, gather
 from megastep.agents.networks.linear import (
     gradient_of_inputs,
     gradient_of_weights,
@@ -19,7 +20,6 @@ from megastep.agents.networks.linear import (
     product,
     sum_rows,
 )
-from megastep.agents.networks.outputs import FORBIDDEN, Output, gather
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.kernels.build.launch import BLOCK, WARP, Blocks, launch
 
@@ -124,6 +124,7 @@ class DuellingOutput(Output):
     """
 
     epsilon = 0.05
+    act = fused(_act_on_gpu, _acts_on_gpu)(Output.act)
 
     def __init__(self, space: spaces.MultiDiscrete, width: int):
         super().__init__()
@@ -148,20 +149,6 @@ class DuellingOutput(Output):
             advantage = self.advantage(advantage).unflatten(-1, self.shape)
         return value + advantage - advantage.mean(-1, keepdim=True)
 
-    @fused(_act_on_gpu, _acts_on_gpu)
-    def act(
-        self,
-        x: torch.Tensor,
-        sample: bool = True,
-        generator: torch.Generator | None = None,
-        mask: torch.Tensor | None = None,
-        epsilon: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        options: dict = {} if epsilon is None else dict(epsilon=epsilon)
-        if mask is not None:
-            options["is_masked"] = True
-        return super().act(x, sample, generator, mask, **options)
-
     def masked(self, logits: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Returns values with which only allowed actions are the best."""
         return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN)
@@ -180,21 +167,17 @@ class DuellingOutput(Output):
         logits: torch.Tensor,
         generator: torch.Generator | None = None,
         epsilon: torch.Tensor | None = None,
-        is_masked: bool = False,
     ) -> torch.Tensor:
-        """Returns the best actions, or random ones with probability epsilon (...,) per lane; if
-        `is_masked`, not those that `masked` forbids.
+        """Returns the best actions, or random ones with probability epsilon (...,) per lane, none
+        of those that `masked` forbids.
         """
         limit = self.epsilon if epsilon is None else epsilon[..., None]
-        best, n = self.greedy(logits), logits.shape[-1]
+        best = self.greedy(logits)
         which, whether = self.noise(best.shape, generator, logits.device)
-        if is_masked:
-            rank = (logits > FORBIDDEN / 2).cumsum(-1)  # of each allowed action, from 1
-            n = rank[..., -1].clamp(min=1)
-            chosen = (which * n).long().clamp(max=n - 1) + 1
-            random = (rank >= chosen[..., None]).int().argmax(-1)
-        else:
-            random = (which * n).long().clamp(max=n - 1)  # the product may round up to n
+        rank = (logits > FORBIDDEN / 2).cumsum(-1)  # of each allowed action, from 1
+        n = rank[..., -1].clamp(min=1)
+        chosen = (which * n).long().clamp(max=n - 1) + 1  # the product may round up to n
+        random = (rank >= chosen[..., None]).int().argmax(-1)
         return torch.where(whether < limit, random, best)
 
     def greedy(self, logits: torch.Tensor) -> torch.Tensor:

@@ -1,5 +1,5 @@
 """Network layers built from spaces: an *intake* turns observations into a vector, an *output* turns
-a vector into actions.
+a vector into actions, by probabilities or by action values.
 
     intake = heads.intake(env.obs_space, width)     # (..., A, C, H, W), (..., A, D) -> (..., width)
     output = heads.output(env.action_space, width)  # (..., width) -> log-probabilities (..., A, n)
@@ -7,22 +7,83 @@ a vector into actions.
     actions = output.sample(logits)                 # (..., A) integers, or numbers within bounds
 
 Nested dicts of spaces give nested dicts of logits and actions. Nothing here synchronises. `...` are
-any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane controls.
+any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane controls, n
+choices of each.
 """
 
+import math
+import typing
+from collections.abc import Callable, Iterable, Mapping
+
+import torch
+from torch import nn
+from torch.autograd.function import once_differentiable
+
 from megastep import spaces
+from megastep.agents.networks.fused import DTYPES, LIBRARY, fused
 from megastep.agents.networks.intakes import ConcatIntake
-from megastep.agents.networks.outputs import DictOutput, MultiDiscreteOutput, Output
-from megastep.types import Space
+from megastep.agents.networks.linear import linear
+from megastep.agents.networks.precision import cast, compute_dtype
+from megastep.arrdict import arrdict
+from megastep.kernels.build.launch import launch
+from megastep.types import Space, Tree
 
 intake = ConcatIntake
+#: Outputs of continuous actions by name.
+CONTINUOUS_OUTPUTS = {"gaussian": "GaussianOutput", "beta": "BetaOutput"}
+#: Score of an action that a mask forbids: its probability is 0, and no sum with it is NaN.
+FORBIDDEN = -1e9
+# below the smallest exponential sample in float32, and far from underflow
+_TINY = 1e-20
+_MAX_CHOICES = LIBRARY.constants["ACT_THREADS"]
+
+
+class Output(nn.Module):
+    """Base of the outputs of one kind of actions.
+
+    A subclass has `forward(x)`, which returns logits, `sample`, `greedy`, `logprob`, and `entropy`
+    ("softmax" and continuous actions) or `action_value` ("duelling").
+    """
+
+    sample: Callable[..., Tree]
+    greedy: Callable[..., Tree]
+    logprob: Callable[..., torch.Tensor]
+    entropy: Callable[..., torch.Tensor]
+    action_value: Callable[..., torch.Tensor]
+
+    def act(
+        self,
+        x: torch.Tensor,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+        mask: Tree = None,
+        **options: torch.Tensor,
+    ) -> tuple[Tree, Tree, torch.Tensor]:
+        """Returns logits, actions and the actions' log-probability (B,) of features (B, width).
+
+        Args:
+            sample: samples; if false, takes the most likely or best actions.
+            generator: generator of the samples.
+            mask: allowed actions, as for `masked`. None: all.
+            options: further arguments of `sample`.
+        """
+        logits = self.masked(self(x), mask)
+        actions = self.sample(logits, generator, **options) if sample else self.greedy(logits)
+        return logits, actions, self.logprob(logits, actions)
+
+    def masked(self, logits: Tree, mask: Tree = None) -> Tree:
+        """Returns logits with which only actions that a mask (..., A, n) bool allows are chosen;
+        all, if it is None or actions are continuous.
+        """
+        return logits
+
+    def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the log-probability of actions and the entropy, (...,) each."""
+        return self.logprob(logits, actions), self.entropy(logits)
 
 
 def output(space: Space, width: int, kind: str = "softmax", continuous: str = "gaussian") -> Output:
-    """Returns a module from vectors (..., width) to logits of an action space.
-
-    Its methods are `sample`, `greedy`, `logprob`, and `entropy` ("softmax") or `action_value`
-    ("duelling").
+    """Returns a module from vectors (..., width) to logits of an action space; see `Output`.
 
     Args:
         space: action space, a MultiDiscrete, a MultiContinuous or nested dicts.
@@ -41,16 +102,215 @@ def output(space: Space, width: int, kind: str = "softmax", continuous: str = "g
         from megastep.agents.networks.duelling_output import DuellingOutput
 
         return DuellingOutput(space, width)
-    if isinstance(space, spaces.MultiContinuous):
-        if kind == "duelling":
-            raise ValueError(
-                f"action values (agent.output=duelling, which R2D2 learns) need discrete actions, "
-                f"not {space!r}: use learner=ppo or learner=vtrace with agent.output=softmax"
-            )
-        from megastep.agents.networks.continuous_outputs import CONTINUOUS_OUTPUTS
+    if not isinstance(space, spaces.MultiContinuous):
+        raise ValueError(
+            f"no output is known for the action space {space!r}: use MultiDiscrete, "
+            "MultiContinuous or dicts of them"
+        )
+    if kind == "duelling":
+        raise ValueError(
+            f"action values (agent.output=duelling, which R2D2 learns) need discrete actions, not "
+            f"{space!r}: use learner=ppo or learner=vtrace with agent.output=softmax"
+        )
+    from megastep.agents.networks import continuous_outputs
 
-        return CONTINUOUS_OUTPUTS[continuous](space, width)
-    raise ValueError(
-        f"no output is known for the action space {space!r}: use MultiDiscrete, MultiContinuous or "
-        "dicts of them"
+    return getattr(continuous_outputs, CONTINUOUS_OUTPUTS[continuous])(space, width)
+
+
+# ---- One choice out of n ----
+
+
+def _act_on_gpu(
+    output, x, sample=True, generator=None, mask=None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    dtype = compute_dtype(output.linear.weight)
+    weight, bias = (cast(leaf, dtype) for leaf in output.linear.parameters())
+    features, (n_agents, n_choices) = x.to(dtype).contiguous(), output.shape
+    n_lanes, width = features.shape
+    noise = None
+    if sample:
+        noise = torch.empty(n_lanes, *output.shape, device=x.device)
+        noise.exponential_(generator=generator)
+    logits = features.new_empty(n_lanes, *output.shape, dtype=torch.float32)
+    actions = torch.empty(n_lanes, n_agents, dtype=torch.int64, device=x.device)
+    logprobs = torch.empty_like(logits[:, 0, 0])
+    launch(
+        *(LIBRARY, f"categorical_act_{DTYPES[dtype]}", x.device, _MAX_CHOICES * n_lanes),
+        **dict(features=features, weight=weight, bias=bias, noise=noise),
+        **dict(logits=logits, actions=actions, logprobs=logprobs),
+        **dict(n_lanes=n_lanes, width=width, n_agents=n_agents, n_choices=n_choices),
     )
+    return logits, actions, logprobs
+
+
+def _acts_on_gpu(output, x, sample=True, generator=None, mask=None) -> bool:
+    is_known = compute_dtype(output.linear.weight) in DTYPES and not x.shape[-1] % 8
+    is_small = output.shape[1] <= _MAX_CHOICES and mask is None
+    return x.is_cuda and is_known and is_small and not torch.is_grad_enabled()
+
+
+class _Terms(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, logits, actions) -> tuple[torch.Tensor, ...]:
+        lead = logits.shape[:-2]
+        logits = logits.flatten(0, -3).contiguous()
+        actions = actions.flatten(0, -2).long().contiguous()
+        ctx.save_for_backward(logits, actions)
+        results = logits.new_empty(2, len(logits))
+        _launch_terms("", logits, actions, results[0], results[1], None)
+        return tuple(each.view(lead) for each in results)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_logprobs, d_entropies) -> tuple[torch.Tensor, None]:
+        logits, actions = ctx.saved_tensors
+        d_logits = torch.empty_like(logits)
+        of = d_logprobs.contiguous(), d_entropies.contiguous(), d_logits
+        _launch_terms("_backward", logits, actions, *of)
+        return d_logits.unflatten(0, d_logprobs.shape), None
+
+
+def _launch_terms(direction, logits, actions, logprobs, entropies, d_logits) -> None:
+    fields = dict(logits=logits, actions=actions, logprobs=logprobs, entropies=entropies)
+    fields |= dict(zip(("n_rows", "n_agents", "n_choices"), logits.shape), d_logits=d_logits)
+    launch(LIBRARY, f"categorical_terms{direction}", logits.device, len(logits), **fields)
+
+
+class MultiDiscreteOutput(Output):
+    """One categorical choice out of n per agent.
+
+    Logits are log-probabilities (..., A, n), actions (..., A) int64. `logprob` and `entropy` (...,)
+    belong to the lane's joint action: they are summed over its agents.
+    """
+
+    act = fused(_act_on_gpu, _acts_on_gpu)(Output.act)
+    terms = fused(
+        lambda self, logits, actions: _Terms.apply(logits, actions),
+        lambda self, logits, actions: logits.is_cuda and logits.dtype == torch.float32,
+    )(Output.terms)
+
+    def __init__(self, space: spaces.MultiDiscrete, width: int):
+        super().__init__()
+        self.shape = (space.n_agents, space.n_actions)
+        self.linear = nn.Linear(width, math.prod(self.shape))
+        # A hundredth of the usual gain, so that the first policy is almost uniform (Andrychowicz et
+        # al. 2021)
+        nn.init.orthogonal_(self.linear.weight, gain=0.01)
+        nn.init.zeros_(self.linear.bias)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        scores = linear(x, self.linear).float()
+        return scores.unflatten(-1, self.shape).log_softmax(-1)
+
+    def masked(self, logits: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns log-probabilities among the allowed actions."""
+        return logits if mask is None else logits.masked_fill(~mask, FORBIDDEN).log_softmax(-1)
+
+    def sample(
+        self, logits: torch.Tensor, generator: torch.Generator | None = None
+    ) -> torch.Tensor:
+        """Samples actions by the Gumbel-max trick."""
+        noise = torch.empty_like(logits).exponential_(generator=generator).clamp_(min=_TINY).log_()
+        return (logits - noise).argmax(-1)
+
+    def greedy(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the most likely actions."""
+        return logits.argmax(-1)
+
+    def logprob(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Returns the log-probability (...,) of actions."""
+        return gather(logits, actions)
+
+    def entropy(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the entropy (...,) in nats."""
+        return -(logits.exp() * logits).sum((-1, -2))
+
+
+def gather(values: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+    """Returns the entries (..., A, n) of the actions (..., A), summed over agents."""
+    return values.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)
+
+
+# ---- Dicts of actions ----
+
+
+class DictOutput(Output):
+    """Independent outputs by key. Logits and actions are arrdicts with the same keys; `logprob`,
+    `entropy` and `action_value` (...,) are summed over the keys. Keys that a mask has not are not
+    masked. ValueError if a key is the name of an attribute that every ``nn.ModuleDict`` has.
+    """
+
+    def __init__(self, outputs: Mapping[str, nn.Module]):
+        super().__init__()
+        for key in outputs:
+            if hasattr(nn.ModuleDict(), key):
+                raise ValueError(
+                    f"an action space cannot have the key {key!r}, which PyTorch's modules use; "
+                    f"rename it, for example to {key}_"
+                )
+        self.outputs = nn.ModuleDict(outputs)
+
+    def _each(self, method: str, *trees: Tree, **options) -> arrdict:
+        """Returns by key what a method of each output returns of these trees' parts."""
+        return arrdict(
+            {
+                key: getattr(output, method)(*(tree[key] for tree in trees), **options)
+                for key, output in self.outputs.items()
+            }
+        )
+
+    def forward(self, x: torch.Tensor) -> arrdict:
+        return arrdict({key: output(x) for key, output in self.outputs.items()})
+
+    def act(
+        self,
+        x: torch.Tensor,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+        mask: Tree = None,
+        **options: torch.Tensor,
+    ) -> tuple[arrdict, arrdict, torch.Tensor]:
+        """Acts key by key."""
+        parts = {
+            key: output.act(x, sample, generator, (mask or {}).get(key), **options)
+            for key, output in self.outputs.items()
+        }
+        logits, actions, logprobs = zip(*parts.values())
+        return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), _total(logprobs)
+
+    def masked(self, logits: Tree, mask: Tree = None) -> Tree:
+        """Masks key by key."""
+        if mask is None:
+            return logits
+        return self._each("masked", logits, {key: mask.get(key) for key in logits})
+
+    def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
+        """Sums the outputs' terms."""
+        logprobs, entropies = zip(*self._each("terms", logits, actions).values())
+        return _total(logprobs), _total(entropies)
+
+    def sample(
+        self, logits: Tree, generator: torch.Generator | None = None, **options: torch.Tensor
+    ) -> arrdict:
+        """Samples actions, key by key."""
+        return self._each("sample", logits, generator=generator, **options)
+
+    def greedy(self, logits: Tree) -> arrdict:
+        """Returns the most likely or best actions."""
+        return self._each("greedy", logits)
+
+    def logprob(self, logits: Tree, actions: Tree) -> torch.Tensor:
+        """Returns the log-probability (...,) of actions."""
+        return _total(self._each("logprob", logits, actions).values())
+
+    def entropy(self, logits: Tree) -> torch.Tensor:
+        """Returns the entropy (...,) in nats."""
+        return _total(self._each("entropy", logits).values())
+
+    def action_value(self, logits: Tree, actions: Tree) -> torch.Tensor:
+        """Returns the value (...,) of actions."""
+        return _total(self._each("action_value", logits, actions).values())
+
+
+def _total(parts: Iterable[torch.Tensor]) -> torch.Tensor:
+    return typing.cast(torch.Tensor, sum(parts))  # there is at least one

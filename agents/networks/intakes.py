@@ -6,16 +6,15 @@ controls. An image leaf is (..., A, C, H, W).
 
 import itertools
 import math
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.fused import LIBRARY, fused
-from megastep.agents.networks.linear import linear
+from megastep.agents.networks.linear import ACTIVATIONS, linear
 from megastep.agents.networks.precision import compute_dtype
-from megastep.agents.networks.row_convolutions import Conv, Encoder, Part, encode
 from megastep.agents.networks.running_norm import (
     MAX_LEAVES,
     RunningNorm,
@@ -26,8 +25,9 @@ from megastep.imports import resolve
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.types import Space, Tree
 
-#: Activations of hidden layers by name.
-ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
+if TYPE_CHECKING:
+    from megastep.agents.networks.convolutions import Conv, Part
+
 _MAX_STEPS = 65_535  # blocks along y
 _ROWS = LIBRARY.constants["NORMALISED_ROWS"]
 
@@ -35,8 +35,21 @@ _ROWS = LIBRARY.constants["NORMALISED_ROWS"]
 # ---- Encoders of a leaf ----
 
 
+class Encoder(nn.Module):
+    """Base of the encoders of a leaf, which map (..., *shape) to (..., n_features).
+
+    Attributes:
+        takes_parts: the input is normalised, and may be a part of wider rows.
+    """
+
+    n_features: int
+    takes_parts = False
+
+
 class Flat(Encoder):
     """Flattens a vector or an image: (..., *shape) -> (..., n_features)."""
+
+    takes_parts = True
 
     def __init__(self, space: Space):
         super().__init__()
@@ -61,40 +74,13 @@ class OneHot(Encoder):
         return obs[..., None].eq(self.values).flatten(-2)
 
 
-class Cnn(Encoder):
-    """Three convolutions of an image in both directions, (..., A, C, H, W) -> (..., n_features):
-    those of Mnih et al. 2015 for images of 36 x 36 pixels and more, of 3 x 3 pixels for smaller
-    ones. Agents share weights.
-    """
-
-    CHANNELS, MIN_SIDE = (32, 64, 64), 36
-    #: (kernel, stride, padding) of each layer
-    LARGE, SMALL = ((8, 4, 0), (4, 2, 0), (3, 1, 0)), ((3, 1, 1), (3, 2, 1), (3, 2, 1))
-
-    def __init__(self, space: spaces.MultiImage):
-        super().__init__()
-        is_large = min(space.H, space.W) >= self.MIN_SIDE
-        layers, sizes, n_channels = [], [space.H, space.W], space.C
-        for n_out, settings in zip(self.CHANNELS, self.LARGE if is_large else self.SMALL):
-            layer = nn.Conv2d(n_channels, n_out, *settings)
-            nn.init.orthogonal_(layer.weight, gain=math.sqrt(2))
-            assert layer.bias is not None
-            nn.init.zeros_(layer.bias)
-            layers += [layer, nn.ReLU()]
-            kernel, stride, padding = settings
-            sizes = [(size + 2 * padding - kernel) // stride + 1 for size in sizes]
-            n_channels = n_out
-        self.layers = nn.Sequential(*layers)
-        self.n_features = space.n_agents * n_channels * math.prod(sizes)
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        images = obs.flatten(0, -4).to(compute_dtype(next(self.layers.parameters())))
-        return self.layers(images).reshape(*obs.shape[:-4], self.n_features)
-
-
 #: Encoders of images by name. An encoder is a module `Encoder(space)` with `n_features` that maps
 #: images (..., A, C, H, W) to features (..., n_features).
-ENCODERS = {"linear": Flat, "conv": Conv, "cnn": Cnn}
+ENCODERS = {
+    "linear": "megastep.agents.networks.intakes:Flat",
+    "conv": "megastep.agents.networks.convolutions:Conv",
+    "cnn": "megastep.agents.networks.convolutions:Cnn",
+}
 
 
 def make_encoder(space: Space, image_encoder: str, path: str) -> Encoder:
@@ -188,8 +174,8 @@ class ConcatIntake(nn.Module):
             nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else RunningNorm(leaf)
             for leaf in leaves.values()
         )
-        #: whether every leaf is normalised, and encoded by what takes a part of wider rows
-        self.is_fused = all(type(encoder) in (Flat, Conv, Cnn) for encoder in self.encoders)
+        #: whether a kernel may normalise all leaves side by side
+        self.is_fused = all(vars(type(encoder)).get("takes_parts") for encoder in encoders)
         sizes = [encoder.n_features for encoder in encoders]
         self.n_features = sum(sizes)
         # GPUs multiply matrices whose columns are a multiple of 8 several times faster
@@ -259,7 +245,9 @@ class ConcatIntake(nn.Module):
         """Returns `encode` of normalised leaves side by side, (..., n_columns)."""
         if all(i is None for i, *_ in self.runs):  # one run, of all columns
             return columns
-        if not any(isinstance(encoder, Cnn) for encoder in self.encoders):
+        from megastep.agents.networks.convolutions import Conv, encode
+
+        if all(isinstance(encoder, (Flat, Conv)) for encoder in self.encoders):
             features = encode(columns.flatten(0, -2), self._parts())
             return features.unflatten(0, columns.shape[:-1])
         features = []
@@ -269,11 +257,13 @@ class ConcatIntake(nn.Module):
             features.append(part.contiguous())  # so that `cat` is several times faster
         return torch.cat(features, -1)
 
-    def _parts(self) -> list[Part]:
+    def _parts(self) -> "list[Part]":
         """Returns `runs` as parts for `encode`, one for each image of each agent."""
+        from megastep.agents.networks.convolutions import Part
+
         parts, n_features = [], 0
         for i, shape, start, end in self.runs:
-            encoder = None if i is None else cast(Conv, self.encoders[i])
+            encoder = None if i is None else cast("Conv", self.encoders[i])
             n_images = 1 if encoder is None else shape[0]
             size = (end - start) // n_images
             for source in range(start, end, size):

@@ -20,6 +20,8 @@ from megastep.devices import threads
 from megastep.kernels.build.launch import WARP, Blocks, launch
 
 Activation = Callable[[torch.Tensor], torch.Tensor]
+#: Activations of hidden layers by name.
+ACTIVATIONS: dict[str, Activation] = {"relu": torch.relu, "tanh": torch.tanh}
 
 _MIN_OUTPUTS = 16  # PyTorch takes less time on a CPU for fewer, such as actions and values
 _STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_THREADS"]

@@ -351,6 +351,8 @@ def _acts_on_gpu(core, x, *_, **__) -> bool:
 class LSTM(nn.Module):
     """An LSTM of `width` units. Its hidden state is arrdict(output, cell), each (B, W) float32."""
 
+    adds_input = True
+
     def __init__(self, width: int):
         super().__init__()
         self.width = width

@@ -265,6 +265,8 @@ def _sequence(core, x, reset, state, is_residual=False) -> tuple[torch.Tensor, a
 class MinGRU(nn.Module):
     """A minGRU of `width` units. Its hidden state is arrdict(output (B, W)) float32."""
 
+    adds_input = True
+
     def __init__(self, width: int):
         super().__init__()
         self.width = width

@@ -55,7 +55,7 @@ class Policy(nn.Module):
         output: "softmax" samples actions by their probabilities, continuous ones too; "duelling"
             takes the action of the highest value.
         continuous: distribution of continuous actions, a name in
-            `continuous_outputs.CONTINUOUS_OUTPUTS`.
+            `heads.CONTINUOUS_OUTPUTS`.
         critic: "asymmetric" sees privileged observations, if there are any; "plain" sees what the
             actor sees; None: no critic. A duelling policy never has one.
         bf16: on a GPU, runs matrix products in bfloat16.

@@ -8,7 +8,7 @@ from torch import distributions
 
 from megastep import spaces
 from megastep.agents.networks import heads
-from megastep.agents.networks.continuous_outputs import CONTINUOUS_OUTPUTS
+from megastep.agents.networks.heads import CONTINUOUS_OUTPUTS
 
 SPACE = spaces.MultiContinuous(2, 3, (-1.0, 0.0, -5.0), (1.0, 10.0, 2.0))
 KINDS = tuple(CONTINUOUS_OUTPUTS)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from megastep.agents.networks.row_convolutions import conv_backward, n_outputs, takes
+from megastep.agents.networks.convolutions import conv_backward, n_outputs, takes
 
 DEVICE = "cuda"
 BF16 = torch.bfloat16

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from megastep.agents.networks.cores import CORES, GRU, make_core, with_residual
+from megastep.agents.networks.cores import CORES, make_core, with_residual
+from megastep.agents.networks.plain_cores import GRU
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 from tests.helpers.recurrent import assert_close as assert_close_by_size

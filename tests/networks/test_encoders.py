@@ -7,9 +7,8 @@ import torch
 from torch.nn import functional
 
 from megastep import spaces
+from megastep.agents.networks import convolutions as kernels
 from megastep.agents.networks import heads
-from megastep.agents.networks import intakes as encoders
-from megastep.agents.networks import row_convolutions as kernels
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.arrdict import arrdict
 
@@ -23,7 +22,7 @@ ROUNDING = dict(rtol=2**-7, atol=1e-2)
 def test_cnn_sees_every_pixel(side, n_features):
     """For 84 x 84 pixels the features of Mnih et al. 2015, 7 x 7 of 64 channels."""
     torch.manual_seed(1)
-    cnn = encoders.Cnn(spaces.MultiImage(1, 3, side, side, dtype=torch.uint8))
+    cnn = kernels.Cnn(spaces.MultiImage(1, 3, side, side, dtype=torch.uint8))
     images = torch.rand(2, 1, 3, side, side, requires_grad=True)
     features = cnn(images)
     assert features.shape == (2, cnn.n_features) == (2, n_features)
@@ -110,7 +109,7 @@ def test_frozen_parameters_get_no_gradient(monkeypatch):
 def test_observations_that_need_gradients_and_odd_columns_are_left_to_pytorch(monkeypatch):
     monkeypatch.setattr(kernels, "takes", lambda rows: True)
     columns = torch.zeros(5, 48, dtype=BF16)
-    encoder = encoders.Conv(IMAGE)
+    encoder = kernels.Conv(IMAGE)
 
     def part(encoder, target):
         return kernels.Part(encoder, slice(0, 48), slice(target, target + 96))
@@ -133,7 +132,7 @@ def weights_of(conv, device="cuda"):
 def test_kernel_matches_convolutions_in_every_order(cuda_on_cpu, monkeypatch, shape):
     """Seven tiles of rows in two blocks."""
     torch.manual_seed(1)
-    conv = encoders.Conv(spaces.MultiImage(1, shape[0], 1, shape[1]))
+    conv = kernels.Conv(spaces.MultiImage(1, shape[0], 1, shape[1]))
     weights, rows = weights_of(conv, "cpu"), torch.randn(100, *shape).to(BF16)
     gpu = SimpleNamespace(multi_processor_count=1)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
@@ -149,7 +148,7 @@ def test_kernel_matches_convolutions_in_every_order(cuda_on_cpu, monkeypatch, sh
 )
 def test_kernel_matches_convolutions(shape, n_rows):
     torch.manual_seed(1)
-    conv = encoders.Conv(spaces.MultiImage(1, shape[0], 1, shape[1]))
+    conv = kernels.Conv(spaces.MultiImage(1, shape[0], 1, shape[1]))
     weights = weights_of(conv)
     rows = torch.randn(n_rows, *shape).to("cuda", BF16)
     assert kernels.takes(rows)
@@ -172,7 +171,7 @@ def test_gradients_through_the_kernel(shape, monkeypatch):
     monkeypatch.setattr(
         kernels, "conv_forward", lambda *args, **at: calls.append(args) or conv_forward(*args, **at)
     )
-    conv = encoders.Conv(spaces.MultiImage(*shape)).cuda()
+    conv = kernels.Conv(spaces.MultiImage(*shape)).cuda()
     images = torch.randn(300, *shape, device="cuda")
     results = []
     for is_enabled in (True, False):

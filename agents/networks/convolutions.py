@@ -1,7 +1,7 @@
-"""The encoder `Conv`: convolutions of images of one or a few rows of pixels.
+"""The encoders of images by convolutions: `Cnn`, and `Conv` for images of one or a few rows.
 
-On a GPU whose tensor cores take bfloat16 and that copies in bulk (Hopper and later), both
-convolutions and their ReLUs are one kernel, and all their gradients another.
+`Conv` on a GPU whose tensor cores take bfloat16 and that copies in bulk (Hopper and later):
+both convolutions and their ReLUs are one kernel, and all their gradients another.
 
 N rows of C channels and W columns; W' columns of features; `...` any leading axes, A agents that
 one lane controls.
@@ -19,6 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep import spaces
 from megastep.agents.networks.fused import aligned, aligned_rows, fused, has_hopper
+from megastep.agents.networks.intakes import Encoder
 from megastep.agents.networks.linear import sum_rows
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
@@ -36,10 +37,36 @@ _BARRIER = 16  # bytes of shared memory that count copies
 _RESERVED = 1024  # bytes of shared memory that each block takes besides its own
 
 
-class Encoder(nn.Module):
-    """Base of the encoders of a leaf, which map (..., *shape) to (..., n_features)."""
+class Cnn(Encoder):
+    """Three convolutions of an image in both directions, (..., A, C, H, W) -> (..., n_features):
+    those of Mnih et al. 2015 for images of 36 x 36 pixels and more, of 3 x 3 pixels for smaller
+    ones. Agents share weights.
+    """
 
-    n_features: int
+    takes_parts = True
+    CHANNELS, MIN_SIDE = (32, 64, 64), 36
+    #: (kernel, stride, padding) of each layer
+    LARGE, SMALL = ((8, 4, 0), (4, 2, 0), (3, 1, 0)), ((3, 1, 1), (3, 2, 1), (3, 2, 1))
+
+    def __init__(self, space: spaces.MultiImage):
+        super().__init__()
+        is_large = min(space.H, space.W) >= self.MIN_SIDE
+        layers, sizes, n_channels = [], [space.H, space.W], space.C
+        for n_out, settings in zip(self.CHANNELS, self.LARGE if is_large else self.SMALL):
+            layer = nn.Conv2d(n_channels, n_out, *settings)
+            nn.init.orthogonal_(layer.weight, gain=math.sqrt(2))
+            assert layer.bias is not None
+            nn.init.zeros_(layer.bias)
+            layers += [layer, nn.ReLU()]
+            kernel, stride, padding = settings
+            sizes = [(size + 2 * padding - kernel) // stride + 1 for size in sizes]
+            n_channels = n_out
+        self.layers = nn.Sequential(*layers)
+        self.n_features = space.n_agents * n_channels * math.prod(sizes)
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        images = obs.flatten(0, -4).to(compute_dtype(next(self.layers.parameters())))
+        return self.layers(images).reshape(*obs.shape[:-4], self.n_features)
 
 
 class Conv(Encoder):
@@ -47,6 +74,8 @@ class Conv(Encoder):
 
     The H rows count as channels, since images are one or a few pixels high. Agents share weights.
     """
+
+    takes_parts = True
 
     def __init__(self, space: spaces.MultiImage):
         super().__init__()
@@ -77,13 +106,6 @@ class Part(NamedTuple):
         return columns[:, self.source].unflatten(1, self.encoder.row_shape)
 
 
-def _can_encode(columns, parts) -> bool:
-    if columns.requires_grad or parts[-1].target.stop % _ALIGNMENT:
-        return False
-    images = [part for part in parts if part.encoder]
-    return all(p.target.start % _ALIGNMENT == 0 and takes(p.rows(columns)) for p in images)
-
-
 class _Encode(torch.autograd.Function):
     """Each part's encoder has four parameters, in the order of the parts."""
 
@@ -107,9 +129,7 @@ class _Encode(torch.autograd.Function):
     def backward(ctx, d) -> tuple[torch.Tensor | None, ...]:
         columns, features, *weights = ctx.saved_tensors
         of_encoders, gradients = iter(weights), [None, None]
-        for part in ctx.parts:
-            if part.encoder is None:
-                continue
+        for part in filter(lambda part: part.encoder, ctx.parts):
             *of_part, _ = itertools.islice(of_encoders, 4)
             is_needed = ctx.needs_input_grad[len(gradients) : len(gradients) + 4]
             found = [None] * 4
@@ -118,6 +138,13 @@ class _Encode(torch.autograd.Function):
                 found = conv_backward(*of_features, part.rows(columns), *of_part)
             gradients += [one if needed else None for one, needed in zip(found, is_needed)]
         return tuple(gradients)
+
+
+def _can_encode(columns, parts) -> bool:
+    if columns.requires_grad or parts[-1].target.stop % _ALIGNMENT:
+        return False
+    images = [part for part in parts if part.encoder]
+    return all(p.target.start % _ALIGNMENT == 0 and takes(p.rows(columns)) for p in images)
 
 
 def _encode_on_gpu(columns, parts) -> torch.Tensor:
@@ -176,12 +203,8 @@ def conv_forward(
             bytes. None: a new tensor.
     """
     n_rows, n_channels, n_columns = rows.shape
-    if rows.stride()[1:] != (n_columns, 1):
-        rows = rows.contiguous()
     if features is None:
         features = rows.new_empty(n_rows, _CHANNELS * n_outputs(n_columns))
-    names = "first_weight", "first_bias", "second_weight", "second_bias"
-    weights = map(aligned, (first_weight, first_bias, second_weight, second_bias))
     gpu = torch.cuda.get_device_properties(rows.device)
     n_blocks = min(-(-n_rows // _ROWS), _BLOCKS * gpu.multi_processor_count)
     sizes = _forward_sizes(n_channels, n_columns)
@@ -189,12 +212,21 @@ def conv_forward(
     launch(
         *(LIBRARY, f"conv_forward_{4 if n_channels <= 4 else 8}", rows.device),
         Blocks(n_blocks, threads=_THREADS, shared=shared),
-        **dict(zip(names, weights, strict=True)),
-        **dict(rows=rows, row_stride=rows.stride(0), n_rows=n_rows),
+        **dict(first_weight=aligned(first_weight), first_bias=aligned(first_bias)),
+        **dict(second_weight=aligned(second_weight), second_bias=aligned(second_bias)),
         **dict(features=features, feature_stride=features.stride(0)),
-        **dict(n_channels=n_channels, n_columns=n_columns, **sizes),
+        **_fields_of(rows),
+        **sizes,
     )
     return features
+
+
+def _fields_of(rows) -> dict[str, object]:
+    n_rows, n_channels, n_columns = rows.shape
+    if rows.stride()[1:] != (n_columns, 1):
+        rows = rows.contiguous()
+    sizes = dict(n_rows=n_rows, n_channels=n_channels, n_columns=n_columns)
+    return dict(rows=rows, row_stride=rows.stride(0), **sizes)
 
 
 def _forward_sizes(n_channels, n_columns) -> dict[str, int]:
@@ -226,8 +258,6 @@ def conv_backward(
     pass where features (N, 32 W') are above 0 or NaN.
     """
     n_rows, n_channels, n_columns = rows.shape
-    if rows.stride()[1:] != (n_columns, 1):
-        rows = rows.contiguous()
     d_features, features = aligned_rows(d_features), aligned_rows(features)
     sizes = [first_weight.numel(), _CHANNELS, second_weight.numel(), _CHANNELS]
     gpu = torch.cuda.get_device_properties(rows.device)
@@ -241,10 +271,10 @@ def conv_backward(
         Blocks(n_blocks, threads=_THREADS, shared=shared),
         **dict(d_features=d_features, d_stride=d_features.stride(0)),
         **dict(features=features, feature_stride=features.stride(0)),
-        **dict(rows=rows, row_stride=rows.stride(0), n_rows=n_rows),
         **dict(first_weight=aligned(first_weight), first_bias=first_bias.contiguous()),
         **dict(second_weight=aligned(second_weight), sums=sums),
-        **dict(n_channels=n_channels, n_columns=n_columns, **shared_sizes),
+        **_fields_of(rows),
+        **shared_sizes,
     )
     parts = sum_rows(sums).split(sizes)
     return parts[0].view_as(first_weight), parts[1], parts[2].view_as(second_weight), parts[3]
