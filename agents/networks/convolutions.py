@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import nn
@@ -21,7 +21,8 @@ from megastep import spaces
 from megastep.agents.networks.fused import aligned, aligned_rows, fused, has_hopper
 from megastep.agents.networks.intakes import Encoder
 from megastep.agents.networks.linear import sum_rows
-from megastep.agents.networks.precision import cast, compute_dtype
+from megastep.agents.networks.precision import cast as cast_weight
+from megastep.agents.networks.precision import compute_dtype
 from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 
@@ -85,6 +86,22 @@ class Conv(Encoder):
         self.n_row_features = _CHANNELS * n_outputs(space.W)  # of one agent
         self.n_features = space.n_agents * self.n_row_features
 
+    @staticmethod
+    def encode_runs(
+        columns: torch.Tensor, runs: Sequence[tuple], encoders: nn.ModuleList
+    ) -> torch.Tensor:
+        """Returns features (N, n) of an intake's runs of columns (N, n_columns); see `encode`."""
+        parts, n_features = [], 0
+        for i, shape, start, end in runs:
+            encoder = None if i is None else cast("Conv", encoders[i])
+            n_images = 1 if encoder is None else shape[0]
+            size = (end - start) // n_images
+            for source in range(start, end, size):
+                target = n_features
+                n_features += size if encoder is None else encoder.n_row_features
+                parts.append(Part(encoder, slice(source, source + size), slice(target, n_features)))
+        return encode(columns, parts)
+
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         rows = obs.reshape(-1, math.prod(self.row_shape)).to(compute_dtype(self.first.weight))
         part = Part(self, slice(0, rows.shape[1]), slice(0, self.n_row_features))
@@ -112,7 +129,7 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, columns, parts, *parameters) -> torch.Tensor:
         features = columns.new_empty(len(columns), parts[-1].target.stop)
-        weights = [cast(leaf, columns.dtype) for leaf in parameters]
+        weights = [cast_weight(leaf, columns.dtype) for leaf in parameters]
         of_encoders = iter(weights)
         for part in parts:
             target = features[:, part.target]

@@ -25,12 +25,16 @@ from megastep.agents.networks.intakes import ConcatIntake
 from megastep.agents.networks.linear import linear
 from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.arrdict import arrdict
+from megastep.imports import import_object
 from megastep.kernels.build.launch import launch
 from megastep.types import Space, Tree
 
 intake = ConcatIntake
 #: Outputs of continuous actions by name.
-CONTINUOUS_OUTPUTS = {"gaussian": "GaussianOutput", "beta": "BetaOutput"}
+CONTINUOUS_OUTPUTS = {
+    "gaussian": "megastep.agents.networks.continuous_outputs:GaussianOutput",
+    "beta": "megastep.agents.networks.continuous_outputs:BetaOutput",
+}
 #: Score of an action that a mask forbids: its probability is 0, and no sum with it is NaN.
 FORBIDDEN = -1e9
 # below the smallest exponential sample in float32, and far from underflow
@@ -99,9 +103,9 @@ def output(space: Space, width: int, kind: str = "softmax", continuous: str = "g
     if isinstance(space, spaces.MultiDiscrete):
         if kind == "softmax":
             return MultiDiscreteOutput(space, width)
-        from megastep.agents.networks.duelling_output import DuellingOutput
-
-        return DuellingOutput(space, width)
+        return import_object("megastep.agents.networks.duelling_output:DuellingOutput")(
+            space, width
+        )
     if not isinstance(space, spaces.MultiContinuous):
         raise ValueError(
             f"no output is known for the action space {space!r}: use MultiDiscrete, "
@@ -112,9 +116,7 @@ def output(space: Space, width: int, kind: str = "softmax", continuous: str = "g
             f"action values (agent.output=duelling, which R2D2 learns) need discrete actions, not "
             f"{space!r}: use learner=ppo or learner=vtrace with agent.output=softmax"
         )
-    from megastep.agents.networks import continuous_outputs
-
-    return getattr(continuous_outputs, CONTINUOUS_OUTPUTS[continuous])(space, width)
+    return import_object(CONTINUOUS_OUTPUTS[continuous])(space, width)
 
 
 # ---- One choice out of n ----
@@ -271,9 +273,10 @@ class DictOutput(Output):
         **options: torch.Tensor,
     ) -> tuple[arrdict, arrdict, torch.Tensor]:
         """Acts key by key."""
+        outputs = typing.cast("Mapping[str, Output]", self.outputs)
         parts = {
             key: output.act(x, sample, generator, (mask or {}).get(key), **options)
-            for key, output in self.outputs.items()
+            for key, output in outputs.items()
         }
         logits, actions, logprobs = zip(*parts.values())
         return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), _total(logprobs)

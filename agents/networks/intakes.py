@@ -6,7 +6,8 @@ controls. An image leaf is (..., A, C, H, W).
 
 import itertools
 import math
-from typing import TYPE_CHECKING, cast
+from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import nn
@@ -25,9 +26,6 @@ from megastep.imports import resolve
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.types import Space, Tree
 
-if TYPE_CHECKING:
-    from megastep.agents.networks.convolutions import Conv, Part
-
 _MAX_STEPS = 65_535  # blocks along y
 _ROWS = LIBRARY.constants["NORMALISED_ROWS"]
 
@@ -40,10 +38,12 @@ class Encoder(nn.Module):
 
     Attributes:
         takes_parts: the input is normalised, and may be a part of wider rows.
+        encode_runs: encodes all runs of an intake together, such as `Conv`'s. None: cannot.
     """
 
     n_features: int
     takes_parts = False
+    encode_runs: Callable[..., torch.Tensor] | None = None
 
 
 class Flat(Encoder):
@@ -243,12 +243,11 @@ class ConcatIntake(nn.Module):
 
     def encode_columns(self, columns: torch.Tensor) -> torch.Tensor:
         """Returns `encode` of normalised leaves side by side, (..., n_columns)."""
-        if all(i is None for i, *_ in self.runs):  # one run, of all columns
+        others = [encoder for encoder in self.encoders if not isinstance(encoder, Flat)]
+        if not others:  # one run, of all columns
             return columns
-        from megastep.agents.networks.convolutions import Conv, encode
-
-        if all(isinstance(encoder, (Flat, Conv)) for encoder in self.encoders):
-            features = encode(columns.flatten(0, -2), self._parts())
+        if (encode_runs := cast(Encoder, others[0]).encode_runs) is not None:
+            features = encode_runs(columns.flatten(0, -2), self.runs, self.encoders)
             return features.unflatten(0, columns.shape[:-1])
         features = []
         for i, shape, start, end in self.runs:
@@ -256,22 +255,6 @@ class ConcatIntake(nn.Module):
             part = part if i is None else self.encoders[i](part.unflatten(-1, shape))
             features.append(part.contiguous())  # so that `cat` is several times faster
         return torch.cat(features, -1)
-
-    def _parts(self) -> "list[Part]":
-        """Returns `runs` as parts for `encode`, one for each image of each agent."""
-        from megastep.agents.networks.convolutions import Part
-
-        parts, n_features = [], 0
-        for i, shape, start, end in self.runs:
-            encoder = None if i is None else cast("Conv", self.encoders[i])
-            n_images = 1 if encoder is None else shape[0]
-            size = (end - start) // n_images
-            for source in range(start, end, size):
-                target = n_features
-                n_features += size if encoder is None else encoder.n_row_features
-                sources, targets = slice(source, source + size), slice(target, n_features)
-                parts.append(Part(encoder, sources, targets))
-        return parts
 
     @property
     def running_norms(self) -> list[RunningNorm]:
