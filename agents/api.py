@@ -104,7 +104,7 @@ class Run:
         """
         from megastep.agents.cli import export
 
-        return export.run(_checked(export.Export, run=self, format=format, file=file))
+        return export.COMMAND.call(_plain(dict(run=self, format=format, file=file), "settings"))
 
     def web(
         self,
@@ -123,8 +123,8 @@ class Run:
         """
         from megastep.agents.cli import web
 
-        chosen = dict(against=against, homes=homes, seed=seed, file=file)
-        return web.run(_checked(web.Web, run=self, **chosen))
+        chosen = dict(run=self, against=against, homes=homes, seed=seed, file=file)
+        return web.COMMAND.call(_plain(chosen, "settings"))
 
 
 def make(env: object, privileged: bool = False, **settings_of_env: object) -> "Env":
@@ -304,11 +304,6 @@ def _plain(value, key) -> Any:
 
 def _given(**arguments) -> dict:
     return {key: value for key, value in arguments.items() if value is not None}
-
-
-def _checked(kind, **arguments) -> Any:
-    """Returns the settings of a command that no file configures."""
-    return check.check(kind, _plain(arguments, "settings"))
 
 
 def _settings(name: str, arguments: Mapping[str, object]) -> Any:

@@ -8,7 +8,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from io import StringIO
 from typing import Any, TextIO
 
@@ -153,13 +153,15 @@ def restore() -> None:
 
 
 class Progress:
-    """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
+    """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds, the
+    first after `wait` seconds.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, wait: float = 0):
         from rich import progress  # only for those who wait
 
         is_dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
-        self.shown_at = -LINE_EVERY
+        self.shown_at = time.monotonic() + wait - LINE_EVERY
         self.bar = progress.Progress(
             progress.BarColumn(24),
             progress.TextColumn("{task.description}"),
@@ -181,6 +183,39 @@ class Progress:
         if self.bar.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
             self.shown_at = time.monotonic()
             say(text)
+
+
+#: What `count` calls.
+_counts: list[Callable[[int, int], None]] = []
+
+
+def count(done: int, total: int) -> None:
+    """Says how much is done of work that may take long; `counting` shows it."""
+    if _counts:
+        _counts[-1](done, total)
+
+
+@contextlib.contextmanager
+def counting(what: str) -> Iterator[None]:
+    """Shows how much of the work inside is done, such as `episodes`, and the time left."""
+    last, began, first = -1, 0.0, 0
+    with Progress(wait=LINE_EVERY) as progress:
+
+        def show(done: int, total: int) -> None:
+            nonlocal last, began, first
+            if last < 0 or done < last:  # the first, or others begin
+                began, first = time.monotonic(), done
+            last, words = done, [f"{done:,} of {total:,} {what}"]
+            if done > first:
+                seconds = (time.monotonic() - began) * (total - done) / (done - first)
+                words.append(f"{duration(seconds)} left")
+            progress.show(done / max(total, 1), words)
+
+        _counts.append(show)
+        try:
+            yield
+        finally:
+            _counts.remove(show)
 
 
 def number(value: float) -> str:

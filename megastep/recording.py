@@ -251,6 +251,7 @@ def film_all(
     dpi: float = 100,
     speed: float = 1.0,
     trail: int = 60,
+    show: Callable[[int, int], None] = lambda done, total: None,
 ) -> Film:
     """Films several environments at once, in a grid; otherwise as :func:`film`.
 
@@ -259,6 +260,7 @@ def film_all(
         dpi: pixels per inch; an environment's picture has 720 lines at 100.
         speed: how much faster than the environment's own frames per second.
         trail: steps of the agents' trails.
+        show: called after each frame with its number, and that of all.
     """
     path = Film(path)
     if path.suffix not in ENDINGS:
@@ -282,8 +284,9 @@ def film_all(
             return _write(path, _still(players, last, format))
         fps = optional(players[0].env, "fps") * speed
         with ParallelEncoder(_image, fps, format) as encoder:
-            for each in moments:
+            for number, each in enumerate(moments, 1):
                 encoder._add(_image, players, each)
+                show(number, steps)
         return encoder.save(path)
 
 

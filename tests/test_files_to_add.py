@@ -97,19 +97,13 @@ ADDED = {
     "command": {
         "agents/cli/greet.py": """
             from megastep.agents.cli.command import Command
-            from megastep.settings import frozen
 
 
-            @frozen
-            class Greet:
-                name: str
+            def run(name: str):
+                print("hello", name)
 
 
-            def run(cfg):
-                print("hello", cfg.name)
-
-
-            COMMAND = Command("greet", Greet, "Says hello.")
+            COMMAND = Command("greet", run, "Says hello.")
             main = COMMAND.main
             """,
         "agents/cli/entry.py": """

@@ -6,7 +6,6 @@ from pathlib import Path
 from megastep.agents import console
 from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError, user_errors
-from megastep.settings import frozen
 
 HELP = """Checks the floor plans of an .npz file: that each is closed, every room can be reached,
 lights are indoors, and no two walls are the same or cross.
@@ -15,18 +14,13 @@ lights are indoors, and no two walls are the same or cross.
 SHOWN = 20  # plans whose errors are printed
 
 
-@frozen
-class Check:
-    path: str
-
-
-def run(cfg: Check) -> None:
+def run(path: str) -> None:
     """Checks the floor plans of a file. Raises UserError if there are errors."""
     from megastep.geometries import checks, files, imported
 
-    path = Path(cfg.path)
+    file = Path(path)
     with user_errors():
-        plans = imported.load(path) if imported.is_database(path) else files.load(path)
+        plans = imported.load(file) if imported.is_database(file) else files.load(file)
     errors = {index: checks.errors(g) for index, g in enumerate(plans)}
     errors = {index: sentences for index, sentences in errors.items() if sentences}
     for index, sentences in list(errors.items())[:SHOWN]:
@@ -38,5 +32,5 @@ def run(cfg: Check) -> None:
     console.say(f"{len(plans):,} geometries, {sum(len(g.walls) for g in plans):,} walls: no errors")
 
 
-COMMAND = Command("check", Check, HELP)
+COMMAND = Command("check", run, HELP)
 main = COMMAND.main

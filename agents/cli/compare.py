@@ -5,7 +5,6 @@ from pathlib import Path
 from megastep.agents import console
 from megastep.agents.cli.command import Command
 from megastep.agents.factory import settings
-from megastep.settings import frozen
 
 HELP = """Draws a metric of several runs over samples: a line for all runs that differ only in
 their seeds, with a 95 % interval. Prints interquartile means; writes the numbers beside the plot.
@@ -15,20 +14,13 @@ their seeds, with a 95 % interval. Prints interquartile means; writes the number
   megastep compare run=[A,B] file=plot.svg          .pdf, .svg or .png, and plot.csv"""
 
 
-@frozen
-class Compare:
-    run: settings.Names
-    metric: str = "episode/return"
-    file: str = "compare.pdf"
-
-
-def run(cfg: Compare) -> None:
+def run(run: settings.Names, metric: str = "episode/return", file: str = "compare.pdf") -> None:
     """Draws a metric of several runs."""
     from megastep.agents.reports import compare, runs  # with PyTorch
 
-    path = compare.write(runs.expanded([*cfg.run]), Path(cfg.file), cfg.metric)
+    path = compare.write(runs.expanded([*run]), Path(file), metric)
     console.say(f"Plot: {path}, with its numbers in {path.with_suffix('.csv').name}")
 
 
-COMMAND = Command("compare", Compare, HELP)
+COMMAND = Command("compare", run, HELP)
 main = COMMAND.main

@@ -1,15 +1,14 @@
 """The words of a command line, or keyword arguments -> Hydra -> checked settings.
 
-Hydra's grammar reads the words, and `hydra.compose` composes the groups from files, with their
-`blocks`. Keys are set in what comes out, so that every error has its own word.
+`hydra.compose` composes the groups from files, with their `blocks`. Keys are set in what comes out,
+so that every error has its own word.
 """
 
 import copy
 import functools
 import os
 import re
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from megastep.agents import package
 from megastep.agents.cli import blocks
-from megastep.agents.cli.words import Typed, key_of, lists_of, parse, typed_of, typed_word
+from megastep.agents.cli.words import Typed, key_of, parse, typed_of, typed_word
 from megastep.agents.errors import ConfigErrors, UserError, shortened
 from megastep.agents.factory import check, components, conflicts
 from megastep.settings import closest
@@ -62,10 +61,7 @@ def refused_resolvers(tree: check.Tree) -> Iterator[tuple[str, str]]:
     """Yields (key, sentence) of values that call a resolver which is not one of `RESOLVERS`."""
     for key, value in check.leaves(tree):
         for name in dict.fromkeys(re.findall(r"\$\{\s*([\w.]+)\s*:", str(value))):
-            if name in ("oc.env", "env"):
-                cure = "would be written to config.yaml; type its value"
-                yield key, f"is an environment variable, and {cure}"
-            elif name not in RESOLVERS:
+            if name not in RESOLVERS:
                 cure = f"settings may call {', '.join(RESOLVERS)}; type the value"
                 yield key, f"calls {shortened(repr(name), 60)}; {cure}"
 
@@ -114,7 +110,7 @@ class Composer:
             is_none = one.value() is None and bool(self.members(one.key_or_group))
             return is_none and self.composed().hydra.runtime.choices.get(key_of(one)) is None
 
-        overrides = parse(words, lists_of(self.command.kind), self.cure_for_value, self.loader)
+        overrides = parse(words, self.command.kind, self.cure_for_value, self.loader)
         return [one for one in overrides if not is_left_out_anyway(one)]
 
     def settings(self, words: Iterable[str]) -> Any:
@@ -151,6 +147,12 @@ class Composer:
             raise ConfigErrors(errors + secret)
         return chosen, config
 
+    def printed(self, words: Iterable[str], part: str) -> str:
+        """Returns the checked settings as YAML, Hydra's own, or all."""
+        cfg, config = self.compose(words)
+        tree = {} if part == "hydra" else check.as_tree(cfg)
+        return OmegaConf.to_yaml(tree if part == "job" else tree | {"hydra": config.hydra})
+
     def cure_for_value(self, word: str) -> str:
         """Returns what to say of a word without `=`: the key that it may be a value of."""
         word, names = word.lstrip("+"), [*self.command.kind.__pydantic_fields__]
@@ -159,10 +161,9 @@ class Composer:
         keys = []
         with suppress(*HYDRA_ERRORS):  # in files, which are named when they are composed
             keys = [group for group, members in self.groups().items() if word in members]
-        is_run = word == "latest" or "/" in word
-        keys += ["file"] * word.endswith(conflicts.FILMS) + ["run"] + ["resume"] * is_run
-        keys = [key for key in keys if key in (*names, "experiment")]
-        if not word or not keys:
+        if word == "latest" or "/" in word:
+            keys += [key for key in ("run", "resume") if key in names]
+        if not keys:
             return "is not key=value; --cfg job prints all keys"
         return f"is not key=value; did you mean {keys[0]}={word}?"
 
@@ -176,9 +177,8 @@ class Composer:
             others = [member for member in chosen if member not in options]
             labels = [components.label(name) for name in {*map(str, chosen)}]
             if len({*labels}) < len(labels):
-                errors.append(
-                    (one.key, "two loggers have the same class name, and so the same keys")
-                )
+                text = "two loggers have the same class name, and so the same keys"
+                errors.append((one.key, text))
             elif one.key == "hydra.searchpath" or options and not others:
                 groups.append(one.word)
             elif not options or isinstance(one.value, dict):
@@ -202,8 +202,8 @@ class Composer:
         except FILE_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
-            text = shortened(text, 400)
-            raise ConfigErrors([*errors, (absent or "configuration", text)]) from None
+            errors.append((absent or "configuration", shortened(text, 400)))
+            raise ConfigErrors(errors) from None
         for key, one in keys.items():
             try:
                 if one.is_delete:
@@ -213,9 +213,8 @@ class Composer:
                     force = one.is_added or not key.startswith("hydra.")
                     OmegaConf.update(config, key, one.value, force_add=force)
             except (ConfigKeyError, ConfigAttributeError, TypeError):  # TypeError: below a value
-                known = check.leaves({"hydra": blocks.plain(config.hydra)})
-                hint = check.closest_key(key, dict(known))
-                errors.append((key, f"no such key; {hint}"))
+                known = dict(check.leaves({"hydra": blocks.plain(config.hydra)}))
+                errors.append((key, f"no such key; {check.closest_key(key, known)}"))
             except OmegaConfBaseException as error:
                 errors.append((key, str(error).partition("\n")[0]))
         return config, errors
@@ -237,14 +236,6 @@ class Composer:
                 OmegaConf.set_struct(config, False)
                 return config
             learner = learner or chosen  # which a block may not choose
-
-    def call_hydra(self, arguments: list[str], task: Callable | None = None) -> None:
-        """Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv."""
-        os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", arguments
-        global_hydra.GlobalHydra.instance().clear()
-        hydra.main(config_path=MAIN, config_name=self.name, version_base="1.3")(
-            task or self.command.run
-        )()
 
 
 def store_member(group: str, member: str, path: str) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from megastep.agents import console
 from megastep.agents.cli.command import Command, with_member
 from megastep.agents.factory import settings
 from megastep.agents.factory.check import Tree
@@ -48,9 +49,10 @@ def run(cfg: settings.Evaluate) -> Path:
     """Evaluates a run; see `megastep.agents.evaluation.evaluate_run.run`."""
     from megastep.agents.evaluation import evaluate_run  # with PyTorch
 
-    return evaluate_run.run(cfg)
+    with console.counting("episodes"):
+        return evaluate_run.run(cfg)
 
 
-COMMAND = Command("evaluate", settings.Evaluate, HELP, True, prepare, ready, has_ranks=True)
+COMMAND = Command("evaluate", run, HELP, settings.Evaluate, prepare, ready, has_ranks=True)
 #: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main

@@ -8,7 +8,6 @@ from megastep.agents.cli.command import Command, with_member
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.factory import settings
 from megastep.agents.runs import folders
-from megastep.settings import frozen
 
 HELP = """Writes a trained agent for use elsewhere.
 
@@ -23,25 +22,22 @@ run= takes a run, one of its checkpoints, latest, or a packaged agent."""
 FORMATS = {"onnx": "policy.onnx", "torch": "policy.pt2", "safetensors": "agent.safetensors"}
 
 
-@frozen
-class Export:
-    run: str
-    format: Literal["onnx", "torch", "safetensors"]
-    file: str | None = None
-    member: settings.PopulationMember = None
-
-
-def run(cfg: Export) -> Path:
+def run(
+    run: str,
+    format: Literal["onnx", "torch", "safetensors"],
+    file: str | None = None,
+    member: settings.PopulationMember = None,
+) -> Path:
     """Writes an agent's file, and says what was written. Returns its path."""
-    kind, run = cfg.format, with_member({"run": cfg.run, "member": cfg.member}, "run")["run"]
-    source, suffix = folders.find(run), Path(FORMATS[kind]).suffix
-    path = folders.folder_of(source) / FORMATS[kind] if cfg.file is None else Path(cfg.file)
+    run = with_member({"run": run, "member": member}, "run")["run"]
+    source, suffix = folders.find(run), Path(FORMATS[format]).suffix
+    path = folders.folder_of(source) / FORMATS[format] if file is None else Path(file)
     if path.suffix != suffix:
-        raise UserError(f"file={path} must end with {suffix} for format={kind}")
+        raise UserError(f"file={path} must end with {suffix} for format={format}")
     from megastep.agents import pretrained  # with PyTorch
     from megastep.agents.export import agent, runtimes
 
-    if kind == "safetensors":
+    if format == "safetensors":
         agent.write(run, path)
         console.say(f"Wrote {path} and its card, {path.with_suffix('.md')}")
         return path
@@ -50,7 +46,7 @@ def run(cfg: Export) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
     step = runtimes.Step(policy, env.reset())
     write, runner = runtimes.write_torch, runtimes.run_torch
-    if kind == "onnx":
+    if format == "onnx":
         write, runner = runtimes.write_onnx, runtimes.run_onnx
     with user_errors(f"{path} cannot be written: ", (OSError,)):
         write(step, path, folders.name_of(source))
@@ -63,5 +59,5 @@ def run(cfg: Export) -> Path:
     return path
 
 
-COMMAND = Command("export", Export, HELP)
+COMMAND = Command("export", run, HELP)
 main = COMMAND.main

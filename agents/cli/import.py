@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import sys
 import time
+import zipfile
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +14,6 @@ from pydantic import Field
 from megastep.agents import console, package
 from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError, user_errors
-from megastep.settings import frozen
 
 HELP = """Imports floor plans.
 
@@ -36,18 +36,19 @@ it. In a drawing walls have the id, class or label `wall`, doors `door`; walls=N
   per=file             one geometry per file, not per floor, as in the original megastep
   entrances=open       leaves the doors to the outside open, as there; by default they are closed"""
 
-
-#: Title, place and licence of the databases.
+#: Title, place, licence and number of files of the databases.
 DATABASES = {
     "cubicasa": (
         "CubiCasa5k (Kalervo et al. 2019)",
         "https://zenodo.org/record/2613548",
         "CC BY-NC 4.0: no commercial use, name the authors",
+        5_000,
     ),
     "houseexpo": (
         "HouseExpo (Li et al. 2019)",
         "https://github.com/TeaganLi/HouseExpo",
         "MIT; its plans are from SUNCG, which was withdrawn after a dispute about rights",
+        35_126,
     ),
 }
 MAX_LINES = 1_000  # of a report's lists
@@ -58,57 +59,57 @@ KEYS = {
     "map": ("file", "metres_per_pixel"),
 }
 NEEDED = ("shapely", "defusedxml", "svgelements")
-
-
 Metres = Annotated[float, Field(gt=0, lt=1e6)]
 
 
-@frozen
-class Import:
-    source: Literal["cubicasa", "houseexpo", "svg", "map"]
-    path: str
-    file: str | None = None
-    scale: Metres | None = None
-    walls: str | None = None
-    doors: str | None = None
-    metres_per_pixel: Metres | None = None
-    licence: Literal["accept"] | None = None
-    per: Literal["floor", "file"] | None = None
-    entrances: Literal["sealed", "open"] | None = None
-
-
-def run(cfg: Import) -> None:
+def run(
+    source: Literal["cubicasa", "houseexpo", "svg", "map"],
+    path: str,
+    file: str | None = None,
+    scale: Metres | None = None,
+    walls: str | None = None,
+    doors: str | None = None,
+    metres_per_pixel: Metres | None = None,
+    licence: Literal["accept"] | None = None,
+    per: Literal["floor", "file"] | None = None,
+    entrances: Literal["sealed", "open"] | None = None,
+) -> None:
     """Imports floor plans."""
-    keys = KEYS[cfg.source]
-    for key, value in vars(cfg).items():
-        if value is not None and key not in ("source", "path", *keys):
-            raise UserError(f"source={cfg.source} has no {key}; it has {', '.join(keys)}")
+    given = {key: value for key, value in locals().items() if value is not None}
+    for key in given:
+        if key not in ("source", "path", *KEYS[source]):
+            raise UserError(f"source={source} has no {key}; it has {', '.join(KEYS[source])}")
     if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
         raise UserError(
             f"importing needs {', '.join(missing)}; pip install {package.DISTRIBUTION}[plans]"
         )
-    (_import_database if cfg.source in DATABASES else _import_own)(cfg)
-
-
-def _import_own(cfg) -> None:
-    """Imports one drawing or map."""
-    path = Path(cfg.path)
-    if not path.is_file():
+    if source in DATABASES:
+        _import_database(source, Path(path), licence, per or "floor", entrances != "open")
+        return
+    own, target = Path(path), Path(file or f"{Path(path).stem}.npz")
+    if not own.is_file():
         raise UserError(f"path={path} does not exist, or is not a file")
-    file = Path(cfg.file or f"{path.stem}.npz")
-    if file.suffix != ".npz":
-        raise UserError(f"file={file} must end with .npz")
+    if target.suffix != ".npz":
+        raise UserError(f"file={target} must end with .npz")
+    if source == "svg" and scale is None:
+        raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
+    _import_own(own, target, scale, metres_per_pixel, {k: given[k] for k in MARKS if k in given})
+
+
+#: What names the walls and doors of a drawing.
+MARKS = "walls", "doors"
+
+
+def _import_own(path, file, scale, metres_per_pixel, marks) -> None:
+    """Imports one drawing, or map if there is no scale."""
     from megastep.geometries import files
     from megastep.geometries.plans import imports, sheets
 
     with user_errors(f"{path} is not a floor plan: "):
-        if cfg.source == "map":
-            own = imports.own_map(path, cfg.metres_per_pixel)
-        elif cfg.scale is None:
-            raise UserError("scale is missing; scale=0.001 is for a drawing in millimetres")
+        if scale is None:
+            own = imports.own_map(path, metres_per_pixel)
         else:
-            marks = {key: getattr(cfg, key) for key in ("walls", "doors") if getattr(cfg, key)}
-            own = imports.own_svg(path, cfg.scale, **marks)
+            own = imports.own_svg(path, scale, **marks)
     with user_errors(f"{file} cannot be written: "):
         files.save(file, [own.geometry])
         sheet = file.with_name(f"{file.stem}-sheet.png")
@@ -123,11 +124,11 @@ def _import_own(cfg) -> None:
     )
 
 
-def _confirm(cfg) -> None:
+def _confirm(source, licence) -> None:
     """Shows where a database is to be had, and has its licence confirmed."""
-    title, place, licence = DATABASES[cfg.source]
-    console.say(f"{title}\n  from {place}\n  licence: {licence}")
-    if cfg.licence == "accept":
+    title, place, terms, _ = DATABASES[source]
+    console.say(f"{title}\n  from {place}\n  licence: {terms}")
+    if licence == "accept":
         return
     if not sys.stdin or not sys.stdin.isatty():
         raise UserError("the licence is not confirmed; licence=accept does so")
@@ -138,21 +139,20 @@ def _confirm(cfg) -> None:
         raise UserError("the licence is not confirmed, so nothing is imported")
 
 
-def _import_database(cfg) -> None:
-    source, path, start = cfg.source, Path(cfg.path), time.monotonic()
+def _import_database(source, path, licence, per, is_sealed) -> None:
+    start = time.monotonic()
     if not path.exists():
         raise UserError(f"path={path} does not exist")
-    _confirm(cfg)
+    _confirm(source, licence)
     from megastep.geometries import imported
     from megastep.geometries.plans import imports, sheets
 
-    options = imports.Options(source, cfg.per or "floor", cfg.entrances != "open")
+    options, suffix = imports.Options(source, per, is_sealed), imports.READERS[source].SUFFIX
     with user_errors(f"{imported.folder()} cannot be written: ", (OSError,)):
         imported.prepare()
-    with console.Progress() as progress, user_errors():
-        plans, shown = imports.run(
-            options, path, lambda n: progress.show(None, [f"{n:,} files read"])
-        )
+    with console.counting("files"), user_errors():
+        n_files = _n_files(path, suffix) or DATABASES[source][-1]
+        plans, shown = imports.run(options, path, lambda n: console.count(n, max(n, n_files)))
     geometries = [g for plan in plans for g in plan.geometries]
     numbers = [i for i, plan in enumerate(plans) for _ in plan.geometries]
     with user_errors(f"{imported.folder()} cannot be written: "):
@@ -170,9 +170,19 @@ def _import_database(cfg) -> None:
     )
 
 
+def _n_files(path, suffix) -> int | None:
+    """Returns the number of files to read; None of a tar.gz, which only reading it would tell."""
+    if path.is_dir():
+        return sum(1 for _ in path.rglob(f"*{suffix}"))
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            return sum(name.endswith(suffix) for name in archive.namelist())
+    return None
+
+
 def _report(source, path, plans, n, file) -> str:
     """Returns the report of an import in Markdown."""
-    title, _, licence = DATABASES[source]
+    title, _, licence, _ = DATABASES[source]
     notes = [(plan.name, note) for plan in plans for note in plan.notes]
     refused = [(plan.name, plan.refusal) for plan in plans if plan.refusal]
     kinds = Counter(refusal for _, refusal in refused)
@@ -194,5 +204,5 @@ def _report(source, path, plans, n, file) -> str:
     return console.visible("\n".join(lines)) + "\n"
 
 
-COMMAND = Command("import", Import, HELP)
+COMMAND = Command("import", run, HELP)
 main = COMMAND.main

@@ -9,7 +9,6 @@ from megastep.agents import console
 from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError
 from megastep.agents.runs import agent_file, checkpoint, folders
-from megastep.settings import frozen
 
 if TYPE_CHECKING:
     from megastep.agents.types import StateDict
@@ -19,29 +18,21 @@ HELP = """Verifies a run's checkpoints and prints what is in them.
   megastep inspect RUN     a run folder, one of its checkpoints, latest, or a pretrained agent"""
 
 
-@frozen
-class Inspect:
-    run: str
-
-
-def run(cfg: Inspect) -> int:
+def run(run: str) -> int:
     """Inspects a run. Returns the exit code: 1 if one of its checkpoints is damaged."""
-    path = folders.find(cfg.run)
+    path = folders.find(run)
     is_agent, folder = agent_file.is_agent_file(path), folders.checkpoints_of(path)
     is_one = is_agent or folder == path
     paths = [path] if is_one else checkpoint.list_checkpoints(folder)
     if not paths:
         raise UserError(f"There is no checkpoint in {folder}; has the run saved one yet?")
-    is_damaged, n_printed = False, 0
-    while paths:
-        path, *paths = paths
+    is_damaged = False
+    for path in paths:
         try:
             console.say("\n".join((_lines_of_agent if is_agent else _lines)(path)))
-            n_printed += 1
         except checkpoint.GoneCheckpoint as error:  # the run has saved others meanwhile
-            if is_one:
+            if path == paths[-1]:
                 raise UserError(str(error)) from None
-            paths = paths if paths or n_printed else checkpoint.list_checkpoints(folder)
         except checkpoint.CheckpointError as error:
             is_damaged = True
             console.say(str(error))
@@ -86,5 +77,5 @@ def _parts(state: "StateDict | None") -> Iterator[str]:
             yield f"  {name}: {len(tensors)} tensors, {n_bytes} bytes"
 
 
-COMMAND = Command("inspect", Inspect, HELP)
+COMMAND = Command("inspect", run, HELP)
 main = COMMAND.main

@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+from megastep.agents import console
 from megastep.agents.cli import evaluate
 from megastep.agents.cli.command import Command
 from megastep.agents.factory import settings
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
+It makes one environment, whatever env.n_envs is.
 
 The most common words:
   run=RUN          a run folder, one of its checkpoints, latest, or a pretrained agent
@@ -26,9 +28,10 @@ def run(cfg: settings.Record) -> Path:
     """Films an agent; see `megastep.agents.evaluation.filming.run`."""
     from megastep.agents.evaluation import filming  # with PyTorch
 
-    return filming.run(cfg)
+    with console.counting("frames"):
+        return filming.run(cfg)
 
 
-COMMAND = Command("record", settings.Record, HELP, True, evaluate.prepare, evaluate.ready)
+COMMAND = Command("record", run, HELP, settings.Record, evaluate.prepare, evaluate.ready)
 #: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main

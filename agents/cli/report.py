@@ -6,7 +6,6 @@ from megastep.agents import console
 from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError
 from megastep.agents.factory import settings
-from megastep.settings import frozen
 
 HELP = """Writes a report that opens in a browser, from one file without a server.
 
@@ -16,25 +15,24 @@ HELP = """Writes a report that opens in a browser, from one file without a serve
   megastep report run=RUN file=x.html    into this file, overwritten if it exists"""
 
 
-@frozen
-class Report:
-    run: settings.Names
-    file: str | None = None
-
-
-def run(cfg: Report) -> None:
+def run(run: settings.Names, file: str | None = None) -> None:
     """Writes the report of a run, or of several."""
     from megastep.agents.reports import report, runs  # with PyTorch
 
-    paths = runs.expanded([*cfg.run])
+    paths = runs.expanded([*run])
     folder = paths[0] if len(paths) == 1 else Path()
-    if len(paths) > 1 and len(cfg.run) == 1:
-        folder = Path(cfg.run[0])  # of a sweep
-    file = folder / "report.html" if cfg.file is None else Path(cfg.file)
-    if file.suffix != ".html":
-        raise UserError(f"file={file} is not a page; its name ends with .html")
-    console.say(f"Report: {report.write(paths, file)}")
+    if len(paths) > 1 and len(run) == 1:
+        folder = Path(run[0])  # of a sweep
+    console.say(f"Report: {report.write(paths, page(file, folder / 'report.html'))}")
 
 
-COMMAND = Command("report", Report, HELP)
+def page(file: str | None, default: Path) -> Path:
+    """Returns the path of a page, by default `default`. Raises UserError if it is no page."""
+    path = default if file is None else Path(file)
+    if path.suffix != ".html":
+        raise UserError(f"file={path} is not a page; its name ends with .html")
+    return path
+
+
+COMMAND = Command("report", run, HELP)
 main = COMMAND.main

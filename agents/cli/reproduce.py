@@ -5,7 +5,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,18 +16,18 @@ from megastep.agents.cli.command import Command
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.runs import json_lines
 from megastep.atomic_files import write_atomically
-from megastep.settings import closest, frozen
+from megastep.settings import closest
 
 HELP = """Makes results of docs/lab again.
 
   megastep reproduce          lists them
   megastep reproduce ROW      trains and evaluates one, and compares"""
-#: The rows; its head says what they consist of.
+#: {name: row}; its head says what a row consists of.
 FILE = Path(__file__).with_name("reproductions.yaml")
 #: Threads of rows for a CPU: as many as the stated results were made with.
 CPU_THREADS = 2
-#: `value (lower to upper)`, or two cells of a table: `value | lower to upper`. In percent or not.
-STATED = re.compile(r"(-?[\d.]+)( %)? (?:\(|\| )(-?[\d.]+) to (-?[\d.]+)\)?")
+#: A stated value and its interval, in percent or not.
+STATED = re.compile(r"-?[\d.]+( %)? \((-?[\d.]+) to (-?[\d.]+)\)")
 
 
 class Interval(NamedTuple):
@@ -40,122 +40,78 @@ class Interval(NamedTuple):
     def __str__(self) -> str:
         return f"{self.value:.4g} ({self.lower:.4g} to {self.upper:.4g})"
 
-
-class Result(NamedTuple):
-    """A number that a page states.
-
-    Attributes:
-        page: of docs/lab. One of its lines contains both `line` and `text`.
-        evaluate: words of `megastep evaluate`.
-        metric: of the evaluation's table; in duels, the opponent.
-        text: value and 95 % interval as the page writes them.
-    """
-
-    page: str
-    line: str
-    evaluate: str
-    metric: str
-    text: str
-
-    def __str__(self) -> str:
-        value, percent, lower, upper = self._parts()
-        return f"{self.metric} {value}{percent} ({lower} to {upper})"
-
-    def agrees(self, found: Interval) -> bool:
-        """Returns true if a 95 % interval, rounded as the stated one is, has a number in common
-        with it.
+    def agrees(self, stated: str) -> bool:
+        """Returns true if the interval, rounded as the stated one is, has a number in common with
+        it.
         """
-        _, percent, *bounds = self._parts()
+        match = STATED.fullmatch(stated)
+        assert match is not None, stated
+        percent, *bounds = match.groups()
         decimals = max(len(bound.partition(".")[2]) for bound in bounds)
         lower, upper = map(float, bounds)
-        _, *ends = (round(100 * end if percent else end, decimals) for end in found)
+        ends = [round(100 * end if percent else end, decimals) for end in self[1:]]
         return ends[0] <= upper and lower <= ends[1]
 
-    def _parts(self) -> Sequence[str]:
-        match = STATED.fullmatch(self.text)
-        assert match is not None
-        return match.groups(default="")
 
-
-class Row(NamedTuple):
-    """A training run with its results.
-
-    Attributes:
-        device: cpu or cuda.
-        train: words of `megastep train`.
-        minutes: of the run and its evaluations, about; given for a CPU.
-    """
-
-    name: str
-    device: str
-    train: str
-    results: list[Result]
-    minutes: int | None = None
-
-
-def read() -> dict[str, Row]:
+def read() -> dict[str, dict]:
     """Returns the rows by name."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is built
-    rows = yaml.load(FILE.read_text(encoding="utf-8"), loader)["rows"]
-    return {name: Row(name, **{**row, "results": [*_results(row)]}) for name, row in rows.items()}
+    return yaml.load(FILE.read_text(encoding="utf-8"), loader)["rows"]
 
 
-def _results(row: dict) -> Iterator[Result]:
+def results(row: dict) -> Iterator[tuple[str, str, str, str]]:
+    """Yields (words of the evaluation, page, metric, value and interval) of a row's results."""
     for result in row["results"]:
         for metric, text in result["states"].items():
-            yield Result(result["page"], result["line"], result.get("evaluate", ""), metric, text)
+            if "|" in text:  # two cells of a table
+                text = f"{text.replace('| ', '(')})"
+            yield result.get("evaluate", ""), result["page"], metric, text
 
 
-@frozen
-class Reproduce:
-    row: str | None = None
-
-
-def run(cfg: Reproduce) -> int:
+def run(row: str | None = None) -> int:
     """Lists the rows, or reproduces one. Returns the exit code: 1 if a result differs."""
     rows = read()
-    if cfg.row is None:
-        for device, title in ("cpu", "On two CPU cores"), ("cuda", "On one H200"):
-            lines = [
-                [row.name, str(row.minutes or ""), row.train, "; ".join(map(str, row.results))]
-                for row in rows.values()
-                if row.device == device
-            ]
-            table = console.table(["row", "minutes", "megastep train", "result"], lines)
-            console.say(f"{title}\n{table}")
-        console.say(f"To run one: {package.command('reproduce', 'python ')} ROW")
-        return 0
-    if cfg.row not in rows:
-        raise UserError(f"{cfg.row!r} is unknown; {closest(cfg.row, rows)}")
-    return reproduce(rows[cfg.row])
+    if row is not None and row not in rows:
+        raise UserError(f"{row!r} is unknown; {closest(row, rows)}")
+    if row is not None:
+        return reproduce(row, rows[row])
+    for device, title in ("cpu", "On two CPU cores"), ("cuda", "On one H200"):
+        lines = []
+        for name, one in rows.items():
+            if one["device"] == device:
+                text = "; ".join(f"{metric} {text}" for *_, metric, text in results(one))
+                lines.append([name, str(one.get("minutes", "")), one["train"], text])
+        table = console.table(["row", "minutes", "megastep train", "result"], lines)
+        console.say(f"{title}\n{table}")
+    console.say(f"To run one: {package.command('reproduce', 'python ')} ROW")
+    return 0
 
 
-def reproduce(row: Row) -> int:
+def reproduce(name: str, row: dict) -> int:
     """Trains and evaluates a row, and compares. Returns the exit code."""
     from megastep.agents.cli import evaluate, train
     from megastep.agents.launch import gpu
     from megastep.agents.runs import folders
 
-    if row.device == "cpu":
+    if row["device"] == "cpu":
         os.environ["OMP_NUM_THREADS"] = str(CPU_THREADS)  # before PyTorch is imported
     elif not gpu.is_available():
         raise UserError(
-            f"{row.name} needs a GPU, and PyTorch finds none here; choose a row for two CPU cores"
+            f"{name} needs a GPU, and PyTorch finds none here; choose a row for two CPU cores"
         )
-    folder = folders.RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-reproduce-{row.name}"
-    device = f"device={row.device}"
-    finish = "finish.evaluate=false", "finish.record=false"
-    if code := train.main([*row.train.split(), *finish, device, f"folder={folder}"]):
+    folder = folders.RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-reproduce-{name}"
+    device, finish = f"device={row['device']}", ("finish.evaluate=false", "finish.record=false")
+    if code := train.main([*row["train"].split(), *finish, device, f"folder={folder}"]):
         return code
     found = []
-    for more, group in itertools.groupby(row.results, lambda result: result.evaluate):
+    for more, group in itertools.groupby(results(row), lambda result: result[0]):
         if code := evaluate.main([f"run={folder}", device, "baseline=false", *more.split()]):
             return code
         tables = (folder / "evaluations").glob("*.json")
         newest = max(tables, key=lambda path: path.stat().st_mtime_ns)
         rows = json.loads(newest.read_bytes())["rows"]
-        found += [found_in(rows, result.metric) for result in group]
-    return compare(row, folder, found)
+        found += [found_in(rows, metric) for *_, metric, _ in group]
+    return compare(name, row, folder, found)
 
 
 def found_in(rows: list[dict], metric: str) -> Interval:
@@ -168,25 +124,26 @@ def found_in(rows: list[dict], metric: str) -> Interval:
     return Interval(cells[key], cells["lower"], cells["upper"])
 
 
-def compare(row: Row, folder: Path, found: Sequence[Interval]) -> int:
+def compare(name: str, row: dict, folder: Path, found: list[Interval]) -> int:
     """Prints how numbers compare with those stated, and writes reproduction.json. Returns the exit
     code.
     """
     samples = json_lines.read(folder / "metrics.jsonl")[-1]["samples"]
-    agree = [*map(Result.agrees, row.results, found)]
-    for result, number, agrees in zip(row.results, found, agree, strict=True):
+    agree, values = True, {}
+    for (_, page, metric, text), number in zip(results(row), found, strict=True):
+        agrees = number.agrees(text)
+        agree, values[f"{metric} {text}"] = agree and agrees, number.value
         verdict = "agrees" if agrees else "DIFFERS"
-        console.say(f"{verdict}: {number}, stated {result}, docs/lab/{result.page}")
-    if not all(agree) and "samples=" not in row.train:
+        console.say(f"{verdict}: {number}, stated {metric} {text}, docs/lab/{page}")
+    if not agree and "samples=" not in row["train"]:
         busy = "in the same seconds a slower or busier machine has fewer"
         console.say(f"The run had {samples:,} samples; {busy}")
-    console.say(f"{row.name} is {'' if all(agree) else 'NOT '}reproduced: {folder}")
-    values = {str(result): number.value for result, number in zip(row.results, found)}
-    report = dict(row=row.name, is_reproduced=all(agree), samples=samples, values=values)
+    console.say(f"{name} is {'' if agree else 'NOT '}reproduced: {folder}")
+    report = dict(row=name, is_reproduced=agree, samples=samples, values=values)
     with user_errors(f"{folder} cannot be written: "):
         write_atomically(folder / "reproduction.json", json.dumps(report, indent=2).encode())
-    return 0 if all(agree) else 1
+    return 0 if agree else 1
 
 
-COMMAND = Command("reproduce", Reproduce, HELP)
+COMMAND = Command("reproduce", run, HELP)
 main = COMMAND.main

@@ -25,13 +25,15 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
+import hydra
+from hydra.core import global_hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from megastep import workers
 from megastep.agents import console, package
-from megastep.agents.cli.compose import Composer
+from megastep.agents.cli.compose import MAIN, Composer
 from megastep.agents.cli.words import key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import settings
@@ -127,7 +129,11 @@ def sweep(composer: Composer, words: list[str]) -> int:
     job, problem = new_job(composer, folder), ""
     try:
         with signals.interrupting(job.interrupt):
-            composer.call_hydra(["--multirun", *words], job)
+            # its errors are raised; it sets sys.argv
+            os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", ["--multirun", *words]
+            global_hydra.GlobalHydra.instance().clear()
+            main = hydra.main(config_path=MAIN, config_name=composer.name, version_base="1.3")
+            main(job)()
     except Exception as error:  # a launcher's or a sweeper's
         problem = shortened(error, 400)
     finally:

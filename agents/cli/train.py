@@ -189,6 +189,6 @@ def run(cfg: settings.Train) -> Path | None:
     return train.run(cfg)
 
 
-COMMAND = Command("train", settings.Train, HELP, True, prepare, ready, has_ranks=True)
+COMMAND = Command("train", run, HELP, settings.Train, prepare, ready, has_ranks=True)
 #: Runs the command with words of a command line, by default this process's.
 main = COMMAND.main

@@ -7,9 +7,9 @@ from pydantic import Field
 
 from megastep.agents import console
 from megastep.agents.cli.command import Command
-from megastep.agents.errors import UserError, user_errors
+from megastep.agents.cli.report import page
+from megastep.agents.errors import user_errors
 from megastep.agents.runs import folders
-from megastep.settings import frozen
 
 HELP = """Writes a page that plays a trained agent in a browser, from one file without a server.
 
@@ -23,26 +23,19 @@ The page has keys to play, pause and step, and to drive an agent yourself. docs/
 put it on a site of your own."""
 
 
-@frozen
-class Web:
-    run: str
-    against: str | None = None
-    homes: tuple[Annotated[int, Field(ge=0)], ...] | None = None
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
-    file: str | None = None
-
-
-def run(cfg: Web) -> Path:
+def run(
+    run: str,
+    against: str | None = None,
+    homes: tuple[Annotated[int, Field(ge=0)], ...] | None = None,
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1,
+    file: str | None = None,
+) -> Path:
     """Writes a page, and says where and how large it is. Returns its path."""
-    own = folders.folder_of(folders.find(cfg.run)) / "page.html"
-    path = own if cfg.file is None else Path(cfg.file)
-    if path.suffix != ".html":
-        raise UserError(f"file={path} is not a page; its name ends with .html")
+    path = page(file, folders.folder_of(folders.find(run)) / "page.html")
     from megastep.agents.export import web  # with PyTorch
     from megastep.atomic_files import write_atomically
 
-    homes = None if cfg.homes is None else [*cfg.homes]
-    text = web.make(cfg.run, cfg.against, homes, cfg.seed)
+    text = web.make(run, against, homes if homes is None else [*homes], seed)
     with user_errors(f"{path} cannot be written: "):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, text.encode())
@@ -50,5 +43,5 @@ def run(cfg: Web) -> Path:
     return path
 
 
-COMMAND = Command("web", Web, HELP)
+COMMAND = Command("web", run, HELP)
 main = COMMAND.main

@@ -9,12 +9,10 @@ from hydra.core.override_parser import overrides_parser, types
 from hydra.errors import HydraException
 
 from megastep.agents.errors import ConfigErrors, shortened
-from megastep.agents.factory import check
+from megastep.agents.factory.check import Tree
 
 if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
-
-    from megastep.agents.cli.command import Command
 
 #: An element of a value with = in it, as folders of sweeps have, and what quotes it.
 WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
@@ -32,18 +30,20 @@ class Typed(NamedTuple):
 
 def parse(
     words: Iterable[str],
-    lists: Iterable[str],
-    cure: Callable[[str], str],
+    kind: Any,
+    cure: Callable[[str], str] = str,
     loader: "ConfigLoader | None" = None,
 ) -> list[types.Override]:
     """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable ones.
 
     Args:
-        lists: keys whose values are lists, also without brackets: run=a,b.
+        kind: of the settings. A list among them needs no brackets: run=a,b.
         cure: what is said of a word without `=`.
         loader: Hydra's, for glob().
     """
     parser = overrides_parser.OverridesParser.create(loader)
+    fields = kind.__pydantic_fields__.items()
+    lists = [name for name, field in fields if "tuple" in repr(field.annotation)]
     overrides: list[types.Override] = []
     errors = []
     for word in words:
@@ -66,12 +66,6 @@ def parse(
     return overrides
 
 
-def lists_of(kind: type) -> list[str]:
-    """Returns the keys of settings that are lists."""
-    fields = kind.__pydantic_fields__.items()
-    return [name for name, field in fields if "tuple" in repr(field.annotation)]
-
-
 def key_of(override: types.Override) -> str:
     """The key or group@package of a word, without the sign before it."""
     return override.get_key_element().lstrip("+~")
@@ -84,18 +78,16 @@ def typed_word(override: types.Override) -> Typed:
     return Typed(key_of(override), override.value(), word, override.is_delete(), is_added)
 
 
-def plain_settings(command: "Command", words: list[str]) -> Any:
-    """Returns the settings of a command without files, whose first key needs no `=`."""
-    kind = command.kind
+def plain_tree(kind: Any, words: list[str]) -> Tree:
+    """Returns the settings that words give a command without files. Its first key needs no `=`."""
     first = next(iter(kind.__pydantic_fields__))
-    words = [word if "=" in word else f"{first}={word}" for word in words]
-    overrides = parse(words, lists_of(kind), str)
+    overrides = parse([word if "=" in word else f"{first}={word}" for word in words], kind)
     keys = [key_of(one) for one in overrides]
     errors = [(key, "is given twice") for key in {*keys} if keys.count(key) > 1]
     errors += [(key_of(one), "takes one value") for one in overrides if one.is_sweep_override()]
     if errors:
         raise ConfigErrors(errors)
-    return check.check(kind, {key_of(one): one.value() for one in overrides})
+    return {key_of(one): one.value() for one in overrides}
 
 
 def typed_of(arguments: Mapping[str, Any]) -> list[Typed]:

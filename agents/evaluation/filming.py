@@ -58,6 +58,7 @@ def run(cfg: settings.Record) -> Path:
             title = ", ".join(text for text in titles if text is not None)
             shown.append(recording.Player(env, policy, title or cfg.title))
     look = {name: getattr(cfg, name) for name in ("theme", "dpi", "speed", "trail")}
+    look["show"] = console.count
     with contextlib.ExitStack() as undo:
         path = Path(cfg.file or take_free_name(folder / "video.mp4"))
         if not cfg.file:
@@ -67,7 +68,8 @@ def run(cfg: settings.Record) -> Path:
         with env_failures.caught(env_settings, folder), user_errors(problem, (Exception,)):
             recording.film_all(shown, path, cfg.steps, cfg.greedy, cfg.seed, **look)
         undo.pop_all()
-    console.say(f"Filmed {cfg.steps} steps: {path}")
+    each = "one environment" if len(shown) == 1 else f"{len(shown)} environments"
+    console.say(f"Filmed {cfg.steps} steps of {each}: {path}")
     return path
 
 

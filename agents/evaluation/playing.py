@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch.utils import _pytree
 
+from megastep.agents import console
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.selfplay.mixed_policy import MixedPolicy, rotating_slots, score_pairs
 from megastep.agents.storage.collector import capture_with
@@ -51,8 +52,11 @@ def step_until(
 
     play, before = several, None
     for start in range(0, max_steps, STEPS_PER_GRAPH):
-        if start % CHECK_EVERY == 0 and bool(is_over.all()):
-            break
+        if start % CHECK_EVERY == 0:
+            n_over, n = int(is_over.sum()), is_over.numel()
+            console.count(n_over, n)
+            if n_over == n:
+                break
         if start == CHECK_EVERY and is_over.is_cuda:
             carried = world, state
             if can_capture(env, policies) and _has_fixed_form(before, carried):

@@ -381,4 +381,4 @@ def test_cfg_prints_composed_config(capsys, logging_as_it_was):
     assert tree == as_tree(compose("logging.every=2"))
     assert "hydra" in yaml.safe_load(printed("--cfg", "all"))
     assert "seed: 1" in printed("-m", "seed=1,2", "--cfg", "job").split("---")[0]
-    assert "blocks://" in printed("--info", "searchpath")
+    assert [*yaml.safe_load(printed("--cfg", "hydra"))] == ["hydra"]

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from megastep import envs, spaces
+from megastep.agents import console
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
 from megastep.agents.evaluation import playing, statistics, tables
@@ -255,6 +256,13 @@ def test_evaluate_prints_and_writes_a_table(trained, capsys):
     row = dict(evaluated=0.0, lower=0.0, upper=0.0)
     assert scores.outcome(written) == dict(score=0.0, **row)
     assert row.items() <= scores.outcome(trained).items()
+
+
+def test_evaluate_shows_how_many_episodes_have_ended(trained, monkeypatch, capsys):
+    monkeypatch.setattr(console, "LINE_EVERY", 0)
+    words = [f"run={trained}", "episodes=4", "baseline=none", "max_steps=9", "device=cpu"]
+    assert evaluate.main(words) == 0
+    assert capsys.readouterr().out.startswith("0 of 4 episodes\n")
 
 
 def test_evaluate_is_reproducible(trained):

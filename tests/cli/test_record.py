@@ -11,6 +11,7 @@ import pytest
 from matplotlib import pyplot as plt
 
 from megastep import recording
+from megastep.agents import console
 from megastep.agents.cli import record, train
 from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
@@ -26,10 +27,13 @@ def trained(tmp_path_factory):
         return base / train.run(settings(*TINY))
 
 
-def test_video_has_a_frame_per_step(trained):
+def test_video_has_a_frame_per_step(trained, monkeypatch, capsys):
     import av
 
+    monkeypatch.setattr(console, "LINE_EVERY", 0)
     assert record.main([f"run={trained}", "steps=3", "device=cpu"]) == 0
+    out = capsys.readouterr().out
+    assert "\n2 of 3 frames · 0 s left\n" in out and "Filmed 3 steps of one environment: " in out
     with av.open(str(trained / "video.mp4")) as video:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
         assert video.streams.video[0].average_rate == 10  # the environment's

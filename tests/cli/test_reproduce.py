@@ -11,14 +11,18 @@ import reference
 
 from megastep.agents.cli import entry, evaluate, reproduce, train
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.reproduce import Interval, Result, Row
+from megastep.agents.cli.reproduce import Interval
 from megastep.agents.launch import gpu
 
 LAB = Path(__file__).parents[2] / "docs" / "lab"
 ROWS = reproduce.read()
-RESULTS = [result for row in ROWS.values() for result in row.results]
-#: Minimal pays nothing, so every return is 0.
-NOTHING = Result("page.md", "line", "episodes=4", "return", "0 (0 to 0)")
+RESULTS = [result for row in ROWS.values() for result in row["results"]]
+
+
+def row_of(train, *results):
+    """A row for a CPU, of results (metric, value and interval, words of the evaluation)."""
+    results = [{"page": "page.md", "evaluate": w, "states": {k: v}} for k, v, w in results]
+    return {"device": "cpu", "train": train, "results": results}
 
 
 def lines_of(page):
@@ -30,21 +34,21 @@ def lines_of(page):
 # ---- The rows and the pages ----
 
 
-@pytest.mark.parametrize("page", sorted({result.page for result in RESULTS}))
+@pytest.mark.parametrize("page", sorted({result["page"] for result in RESULTS}))
 def test_page_states_the_results_of_the_rows(page):
     lines = lines_of(page)
     for result in RESULTS:
-        if result.page == page:
-            assert any(result.line in line and result.text in line for line in lines), result
+        for text in result["states"].values() if result["page"] == page else ():
+            assert any(result["line"] in line and text in line for line in lines), result
 
 
 @pytest.mark.slow
 def test_words_of_rows_compose():
     composer = Composer(train.COMMAND)
     for row in ROWS.values():
-        composer.settings([*row.train.split(), f"device={row.device}"])
+        composer.settings([*row["train"].split(), f"device={row['device']}"])
     composer = Composer(evaluate.COMMAND)
-    for words in {result.evaluate for result in RESULTS}:
+    for words in {result.get("evaluate", "") for result in RESULTS}:
         composer.settings(["run=runs/x", *words.split()])
 
 
@@ -57,13 +61,12 @@ def test_words_of_rows_compose():
         ("0.999 (0.997 to 1)", [(0.99, 0.9966), (1.0, 1.0)], [(0.99, 0.9964)]),
         ("29.1 (27.2 to 31.0)", [(20, 27.2), (31.04, 40), (20, 40)], [(20, 27.1), (31.06, 40)]),
         ("92.9 % (91.9 to 93.9)", [(0.9, 0.919), (0.92, 0.93)], [(0.9, 0.918), (0.94, 0.95)]),
-        ("-6.4 | -6.8 to -6.1", [(-9, -6.8), (-6.1, -5)], [(-9, -6.9), (-6.0, -5)]),
+        ("-6.4 (-6.8 to -6.1)", [(-9, -6.8), (-6.1, -5)], [(-9, -6.9), (-6.0, -5)]),
     ],
 )
 def test_intervals_with_a_number_in_common_agree(text, agreeing, differing):
-    result = Result("page.md", "line", "", "return", text)
-    assert all(result.agrees(Interval(sum(ends) / 2, *ends)) for ends in agreeing)
-    assert not any(result.agrees(Interval(sum(ends) / 2, *ends)) for ends in differing)
+    assert all(Interval(0, *ends).agrees(text) for ends in agreeing)
+    assert not any(Interval(0, *ends).agrees(text) for ends in differing)
 
 
 def test_values_of_an_evaluation_and_of_duels():
@@ -92,10 +95,9 @@ def test_each_place_is_evaluated_once(tmp_path, monkeypatch, capsys):
 
     for module, name in ((train, "train"), (evaluate, "evaluate")):
         monkeypatch.setattr(module, "main", functools.partial(called, name))
-    homes = [("return", "2 (1 to 3)"), ("spl", "0.5 (0.4 to 0.6)")]
-    results = [Result("page.md", "line", "", *stated) for stated in homes]
-    results.append(Result("page.md", "line", "geometry=bench", "return", "2 (1 to 2)"))
-    assert reproduce.reproduce(Row("row", "cpu", "env=minimal samples=64", results)) == 1
+    homes = ("return", "2 (1 to 3)", ""), ("spl", "0.5 | 0.4 to 0.6", "")
+    row = row_of("env=minimal samples=64", *homes, ("return", "2 (1 to 2)", "geometry=bench"))
+    assert reproduce.reproduce("row", row) == 1
     training, homes, bench = calls
     assert training.startswith("train env=minimal samples=64 ") and "device=cpu" in training
     assert "geometry" not in homes and bench.endswith(" geometry=bench")
@@ -106,9 +108,9 @@ def test_each_place_is_evaluated_once(tmp_path, monkeypatch, capsys):
 
 def test_a_result_that_differs_is_not_reproduced(tmp_path, capsys):
     (tmp_path / "metrics.jsonl").write_text('{"samples": 64}\n')
-    row = Row("slow", "cpu", "env=minimal seconds=9", [NOTHING])
-    assert reproduce.compare(row, tmp_path, [Interval(0, 0, 0)]) == 0
-    assert reproduce.compare(row, tmp_path, [Interval(1, 1, 2)]) == 1
+    row = row_of("env=minimal seconds=9", ("return", "0 (0 to 0)", ""))
+    assert reproduce.compare("slow", row, tmp_path, [Interval(0, 0, 0)]) == 0
+    assert reproduce.compare("slow", row, tmp_path, [Interval(1, 1, 2)]) == 1
     shown = capsys.readouterr().out
     assert "DIFFERS: 1 (1 to 2), stated return 0 (0 to 0), docs/lab/page.md" in shown
     assert "The run had 64 samples" in shown

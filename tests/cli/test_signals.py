@@ -81,7 +81,7 @@ def swallowing(monkeypatch, number):
         with contextlib.suppress(BaseException):
             os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(train, "run", swallowed)
+    monkeypatch.setattr(train.COMMAND, "run", swallowed)
 
 
 def making_a_folder(monkeypatch, number):

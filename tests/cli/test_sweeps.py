@@ -146,7 +146,7 @@ def test_table_stands_while_jobs_run(here, monkeypatch):
     def run(cfg):
         states.append([row["state"] for row in rows("mine")])
 
-    monkeypatch.setattr(train, "run", run)
+    monkeypatch.setattr(train.COMMAND, "run", run)
     assert train.main([*SHORT, "-m", "seed=1,2", "hydra.sweep.dir=mine"]) == 0
     assert states == [["running"], ["done", "running"]]
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from megastep import cubicasa as original
 from megastep import geometries, geometry, toys
+from megastep.agents import console
 from megastep.agents.cli import entry
 from megastep.geometries import checks, imported
 
@@ -145,8 +146,10 @@ def test_archive_becomes_a_database(data_folder, capsys, monkeypatch):
     words = ("source=cubicasa", f"path={HOSTILE / 'ok_archive.zip'}")
     assert run(*words) == 2 and "licence=accept" in capsys.readouterr().err
     assert not data_folder.exists()
+    monkeypatch.setattr(console, "LINE_EVERY", 0)
     assert run(*words, "licence=accept") == 0
-    assert "2 floor plans of 2 files" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "\n2 of 2 files\n" in out and "2 floor plans of 2 files" in out
     names = sorted(path.name.split("-")[0] for path in data_folder.iterdir())
     assert names == ["cubicasa", "cubicasa.md", "cubicasa.png", "cubicasa.sha256"]
     (npz,) = data_folder.glob("*.npz")
