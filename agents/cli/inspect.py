@@ -26,13 +26,16 @@ def run(run: str) -> int:
     paths = [path] if is_one else checkpoint.list_checkpoints(folder)
     if not paths:
         raise UserError(f"There is no checkpoint in {folder}; has the run saved one yet?")
-    is_damaged = False
+    is_damaged, n_printed = False, 0
     for path in paths:
         try:
             console.say("\n".join((_lines_of_agent if is_agent else _lines)(path)))
-        except checkpoint.GoneCheckpoint as error:  # the run has saved others meanwhile
-            if path == paths[-1]:
+            n_printed += 1
+        except checkpoint.GoneCheckpoint as error:
+            if is_one:
                 raise UserError(str(error)) from None
+            if path == paths[-1] and not n_printed:  # the run has saved others meanwhile
+                paths += checkpoint.list_checkpoints(folder)
         except checkpoint.CheckpointError as error:
             is_damaged = True
             console.say(str(error))

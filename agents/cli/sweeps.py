@@ -1,13 +1,10 @@
-"""Sweeps are Hydra's own, with its launchers and sweepers. Added here: the check of all jobs before
-the first starts, the GPUs of each job, what a job returns, and the table of them all.
-
-Jobs of joblib run in processes of their own, so that one that is killed leaves the others.
+"""Sweeps by Hydra's launchers and sweepers. Added here: the check of all jobs before the first
+starts, the GPUs of each job, what a job returns, and the table of them all.
 """
 
 import contextlib
 import csv
 import dataclasses
-import importlib
 import io
 import itertools
 import json
@@ -22,6 +19,7 @@ import time
 import traceback
 import uuid
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
@@ -33,6 +31,7 @@ from omegaconf import OmegaConf
 
 from megastep import workers
 from megastep.agents import console, package
+from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import MAIN, Composer
 from megastep.agents.cli.words import key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
@@ -46,6 +45,8 @@ if TYPE_CHECKING:
     from megastep.agents.types import Row
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
+#: What the score of a job is, unless `metric=` says otherwise.
+EARNED = "episode/return"
 #: Columns of the table beside the job and the keys that vary.
 COLUMNS = ("state", "score", "evaluated", "lower", "upper", "seconds")
 #: What a search is to do, if nothing else is typed: look for high returns, and go past failed jobs.
@@ -99,46 +100,69 @@ def _values(override: Override) -> list[str | None]:
     raise ConfigErrors([(key, f"{override.input_line!r} has no value")])
 
 
+def metric_of(words: list[str]) -> tuple[str, list[str]]:
+    """Returns the metric that is the score of jobs, the last `metric=`, and the other words."""
+    given = [word.partition("=")[2] for word in words if word.startswith("metric=")]
+    metric = [EARNED, *given][-1]
+    if not re.fullmatch("(episode|eval)/.+", metric):
+        text = f"{metric!r} is neither episode/NAME, of training, nor eval/NAME, of evaluations"
+        raise ConfigErrors([("metric", text)])
+    return metric, [word for word in words if not word.startswith("metric=")]
+
+
+def check_metric(metric: str, jobs: list) -> None:
+    """Raises ConfigErrors if the metric is of evaluations, and a training has none."""
+    for cfg in jobs if metric.startswith("eval/") else ():
+        if isinstance(cfg, settings.Train) and not (cfg.finish.evaluate or cfg.evaluation.every):
+            cure = "needs evaluations: finish.evaluate=true, or evaluation.every=1M"
+            raise ConfigErrors([("metric", cure)])
+
+
 def sweep(composer: Composer, words: list[str]) -> int:
     """Checks all jobs, then has Hydra run them, past those that fail. Returns the exit code."""
     rank.refuse("The jobs of a sweep start their own ranks; leave torchrun out, and add ranks=")
+    metric, words = metric_of(words)
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
     _, jobs, config = jobs_of(composer, words)
     gpu_slots.check(jobs, config)
+    check_metric(metric, jobs)
     folder = Path(config.sweep.dir)
-    is_new = not folder.exists()
+    is_new, is_search = not folder.exists(), config.runtime.choices["hydra/sweeper"] == "optuna"
     with user_errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
             folder = folders.make(folder)  # another sweep may start in the same second
         folder.mkdir(parents=True, exist_ok=True)
-    options = SEARCH if config.runtime.choices["hydra/sweeper"] == "optuna" else {}
-    options = options | {
+    seeds = []
+    if is_search and "seed" in overrides and overrides["seed"].is_sweep_override():
+        seeds = [*filter(None, _values(overrides.pop("seed")))]  # of each trial
+    once = [key for key, override in overrides.items() if not override.is_sweep_override()]
+    options = (SEARCH if is_search else {}) | {
         "hydra.job.name": composer.command.name,
         "hydra.sweep.dir": json.dumps(str(folder), ensure_ascii=False),
-        "hydra.job.config.override_dirname.exclude_keys": json.dumps(
-            [key for key, override in overrides.items() if not override.is_sweep_override()]
-        ),
+        "hydra.job.config.override_dirname.exclude_keys": json.dumps(once),
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
     words += [str(override.input_line) for override in overrides.values()]
     if (package.ROOT / "train.py").exists():  # processes of launchers find a checkout, too
         paths = str(package.ROOT), os.environ.get("PYTHONPATH")
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
-    job, problem = new_job(composer, folder), ""
+    job, problem = new_job(composer, folder, metric, seeds), ""
+    # its errors are raised; it sets sys.argv
+    os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", ["--multirun", *words]
+    global_hydra.GlobalHydra.instance().clear()
+    main = hydra.main(config_path=MAIN, config_name=composer.name, version_base="1.3")(job)
     try:
         with signals.interrupting(job.interrupt):
-            # its errors are raised; it sets sys.argv
-            os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", ["--multirun", *words]
-            global_hydra.GlobalHydra.instance().clear()
-            main = hydra.main(config_path=MAIN, config_name=composer.name, version_base="1.3")
-            main(job)()
+            main()
     except Exception as error:  # a launcher's or a sweeper's
         problem = shortened(error, 400)
     finally:
-        if rows := job.ended_rows():
-            report(folder, rows)
+        lost = {"state": LOST}
+        if rows := [row | lost if row["state"] == RUNNING else row for row in job.rows()]:
+            with console.warned(f"{folder} cannot be written: "):
+                write_table(folder, rows, is_printed=True)
         elif is_new:
             shutil.rmtree(folder, ignore_errors=True)
             with contextlib.suppress(OSError):  # there are others in it
@@ -147,8 +171,10 @@ def sweep(composer: Composer, words: list[str]) -> int:
         raise UserError(f"The sweep cannot start: {problem}")
     scored = [row["score"] for row in rows if row["state"] == DONE and "score" in row]
     if scored and all(score is None for score in scored):
-        text = "No job has a score, so none is the best, as no episode finished; train longer"
-        console.say(text, sys.stderr)
+        cause = "no episode finished; train longer"
+        if metric != EARNED:
+            cause = f"none has {metric}; type finish.evaluate=true, or another metric="
+        console.say(f"No job has a score, so none is the best, as {cause}", sys.stderr)
     elif problem and all(row["state"] in (DONE, LOST) for row in rows):
         console.say(f"The launcher failed: {problem}", sys.stderr)
     return 1 if problem or any(row["state"] != DONE for row in rows) else 0
@@ -160,12 +186,15 @@ def sweep(composer: Composer, words: list[str]) -> int:
 ALONE = "import sys; from megastep.agents.cli import sweeps; sweeps.run_job(sys.argv[1])"
 
 
-def new_job(composer: Composer, folder: Path) -> "Job":
+def new_job(
+    composer: Composer, folder: Path, metric: str = EARNED, seeds: Sequence[str] = ()
+) -> "Job":
     """Returns what Hydra is to call for the jobs of a sweep."""
     records = folder.absolute() / ".jobs" / uuid.uuid4().hex[:8]
     records.mkdir(parents=True)
     source = composer.command.name, composer.name, composer.folder
-    return Job(source, str(folder.absolute()), str(records), os.getpid(), os.getcwd())
+    where = str(folder.absolute()), str(records), os.getpid(), os.getcwd()
+    return Job(source, *where, metric, tuple(seeds))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,6 +208,8 @@ class Job:
         records: a folder of files about the jobs.
         process: that of the sweep.
         start: the folder it was started in.
+        metric: whose value is the score.
+        seeds: `seed=1` and so on of the runs of which each job is the mean; none: of itself.
     """
 
     source: tuple
@@ -186,44 +217,55 @@ class Job:
     records: str
     process: int
     start: str
+    metric: str
+    seeds: tuple[str, ...]
 
     def __call__(self, config: object) -> float | None:
         """Returns the job's score, None if it failed: a sweeper is to go on."""
         hydra = HydraConfig.get()
-        words, number = [*hydra.overrides.task], hydra.job.num
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
-        pairs = (word.lstrip("+~").partition("=") for word in words)
         fixed = hydra.job.config.override_dirname.exclude_keys
-        row: Row = dict(
-            number=number,
-            varied={key: _unquoted(value) for key, _, value in pairs if key not in fixed},
-            state=RUNNING,
-            folder=hydra.runtime.output_dir,
-        )
-        words += [word for word in hydra.overrides.hydra if "searchpath" in word]
-        launcher = hydra.runtime.choices["hydra/launcher"]
-        if self.path(f"{number}.json").exists():
-            earlier = self.recorded(number)  # a cluster starts it again
-            row = earlier if earlier["state"] == DONE else self.run(row, words, is_again=True)
-        elif launcher != "joblib":
-            row = self.run(row, words)
-        elif not self.path("stopped").exists():
-            row = self.run_alone(row, words)
-        return row.get("score")
+        searched = [word for word in hydra.overrides.hydra if "searchpath" in word]
+        rows = []
+        for i, seed in enumerate(self.seeds or ("",)):
+            words, folder = [*hydra.overrides.task], hydra.runtime.output_dir
+            if seed:
+                words, folder = [*words, seed], f"{folder}_{seed}"
+            pairs = (word.lstrip("+~").partition("=") for word in words)
+            row: Row = dict(
+                number=hydra.job.num * max(1, len(self.seeds)) + i,
+                varied={key: _unquoted(value) for key, _, value in pairs if key not in fixed},
+                state=RUNNING,
+                folder=folder,
+            )
+            is_joblib = hydra.runtime.choices["hydra/launcher"] == "joblib"
+            rows.append(self.run_once(row, words + searched, is_joblib))
+        scores = [row.get("score") for row in rows]
+        return None if None in scores else sum(scores) / len(scores)
 
-    def run_alone(self, row: "Row", words: list[str]) -> "Row":
-        """Runs a job in a process of its own. Returns what became of it."""
+    def run_once(self, row: "Row", words: list[str], is_joblib: bool) -> "Row":
+        """Runs a job unless a cluster starts it again and it is done. Returns its row. A job of
+        joblib has a process of its own, so that one that is killed leaves the others.
+        """
+        number = row["number"]
+        if self.path(f"{number}.json").exists():
+            earlier = self.recorded(number)
+            return earlier if earlier["state"] == DONE else self.run(row, words, is_again=True)
+        if not is_joblib:
+            return self.run(row, words)
+        if self.path("stopped").exists():
+            return row
         workers.end_with_parent(self.process)
         self.record(row)
         job = json.dumps([dataclasses.asdict(self), row, words])
         process = subprocess.Popen([sys.executable, "-c", ALONE, job])
         with workers.terminal_signals_blocked():
             process.wait()
-        ended = self.recorded(row["number"])
+        ended = self.recorded(number)
         if ended["state"] == RUNNING:
             ended["state"] = LOST
             self.record(ended)
-            console.say(f"Job {row['number']} {LOST}", sys.stderr)
+            console.say(f"Job {number} {LOST}", sys.stderr)
         return ended
 
     def run(self, row: "Row", words: list[str], is_again: bool = False) -> "Row":
@@ -238,14 +280,15 @@ class Job:
         try:
             with signals.interrupting():
                 name, *rest = self.source
-                module = importlib.import_module(f"megastep.agents.cli.{name}")
-                composer = Composer(module.COMMAND, *rest)
+                composer = Composer(load(name), *rest)
                 cfg = composer.settings(words)
                 if isinstance(cfg, settings.Train):
                     cfg = self.own_settings(cfg, row["folder"], is_again)
                 with gpu_slots.taken(cfg, number) as cfg:
                     result = composer.command.run(cfg)
-                row |= {"state": DONE, **(scores.outcome(result) if result else {})}
+                row["state"] = DONE
+                if result:
+                    row |= scores.outcome(result, self.metric)
         except signals.Interrupted as stop:
             row["state"] = f"interrupted: {stop.args[1]}"
             if stop.args[0] in signals.ANNOUNCING and "SUBMITIT_EXECUTOR" in os.environ:
@@ -262,17 +305,18 @@ class Job:
             row["seconds"] = round(time.monotonic() - began, 1)
             self.record(row)
         if result and result.is_dir() and row["score"] is None:
-            console.warn(f"job {number}: no episode finished, so it has no score; train longer")
+            console.warn(f"job {number}: it has no {self.metric}, and so no score; train longer")
         return row
 
     def own_settings(self, cfg: settings.Train, folder: str, is_again: bool) -> settings.Train:
         """Returns the settings of a training with what differs for a job of a sweep."""
-        for label, one in cfg.logger.items():
-            if getattr(one, "group", "") is None:
-                one = settings.changed(one, group=Path(self.folder).name)
-                cfg = settings.changed(cfg, logger=cfg.logger | {label: one})
-        resume = AUTO if is_again else cfg.resume
-        return settings.changed(cfg, folder=os.path.relpath(folder), resume=resume)
+        name = Path(self.folder).name
+        loggers = {
+            label: settings.changed(one, group=name) if getattr(one, "group", "") is None else one
+            for label, one in cfg.logger.items()
+        }
+        resume, folder = AUTO if is_again else cfg.resume, os.path.relpath(folder)
+        return settings.changed(cfg, logger=loggers, folder=folder, resume=resume)
 
     def path(self, name: str) -> Path:
         return Path(self.records, name)
@@ -288,11 +332,6 @@ class Job:
         with contextlib.suppress(OSError):  # of a full disk
             return json.loads(self.path(f"{number}.json").read_text())
         return {"number": number, "varied": {}, "state": RUNNING}
-
-    def ended_rows(self) -> "list[Row]":
-        """Returns what the jobs recorded, once none runs."""
-        rows = self.rows()
-        return [row | {"state": LOST} if row["state"] == RUNNING else row for row in rows]
 
     def rows(self) -> "list[Row]":
         """Returns what the jobs of this sweep recorded, in order."""
@@ -316,7 +355,7 @@ class Job:
 
 
 def run_job(text: str) -> None:
-    """Runs a job of `Job.run_alone`, and ends with the process that started it."""
+    """Runs a job of `Job.run_once`, and ends with the process that started it."""
     fields, row, words = json.loads(text)
     job = Job(**fields)
     signals.exit_on_signals(job.source[0])
@@ -329,37 +368,24 @@ def run_job(text: str) -> None:
 # ---- The table ----
 
 
-def report(folder: Path, rows: "list[Row]") -> None:
-    """Prints the table of a sweep, and writes it into its folder."""
-    console.say(f"Sweep\n{console.table(*_cells(rows), width=console.terminal_width())}")
-    with console.warned(f"{folder} cannot be written: "):
-        write_table(folder, rows)
-        console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
-
-
-def write_table(folder: Path, rows: "list[Row]") -> None:
-    """Writes sweep.md, the tables as printed, and sweep.csv, with all digits and folders."""
-    text = console.table(*_cells(rows), is_markdown=True)
-    write_atomically(folder / "sweep.md", text.encode())
-    head, text = [*_head(rows), "folder"], io.StringIO()
+def write_table(folder: Path, rows: "list[Row]", is_printed: bool = False) -> None:
+    """Writes sweep.md, the table as it is printed, and sweep.csv, with all digits and folders."""
     rows = [row | row["varied"] | {"job": row["number"]} for row in rows]
-    csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
+    head = ["job", *dict.fromkeys(key for row in rows for key in row["varied"]), *COLUMNS]
+    cells = [[_brief(row.get(name)) for name in head] for row in rows]
+    if is_printed:
+        console.say(f"Sweep\n{console.table(head, cells, width=console.terminal_width())}")
+    write_atomically(folder / "sweep.md", console.table(head, cells, is_markdown=True).encode())
+    text, names = io.StringIO(), [*head, "folder"]
+    csv.writer(text).writerows([names, *([row.get(name) for name in names] for row in rows)])
     write_atomically(folder / "sweep.csv", text.getvalue().encode())
+    if is_printed:
+        console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
 
 
 def _unquoted(value: str) -> str:
     # as it was typed: Hydra puts a \ before what its grammar knows
     return re.sub(r"\\([\\()\[\]{}:=, \t'\"])", r"\1", value.strip("\"'"))
-
-
-def _head(rows) -> list[str]:
-    return ["job", *dict.fromkeys(key for row in rows for key in row["varied"]), *COLUMNS]
-
-
-def _cells(rows) -> tuple[list[str], list[list[str]]]:
-    """Returns the head and the rows of a table, as text."""
-    rows, head = [row | row["varied"] | {"job": row["number"]} for row in rows], _head(rows)
-    return head, [[_brief(row.get(name)) for name in head] for row in rows]
 
 
 def _brief(value: object) -> str:

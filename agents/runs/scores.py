@@ -36,19 +36,25 @@ def evaluation(file: Path) -> "Row":
         return typed_json.loads(file.read_bytes(), typed_json.Evaluation)
 
 
-def outcome(result: Path) -> dict[str, float | None]:
+def outcome(result: Path, metric: str = "episode/return") -> dict[str, float | None]:
     """Returns the scores of a run folder, or of the .json file of an evaluation.
 
-    `evaluated` is the return in an evaluation (for a run, its last), or the fraction of duels won
-    against the first opponent, `lower` and `upper` its 95 % interval; `score` is a run's `mean`, or
-    the same as `evaluated`. Each is None if unknown.
+    `evaluated` is the metric in an evaluation (for a run, its last), such as the return, or the
+    fraction of duels won against the first opponent, `lower` and `upper` its 95 % interval; `score`
+    is a run's `mean`, or the same as `evaluated` if the metric is `eval/NAME`. Each is None if
+    unknown.
     """
     files, rows = [result], []
+    kind, _, name = metric.partition("/")
     if is_run := result.is_dir():
         files = sorted(result.glob("evaluations/*.json"), key=lambda file: -file.stat().st_mtime)
         rows = json_lines.read(result / "metrics.jsonl", typed_json.Metrics)
     tables = [evaluation(file)["rows"][0] for file in files if file.suffix == ".json"]
     row = next((row for row in tables if not is_run or "return" in row), {})
-    evaluated = row.get("return", row.get("won"))
-    score = mean(rows) if is_run else evaluated
+    if name != "return" and "return" in row:
+        row = row["metrics"].get(name, {"mean": row.get(name)})  # the second of `length`
+    evaluated = row.get("mean", row.get("return", row.get("won")))
+    score = mean(rows, name) if is_run and kind == "episode" else evaluated
+    if score is None and kind == "eval":  # of the last evaluation in training
+        score = next((row[metric] for row in reversed(rows) if metric in row), None)
     return dict(score=score, evaluated=evaluated, lower=row.get("lower"), upper=row.get("upper"))

@@ -9,6 +9,7 @@ import pathlib
 import signal
 import sys
 import tempfile
+from types import SimpleNamespace
 
 import cloudpickle
 import pytest
@@ -117,6 +118,8 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
     for words, message in (
         (["seed=1,2", "learner.lr=1e-3,-1"], "learner.lr: -1 is out of range"),
         (["seed=1,2", "folder=x"], "hydra.sweep.dir="),
+        (["seed=1,2", "metric=eval/success"], "metric: needs evaluations: finish.evaluate=true"),
+        (["seed=1,2", "metric=loss/value"], "metric: 'loss/value' is neither episode/NAME"),
         (["hydra.launcher.n_job=3"], "hydra.launcher.n_job: no such key"),
         (["hydra.sweep.dir=payer.py/x"], "payer.py/x"),
         (["hydra.sweeper.max_batch_size=0"], "The sweep cannot start: "),
@@ -218,16 +221,34 @@ def test_optuna_maximises_and_skips_failed_trials(here):
     words = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=1"]
     words += ["hydra.sweeper.storage=sqlite:///study.db", "hydra.sweeper.study_name=pay"]
     words += ["hydra.sweeper.sampler.seed=1", "env.pay=interval(0.5,8.0)", "env.mood=fine,cross"]
+    words += ["metric=eval/length", "finish.evaluate=true", "finish.episodes=4", "seed=1,2"]
     code = train.main([*SHORT, "-m", *words, "hydra.sweep.dir=mine"])
     table = rows("mine")
-    assert len(table) == 4 and (here / "study.db").exists()
+    assert [row["seed"] for row in table] == 4 * ["1", "2"] and (here / "study.db").exists()
     assert code == (1 if any(row["state"] != "done" for row in table) else 0)
     scores = [float(row["score"]) for row in table if row["score"]]
-    paid = [4 * float(row["env.pay"]) for row in table if row["score"]]
-    assert scores and scores == pytest.approx(paid, rel=1e-5)
+    assert scores and {*scores} == {4.0}, "the length of an episode, not its return"
     best = yaml.safe_load((here / "mine/optimization_results.yaml").read_text())
     assert best["best_value"] == max(scores)
     assert set(best["best_params"]) == {"env.pay", "env.mood"}
+
+
+def test_a_job_is_the_mean_of_its_seeds(here, monkeypatch):
+    job = sweeps.new_job(Composer(load("train")), here, "eval/return", ["seed=1", "seed=5"])
+    monkeypatch.setattr(sweeps, "HydraConfig", SimpleNamespace(get=lambda: hydra))
+    own = SimpleNamespace(num=3, config=SimpleNamespace(override_dirname=SimpleNamespace()))
+    own.config.override_dirname.exclude_keys = []
+    hydra = SimpleNamespace(job=own, overrides=SimpleNamespace(task=["env.pay=2"], hydra=[]))
+    hydra.runtime = SimpleNamespace(output_dir="mine/3", choices={"hydra/launcher": "basic"})
+    runs = []
+
+    def run_once(self, row, words, is_joblib):
+        runs.append((row["number"], row["folder"], words))
+        return row | {"score": float(row["varied"]["seed"])}
+
+    monkeypatch.setattr(sweeps.Job, "run_once", run_once)
+    assert job(None) == 3.0
+    assert runs == [(6 + i, f"mine/3_{s}", ["env.pay=2", s]) for i, s in enumerate(job.seeds)]
 
 
 @pytest.mark.nightly
