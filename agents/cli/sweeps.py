@@ -5,6 +5,7 @@ starts, the GPUs of each job, what a job returns, and the table of them all.
 import contextlib
 import csv
 import dataclasses
+import importlib
 import io
 import itertools
 import json
@@ -31,7 +32,6 @@ from omegaconf import OmegaConf
 
 from megastep import workers
 from megastep.agents import console, package
-from megastep.agents.cli.command import load
 from megastep.agents.cli.compose import MAIN, Composer
 from megastep.agents.cli.words import key_of
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
@@ -280,7 +280,8 @@ class Job:
         try:
             with signals.interrupting():
                 name, *rest = self.source
-                composer = Composer(load(name), *rest)
+                module = importlib.import_module(f"megastep.agents.cli.{name}")
+                composer = Composer(module.COMMAND, *rest)
                 cfg = composer.settings(words)
                 if isinstance(cfg, settings.Train):
                     cfg = self.own_settings(cfg, row["folder"], is_again)
