@@ -7,15 +7,14 @@ import contextlib
 import difflib
 import functools
 import importlib
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 import torch
 from pydantic import Field
 
 from megastep import global_generators
-from megastep.hosting.vectorized import VectorizedEnv
+from megastep.hosting.env_error import one_line
+from megastep.hosting.vectorized import VectorizedEnv, one_sentence
 from megastep.imports import import_object, search_current_folder
 from megastep.settings import checked
 
@@ -32,9 +31,8 @@ MAX_ENVS = 2**16
 class Gymnasium(VectorizedEnv):
     """Any environment of Gymnasium, or of a package that registers its own with it.
 
-    They step on the CPU: one after the other in this process (sync), in worker processes, one per
-    core (async), or together, by the environment's own vector class (own).
-    With a learner on a GPU, observations cross through pinned memory.
+    They step on the CPU: one after the other in this process (sync), or in worker processes, one
+    per core (async). With a learner on a GPU, observations cross through pinned memory.
 
     Observation:
         Box: (B, 1, n) float32, flattened, or an image (B, 1, C, H, W), uint8 or float32, if it has
@@ -65,8 +63,7 @@ class Gymnasium(VectorizedEnv):
         wrappers: import paths of Gymnasium's wrappers, ``package.module:Wrapper``, put around every
             environment in this order.
         vectorization: how environments are stepped: sync, one after the other in this process;
-            async, divided among processes, one per core; own, the environment's own vector
-            environment.
+            async, divided among processes, one per core.
         seed: each environment is reset with a seed of its own, which derives from this one.
         films: renders images from the start, if it can. Some environments make their renderer in
             the constructor, and some step more slowly with it.
@@ -84,7 +81,7 @@ class Gymnasium(VectorizedEnv):
         id: str | None = None,
         kwargs: dict[str, Any] | None = None,
         wrappers: tuple[str, ...] = (),
-        vectorization: Literal["sync", "async", "own"] = "sync",
+        vectorization: Literal["sync", "async"] = "sync",
         seed: int = 1,
         films: bool = False,
         check: bool = True,
@@ -95,15 +92,10 @@ class Gymnasium(VectorizedEnv):
             functions = [import_object(name) for name in wrappers]
         except ValueError as error:
             raise ValueError(f"env.wrappers: {error}") from None
-        # one seed for each, or one for all
-        seeds = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
-        with _one_sentence(id, kwargs):
-            if vectorization == "own":
-                seeds, vector = seeds[0], _own(spec, n_envs, kwargs, bool(wrappers))
-            else:
-                settings = dict(seed=seed, check=check)
-                vector = _hosted(spec, n_envs, kwargs, functions, vectorization, films, settings)
-        super().__init__(id, vector, n_envs, 1, seeds, device, check)
+        with one_sentence(id, kwargs):
+            more = dict(seed=seed, check=check)
+            vector = _hosted(spec, n_envs, kwargs, functions, vectorization, films, more)
+        super().__init__(id, vector, n_envs, 1, seed, device, check)
 
 
 def _spec(id) -> "EnvSpec":
@@ -122,7 +114,7 @@ def _spec(id) -> "EnvSpec":
         except Exception as error:
             raise ValueError(
                 f"env.id={id} needs the package {package}, which cannot be imported "
-                f"({_line(error)}); install the one that has it"
+                f"({one_line(error)}); install the one that has it"
             ) from None
     if name not in gymnasium.registry:
         near = difflib.get_close_matches(name, gymnasium.registry, 1)
@@ -134,31 +126,7 @@ def _spec(id) -> "EnvSpec":
     return gymnasium.registry[name]
 
 
-def _own(spec, n_envs, kwargs, has_wrappers) -> Any:
-    """Returns the environment's own vector environment."""
-    import gymnasium
-
-    if has_wrappers:
-        raise ValueError(
-            "env.wrappers go around single environments, which its own vector environment has "
-            "not; use env.vectorization=sync or async"
-        )
-    if spec.vector_entry_point is None:
-        raise ValueError("it has no vector environment of its own; use env.vectorization=sync")
-    vector: Any = gymnasium.make_vec(
-        spec, num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs
-    )
-    mode = vector.metadata.get("autoreset_mode")
-    if mode != gymnasium.vector.AutoresetMode.NEXT_STEP:
-        vector.close()
-        raise ValueError(
-            f"its own vector environment resets by {mode}, which loses the last observation of an "
-            "episode or leaves the reset to others; use env.vectorization=sync"
-        )
-    return vector
-
-
-def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, settings) -> Any:
+def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, more) -> Any:
     """Returns single environments as a vector environment, in this process or in others."""
     from megastep.hosting.hosted import HostedEnvs, make_env
     from megastep.hosting.probe import probe
@@ -174,32 +142,8 @@ def _hosted(spec, n_envs, kwargs, wrappers, vectorization, films, settings) -> A
         example.close()
     make = functools.partial(make_env, spec, wrappers, kwargs)
     if vectorization == "sync":
-        vector = HostedEnvs(make, n_envs, found=probe(make), **settings)
+        vector = HostedEnvs(make, n_envs, found=probe(make), **more)
     else:
-        vector = VectorProcesses(make, n_envs, **settings)
+        vector = VectorProcesses(make, n_envs, **more)
     vector.max_episode_steps = example.unwrapped.spec and example.unwrapped.spec.max_episode_steps
     return vector
-
-
-@contextlib.contextmanager
-def _one_sentence(id, kwargs) -> Iterator[None]:
-    """Raises what goes wrong inside as a ValueError, with the likely cure."""
-    import gymnasium
-
-    try:
-        yield
-    except gymnasium.error.DependencyNotInstalled as error:
-        raise ValueError(f"{id} needs a package that is missing: {_line(error)}") from None
-    except ValueError as error:
-        raise ValueError(f"{id} cannot be made: {_line(error)}") from None
-    except Exception as error:
-        cause = f" with env.kwargs={kwargs}" if kwargs else ""
-        raise ValueError(
-            f"{id} cannot be made{cause}: {type(error).__name__}: {_line(error)}"
-        ) from error
-
-
-def _line(error) -> str:
-    """Returns the first line of an error, without what Gymnasium adds to it."""
-    line = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return line.partition(" was raised from the environment creator")[0]

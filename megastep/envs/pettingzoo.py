@@ -5,11 +5,10 @@ They step on the CPU, one after the other, even if the learner is on a GPU. B = 
 
 from typing import Annotated, Any
 
-import numpy as np
 import torch
 from pydantic import Field
 
-from megastep.hosting.vectorized import VectorizedEnv
+from megastep.hosting.vectorized import VectorizedEnv, one_sentence
 from megastep.imports import import_object
 from megastep.settings import checked
 
@@ -74,12 +73,6 @@ class PettingZoo(VectorizedEnv):
         except ImportError:
             raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
         make, functions = import_object(id), [import_object(name) for name in wrappers]
-        try:
+        with one_sentence(id, kwargs):
             vector = ParallelEnvs(make, n_envs, kwargs or {}, check, functions)
-        except Exception as error:  # whatever another's constructor raises
-            kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-            line = (str(error).splitlines() or [""])[0]
-            cause = f" with env.kwargs={kwargs}" if kwargs else ""
-            raise ValueError(f"{id} cannot be made{cause}: {kind}{line}") from error
-        seeds = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
-        super().__init__(id, vector, n_envs, len(vector.agents), seeds, device, check)
+        super().__init__(id, vector, n_envs, len(vector.agents), seed, device, check)

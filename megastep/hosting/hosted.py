@@ -18,7 +18,7 @@ from megastep.hosting.values import CHECKED_STEPS, allowed_actions, problem
 from megastep.hosting.wrapper_state import freeze, load_wrapper_state, wrapper_state
 from megastep.types import Space, Tree
 
-__all__ = ["Hosted", "HostedEnvs", "make_env", "start_rendering"]
+__all__ = ["Hosted", "HostedEnvs", "make_env"]
 
 
 def make_env(spec: Any, wrappers: Sequence[Callable], settings: dict) -> gymnasium.Env:
@@ -44,11 +44,40 @@ class Hosted:
     max_episode_steps: int | None = None
     first = 0
     envs: list[Any]
+    metadata: dict[str, Any]
+    render_mode: str | None
     single_observation_space: Space
     single_action_space: Space
 
     def __init__(self, found: Probe | None, check: bool):
         self.found, self.n_to_check = found or Probe(), CHECKED_STEPS if check else 0
+        self.frozen: Tree = None  # a state of the wrappers that does not change
+
+    def wrapper_state(self) -> Tree:
+        """Returns what the wrappers of the first environment have learnt, by path."""
+        return wrapper_state(self.envs[0], self.found.learnt) if self.found.learnt else {}
+
+    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
+        """Gives the wrappers of all environments what others have learnt, which stays as it is if
+        it `is_frozen`. Raises ValueError if they are not in such wrappers.
+        """
+        self.frozen = state if is_frozen else None
+        for env in self.envs:
+            load_wrapper_state(env, state)
+            if is_frozen:
+                freeze(env)
+
+    def start_rendering(self) -> str | None:
+        """Sets the render mode to rgb_array, if there is that and no other was chosen, and returns
+        it. Not before the first frame: LunarLander then steps at a third of the speed.
+        """
+        if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+            os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame complains of no display
+        if self.render_mode is None and "rgb_array" in self.metadata.get("render_modes", ()):
+            for env in self.envs:
+                env.unwrapped.render_mode = "rgb_array"
+            self.render_mode = "rgb_array"
+        return self.render_mode
 
     def render(self) -> list[np.ndarray]:
         return [env.render() for env in self.envs]
@@ -120,21 +149,6 @@ class HostedEnvs(Hosted):
         is_recorded = TRUE_RETURN in self.found.names
         self.recorders: Any = [RewardRecorder.inside(env) for env in self.envs if is_recorded]
         self.true_returns = np.zeros(n_envs)
-        self.frozen: Tree = None  # a state of the wrappers that does not change
-
-    def wrapper_state(self) -> Tree:
-        """Returns what the wrappers of the first environment have learnt, by path."""
-        return wrapper_state(self.envs[0], self.found.learnt) if self.found.learnt else {}
-
-    def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
-        """Gives the wrappers of all environments what others have learnt, which stays as it is if
-        it `is_frozen`. Raises ValueError if they are not in such wrappers.
-        """
-        self.frozen = state if is_frozen else None
-        for env in self.envs:
-            load_wrapper_state(env, state)
-            if is_frozen:
-                freeze(env)
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
         """Resets every environment. Returns (observations, infos)."""
@@ -193,15 +207,3 @@ class HostedEnvs(Hosted):
         if self.recorders:
             numbers[TRUE_RETURN] = float(self.true_returns[e])
         self.numbers[e] = [numbers.get(name, np.nan) for name in self.found.names]
-
-
-def start_rendering(vector: Any) -> None:
-    """Sets the render mode of environments to rgb_array, if they have it and no other was chosen.
-    Not before the first frame: LunarLander then steps at a third of the speed.
-    """
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame complains of no display
-    if vector.render_mode is None and "rgb_array" in vector.metadata.get("render_modes", ()):
-        for env in getattr(vector, "envs", ()):
-            env.unwrapped.render_mode = "rgb_array"
-        vector.render_mode = "rgb_array"

@@ -14,11 +14,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.vector.utils import create_empty_array
 
 from megastep import workers
 from megastep.hosting.env_error import EnvError
-from megastep.hosting.hosted import HostedEnvs, start_rendering
+from megastep.hosting.hosted import HostedEnvs
 from megastep.hosting.probe import Probe, probe
 from megastep.types import Tree
 
@@ -67,16 +66,16 @@ class VectorProcesses:
         (example, *_) = self._ask("begin", found=self.found)
         self.metadata, self.render_mode, spaces = example
         self.single_observation_space, self.single_action_space = spaces
-        self.observations = create_empty_array(self.single_observation_space, n_envs)
         self.latest_state: Tree = {}
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
-        obs, infos = zip(*self._ask("reset", seed=seed))
-        return self._batch(obs), _joined(infos)
+        return _joined(self._ask("reset", seed=seed))
 
     def step(self, actions: Tree) -> tuple:
-        obs, *results, infos = zip(*self._ask("step", actions=actions))
-        return self._batch(obs), *map(np.concatenate, results), _joined(infos)
+        return _joined(self._ask("step", actions=actions))
+
+    def start_rendering(self) -> None:
+        self.render_mode, *_ = self._ask("start_rendering")
 
     def render(self) -> list:
         return [frame for frames in self._ask("render") for frame in frames]
@@ -142,11 +141,6 @@ class VectorProcesses:
             f"the process that steps environments {rows.start} to {rows.stop - 1} was ended {how}"
         )
 
-    def _batch(self, parts) -> Tree:
-        for rows, part in zip(self.rows, parts):
-            _write(self.observations, rows, part)
-        return self.observations
-
 
 def _serve(pipe, make, rows, seed, check) -> None:
     """Answers commands until the pipe is closed, which it is when the other process ends."""
@@ -164,8 +158,6 @@ def _serve(pipe, make, rows, seed, check) -> None:
             envs = HostedEnvs(make, n_envs, rows.start, seed=seed, check=check, **arguments)
             spaces = envs.single_observation_space, envs.single_action_space
             return envs.metadata, envs.render_mode, spaces
-        if command == "render":
-            start_rendering(envs)
         return getattr(envs, command)(**arguments)
 
     command = None
@@ -204,19 +196,13 @@ def _end(pipes, processes) -> None:
             process.join()
 
 
-def _joined(infos) -> dict[str, np.ndarray]:
-    return {key: np.concatenate([own[key] for own in infos]) for key in infos[0]}
-
-
-def _write(to, rows, values) -> None:
-    """Copies the values of some environments into the batch of all."""
-    if isinstance(to, dict):
-        to, values = to.values(), values.values()
-    if isinstance(to, np.ndarray):
-        to[rows] = values
-    else:
-        for part, value in zip(to, values, strict=True):
-            _write(part, rows, value)
+def _joined(parts) -> Any:
+    """Returns the values of all environments, from those of each process."""
+    if isinstance(parts[0], dict):
+        return {key: _joined([part[key] for part in parts]) for key in parts[0]}
+    if isinstance(parts[0], tuple):
+        return tuple(map(_joined, zip(*parts)))
+    return np.concatenate(parts)
 
 
 def _rows_of(batch, rows) -> Any:

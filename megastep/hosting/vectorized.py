@@ -6,7 +6,7 @@ N environments of A agents each, B = N A lanes.
 import contextlib
 import functools
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,10 @@ from megastep.contract import RESERVED
 from megastep.env_state import EnvState
 from megastep.hosting.conversions import RESERVED as RESERVED_KEYS
 from megastep.hosting.conversions import actions, identifiers, observation
-from megastep.hosting.env_error import BadValue, EnvError
+from megastep.hosting.env_error import BadValue, EnvError, one_line
 from megastep.types import Tree
 
-__all__ = ["VectorizedEnv"]
+__all__ = ["VectorizedEnv", "one_sentence"]
 
 #: The most numbers of an ``info`` that become metrics.
 MAX_NUMBERS = 16
@@ -37,12 +37,11 @@ class VectorizedEnv:
 
     Args:
         id: name of the environments in messages.
-        vector: a vector environment of Gymnasium with a row per lane, or one with the same methods.
-            With ``found``, its infos are those of :class:`~megastep.hosting.hosted.HostedEnvs`;
-            with ``present``, they have the lanes whose next action is used.
+        vector: environments with a row per lane, in this process or others:
+            :class:`~megastep.hosting.hosted.HostedEnvs`, or ones with the same methods.
         n_envs: number of environments, N.
         n_agents: lanes per environment, A.
-        seeds: passed to the first ``vector.reset``, one per environment or one for all.
+        seed: from which each environment's seed at its first reset derives.
         device: where worlds and actions are. Default: a GPU if there is one.
         check: refuses actions that are not finite, and in the first `CHECKED_STEPS` observations
             that are not in their space; warns of those beyond the bounds of a Box.
@@ -57,18 +56,18 @@ class VectorizedEnv:
         vector: Any,
         n_envs: int,
         n_agents: int,
-        seeds: list[int] | int,
+        seed: int,
         device: torch.device | str | None,
         check: bool = True,
     ):
-        from megastep.hosting.probe import Probe
         from megastep.hosting.values import CHECKED_STEPS
 
         self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
         self.device = engine.device("auto" if device is None else device)
-        self._checks, self._seeds = check, seeds
+        self._checks = check
+        self._seeds: list | None = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
         self.fps = float(vector.metadata.get("render_fps") or 10)
-        self.max_episode_steps = getattr(vector, "max_episode_steps", None) or MAX_EPISODE_STEPS
+        self.max_episode_steps = vector.max_episode_steps or MAX_EPISODE_STEPS
         try:
             self.obs_space, self._read = observation(vector.single_observation_space)
             self.action_space, self._write = actions(vector.single_action_space)
@@ -76,7 +75,7 @@ class VectorizedEnv:
             with contextlib.suppress(EnvError):
                 self.close()
             raise ValueError(f"{id}: {error}") from None
-        found = getattr(vector, "found", Probe())
+        found = vector.found
         if left_out := found.names[MAX_NUMBERS:]:
             warnings.warn(
                 f"{id}: the last info of an episode has {len(found.names)} numbers; {MAX_NUMBERS} "
@@ -90,7 +89,7 @@ class VectorizedEnv:
                 stacklevel=3,
             )
         self._metrics = identifiers(found.names[:MAX_NUMBERS], {*RESERVED_KEYS, *RESERVED})
-        self._has_mask, self._has_present = found.n_masked > 0, hasattr(vector, "present")
+        self._has_mask = found.n_masked > 0
         self._ended = np.ones(n_envs * n_agents, bool)
         self._n_to_check = CHECKED_STEPS if check else 0
 
@@ -113,15 +112,12 @@ class VectorizedEnv:
         """Returns what the wrappers of an environment have learnt, such as running statistics, as
         tensors and numbers by path.
         """
-        state = getattr(self.vector, "wrapper_state", dict)()
-        return {path: _plain(value) for path, value in state.items()}
+        return {path: _plain(value) for path, value in self.vector.wrapper_state().items()}
 
     def load_wrapper_state(self, state: Tree, is_frozen: bool) -> None:
         """Gives the wrappers of all environments what those of others have learnt, which stays as
         it is if it `is_frozen`. Raises ValueError if they are not in such wrappers.
         """
-        if not hasattr(self.vector, "load_wrapper_state"):
-            raise ValueError(f"{self.id} is in no wrappers, as in the training of the agent")
         state = {
             path: value.cpu().numpy() if isinstance(value, torch.Tensor) else value
             for path, value in state.items()
@@ -143,9 +139,7 @@ class VectorizedEnv:
         """Returns the frame of environment ``e``, (H, W, 3) uint8, as the environment renders it.
         Raises ValueError if it renders no images.
         """
-        from megastep.hosting.hosted import start_rendering
-
-        start_rendering(self.vector)
+        self._call(self.vector.start_rendering)
         if self.vector.render_mode != "rgb_array":
             raise ValueError(
                 f"{self.id} renders no images: it has no render mode rgb_array, or env.kwargs "
@@ -202,7 +196,8 @@ class VectorizedEnv:
         truncated = truncated > (reset | terminal)
         if self._n_to_check > 0:
             self._check_observations(obs)
-        self._ended[:] = ~infos["present"] if self._has_present else terminal | truncated
+        present = infos.get("present")
+        self._ended[:] = terminal | truncated if present is None else ~present
         world = dict(
             obs=spaces.map(_as_array, self.obs_space, self._read(obs)),
             reward=np.where(reset, 0.0, reward).astype(np.float32),
@@ -210,8 +205,8 @@ class VectorizedEnv:
             terminal=terminal,
             truncated=truncated,
         )
-        if self._has_present:
-            world["learns"] = infos["present"].copy()
+        if present is not None:
+            world["learns"] = present.copy()
         if self._metrics:
             columns = infos["numbers"].astype(np.float32).T.copy()
             world["metrics"] = arrdict(zip(self._metrics, columns))
@@ -225,6 +220,20 @@ class VectorizedEnv:
         if self.device.type == "cpu":
             return tensor
         return tensor.pin_memory().to(self.device, non_blocking=True)
+
+
+@contextlib.contextmanager
+def one_sentence(id: str | None, kwargs: dict | None) -> Iterator[None]:
+    """Raises whatever another's constructor raises as a ValueError with the first line of it."""
+    try:
+        yield
+    except Exception as error:
+        line = str(error) if isinstance(error, ValueError) else one_line(error)
+        line = (
+            line.strip().partition("\n")[0].partition(" was raised from the environment creator")[0]
+        )
+        cause = f" with env.kwargs={kwargs}" if kwargs else ""
+        raise ValueError(f"{id} cannot be made{cause}: {line}") from error
 
 
 def _as_array(space, values) -> np.ndarray:

@@ -27,40 +27,30 @@ def wrapper_state(env: Any, paths: Collection[str] | None = None) -> Tree:
     """Returns copies of the numbers, the arrays and the lists of numbers in wrappers by path, or of
     some, such as `0.NormalizeObservation.obs_rms.mean`; wrapper 0 is the outermost.
     """
-    found, visited, stack = {}, set(), [*reversed(_wrappers(env).items())]
-    while stack:
-        place, node = stack.pop()
-        if id(node) in visited:
-            continue
-        visited.add(id(node))
-        for key, value in _children(node).items():
-            path = f"{place}.{key}"
-            if not isinstance(key, str) or not key.isidentifier() or key in SKIPPED:
-                continue
-            if _is_value(value):
-                found[path] = value
-            elif _may_own_values(value):
-                stack.append((path, value))
-    wanted = found if paths is None else [path for path in found if path in paths]
-    return {path: copy.deepcopy(found[path]) for path in wanted}
+    state = {
+        f"{place}.{name}": value
+        for place, owner in _owners(env).items()
+        for name, value in _members(owner).items()
+        if _is_value(value)
+    }
+    return {p: copy.deepcopy(value) for p, value in state.items() if paths is None or p in paths}
 
 
 def load_wrapper_state(env: Any, state: Tree) -> None:
     """Puts a `wrapper_state`, which may be a stranger's, into the wrappers of another environment.
     Raises ValueError if it is not in such wrappers.
     """
-    wrappers = _wrappers(env)
+    owners = _owners(env)
     for path, value in state.items():
-        number, kind, *keys, last = path.split(".") if _is_safe(path, value) else ("", "", "")
-        holder = wrappers.get(f"{number}.{kind}")
-        for key in keys:
-            holder = _children(holder).get(key)
-        if holder is None:
+        place, _, name = path.rpartition(".")
+        if place not in owners or not _is_name(name) or not _is_value(value, is_nested=True):
+            kind = path.split(".")[1:2]
             raise ValueError(
-                f"the agent needs what its wrapper {kind} has learnt, and this environment is in "
-                "other wrappers; give env.wrappers as in training"
+                f"the agent needs what its wrapper {''.join(kind)} has learnt, and this "
+                "environment is in other wrappers; give env.wrappers as in training"
             )
-        now = _children(holder).get(last)
+        owner = owners[place]
+        now = _members(owner).get(name)
         if isinstance(now, np.ndarray) or isinstance(value, np.ndarray):
             value = np.array(value, getattr(now, "dtype", None))
         elif isinstance(now, collections.deque):
@@ -69,50 +59,54 @@ def load_wrapper_state(env: Any, state: Tree) -> None:
             value = type(now)(value)
         if isinstance(now, np.ndarray) and now.shape == np.shape(value):
             np.copyto(now, value)
-        elif isinstance(holder, dict):
-            holder[last] = value
+        elif isinstance(owner, dict):
+            owner[name] = value
         else:
-            setattr(holder, last, value)
+            setattr(owner, name, value)
 
 
 def freeze(env: Any) -> None:
     """Stops the running statistics of Gymnasium's own wrappers."""
-    for wrapper in _wrappers(env).values():
-        if hasattr(type(wrapper), "update_running_mean"):
-            wrapper.update_running_mean = False
+    for owner in _owners(env).values():
+        if hasattr(type(owner), "update_running_mean"):
+            owner.update_running_mean = False
 
 
-def _is_safe(path, value) -> bool:
-    """Returns whether a part of a state is numbers for an attribute that is not special."""
-    _, *names = str(path).split(".")
-    is_special = any(name.startswith("__") or name in SKIPPED for name in names)
-    is_named = len(names) > 1 and all(name.isidentifier() for name in names)
-    return is_named and not is_special and _are_numbers(value)
-
-
-def _are_numbers(value) -> bool:
-    is_nested = isinstance(value, SEQUENCES)  # as arrays are in the files of agents
-    return all(map(_are_numbers, value)) if is_nested else _is_value(value)
-
-
-def _wrappers(env) -> dict[str, Any]:
-    """Returns wrappers by number and class, the outermost first."""
-    wrappers = {}
+def _owners(env) -> dict[str, Any]:
+    """Returns wrappers, and the objects and dicts below them, by path, the outermost first."""
+    owners, visited, stack = {}, set(), []
     while "env" in getattr(env, "__dict__", ()) and env.unwrapped is not env:
-        wrappers[f"{len(wrappers)}.{type(env).__name__}"] = env
+        stack.insert(0, (f"{len(stack)}.{type(env).__name__}", env))
         env = env.env
-    return wrappers
+    while stack:
+        path, owner = stack.pop()
+        if id(owner) in visited:
+            continue
+        visited.add(id(owner))
+        owners[path] = owner
+        below = _members(owner).items()
+        stack += [(f"{path}.{name}", child) for name, child in below if _may_own_values(child)]
+    return owners
 
 
-def _children(node) -> dict:
-    return node if isinstance(node, dict) else getattr(node, "__dict__", {})
+def _members(owner) -> dict[str, Any]:
+    pairs = owner if isinstance(owner, dict) else vars(owner)
+    return {name: value for name, value in pairs.items() if _is_name(name)}
 
 
-def _is_value(value) -> bool:
+def _is_name(key) -> bool:
+    is_special = key in SKIPPED or str(key).startswith("__")
+    return isinstance(key, str) and key.isidentifier() and not is_special
+
+
+def _is_value(value, is_nested=False) -> bool:
+    """Returns whether it is a number, an array or a list of numbers, or of such lists, which arrays
+    are in the files of agents.
+    """
     if isinstance(value, np.ndarray):
         return value.dtype.kind in "biuf"
     if isinstance(value, SEQUENCES):
-        return all(isinstance(part, numbers.Real) for part in value)
+        return all(isinstance(p, numbers.Real) or (is_nested and _is_value(p, True)) for p in value)
     return isinstance(value, (numbers.Real, np.bool_))
 
 

@@ -18,7 +18,7 @@ from megastep.envs import Gymnasium
 from megastep.hosting.env_error import EnvError
 
 gymnasium = pytest.importorskip("gymnasium")
-VECTORIZATIONS = "sync", "async", "own"
+VECTORIZATIONS = "sync", "async"
 
 
 class Counter(gymnasium.Env):
@@ -41,11 +41,6 @@ class Counter(gymnasium.Env):
         return np.full(1, self.count, np.float32), float(self.count), *ends, {"info": object()}
 
 
-class SameStep(gymnasium.vector.VectorEnv):
-    metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
-    single_observation_space, single_action_space = Counter.observation_space, Counter.action_space
-
-
 class Unbounded(Counter):
     action_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
 
@@ -56,19 +51,10 @@ class Reader(Counter):
     )
 
 
-class Doubled(gymnasium.ObservationWrapper):
-    def observation(self, observation):
-        return 2 * observation
-
-
 @pytest.fixture(autouse=True, scope="module")
 def registered():
-    for cls, settings in {
-        Counter: dict(vector_entry_point=lambda num_envs: SameStep()),
-        Unbounded: {},
-        Reader: {},
-    }.items():
-        gymnasium.register(f"Test{cls.__name__}-v0", cls, disable_env_checker=True, **settings)
+    for cls in (Counter, Unbounded, Reader):
+        gymnasium.register(f"Test{cls.__name__}-v0", cls, disable_env_checker=True)
     yield
     for name in [name for name in gymnasium.registry if name.startswith("Test")]:
         del gymnasium.registry[name]
@@ -167,9 +153,8 @@ def test_killed_process_is_named_and_the_others_end():
 def test_error_of_an_environment_is_named_with_its_traceback(vectorization):
     env = cart_pole(vectorization=vectorization)
     env.reset()
-    name = "an environment" if vectorization == "own" else "environment 0"
     with pytest.raises(
-        EnvError, match=f"^CartPole-v1: {name} failed: AssertionError: .*invalid"
+        EnvError, match="^CartPole-v1: environment 0 failed: AssertionError: .*invalid"
     ) as error:
         env.step(arrdict(actions=torch.full((4, 1), 7)))
     assert "cartpole.py" in error.value.trace and "hosting" not in error.value.trace
@@ -243,7 +228,7 @@ def test_state_is_restored_exactly(name):
 
 
 def test_resumable_if_all_state_is_in_python():
-    assert cart_pole().resumable and cart_pole(vectorization="own").resumable
+    assert cart_pole().resumable
     env = cart_pole(vectorization="async")
     assert not env.resumable
     env.close()
@@ -264,15 +249,6 @@ def test_resumable_if_all_state_is_in_python():
             r"^CartPole-v1 cannot be made with env.kwargs={'mass': 3}: .*unexpected .* 'mass'$",
         ),
         ({"id": "CartPole-v1", "wrappers": ("nowhere:A",)}, "^env.wrappers: nowhere:A cannot be"),
-        ({"id": "Acrobot-v1", "vectorization": "own"}, "no vector environment of its own; use"),
-        (
-            {"id": "TestCounter-v0", "vectorization": "own"},
-            "resets by AutoresetMode.SAME_STEP, .*; use env.vectorization=sync",
-        ),
-        (
-            {"id": "CartPole-v1", "vectorization": "own", "wrappers": (f"{__name__}:Doubled",)},
-            "env.wrappers go around single environments",
-        ),
         (
             {"id": "TestUnbounded-v0"},
             "^TestUnbounded-v0: action is Box.*, and actions need finite bounds.*env.wrappers=",
