@@ -5,7 +5,8 @@ the first world that breaks a clause. Axes: N environments, A agents, B = N A la
 """
 
 import numbers
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
+from typing import cast
 
 import torch
 
@@ -46,45 +47,37 @@ class ContractError(AssertionError):
     """An environment breaks a clause of the contract. The message names class and clause."""
 
 
-# ---- The environment ----
+def _require(env, holds, clause) -> None:
+    if not holds:
+        raise ContractError(f"{type(env).__name__} breaks the contract: {clause}")
 
 
 def check_environment(env: Env) -> None:
     """Checks the required and the optional attributes of an environment. Raises ContractError."""
-    _raise_first(env, _problems_of_environment(env))
-
-
-def _raise_first(env, problems) -> None:
-    for problem in problems:
-        raise ContractError(f"{type(env).__name__} breaks the contract: {problem}")
-
-
-def _problems_of_environment(env) -> Iterator[str]:
-    """Yields what is wrong, as clauses. Those after the first may not hold."""
     for name, meaning in ATTRIBUTES.items():
-        if not hasattr(env, name):
-            yield f"it has no {name}: {meaning}"
+        _require(env, hasattr(env, name), f"it has no {name}: {meaning}")
     for path, space in spaces.leaves(env.action_space, "action_space").items():
-        if not isinstance(space, (spaces.MultiDiscrete, spaces.MultiContinuous)):
-            yield f"{path} must be MultiDiscrete, MultiContinuous or a dict of them, not {space!r}"
+        is_action = isinstance(space, (spaces.MultiDiscrete, spaces.MultiContinuous))
+        must = f"{path} must be MultiDiscrete, MultiContinuous or a dict of them"
+        _require(env, is_action, f"{must}, not {space!r}")
     names = "n_agents", "fps", "check", "layout", "roles"
     n_agents, fps, check, layout, roles = (optional(env, name) for name in names)
-    if not (isinstance(n_agents, numbers.Integral) and int(n_agents) > 0):
-        yield f"n_agents must be a positive integer, not {n_agents!r}"
-    if not (isinstance(fps, numbers.Real) and float(fps) > 0):
-        yield f"fps must be a positive number, not {fps!r}"
-    if not callable(check):
-        yield f"check must be a method without arguments, not {check!r}"
+    is_positive = isinstance(n_agents, numbers.Integral) and int(n_agents) > 0
+    _require(env, is_positive, f"n_agents must be a positive integer, not {n_agents!r}")
+    is_positive = isinstance(fps, numbers.Real) and float(fps) > 0
+    _require(env, is_positive, f"fps must be a positive number, not {fps!r}")
+    _require(env, callable(check), f"check must be a method without arguments, not {check!r}")
     check()
-    if layout is not None and (layout.shape != (env.n_envs,) or layout.is_floating_point()):
-        yield f"layout must hold one integer per environment, shape ({env.n_envs},)"
-    if roles is None:
-        return
-    if not isinstance(roles, (tuple, list)) or len(roles) != n_agents:
-        yield f"roles must hold one name per agent, {n_agents} in all, not {roles!r}"
-    if not all(map(_is_name, roles)):
-        names = "such as red_team, as metrics have them in their names"
-        yield f"roles must be identifiers, {names}, not {roles!r}"
+    if layout is not None:
+        is_alike = layout.shape == (env.n_envs,) and not layout.is_floating_point()
+        must = "layout must hold one integer per environment"
+        _require(env, is_alike, f"{must}, shape ({env.n_envs},)")
+    if roles is not None:
+        is_alike = isinstance(roles, (tuple, list)) and len(roles) == n_agents
+        must = f"roles must hold one name per agent, {n_agents} in all"
+        _require(env, is_alike, f"{must}, not {roles!r}")
+        must = "roles must be identifiers, such as red_team, as metrics have them in their names"
+        _require(env, all(map(_is_name, roles)), f"{must}, not {roles!r}")
 
 
 def _is_name(word) -> bool:
@@ -100,128 +93,113 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
     Args:
         last: the world one step earlier; None if ``world`` came from ``reset``.
     """
-    _raise_first(env, _problems_of_world(env, world, last))
-
-
-def _problems_of_world(env, world, last) -> Iterator[str]:
-    if not isinstance(world, arrdict):
-        yield f"a world must be a megastep.arrdict, not a {type(world).__name__}"
+    is_arrdict = isinstance(world, arrdict)
+    _require(env, is_arrdict, f"a world must be a megastep.arrdict, not a {type(world).__name__}")
     for key in ("obs", "reward", *FLAGS):
-        if key not in world:
-            yield f"the world has no {key}"
-    yield from _problems_per_lane(env, "reward", world["reward"], torch.float32)
+        _require(env, key in world, f"the world has no {key}")
+    lanes = (n_lanes(env),)
+    _check_tensor(env, "reward", world["reward"], lanes, (torch.float32,))
     for key in FLAGS:
-        yield from _problems_per_lane(env, key, world[key], torch.bool)
-    yield from _problems_of_observation(env, "obs", env.obs_space, world)
+        _check_tensor(env, key, world[key], lanes, (torch.bool,))
+    _check_observation(env, "obs", env.obs_space, world)
     privileged = optional(env, "privileged_space")
-    if ("privileged" in world) != (privileged is not None):
-        yield "privileged must be in the world if, and only if, privileged_space is not None"
+    clause = "privileged must be in the world if, and only if, privileged_space is not None"
+    _require(env, ("privileged" in world) == (privileged is not None), clause)
     if privileged is not None:
-        yield from _problems_of_observation(env, "privileged", privileged, world)
-    yield from _problems_of_episodes(env, world, last)
-    yield from _problems_of_metrics(env, world, last)
+        _check_observation(env, "privileged", privileged, world)
+    _check_episodes(env, world, last)
+    _check_metrics(env, world, last)
     for key in ("learns", "mask"):
-        if last is not None and (key in world) != (key in last):
-            yield f"{key} must be in every world or in none"
+        is_same = last is None or (key in world) == (key in last)
+        _require(env, is_same, f"{key} must be in every world or in none")
     if "learns" in world:
-        yield from _problems_per_lane(env, "learns", world["learns"], torch.bool)
+        _check_tensor(env, "learns", world["learns"], lanes, (torch.bool,))
     if "mask" in world:
-        yield from _problems_of_mask(env, world["mask"])
+        _check_mask(env, world["mask"])
 
 
-def _problems_of_tensor(env, path, values, shape, dtypes, kind=None) -> Iterator[str]:
+def _check_tensor(env, path, values, shape, dtypes, kind=None) -> None:
     """Requires a tensor of this shape, of one of the dtypes, on the environment's device."""
-    described, device = repr(values), torch.device(env.device).type
+    described, device, is_alike = repr(values), torch.device(env.device).type, False
     if isinstance(values, torch.Tensor):
         described = f"{values.dtype} {tuple(values.shape)} on {values.device.type}"
         is_alike = values.shape == shape and values.dtype in dtypes
-        if is_alike and values.device.type == device:
-            return
-    kind = kind or " or ".join(str(dtype) for dtype in dtypes)
-    yield f"{path} must be {kind} {tuple(shape)} on {device}, not {described}"
+        is_alike = is_alike and values.device.type == device
+    kind = kind or " or ".join(map(str, dtypes))
+    _require(env, is_alike, f"{path} must be {kind} {tuple(shape)} on {device}, not {described}")
 
 
-def _problems_per_lane(env, path, values, dtype) -> Iterator[str]:
-    return _problems_of_tensor(env, path, values, (n_lanes(env),), (dtype,))
-
-
-def _problems_of_observation(env, name, space, world) -> Iterator[str]:
+def _check_observation(env, name, space, world) -> None:
     expected, present = spaces.leaves(space, name), spaces.leaves(world[name], name)
-    if expected.keys() != present.keys():
-        has = f"{', '.join(expected)}, as {name}_space has, not {', '.join(present)}"
-        yield f"the world must have {has}"
+    must = f"the world must have {', '.join(expected)}, as {name}_space has"
+    _require(env, expected.keys() == present.keys(), f"{must}, not {', '.join(present)}")
     for path, leaf in expected.items():
         shape, values = (n_lanes(env), *leaf.shape), present[path]
         if isinstance(leaf, spaces.MultiDiscrete):
-            yield from _problems_of_tensor(env, path, values, shape, INTEGERS, "integers")
-            if not bool(((values >= 0) & (values < leaf.n_actions)).all()):
-                yield f"{path} must be from 0 to {leaf.n_actions - 1}"
+            _check_tensor(env, path, values, shape, INTEGERS, "integers")
+            is_inside = bool(((values >= 0) & (values < leaf.n_actions)).all())
+            _require(env, is_inside, f"{path} must be from 0 to {leaf.n_actions - 1}")
             continue
         dtypes = (leaf.dtype,) if getattr(leaf, "dtype", None) else FLOATS
         dtypes = dtypes if name == "obs" else (torch.float32,)
-        yield from _problems_of_tensor(env, path, values, shape, dtypes)
-        if not bool(values.isfinite().all()):
-            yield f"{path} must be finite"
+        _check_tensor(env, path, values, shape, dtypes)
+        _require(env, bool(values.isfinite().all()), f"{path} must be finite")
         if getattr(leaf, "low", None) is not None or getattr(leaf, "high", None) is not None:
             low, high = leaf.bounds(values.device)
             outside = values[(values < low) | (values > high)].float().tolist()[:1]
-            if outside:
-                yield f"{path} must be within {leaf.low} and {leaf.high}, not {outside}"
+            must = f"{path} must be within {leaf.low} and {leaf.high}"
+            _require(env, not outside, f"{must}, not {outside}")
 
 
-def _problems_of_mask(env, mask) -> Iterator[str]:
+def _check_mask(env, mask) -> None:
     """Requires a bool per action of discrete spaces, of which at least one is true."""
     actions = spaces.leaves(env.action_space, "mask")
     for path, values in spaces.leaves(mask, "mask").items():
-        space = actions.get(path)
-        if not isinstance(space, spaces.MultiDiscrete):
-            yield f"{path} is of no discrete action space: leave it out"
-            return
+        space: Tree = actions.get(path)
+        is_discrete = isinstance(space, spaces.MultiDiscrete)
+        _require(env, is_discrete, f"{path} is of no discrete action space: leave it out")
         shape = n_lanes(env), *space.shape, space.n_actions
-        yield from _problems_of_tensor(env, path, values, shape, (torch.bool,))
-        if not bool(values.any(-1).all()):
-            yield f"{path} must allow at least one action"
+        _check_tensor(env, path, values, shape, (torch.bool,))
+        _require(env, bool(values.any(-1).all()), f"{path} must allow at least one action")
 
 
-def _problems_of_episodes(env, world, last) -> Iterator[str]:
+def _check_episodes(env, world, last) -> None:
     """Requires finite rewards, and flags that agree with those of the last step."""
     reward, (reset, terminal, truncated) = world["reward"], (world[key] for key in FLAGS)
     ended = terminal | truncated
-    if not bool(reward.isfinite().all()):
-        yield "reward must be finite"
-    if bool((terminal & truncated).any()):
-        yield "terminal and truncated exclude each other"
-    if bool((reset & ended).any()):
-        yield (
-            "an episode must not end at its first observation: where reset is True, terminal and "
-            "truncated are False"
-        )
-    if bool(reward[reset].any()):
-        yield "reward must be 0 at the first observation of an episode"
     expected = torch.ones_like(reset) if last is None else last["terminal"] | last["truncated"]
     learned = True if last is None else last.get("learns", True)
-    if not torch.equal(reset & (expected | learned), expected):
-        yield (
+    for holds, clause in (
+        (reward.isfinite().all(), "reward must be finite"),
+        (~(terminal & truncated).any(), "terminal and truncated exclude each other"),
+        (
+            ~(reset & ended).any(),
+            "an episode must not end at its first observation: where reset is True, terminal and "
+            "truncated are False",
+        ),
+        (~reward[reset].any(), "reward must be 0 at the first observation of an episode"),
+        (
+            torch.equal(reset & (expected | learned), expected),
             "reset must be True after env.reset() and in the step after an episode ended, and "
-            "False otherwise, but may be True in lanes whose learns was False"
-        )
+            "False otherwise, but may be True in lanes whose learns was False",
+        ),
+    ):
+        _require(env, bool(holds), clause)
     if (over := optional(env, "game_over")) is not None:
-        yield from _problems_of_tensor(env, "game_over", over, (env.n_envs,), (torch.bool,))
-        if bool((over & ~ended.view(env.n_envs, -1).all(1)).any()):
-            yield "where game_over is True, every lane must be terminal or truncated"
+        _check_tensor(env, "game_over", over, (env.n_envs,), (torch.bool,))
+        is_ended = not bool((over & ~ended.view(env.n_envs, -1).all(1)).any())
+        _require(env, is_ended, "where game_over is True, every lane must be terminal or truncated")
 
 
-def _problems_of_metrics(env, world, last) -> Iterator[str]:
+def _check_metrics(env, world, last) -> None:
     metrics = world.get("metrics", {})
-    if not isinstance(metrics, Mapping):
-        yield "metrics must be a dict of tensors"
-    if last is not None and metrics.keys() != last.get("metrics", {}).keys():
-        yield "metrics must have the same keys in every world"
+    _require(env, isinstance(metrics, Mapping), "metrics must be a dict of tensors")
+    is_same = last is None or metrics.keys() == last.get("metrics", {}).keys()
+    _require(env, is_same, "metrics must have the same keys in every world")
     for name, values in metrics.items():
-        if not _is_name(name) or name in RESERVED:
-            words = ", ".join(RESERVED)
-            yield f"the name of a metric must be an identifier other than {words}, not {name!r}"
-        yield from _problems_per_lane(env, f"metrics.{name}", values, torch.float32)
+        must = f"the name of a metric must be an identifier other than {', '.join(RESERVED)}"
+        _require(env, _is_name(name) and name not in RESERVED, f"{must}, not {name!r}")
+        _check_tensor(env, f"metrics.{name}", values, (n_lanes(env),), (torch.float32,))
 
 
 # ---- Stepping ----
@@ -232,28 +210,23 @@ def check_resets(env: Env) -> None:
     Leaves its tensors as they were. Raises ContractError if a masked reset changes other lanes or
     begins no episode in its own, or one seed gives two first worlds.
     """
-    before = snapshot(env)
-    _raise_first(env, _problems_of_resets(env))
-    restore(env, before)
-
-
-def _problems_of_resets(env) -> Iterator[str]:
-    n, reset = n_lanes(env), env.reset
+    before, n, reset = snapshot(env), n_lanes(env), cast(Callable, env.reset)
     first = reset(seed=1).clone()
-    yield from _problems_of_world(env, first, None)
+    check_world(env, first)
     decision = arrdict(actions=random_actions(env, torch.Generator().manual_seed(1)))
-    last = env.step(decision).clone()
+    last = spaces.leaves(env.step(decision).clone())
     # every other environment
     mask = torch.arange(n, device=env.device) // optional(env, "n_agents") % 2 == 0
     world = reset(seed=torch.ones(n, dtype=torch.int64, device=env.device), mask=mask)
-    if not bool(world["reset"][mask].all()):
-        yield "reset must be True in the lanes of a masked reset"
+    begins = bool(world["reset"][mask].all())
+    _require(env, begins, "reset must be True in the lanes of a masked reset")
     for path, leaf in spaces.leaves(world).items():
-        was, begins = spaces.leaves(last)[path], spaces.leaves(first)[path]
-        if not torch.equal(leaf[~mask], was[~mask]):
-            yield f"a masked reset must leave other lanes as they are, but {path} has changed"
-        if path.startswith("obs") and not torch.equal(leaf[mask], begins[mask]):
-            yield f"a seed must give the same first world each time, but {path} differs"
+        clause = f"a masked reset must leave other lanes as they are, but {path} has changed"
+        _require(env, torch.equal(leaf[~mask], last[path][~mask]), clause)
+        if path.startswith("obs"):
+            clause = f"a seed must give the same first world each time, but {path} differs"
+            _require(env, torch.equal(leaf[mask], spaces.leaves(first)[path][mask]), clause)
+    restore(env, before)
 
 
 def random_actions(env: Env, generator: torch.Generator, mask: Tree = None) -> Tree:

@@ -7,9 +7,8 @@
     r[:2]   # RaggedNumpy([3 1])
 """
 
-import operator
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, SupportsIndex
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -37,7 +36,6 @@ class Ragged(SetOnce):
 
     vals: Any
     widths: Any
-    inverse: Any
 
     def __new__(cls, *args: object) -> "Self":
         if cls is Ragged:
@@ -46,17 +44,19 @@ class Ragged(SetOnce):
         return super().__new__(cls)
 
     def __init__(self, vals: Array, widths: Array):
-        widths = np.zeros(0, int) if len(widths) == 0 else widths
+        integers: Any = np.zeros(0, int) if len(widths) == 0 else widths
         if isinstance(self, RaggedTorch):
             self.vals = torch.as_tensor(vals)
-            widths = torch.as_tensor(widths, device=self.vals.device)
+            integers = torch.as_tensor(integers, device=self.vals.device)
+            _check(self.vals, integers)
+            self.widths = integers.long()
         else:
             self.vals = np.asarray(vals)
-            widths = np.asarray(widths.cpu() if isinstance(widths, torch.Tensor) else widths)
-        _check(self.vals, widths)
-        integers: Any = widths
-        is_tensor = isinstance(integers, torch.Tensor)
-        self.widths = integers.long() if is_tensor else integers.astype(np.int64, copy=False)
+            integers = np.asarray(
+                integers.cpu() if isinstance(integers, torch.Tensor) else integers
+            )
+            _check(self.vals, integers)
+            self.widths = integers.astype(np.int64, copy=False)
 
     @cached_property
     def ends(self) -> Array:
@@ -69,6 +69,13 @@ class Ragged(SetOnce):
         return self.ends - self.widths
 
     @cached_property
+    def inverse(self) -> Any:
+        """(V,) the subarray that each element of ``vals`` belongs to."""
+        if isinstance(self, RaggedTorch):
+            return torch.arange(len(self), device=self.device).repeat_interleave(self.widths)
+        return np.arange(len(self)).repeat(self.widths)
+
+    @cached_property
     def _host(self) -> tuple[list[int], list[int]]:
         """Starts and ends as lists, so that only the first indexing synchronises."""
         return self.starts.tolist(), self.ends.tolist()
@@ -78,37 +85,48 @@ class Ragged(SetOnce):
 
     def __getitem__(self, index: int | slice) -> "Array | Ragged":
         starts, ends = self._host
-        if isinstance(index, slice):
-            selected = range(len(self))[index]
-            if not selected:
-                return Ragged(self.vals[:0], self.widths[:0])
-            if selected.step == 1:
-                return Ragged(
-                    self.vals[starts[selected[0]] : ends[selected[-1]]],
-                    self.widths[selected.start : selected.stop],
-                )
-            parts = [self.vals[starts[i] : ends[i]] for i in selected]
-            joined = torch.cat if isinstance(self, RaggedTorch) else np.concatenate
-            return Ragged(joined(parts), self.widths[list(selected)])
-        i = self._index(index)
-        return self.vals[starts[i] : ends[i]]
-
-    def _index(self, index: SupportsIndex) -> int:
         try:
-            i = operator.index(index)
+            selected = range(len(self))[index]
+        except IndexError:
+            n = len(self)
+            raise IndexError(
+                f"index {index} is out of range for a Ragged of {n} subarrays"
+            ) from None
         except TypeError:
             raise TypeError(
                 f"a Ragged is indexed with an integer or a slice, not a {type(index).__name__}"
             ) from None
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"index {i} is out of range for a Ragged of {len(self)} subarrays")
-        return i % len(self)
+        if isinstance(selected, int):
+            return self.vals[starts[selected] : ends[selected]]
+        if not selected:
+            return Ragged(self.vals[:0], self.widths[:0])
+        if selected.step == 1:
+            vals = self.vals[starts[selected[0]] : ends[selected[-1]]]
+            return Ragged(vals, self.widths[selected.start : selected.stop])
+        joined = torch.cat if isinstance(self, RaggedTorch) else np.concatenate
+        vals = joined([self.vals[starts[i] : ends[i]] for i in selected])
+        return Ragged(vals, self.widths[list(selected)])
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({np.array(self.widths.tolist(), int)})"
 
     def __reduce__(self) -> tuple:
         return Ragged, (self.vals, self.widths)
+
+    def torchify(self) -> "RaggedTorch":
+        """Returns it on tensors: itself, or on the CPU. float64 becomes float32."""
+        if isinstance(self, RaggedTorch):
+            return self
+        vals = self.vals.astype(np.float32) if self.vals.dtype == np.float64 else self.vals
+        return RaggedTorch(torch.as_tensor(vals), torch.as_tensor(self.widths))
+
+    def numpyify(self) -> "RaggedNumpy":
+        """Returns it on numpy arrays: itself, or a copy of it. bfloat16 becomes float32."""
+        if isinstance(self, RaggedNumpy):
+            return self
+        vals = self.vals.detach().cpu()
+        vals = vals.float() if vals.dtype == torch.bfloat16 else vals
+        return RaggedNumpy(vals.numpy(), self.widths.cpu().numpy())
 
 
 class RaggedNumpy(Ragged):
@@ -117,20 +135,6 @@ class RaggedNumpy(Ragged):
     vals: np.ndarray
     widths: np.ndarray
 
-    @cached_property
-    def inverse(self) -> np.ndarray:
-        """(V,) the subarray that each element of ``vals`` belongs to."""
-        return np.repeat(np.arange(len(self)), self.widths)
-
-    def torchify(self) -> "RaggedTorch":
-        """Returns the same Ragged on CPU tensors. float64 becomes float32."""
-        vals = self.vals.astype(np.float32) if self.vals.dtype == np.float64 else self.vals
-        return RaggedTorch(torch.as_tensor(vals), torch.as_tensor(self.widths))
-
-    def numpyify(self) -> "RaggedNumpy":
-        """Returns itself."""
-        return self
-
 
 class RaggedTorch(Ragged):
     """A Ragged of tensors on the device of ``vals``."""
@@ -138,27 +142,10 @@ class RaggedTorch(Ragged):
     vals: torch.Tensor
     widths: torch.Tensor
 
-    @cached_property
-    def inverse(self) -> torch.Tensor:
-        """(V,) the subarray that each element of ``vals`` belongs to."""
-        return torch.repeat_interleave(torch.arange(len(self), device=self.device), self.widths)
-
     @property
     def device(self) -> torch.device:
         """The device of ``vals``."""
         return self.vals.device
-
-    def torchify(self) -> "RaggedTorch":
-        """Returns itself."""
-        return self
-
-    def numpyify(self) -> RaggedNumpy:
-        """Returns the same Ragged on numpy arrays. bfloat16 becomes float32."""
-        vals = self.vals.detach().cpu()
-        return RaggedNumpy(
-            (vals.float() if vals.dtype == torch.bfloat16 else vals).numpy(),
-            self.widths.cpu().numpy(),
-        )
 
     def to(self, *args: Any, **kwargs: Any) -> "RaggedTorch":
         """Returns a Ragged of ``vals.to(...)``, with the widths on the same device."""

@@ -89,7 +89,7 @@ class Hosted:
             try:
                 env.close()
             except Exception as error:
-                errors.append(EnvError.of(error, f"environment {self.first + e}"))
+                errors.append(EnvError.of(error, self._name(e)))
         if errors:
             raise errors[0]
 
@@ -97,8 +97,11 @@ class Hosted:
         """Returns what environment e returned. Raises BadValue if its form is wrong."""
         space = self.single_observation_space
         if self.n_to_check and (clause := problem(method, result, space, agents)):
-            raise BadValue.of(clause, f"environment {self.first + e}")
+            raise BadValue.of(clause, self._name(e))
         return result
+
+    def _name(self, e) -> str:
+        return f"environment {self.first + e}"
 
 
 class HostedEnvs(Hosted):
@@ -127,8 +130,7 @@ class HostedEnvs(Hosted):
         check: bool = True,
     ):
         super().__init__(found, check)
-        self.first, self.generators = first, []
-        self.envs = []
+        self.first, self.envs, self.generators = first, [], []
         for number in range(first, first + n_envs):
             generators = GlobalGenerators([seed, number])
             with generators.installed(KINDS):
@@ -146,9 +148,6 @@ class HostedEnvs(Hosted):
         self.terminated, self.truncated = np.zeros(n_envs, bool), np.zeros(n_envs, bool)
         self.numbers = np.zeros((n_envs, len(self.found.names)))
         self.masks = np.ones((n_envs, max(0, self.found.n_masked)), bool)
-        is_recorded = TRUE_RETURN in self.found.names
-        self.recorders: Any = [RewardRecorder.inside(env) for env in self.envs if is_recorded]
-        self.true_returns = np.zeros(n_envs)
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
         """Resets every environment. Returns (observations, infos)."""
@@ -164,8 +163,8 @@ class HostedEnvs(Hosted):
 
     def _advance(self, actions, seeds=None) -> tuple:
         """Resets environments whose episodes have ended, and steps the others."""
-        latest, rewards, flags = self.latest, self.rewards, (self.terminated, self.truncated)
-        terminated, truncated = flags
+        latest, rewards = self.latest, self.rewards
+        terminated, truncated = flags = self.terminated, self.truncated
         is_watched = bool(self.found.generators or self.frozen or self.n_to_check)
         n_masked, e = self.masks.shape[1], 0
         try:
@@ -173,22 +172,19 @@ class HostedEnvs(Hosted):
                 if begins:
                     settings = {"seed": int(seeds[e])} if seeds else {}
                     latest[e], info = self._call(e, "reset", **settings)
-                    rewards[e] = terminated[e] = truncated[e] = self.true_returns[e] = 0
+                    rewards[e] = terminated[e] = truncated[e] = 0
                 else:
                     env = self.envs[e]
                     result = self._call(e, "step", action) if is_watched else env.step(action)
                     latest[e], rewards[e], terminated[e], truncated[e], info = result
-                    if self.recorders:
-                        self.true_returns[e] += self.recorders[e].recorded_reward
                     if self.found.names and (terminated[e] or truncated[e]):
                         self._keep_numbers(e, info)
                 if n_masked:
-                    place = f"environment {self.first + e}"
-                    self.masks[e] = allowed_actions(info, n_masked, place)
+                    self.masks[e] = allowed_actions(info, n_masked, self._name(e))
         except (EnvError, MemoryError):
             raise
         except Exception as error:
-            raise EnvError.of(error, f"environment {self.first + e}") from error
+            raise EnvError.of(error, self._name(e)) from error
         self.n_to_check = max(0, self.n_to_check - 1)
         np.logical_or(*flags, out=self.ended)
         obs = concatenate(self.single_observation_space, latest, self.batch)
@@ -204,6 +200,6 @@ class HostedEnvs(Hosted):
 
     def _keep_numbers(self, e, info) -> None:
         numbers = numbers_of(info)
-        if self.recorders:
-            numbers[TRUE_RETURN] = float(self.true_returns[e])
+        if recorder := RewardRecorder.inside(self.envs[e]):
+            numbers[TRUE_RETURN] = recorder.recorded_return
         self.numbers[e] = [numbers.get(name, np.nan) for name in self.found.names]

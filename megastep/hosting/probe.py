@@ -4,10 +4,9 @@ asked of it. Workers import it, so without PyTorch.
 
 import contextlib
 import copy
-import itertools
 import numbers
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -44,13 +43,18 @@ class Probe(NamedTuple):
 
 
 class RewardRecorder(gymnasium.Wrapper):
-    """Keeps the last reward of an environment, which wrappers around it may change."""
+    """Sums an episode's rewards, which wrappers around it may change."""
 
-    recorded_reward = 0.0
+    recorded_return = 0.0
+
+    def reset(self, **settings: Tree) -> tuple:
+        self.recorded_return = 0.0
+        return super().reset(**settings)
 
     def step(self, action: Tree) -> tuple:
         result = super().step(action)
-        self.recorded_reward = result[1]
+        with contextlib.suppress(TypeError, ValueError):  # which a check names
+            self.recorded_return += float(result[1])
         return result
 
     @classmethod
@@ -73,32 +77,27 @@ def numbers_of(info: object) -> dict[str, float]:
     return values
 
 
-def _play(env, seed) -> Iterator[tuple]:
-    """Yields reward, whether the episode is over, and info, for each step by a random action."""
-    actions = copy.deepcopy(env.action_space)  # which may be that of a class
-    actions.seed(seed)
-    while True:
-        _, reward, terminated, truncated, info = env.step(actions.sample())
-        yield reward, terminated or truncated, info
-
-
 def probe(make: Callable, seed: int = 0) -> Probe:
     """Makes an environment, plays an episode of at most `MAX_STEPS` and `MAX_SECONDS`, and closes
     it. Leaves the global generators as they were. An error ends the episode: the same one comes in
     training, which names it.
     """
-    names, first, last, is_changed, n_masked = (), {}, {}, False, 0
+    names, first, last, total, is_changed, n_masked = [], {}, {}, 0.0, False, 0
     with kept():
         env = make()
+        recorder = RewardRecorder.inside(env)
         drawn, fresh = GlobalGenerators([seed]), GlobalGenerators([seed])
         with contextlib.suppress(Exception), drawn.installed(KINDS):
             n_masked = masked_actions(env.action_space, env.reset(seed=seed)[1])
             first, end = wrapper_state(env), time.monotonic() + MAX_SECONDS
-            recorder = RewardRecorder.inside(env)
-            for reward, is_over, info in itertools.islice(_play(env, seed), MAX_STEPS):
-                is_changed |= recorder is not None and bool(recorder.recorded_reward != reward)
+            actions = copy.deepcopy(env.action_space)  # which may be that of a class
+            actions.seed(seed)
+            for _ in range(MAX_STEPS):
+                _, reward, terminated, truncated, info = env.step(actions.sample())
+                total += float(reward)
+                is_changed = recorder is not None and recorder.recorded_return != total
                 names = sorted(numbers_of(info), key=lambda name: name != "is_success")
-                if is_over or time.monotonic() > end:
+                if terminated or truncated or time.monotonic() > end:
                     break
         before = fresh.states()
         generators = tuple(kind for kind, state in drawn.states().items() if state != before[kind])

@@ -17,7 +17,7 @@ from megastep.types import Tree
 __all__ = ["freeze", "load_wrapper_state", "wrapper_state"]
 
 #: Attributes of a wrapper that are no state of its own.
-SKIPPED = "env", "metadata", "spec", "_np_random", "recorded_reward"
+SKIPPED = "env", "metadata", "spec", "_np_random", "recorded_return"
 SEQUENCES = list, tuple, collections.deque
 #: What a wrapper may refer to without owning it.
 OTHERS = gymnasium.Env, gymnasium.Space, types.ModuleType, type
