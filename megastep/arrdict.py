@@ -6,7 +6,7 @@ numbers.
 
 import copy
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,6 @@ from torch.utils import _pytree
 from megastep.dotdict import _map, dotdict, leaves, mapping
 
 __all__ = ["arrdict", "stack", "cat", "torchify", "numpyify", "clone", "leaves", "mapping"]
-
-Array = np.ndarray | torch.Tensor
 
 
 class arrdict(dotdict):
@@ -55,57 +53,49 @@ def _combine(op: Callable, tree: dict, other) -> Any:
     return _map(lambda leaf: op(leaf, other), tree)
 
 
-def _forward(op: Callable) -> Callable:
+def _binary(op: Callable) -> Callable:
     return lambda self, other: _combine(op, self, other)
-
-
-def _reflected(op: Callable) -> Callable:
-    return lambda self, other: _combine(lambda leaf, value: op(value, leaf), self, other)
 
 
 def _unary(op: Callable) -> Callable:
     return lambda self: _map(op, self)
 
 
-def _operators() -> Iterator[tuple[str, Callable]]:
-    """Yields (name, method) of the operators of arithmetic, comparison and sign."""
+def _define_operators() -> None:
+    """Gives arrdict the operators of arithmetic, comparison and sign."""
     names = "add sub mul matmul truediv floordiv mod pow lshift rshift and or xor".split()
     arithmetic = {name: getattr(operator, f"__{name}__") for name in names}
     for name, op in {**arithmetic, "divmod": divmod}.items():
-        yield f"__{name}__", _forward(op)
-        yield f"__r{name}__", _reflected(op)
-    yield "__ior__", _forward(operator.or_)  # dict has |=, which merges keys, and no other
+        setattr(arrdict, f"__{name}__", _binary(op))
+        setattr(arrdict, f"__r{name}__", _binary(lambda leaf, value, op=op: op(value, leaf)))
+    arrdict.__ior__ = _binary(operator.or_)  # dict has |=, which merges keys, and no other
     for name in ("lt", "le", "eq", "ne", "ge", "gt"):
-        yield f"__{name}__", _forward(getattr(operator, name))
+        setattr(arrdict, f"__{name}__", _binary(getattr(operator, name)))
     for name in ("neg", "pos", "abs", "invert"):
-        yield f"__{name}__", _unary(getattr(operator, name))
+        setattr(arrdict, f"__{name}__", _unary(getattr(operator, name)))
 
 
-for _name, _method in _operators():
-    setattr(arrdict, _name, _method)
+_define_operators()
 
 
 def stack(trees: Iterable, dim: int = 0) -> Any:
     """Joins trees with the same keys along a new axis ``dim``. Numbers become a numpy array."""
-    return _join("stack", torch.stack, np.stack, trees, dim)
+    return _join(torch.stack, np.stack, trees, dim)
 
 
 def cat(trees: Iterable, dim: int = 0) -> Any:
     """Joins trees with the same keys along an existing axis ``dim``."""
-    return _join("cat", torch.cat, np.concatenate, trees, dim)
+    return _join(torch.cat, np.concatenate, trees, dim)
 
 
-def _join(name: str, torch_join: Callable, numpy_join: Callable, trees: Iterable, dim: int) -> Any:
-    trees = list(trees)
-    if not trees:
-        raise ValueError(f"{name} needs at least one tree, but got none")
-
-    def join(*values) -> Array:
+def _join(torch_join: Callable, numpy_join: Callable, trees: Iterable, dim: int) -> Any:
+    def join(*values) -> np.ndarray | torch.Tensor:
         if isinstance(values[0], torch.Tensor):
             return torch_join(values, dim)
         return numpy_join([np.asarray(value) for value in values], dim)
 
-    return _map(join, *trees)
+    first, *others = trees
+    return _map(join, first, *others)
 
 
 @mapping
@@ -155,16 +145,12 @@ def _flattened(tree: Any) -> tuple[list, list]:
     return [(_pytree.MappingKey(key), value) for key, value in tree.items()], list(tree)
 
 
-def _register(cls: type[dotdict]) -> None:
-    """Registers a tree type with torch's pytrees, for torch.compile, torch.func and others."""
+# with torch's pytrees, for torch.compile, torch.func and others
+for _kind in (dotdict, arrdict):
     _pytree.register_pytree_node(
-        cls,
+        _kind,
         lambda tree: (list(tree.values()), list(tree)),
-        lambda values, keys: cls(zip(keys, values, strict=True)),
-        serialized_type_name=f"{cls.__module__}.{cls.__name__}",
+        lambda values, keys, kind=_kind: kind(zip(keys, values, strict=True)),
+        serialized_type_name=f"{_kind.__module__}.{_kind.__name__}",
         flatten_with_keys_fn=_flattened,
     )
-
-
-_register(dotdict)
-_register(arrdict)

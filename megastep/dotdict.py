@@ -33,27 +33,21 @@ class dotdict(dict):
     def __getattr__(self, name: str) -> Any:
         if name in self:
             return self[name]
-        if name.startswith("_"):
-            raise AttributeError(_absent(self, name))
+        if name.startswith("_") or not leaves(self):
+            raise AttributeError(f"'{name}' is not a key of this {type(self).__name__}")
         try:
-            attributes = {key: _attribute(value, name) for key, value in self.items()}
-        except _Missing as missing:
-            raise AttributeError(_absent(self, name, missing.leaf)) from None
-        if not leaves(self):
-            raise AttributeError(_absent(self, name))
-        return type(self)(attributes)
+            return type(self)({key: _attribute(value, name) for key, value in self.items()})
+        except AttributeError as error:
+            raise AttributeError(
+                f"'{name}' is not a key of this {type(self).__name__} or an attribute of its "
+                f"values ({error}); {_listing(self, name)}"
+            ) from None
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
-        raise AttributeError(
-            f"a {type(self).__name__} is assigned by key: write d['{name}'] = ..., not "
-            f"d.{name} = ..."
-        )
+        raise AttributeError(f"write d['{name}'] = ..., not d.{name} = ...")
 
     def __delattr__(self, name: str) -> NoReturn:
-        raise AttributeError(
-            f"a {type(self).__name__}'s items are deleted by key: write del d['{name}'], not "
-            f"del d.{name}"
-        )
+        raise AttributeError(f"write del d['{name}'], not del d.{name}")
 
     def __missing__(self, key: object) -> NoReturn:
         raise KeyError(f"{key!r} is not a key; {_listing(self, key)}")
@@ -115,38 +109,25 @@ def _map(f: Callable, tree, *others) -> Any:
     if not isinstance(tree, dict):
         return f(tree, *others)
     for other in others:
-        _check_keys(tree, other)
+        if not isinstance(other, dict):
+            kind = type(other).__name__
+            raise ValueError(f"a tree with keys {_names(tree)} needs another tree, not a {kind}")
+        if tree.keys() != other.keys():
+            raise ValueError(
+                f"two trees must have the same keys, but one has {_names(tree)} and the other "
+                f"{_names(other)}"
+            )
     return type(tree)(
         {key: _map(f, value, *(other[key] for other in others)) for key, value in tree.items()}
     )
 
 
-def _check_keys(tree: dict, other: object) -> None:
-    if not isinstance(other, dict):
-        raise ValueError(
-            f"a tree with keys {_names(tree)} needs another tree, but got a {type(other).__name__}"
-        )
-    if tree.keys() != other.keys():
-        raise ValueError(
-            f"two trees must have the same keys, but one has {_names(tree)} and the other "
-            f"{_names(other)}"
-        )
-
-
-class _Missing(Exception):
-    def __init__(self, leaf: object):
-        self.leaf = leaf
-
-
 def _attribute(value, name: str) -> Any:
-    if isinstance(value, dict):
-        if name in value:
-            return value[name]
-        return type(value)({key: _attribute(inner, name) for key, inner in value.items()})
-    try:
+    if not isinstance(value, dict):
         return getattr(value, name)
-    except AttributeError:
-        raise _Missing(value) from None
+    if name in value:
+        return value[name]
+    return type(value)({key: _attribute(inner, name) for key, inner in value.items()})
 
 
 def _names(tree: dict) -> str:
@@ -157,11 +138,6 @@ def _listing(tree: dict, key: object) -> str:
     nearest = difflib.get_close_matches(str(key), map(str, tree), n=1)
     hint = f" (did you mean '{nearest[0]}'?)" if nearest else ""
     return f"its keys are {_names(tree)}{hint}"
-
-
-def _absent(tree: dict, name: str, leaf: object = None) -> str:
-    values = "" if leaf is None else f" or an attribute of its values (type {type(leaf).__name__})"
-    return f"'{name}' is not a key of this {type(tree).__name__}{values}; {_listing(tree, name)}"
 
 
 def _rows(tree: dict) -> Iterator[str]:
@@ -178,18 +154,11 @@ def _summary(value, column: int) -> str:
     name = type(value).__name__
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{name}({tuple(value.shape)}, {value.dtype})"
-    if _is_shape(value):
+    is_short = isinstance(value, tuple) and len(value) <= _MAX_AXES
+    if is_short and all(type(size) is int for size in value):  # a shape
         return str(tuple(value))
     if isinstance(value, (list, tuple, set, frozenset)):
         return f"{name}(({len(value)},))"
     text = " ".join(str(value).split())
     width = max(_WIDTH - column, 16)
     return text if len(text) <= width else f"{text[: width - 3]}..."
-
-
-def _is_shape(value: object) -> bool:
-    return (
-        isinstance(value, tuple)
-        and len(value) <= _MAX_AXES
-        and all(type(size) is int for size in value)
-    )

@@ -12,9 +12,9 @@ would replace Python's.
 
 import ast
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import torch
 
@@ -37,12 +37,13 @@ class _Space:
     def __post_init__(self) -> None:
         for name, size in self._sizes().items():
             if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-                raise ValueError(
-                    f"{type(self).__name__} needs a positive integer for {name}, not {size!r}"
-                )
+                self._refuse(f"needs a positive integer for {name}, not {size!r}")
 
     def _sizes(self) -> dict[str, int]:
         return {f.name: getattr(self, f.name) for f in fields(self) if f.type is int}
+
+    def _refuse(self, problem) -> NoReturn:
+        raise ValueError(f"{type(self).__name__} {problem}")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -60,42 +61,31 @@ class _Numbers(_Space):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in "low", "high":
-            object.__setattr__(self, name, self._bound(name))
+            bound = getattr(self, name)
+            if isinstance(bound, Iterable):
+                bound = tuple(float(value) for value in bound)
+                if len(bound) != self.shape[1]:
+                    self._refuse(f"needs one number for {name}, or {self.shape[1]}, not {bound}")
+            elif bound is not None:
+                bound = float(bound)
+            object.__setattr__(self, name, bound)
         if self.dtype not in (None, *DTYPES):
             allowed = ", ".join(str(dtype) for dtype in DTYPES)
-            raise ValueError(
-                f"{type(self).__name__} cannot have dtype={self.dtype!r}: allowed are {allowed}"
-            )
-
-    def _bound(self, name) -> Bound:
-        given = getattr(self, name)
-        if given is None or isinstance(given, (int, float)):
-            return given if given is None else float(given)
-        values = tuple(float(value) for value in given)
-        if len(values) != self.shape[1]:
-            raise ValueError(
-                f"{type(self).__name__} needs one number for {name}, or {self.shape[1]}, not "
-                f"{given!r}"
-            )
-        return values
+            self._refuse(f"cannot have dtype={self.dtype!r}: allowed are {allowed}")
 
     def bounds(self, device: torch.device | str | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns (low, high), float32 each, that broadcast with ``shape``; infinite without."""
         axes = (-1, *[1] * (len(self.shape) - 2))
-        pairs = (self.low, -math.inf), (self.high, math.inf)
-        low, high = (
-            torch.tensor(none if bound is None else bound, device=device).view(axes)
-            for bound, none in pairs
-        )
+        low = -math.inf if self.low is None else self.low
+        high = math.inf if self.high is None else self.high
+        low, high = (torch.tensor(bound, device=device).view(axes) for bound in (low, high))
         return low, high
 
     def __repr__(self) -> str:
         # without a dtype of None and bounds: checkpoints compare spaces as text
-        dtype = {"dtype": self.dtype} if self.dtype else {}
-        values = ", ".join(
-            f"{name}={value!r}" for name, value in {**self._sizes(), **dtype}.items()
-        )
-        return f"{type(self).__name__}({values})"
+        values = self._sizes() | ({"dtype": self.dtype} if self.dtype else {})
+        words = ", ".join(f"{name}={value!r}" for name, value in values.items())
+        return f"{type(self).__name__}({words})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -143,31 +133,24 @@ class MultiContinuous(_Space):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        bounds = []
         for name in "low", "high":
             given = getattr(self, name)
-            try:
-                values = tuple(float(value) for value in given)
-            except TypeError:
-                values = (float(given),) * self.dim
+            values = given if isinstance(given, Iterable) else (given,) * self.dim
+            values = tuple(float(value) for value in values)
             if len(values) != self.dim or not all(math.isfinite(value) for value in values):
-                raise ValueError(
-                    f"MultiContinuous needs {self.dim} finite numbers for {name}, or one for all, "
-                    f"not {given!r}"
+                self._refuse(
+                    f"needs {self.dim} finite numbers for {name}, or one for all, not {given!r}"
                 )
             object.__setattr__(self, name, values)
-            bounds.append(values)
-        if not all(low < high for low, high in zip(*bounds)):
-            raise ValueError(
-                f"MultiContinuous needs each low below its high, not {self.low} and {self.high}"
-            )
+        low, high = cast("tuple", self.low), cast("tuple", self.high)
+        if not all(a < b for a, b in zip(low, high)):
+            self._refuse(f"needs each low below its high, not {low} and {high}")
 
     def tensors(
         self, device: torch.device | str | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns (low, high), (dim,) float32 each."""
-        options: dict = dict(dtype=torch.float32, device=device)
-        return torch.tensor(self.low, **options), torch.tensor(self.high, **options)
+        return torch.tensor(self.low, device=device), torch.tensor(self.high, device=device)
 
 
 @dataclass(frozen=True)
