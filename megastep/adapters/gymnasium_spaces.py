@@ -41,19 +41,12 @@ def gymnasium_space(space: Space, dtype: torch.dtype) -> gymnasium.Space:
 
 
 def without_agents(space: Space, values: Tree) -> Tree:
-    """Returns observations (B, ...) as a dict of tensors, without an axis of one agent per lane."""
-    if isinstance(space, Mapping):
-        return {key: without_agents(part, values[key]) for key, part in space.items()}
-    return values[:, 0] if space.shape[0] == 1 else values
-
-
-def action_mask(space: Space, mask: Tree) -> Tree:
-    """Returns the mask (B, A, n) bool of a world, or a dict of those of some action spaces, without
-    an axis of one agent per lane.
+    """Returns observations (B, ...) or masks (B, A, n), a tensor or a dict of those of some parts
+    of a space, without an axis of one agent per lane.
     """
-    if isinstance(mask, Mapping):
-        return {key: action_mask(space[key], part) for key, part in mask.items()}
-    return mask[:, 0] if space.shape[0] == 1 else mask
+    if isinstance(values, Mapping):
+        return {key: without_agents(space[key], part) for key, part in values.items()}
+    return values[:, 0] if space.shape[0] == 1 else values
 
 
 @mapping

@@ -85,19 +85,23 @@ class Lanes:
     """
 
     def __init__(self, env: Env, same_step: bool = False, purpose: str | None = None):
-        self.purpose = purpose
-        if purpose and not takes_masks(env):
-            raise ValueError(
-                f"{purpose} needs reset(seed=None, mask=None) of the environment, which "
-                f"{type(env).__name__} does not have: see megastep.types.Env"
-            )
         self.env, self.n_lanes, self.device = env, n_lanes(env), torch.device(env.device)
         self.roots: tuple = (env,)  # what a step changes
-        self.takes_masks, self._is_same_step = takes_masks(env), same_step
-        on_gpu = self.device.type == "cuda" and optional(env, "capturable")
-        self._on_gpu, self._reset = on_gpu, cast(Callable, env.reset)
+        self._takes_masks = takes_masks(env)
+        self._advance = self._same_step if same_step else self._next_step
+        self._on_gpu = self.device.type == "cuda" and optional(env, "capturable")
+        self._reset = cast(Callable, env.reset)
         self._step: Callable | None = None
         self._resets: dict[int, Callable] = {}  # by their number of arguments
+        if purpose:
+            self._require_masks(purpose)
+
+    def _require_masks(self, purpose) -> None:
+        if not self._takes_masks:
+            raise ValueError(
+                f"{purpose} needs reset(seed=None, mask=None), which {type(self.env).__name__} "
+                "does not have; docs/new-environment.md says under The contract what it does"
+            )
 
     @torch.inference_mode(False)
     @torch.no_grad()
@@ -109,13 +113,10 @@ class Lanes:
                 on the seed and the lane.
             mask: (B,) bool, a tensor or an array, lanes that begin.
         """
-        if not self.takes_masks and seed is None and mask is None:
+        if seed is not None or mask is not None:
+            self._require_masks("a seed or a mask")
+        elif not self._takes_masks:
             return self.env.reset()
-        if not self.takes_masks:
-            raise ValueError(
-                f"{type(self.env).__name__} takes neither seeds nor masks: it has no "
-                "reset(seed=None, mask=None), see megastep.types.Env"
-            )
         seeds, mask = self._seeds(seed), self._mask(mask)
         if not isinstance(self._step, Graph):
             return self._reset(seed=seeds, mask=mask)
@@ -174,16 +175,11 @@ class Lanes:
         if isinstance(self._step, Graph):  # which reads the decision, so inference mode may stay
             with torch.no_grad():
                 return self._step.with_leaves(leaves(self._decision(actions)))
-        return self._eager_step(actions)
-
-    @torch.inference_mode(False)
-    @torch.no_grad()
-    def _eager_step(self, actions) -> tuple[World, World, torch.Tensor]:
-        decision = self._decision(actions)
-        if self._step is None:
-            step = self._same_step if self._is_same_step else self._next_step
-            self._step = capture(step, (decision,), self.roots) if self._on_gpu else step
-        return self._step(decision)
+        with torch.inference_mode(False), torch.no_grad():
+            decision = self._decision(actions)
+            if self._step is None and self._on_gpu:
+                self._step = capture(self._advance, (decision,), self.roots)
+            return (self._step or self._advance)(decision)
 
     def _next_step(self, decision) -> tuple[World, World, torch.Tensor]:
         world = self.env.step(decision)

@@ -69,21 +69,19 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         if not self.agents:
             return {}, {}, {}, {}, {}
         chosen = stacked([actions[agent] for agent in self.possible_agents])
-        obs, rewards, *flags, facts = self.vector.step(chosen)
+        obs, rewards, terminated, truncated, facts = self.vector.step(chosen)
         over = optional(self.env, "game_over")
-        is_over = bool((flags[0] | flags[1]).all() if over is None else over.all())
+        is_over = bool(np.logical_or(terminated, truncated).all() if over is None else over.all())
         infos = self._masks(facts)
+        metrics = {k: v for k, v in facts.items() if k[0] != "_" and k != "action_mask"}
         for i, agent in enumerate(self.agents):
-            ends = {k: True for k, flag in zip(("terminal", "truncated"), flags) if flag[i]}
-            metrics = {k: v for k, v in facts.items() if k[0] != "_" and k != "action_mask"}
-            infos[agent] |= ends and ends | {k: float(v[i]) for k, v in metrics.items()}
-        by_agent = (dict(zip(self.agents, values.tolist())) for values in (rewards, *flags))
-        rewards, terminations, truncations = by_agent
-        if not is_over:
-            terminations, truncations = (dict.fromkeys(self.agents, False) for _ in range(2))
-        else:
-            self.agents = []
-        return self._rows(obs), rewards, terminations, truncations, infos
+            if terminated[i] or truncated[i]:
+                infos[agent]["terminal" if terminated[i] else "truncated"] = True
+                infos[agent] |= {k: float(v[i]) for k, v in metrics.items()}
+        flags = terminated & is_over, truncated & is_over
+        parts = [dict(zip(self.agents, values.tolist())) for values in (rewards, *flags)]
+        self.agents = [] if is_over else self.agents
+        return self._rows(obs), parts[0], parts[1], parts[2], infos
 
     def _rows(self, batch) -> dict[str, Tree]:
         return {agent: row(batch, i) for i, agent in enumerate(self.possible_agents)}

@@ -10,7 +10,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs import EnvBase
 
 from megastep import spaces
-from megastep.adapters.gymnasium_spaces import action_mask, as_dtype, without_agents
+from megastep.adapters.gymnasium_spaces import as_dtype, without_agents
 from megastep.adapters.lane_steps import Lanes, ended, fresh
 from megastep.types import Env, optional
 
@@ -46,7 +46,7 @@ class TorchRLEnv(EnvBase):
         world = self.lanes.reset()
         self._is_masked = "mask" in world
         if self._is_masked:
-            mask = action_mask(actions, world["mask"])
+            mask = without_agents(actions, world["mask"])
             self.observation_spec["action_mask"] = _mask_spec(mask, n, on)
         self.action_spec = _spec(actions, n, torch.float32, on)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, **on)
@@ -62,7 +62,7 @@ class TorchRLEnv(EnvBase):
         named = {key: named[key] if key in named else world[key] for key in self._space}
         parts = without_agents(self._space, named)
         if self._is_masked:
-            parts["action_mask"] = action_mask(self.megastep.action_space, world["mask"])
+            parts["action_mask"] = without_agents(self.megastep.action_space, world["mask"])
         flags = dict(done=ended(world), terminated=world["terminal"], truncated=world["truncated"])
         parts = fresh(parts | flags | dict(reward=world["reward"]))
         parts = {

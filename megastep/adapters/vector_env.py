@@ -11,7 +11,6 @@ from gymnasium.vector.utils import batch_space
 
 from megastep import envs
 from megastep.adapters.gymnasium_spaces import (
-    action_mask,
     as_dtype,
     gymnasium_space,
     row,
@@ -72,7 +71,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         modes, fps = ["rgb_array"] if hasattr(env, "plot_state") else [], optional(env, "fps")
         if render_mode is not None and render_mode not in modes:
-            raise ValueError(f"render_mode must be None or one of {modes}, not {render_mode!r}")
+            cure = "" if modes else "; docs/new-environment.md shows how to draw with plot_state"
+            raise ValueError(
+                f"render_mode must be None or one of {modes}, not {render_mode!r}{cure}"
+            )
         self.render_mode = render_mode
         self.metadata = dict(autoreset_mode=mode, render_modes=modes, render_fps=fps)
         self._ended = np.zeros(self.num_envs, bool)
@@ -94,12 +96,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if options:
             raise ValueError(f"reset takes options['reset_mask'] alone, not {sorted(options)}")
         world = self.lanes.reset(seed, mask)
-        obs, mask_now = without_agents(self.env.obs_space, world["obs"]), self._mask(world)
+        parts = dict(obs=without_agents(self.env.obs_space, world["obs"]), mask=self._mask(world))
         if self.to_numpy:
             self._ended = np.zeros_like(self._ended) if mask is None else to_numpy(ended(world))
-            return to_numpy(as_dtype(obs, self.dtype)), self._mask_infos(to_numpy(mask_now))
-        obs = as_dtype(fresh(obs) if self.copy else obs, self.dtype)
-        return obs, self._mask_infos(fresh(mask_now))
+            parts = to_numpy(self._cast(parts))
+        else:
+            parts = self._cast(fresh(parts) if self.copy else parts)
+        return parts["obs"], self._mask_infos(parts["mask"])
 
     def step(self, actions: Tree) -> tuple[Tree, Tree, Tree, Tree, dict[str, Tree]]:
         """Steps all lanes. Returns (observations, rewards, terminations, truncations, infos)."""
@@ -110,9 +113,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             )
         stepped = self.lanes.step(actions)
         parts = self._arrays(stepped) if self.to_numpy else self._tensors(stepped)
-        infos = {}
-        if not self.to_numpy or parts["over"].any():
-            infos = self._infos(parts["over"], parts["metrics"], parts.get("final_obs"))
+        infos, over = {}, parts["over"]
+        if not self.to_numpy or over.any():  # Gymnasium's form: each key with a mask of its lanes
+            infos = parts["metrics"] | {f"_{name}": over for name in parts["metrics"]}
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                final_obs = parts["final_obs"]
+                infos = dict(final_obs=final_obs, _final_obs=over, final_info=infos)
+                infos["_final_info"] = over
         infos |= self._mask_infos(parts["mask"])
         return parts["obs"], *(parts[name] for name in OUTCOMES), infos
 
@@ -125,6 +132,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             parts["final_obs"] = without_agents(self.env.obs_space, final["obs"])
         return parts
 
+    def _cast(self, parts) -> dict[str, Tree]:
+        """Returns parts with floats of observations in the dtype."""
+        names = [name for name in ("obs", "final_obs") if name in parts]
+        return parts | {name: as_dtype(parts[name], self.dtype) for name in names}
+
     def _tensors(self, stepped) -> dict[str, Tree]:
         if stepped is not self._stepped:  # on a GPU the same each time
             self._stepped, self._views = stepped, self._parts(*stepped)
@@ -132,18 +144,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             floats = filter(torch.is_floating_point, leaves(self._views["obs"]))
             self._casts = any(leaf.dtype != self.dtype for leaf in floats)
         parts = self._copies() if self.copy else self._views
-        if not self._casts:
-            return parts
-        names = [name for name in ("obs", "final_obs") if name in parts]
-        return parts | {name: as_dtype(parts[name], self.dtype) for name in names}
+        return self._cast(parts) if self._casts else parts
 
     def _arrays(self, stepped) -> dict[str, Tree]:
-        parts = self._parts(*stepped)
+        parts = self._cast(self._parts(*stepped))
         last = parts.pop("final_obs", None)
-        parts = to_numpy(parts | dict(obs=as_dtype(parts["obs"], self.dtype)))
+        parts = to_numpy(parts)
         self._ended = parts["over"] if last is None else np.zeros_like(self._ended)
         if last is not None and parts["over"].any():
-            last = to_numpy(as_dtype(last, self.dtype))
+            last = to_numpy(last)
             parts["final_obs"] = np.full(self.num_envs, None, dtype=object)
             for lane in np.flatnonzero(parts["over"]):
                 parts["final_obs"][lane] = row(last, lane)
@@ -153,7 +162,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """Returns the mask of the actions that are allowed now, if the environment gives one."""
         if "mask" not in world:
             return {}
-        return {"action_mask": action_mask(self.env.action_space, world["mask"])}
+        return {"action_mask": without_agents(self.env.action_space, world["mask"])}
 
     def _mask_infos(self, mask) -> dict[str, Tree]:
         """Returns a mask for infos; an array is int8, as Gymnasium's spaces sample by."""
@@ -164,14 +173,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             return mask | {"_action_mask": np.ones(self.num_envs, bool)}
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         return mask | {"_action_mask": everyone}
-
-    def _infos(self, over, metrics, final_obs) -> dict[str, Tree]:
-        """Returns Gymnasium's infos: each key with a mask of the lanes that have it."""
-        pairs = ({name: values, f"_{name}": over} for name, values in metrics.items())
-        own = {key: part for pair in pairs for key, part in pair.items()}
-        if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            return dict(final_obs=final_obs, _final_obs=over, final_info=own, _final_info=over)
-        return own
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns a drawing (H, W, 3) uint8 of each environment if ``render_mode`` is
@@ -253,23 +254,14 @@ def _info(infos) -> dict[str, Tree]:
     }
 
 
-def make_vector(
-    name: str,
-    num_envs: int = 1,
-    *,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    to_numpy: bool = True,
-    dtype: torch.dtype | None = None,
-    copy: bool = True,
-    render_mode: str | None = None,
-    **settings: Tree,
-) -> VectorEnv:
+def make_vector(name: str, num_envs: int = 1, **settings: Tree) -> VectorEnv:
     """Returns a :class:`VectorEnv` by its class name, for ``gymnasium.make_vec``. ``settings`` are
-    the environment's. ``num_envs`` counts environments; several agents are that many lanes.
+    its arguments and the environment's. ``num_envs`` counts environments; several agents are that
+    many lanes.
     """
-    env = _made(name, num_envs, settings)
-    options: dict[str, Tree] = dict(to_numpy=to_numpy, dtype=dtype, copy=copy)
-    return VectorEnv(env, autoreset_mode, render_mode=render_mode, **options)
+    _, *arguments = inspect.signature(VectorEnv).parameters
+    own = {key: settings.pop(key) for key in arguments if key in settings}
+    return VectorEnv(_made(name, num_envs, settings), **own)
 
 
 def make_single(name: str, render_mode: str | None = None, **settings: Tree) -> SingleEnv:

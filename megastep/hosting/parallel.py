@@ -37,7 +37,7 @@ class ParallelEnvs(Hosted):
         self,
         make: Callable,
         n_envs: int,
-        kwargs: dict[str, object],
+        kwargs: dict[str, Any],
         check: bool = True,
         wrappers: Sequence[Callable] = (),
     ):

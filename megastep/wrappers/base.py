@@ -95,8 +95,8 @@ class Wrapper:
         if not takes_masks(self.env):
             raise ValueError(
                 f"{type(self).__name__} {why}, for which {type(self.env).__name__} needs "
-                "reset(seed=None, mask=None); wrap it with a wrapper of its own package, if it has "
-                "one"
+                "reset(seed=None, mask=None), as docs/new-environment.md says under The contract; "
+                "wrap it with a wrapper of its own package, if it has one"
             )
 
 
