@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import base64
 import collections
+import functools
+import math
 import os
 import pathlib
 import sys
@@ -29,16 +31,15 @@ from megastep import plotting
 from megastep.arrdict import clone, numpyify
 from megastep.atomic_files import write_atomically
 from megastep.types import Tree, n_lanes, optional
-from megastep.video import GifWriter, Mp4Writer, as_image
+from megastep.video import WRITERS, GifWriter, Mp4Writer, as_image
 
 if TYPE_CHECKING:
     from IPython.display import HTML  # pyright: ignore[reportMissingImports]
 
     from megastep.types import Env, PolicyLike
 
-__all__ = ["Film", "ParallelEncoder", "Player", "draw", "film", "film_all"]
+__all__ = ["Film", "ParallelEncoder", "Player", "film", "film_all"]
 
-WRITERS = {"mp4": Mp4Writer, "gif": GifWriter}
 VIDEO, IMAGE = "<video controls autoplay loop muted {}></video>", "<img {}>"
 ENDINGS = {  # of films and pictures: their types, and how pages show them
     ".mp4": ("video/mp4", VIDEO),
@@ -59,7 +60,8 @@ class ParallelEncoder:
     Args:
         plot_state: takes a numpyified state, returns a matplotlib figure or an (H, W, 3) uint8
             array.
-        fps: frames per second of the video.
+        fps: frames per second. Where they are more than the format can show, 50 in a GIF and 120
+            in an mp4, every second or third is drawn alone, and the video takes as long.
         format: mp4 or gif.
 
     Raises:
@@ -67,39 +69,49 @@ class ParallelEncoder:
     """
 
     def __init__(self, plot_state: Callable, fps: float = 20, format: str = "mp4"):
-        if not 0 < fps <= 1000:
-            raise ValueError(
-                f"fps must be more than 0 and at most 1000 frames per second, but {fps} was given"
-            )
+        if fps <= 0:
+            raise ValueError(f"fps must be more than 0 frames per second, but {fps} was given")
         if format not in WRITERS:
             raise ValueError(f"format must be {' or '.join(WRITERS)}, but {format!r} was given")
         self._plot_state, self._fps, self._format = plot_state, fps, format
+        self._every = math.ceil(fps / WRITERS[format][1])
         self._writer: Mp4Writer | GifWriter | None = None
         self._bytes: bytes | None = None
 
     def __enter__(self) -> ParallelEncoder:
-        self._writer, self._bytes, self._n_frames = WRITERS[self._format](self._fps), None, 0
+        self._writer = WRITERS[self._format][0](self._fps / self._every)
+        self._bytes, self._n_frames, self._shape = None, 0, None
         return self
 
     def __call__(self, state: Tree) -> None:
         """Draws a state, a tree of tensors or arrays, as the next frame."""
-        self._add(draw, self._plot_state, numpyify(clone(state)))
+        self._add(lambda: image_of(self._plot_state(numpyify(clone(state)))))
 
     def frame(self, array: ArrayLike) -> None:
         """Adds an image as the next frame: (H, W, 3), uint8 or floats in [0, 1].
 
         All frames must have the same size.
         """
-        self._add(np.asarray, as_image(array))
+        image = as_image(array)
+        self._add(lambda: image)
 
-    def _add(self, draw: Callable[..., np.ndarray], *arguments: Any) -> None:
+    def _add(self, draw: Callable[[], np.ndarray]) -> None:
         if self._writer is None:
             raise RuntimeError(
                 "frames can only be added inside the with block: with ParallelEncoder(...) as "
                 "encoder"
             )
         try:
-            self._writer.add(draw(*arguments))
+            if self._n_frames % self._every == 0:
+                image = draw()
+                self._shape = self._shape or image.shape
+                if image.shape != self._shape:
+                    size = "{1} x {0} pixels".format
+                    raise ValueError(
+                        f"all frames must have the size of the first, {size(*self._shape)}, but "
+                        f"this one has {size(*image.shape)}"
+                    )
+                self._writer.add(image)
         except Exception as error:  # signals pass unchanged
             first_line = next(iter(str(error).splitlines()), "")
             raise RuntimeError(
@@ -157,16 +169,11 @@ class ParallelEncoder:
         return self._bytes
 
 
-def draw(plot_state: Callable, state: Tree) -> np.ndarray:
-    """Returns what ``plot_state`` draws of a numpyified state, as (H, W, 3) uint8.
-
-    Closes the figure if pyplot knows it. Below the note and the title of the current
-    :class:`megastep.plotting.Style`, if there are any.
+def image_of(drawing: Any) -> np.ndarray:
+    """Returns a matplotlib figure or an image as (H, W, 3) uint8. Closes the figure if pyplot knows
+    it. Below the note and the title of the current :class:`megastep.plotting.Style`, if there are
+    any.
     """
-    return _drawn(plot_state(state))
-
-
-def _drawn(drawing) -> np.ndarray:
     style = plotting.current()
     if isinstance(drawing, np.ndarray):
         image = as_image(drawing)
@@ -281,42 +288,37 @@ def film_all(
     with plotting.styled(theme=theme, dpi=dpi):
         if (format := path.suffix[1:]) not in WRITERS:
             (last,) = collections.deque(moments, maxlen=1)
-            return _write(path, _still(players, last, format))
+            return _write(path, plotting.encoded(_picture(players, last), format))
         fps = optional(players[0].env, "fps") * speed
         with ParallelEncoder(_image, fps, format) as encoder:
             for number, each in enumerate(moments, 1):
-                encoder._add(_image, players, each)
+                encoder._add(functools.partial(_image, players, each))
                 show(number, steps)
         return encoder.save(path)
 
 
 def _image(players, moments) -> np.ndarray:
     images = []
-    for player, moment in zip(players, moments, strict=True):
-        with plotting.styled(title=player.title, note=moment.note):
-            images.append(draw(player.env.plot_state, moment.state))
+    for player, (state, note) in zip(players, moments, strict=True):
+        with plotting.styled(title=player.title, note=note):
+            images.append(image_of(player.env.plot_state(state)))
     return images[0] if len(images) == 1 else plotting.side_by_side(images)
 
 
-def _still(players, moments, format) -> bytes:
+def _picture(players, moments) -> plotting.Picture:
     if len(players) > 1:
-        return plotting.encoded(plotting.framed(_image(players, moments)), format)
-    with plotting.styled(title=players[0].title, note=moments[0].note):
-        drawing = players[0].env.plot_state(moments[0].state)
-        if not isinstance(drawing, plotting.Picture):
-            drawing = plotting.framed(_drawn(drawing))
-        return plotting.encoded(drawing, format)
+        return plotting.framed(_image(players, moments))
+    (player,), ((state, note),) = players, moments
+    with plotting.styled(title=player.title, note=note):
+        drawing = player.env.plot_state(state)
+        is_picture = isinstance(drawing, plotting.Picture)
+        return drawing if is_picture else plotting.framed(image_of(drawing))
 
 
-class Moment(NamedTuple):
-    """A frame to be: a numpyified state, and the return so far."""
-
-    state: Tree
-    note: str
-
-
-def film_moments(player: Player, steps: int, greedy, seed, trail) -> Iterator[Moment]:
-    """Plays for some steps from a reset, and yields the moment before each."""
+def film_moments(player: Player, steps: int, greedy, seed, trail) -> Iterator[tuple[Tree, str]]:
+    """Plays for some steps from a reset. Yields before each a numpyified state, and a note of the
+    returns so far.
+    """
     env, policy = cast(Any, player.env), player.policy
     n_agents, generator = optional(env, "n_agents"), torch.Generator(env.device).manual_seed(seed)
     returns = np.zeros(n_agents, np.float32)
@@ -335,7 +337,7 @@ def film_moments(player: Player, steps: int, greedy, seed, trail) -> Iterator[Mo
         note = f"mean return {returns.mean():.1f}"
         if n_agents <= MAX_RETURNS:
             note = "return " + ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in returns)
-        yield Moment(state, note)
+        yield state, note
 
 
 def _add_past(core: dict, starts: np.ndarray, trails: collections.deque, views: list) -> None:

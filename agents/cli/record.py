@@ -19,9 +19,9 @@ The most common words:
   homes=[1,2,3,4]  several homes in a grid
   runs=[A,B]       several runs side by side, in one home from the same spawn
   theme=dark       also title=, dpi=200, speed=2, trail=0
-  file=out.mp4     this file, overwritten if it exists; out.gif: the same as a GIF; out.png, out.svg
-                   or out.pdf: the last frame only. Otherwise video.mp4 in the run folder, or
-                   video-2.mp4, ... if there is one"""
+  file=out.mp4     this file, overwritten if it exists; out.gif: a GIF, of at most 50 frames/s;
+                   out.png, out.svg or out.pdf: the last frame only. Otherwise video.mp4 in the
+                   run folder, or video-2.mp4, ... if there is one"""
 
 
 def run(cfg: settings.Record) -> Path:

@@ -51,10 +51,10 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
     axes.set_ylabel(metric, parse_math=False)  # a $ is a $
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
-    for text in axes.legend(fontsize="small").get_texts():
+    for text in figure.legend(fontsize="small", loc="outside lower left").get_texts():
         text.set_parse_math(False)
     plot, text = io.BytesIO(), io.StringIO()
-    figure.savefig(plot, format=file.suffix[1:], dpi=200)
+    figure.savefig(plot, format=file.suffix[1:], dpi=200, bbox_inches="tight")  # long names
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([["runs", "samples", "mean", "lower", "upper"], *table])
     with user_errors(f"{file} cannot be written: "):

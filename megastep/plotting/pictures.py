@@ -192,13 +192,11 @@ class Area(Artist):
             shift = {"left": 0, "centre": 0.5, "right": 1}[align]
             gc = renderer.new_gc()
             if isinstance(renderer, RendererAgg):
-                # word by word, since most have been drawn before
-                images = [_word(w, size, bold, colour, renderer.dpi) for w in words.split(" ")]
-                space = 0.3 * renderer.points_to_pixels(size)
-                x -= shift * (sum(width + space for _, width, _ in images) - space)
+                images, total = _line(words, size, bold, colour, renderer.dpi)
+                x -= shift * total
                 for pixels, width, below in images:
                     renderer.draw_image(gc, round(x), round(y) - below, pixels)
-                    x += width + space
+                    x += width
             else:
                 font = _font(size, bold)
                 x -= shift * renderer.get_text_width_height_descent(words, font, False)[0]
@@ -242,9 +240,17 @@ def _font(size, bold) -> FontProperties:
     return FontProperties(family="DejaVu Sans", size=size, weight="bold" if bold else "normal")
 
 
+def _line(words, size, bold, colour, dpi) -> tuple[list, float]:
+    """Returns the words of a line, most of which have been drawn before, and its width."""
+    images = [_word(word, size, bold, colour, dpi) for word in words.split(" ")]
+    return images, sum(width for _, width, _ in images) - 0.3 * size * dpi / 72
+
+
 @functools.lru_cache(1024)
 def _word(word, size, bold, colour, dpi) -> tuple[np.ndarray, float, int]:
-    """The word as an image, lowest row first, its width, and the rows below letters."""
+    """Returns a word as an image, lowest row first, its width with the space after it, and the rows
+    below letters.
+    """
     font = _font(size, bold)
     width, _, _ = RendererAgg(1, 1, dpi).get_text_width_height_descent(word, font, False)
     letters = size * dpi / 72
@@ -253,7 +259,7 @@ def _word(word, size, bold, colour, dpi) -> tuple[np.ndarray, float, int]:
     gc = renderer.new_gc()
     gc.set_foreground(to_rgba(colour), isRGBA=True)
     renderer.draw_text(gc, 0, renderer.height - below, word, font, 0)
-    return np.array(renderer.buffer_rgba())[::-1], width, below
+    return np.array(renderer.buffer_rgba())[::-1], width + 0.3 * letters, below
 
 
 # ---- Layouts ----
@@ -304,21 +310,26 @@ def captioned(image: np.ndarray) -> np.ndarray:
     """
     style = current()
     scale = max(round(100 * (HEIGHT - HEAD)) // len(image), 1)
-    image = image.repeat(scale, 0).repeat(scale, 1)
-    width, head = max(image.shape[1] / 100, 3.2), HEAD + TITLE * (style.title is not None)
-    picture = Picture(figsize=(width, head), dpi=100, facecolor=style.colours.page)
-    _write_head(picture, head, None)
-    return np.concatenate([rasterise(picture)[:, : image.shape[1]], image])
+    height, width = (scale * size / 100 for size in image.shape[:2])
+    head, page = HEAD + TITLE * (style.title is not None), max(width, 3.2)
+    picture = Picture(figsize=(page, head + height), dpi=100, facecolor=style.colours.page)
+    _write_head(picture, head + height, None)
+    Area(picture, (page - width) / 2, 0, width, height).image(image)
+    return rasterise(picture)
 
 
 def _write_head(picture, height, numbers) -> None:
+    """Writes a line of numbers and a title, smaller where they are longer than the picture."""
     style, width = picture.style, picture.get_figwidth() - 2 * MARGIN
     tall = HEAD + TITLE * (style.title is not None)
     head = Area(picture, MARGIN, height - tall, width, tall)
     line = " · ".join(part for part in (numbers, style.note) if part)
-    head.text((0, 0.2), line, size=13 * min(1, 9.6 * width / max(len(line), 1)))
-    if style.title is not None:
-        head.text((0, tall - 0.22), style.title, size=15, bold=True)
+    for words, y, size, bold in (line, 0.2, 13, False), (style.title, tall - 0.22, 15, True):
+        if words:
+            look = bold, style.colours.text, picture.dpi
+            while _line(words, size, *look)[1] > width * picture.dpi:
+                size *= 0.95
+            head.text((0, y), words, size=size, bold=bold)
 
 
 def plot_level(area: Area, level: float) -> None:

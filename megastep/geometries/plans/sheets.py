@@ -1,5 +1,6 @@
 """Draws drawings beside the geometries that they became."""
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -56,6 +57,6 @@ def write(
         geometry.display(g, right)
         for line in g.get("doors", ()):
             right.plot(*line.T, color="#d62728", linewidth=1.5)
-        left.set_title(title, fontsize=8)
+        left.set_title(textwrap.fill(title, 40), fontsize=8)
         right.set_title(f"{g.masks.max()} rooms, {len(g.walls)} walls", fontsize=8)
     figure.savefig(path, dpi=90)
