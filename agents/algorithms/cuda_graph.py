@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import torch
 
-from megastep.agents.distributed.segments import SegmentedGraph
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.types import RolloutLike
+from megastep.capture import end_failed_recording
 
 # Updates that run eagerly before the capture, since libraries initialise themselves in the first.
 # They train the policy like any other update.
@@ -16,8 +16,7 @@ Metrics = dict[str, torch.Tensor]
 
 
 class CudaGraphUpdate:
-    """Calls an update function, on a GPU through a CUDA graph, or several with the communication of
-    ranks between them.
+    """Calls an update function, on a GPU through a CUDA graph, with the sums over the ranks in it.
 
     The first updates run eagerly. A graph reads the memory of the rollout it was captured with, so
     another rollout object causes another capture: pass the same object every time.
@@ -43,8 +42,8 @@ class CudaGraphUpdate:
 
     def restart(self) -> None:
         """Discards the graph. The next updates warm up and capture again."""
-        self.graph: SegmentedGraph | None = None
-        self._rollout, self._names = None, []
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self._rollout, self._names, self._output = None, [], torch.empty(0)
         self._n_warm_ups_left = _N_WARM_UPS
 
     def __call__(self, rollout: RolloutLike) -> Metrics:
@@ -56,21 +55,26 @@ class CudaGraphUpdate:
                 if self._n_warm_ups_left:
                     self._n_warm_ups_left -= 1
                     return self._warm_up(rollout)
-                generators = [generator.on(self.device) for generator in self.generators]
-                self.graph = SegmentedGraph(lambda: self._packed(rollout), self.stream, generators)
-                self._rollout = rollout
-                return self._replayed(self.graph)
-        return self._replayed(self.graph)
+                self.graph, self._rollout = self._recorded(rollout), rollout
+        with torch.cuda.device(self.device):
+            self.graph.replay()
+        return dict(zip(self._names, self._output.clone().unbind())) if self._names else {}
 
-    def _replayed(self, graph) -> Metrics:
-        graph.replay()
-        return dict(zip(self._names, graph.output.clone().unbind())) if self._names else {}
-
-    def _packed(self, rollout) -> torch.Tensor | None:
-        """Returns the metrics in one tensor, of which a single kernel makes a copy."""
-        metrics = self.update(rollout)
-        self._names = [*metrics]
-        return torch.stack([*metrics.values()]).detach() if metrics else None
+    def _recorded(self, rollout) -> torch.cuda.CUDAGraph:
+        graph = torch.cuda.CUDAGraph()
+        for generator in self.generators:
+            graph.register_generator_state(generator.on(self.device))
+        try:
+            # thread_local, since NCCL's threads may query events meanwhile
+            with torch.cuda.graph(graph, stream=self.stream, capture_error_mode="thread_local"):
+                metrics = self.update(rollout)
+                self._names = [*metrics]
+                if metrics:  # in one tensor, of which a single kernel makes a copy
+                    self._output = torch.stack([*metrics.values()]).detach()
+        except RuntimeError as error:
+            end_failed_recording()
+            raise error.__context__ or error from None  # the first error is the informative one
+        return graph
 
     def _warm_up(self, rollout) -> Metrics:
         # PyTorch would warn of gradients accumulated on another stream, which this one waits for

@@ -12,7 +12,6 @@ import torch
 from torch import distributed
 
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
-from megastep.agents.distributed.segments import between_graphs
 from megastep.agents.types import Moments
 
 _is_alone = False
@@ -37,12 +36,9 @@ def n_pooled() -> int:
 def all_reduce(tensor: torch.Tensor) -> torch.Tensor:
     """Sums a tensor over the ranks, in place, and returns it."""
 
-    def call() -> None:
+    if n_pooled() > 1:
         with communicating():
             distributed.all_reduce(tensor)
-
-    if n_pooled() > 1:
-        between_graphs(call)
     return tensor
 
 
