@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 
+from megastep.agents.distributed import process_group
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.types import RolloutLike
 from megastep.capture import end_failed_recording
@@ -74,6 +75,7 @@ class CudaGraphUpdate:
         except RuntimeError as error:
             end_failed_recording()
             raise error.__context__ or error from None  # the first error is the informative one
+        process_group.graphs.add(graph)
         return graph
 
     def _warm_up(self, rollout) -> Metrics:

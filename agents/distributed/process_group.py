@@ -14,6 +14,7 @@ import functools
 import itertools
 import os
 import pickle
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar, cast
 
@@ -33,6 +34,8 @@ CONNECT_SECONDS, STOP_SECONDS = 50.0, 30.0
 LONGEST_WAIT = datetime.timedelta(minutes=30)
 #: Counts the starts of this process, equally on all ranks.
 _STARTS = itertools.count()
+#: CUDA graphs with collective operations in them, for which NCCL waits before it ends.
+graphs: weakref.WeakSet[torch.cuda.CUDAGraph] = weakref.WeakSet()
 
 
 class RankLost(RuntimeError):
@@ -60,6 +63,8 @@ def stop() -> None:
     if distributed.is_initialized():
         with open(os.devnull, "w") as nowhere:
             faulthandler.dump_traceback_later(STOP_SECONDS, file=nowhere, exit=True)
+            for graph in graphs:
+                graph.reset()
             distributed.destroy_process_group()
             faulthandler.cancel_dump_traceback_later()
 
