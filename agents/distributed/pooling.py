@@ -124,17 +124,16 @@ def average_gradients(
     with torch.no_grad():
         held = [(p, p.grad) for p in parameters if p.grad is not None]
         gradients = [gradient.flatten() for _, gradient in held]
-        numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
+        numbers = [number.float() for number in [*means, n_valid]]
         # one buffer; each gradient starts at a multiple of 16 bytes, for Adam's vector loads
         sizes = [n + -n % 4 for n in map(len, gradients)]
-        n_numbers = sum(sizes) + len(numbers)
-        bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)
+        bucket = torch.empty(sum(sizes) + len(numbers), device=n_valid.device)
         *parts, pooled = bucket.split([*sizes, len(numbers)])
         parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
         torch._foreach_copy_([*parts, *pooled.unbind()], [*gradients, *numbers])  # pyright: ignore[reportPrivateImportUsage]
-        all_reduce(bucket.mul_(n_valid))
-        n = pooled[-1].clone()
-        bucket /= n.clamp(min=1)
+        bucket[:-1] *= n_valid
+        n = all_reduce(bucket)[-1]
+        bucket[:-1] /= n.clamp(min=1)
         for (p, _), part in zip(held, parts, strict=True):
             p.grad = part.view_as(p)
     return n, list(pooled[:-1].unbind())
