@@ -47,7 +47,6 @@ from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.agents.errors import UserError, shortened
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
-from megastep.agents.networks.running_norm import VERSION
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout, without_last
 from megastep.agents.types import StateDict
@@ -295,7 +294,6 @@ class GradientLearner:
         """
         return dict(
             learner=type(self).__name__,
-            normalisation=VERSION,
             **self.steps.state_dict(),
             coefficients={k: v for k, v in self.coefficients.values.items() if k != "lr"},
             **({"extra": [parameter.detach() for parameter in self.extra]} if self.extra else {}),
@@ -323,12 +321,6 @@ class GradientLearner:
             raise ValueError(
                 f"the state of a {saved_name} learner cannot be loaded by {name}: use "
                 f"{saved_name}, or start from the policy's weights alone (init=RUN)"
-            )
-        if state.get("normalisation") != VERSION:
-            raise ValueError(
-                "a version of megastep that normalised observations and returns otherwise began "
-                "this run: continue it with the version that began it, or start from its weights "
-                "(init=RUN)"
             )
         saved_extra = [tuple(leaf.shape) for leaf in state.get("extra", [])]
         own_extra = [tuple(leaf.shape) for leaf in self.extra]

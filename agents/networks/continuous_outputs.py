@@ -1,9 +1,8 @@
 """Outputs of continuous actions within bounds: a squashed Gaussian, or a Beta distribution.
 
-`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane
-controls, D numbers of each. Numbers are independent of each other. Probabilities and entropy are of
-x, the action scaled to -1 to 1: whatever the bounds, a uniform distribution has an entropy of log 2
-per number.
+`...` any leading axes; A agents that one lane controls, D independent numbers of each.
+Probabilities and entropy are of x, the action scaled to -1 to 1: whatever the bounds, a uniform
+distribution has an entropy of log 2 per number.
 """
 
 import math
@@ -23,7 +22,11 @@ _N_NODES = 16
 
 
 class _BoundedOutput(Output):
-    """Base: a linear layer that starts near 0, with `n_parameters` per number."""
+    """Base: a linear layer that starts near 0, with `n_parameters` per number.
+
+    Logits are (..., A, 2 D), actions (..., A, D) float32 within the bounds. `logprob` and `entropy`
+    (...,) belong to the lane's joint action: they are summed over agents and numbers.
+    """
 
     low: torch.Tensor  # (D,)
     high: torch.Tensor
@@ -39,11 +42,9 @@ class _BoundedOutput(Output):
         nn.init.zeros_(self.linear.bias)
 
     def _linear(self, x) -> torch.Tensor:
-        out = linear(x, self.linear).float()
-        return out.unflatten(-1, (self.shape[0], -1))
+        return linear(x, self.linear).float().unflatten(-1, (self.shape[0], -1))
 
     def _scaled(self, actions) -> torch.Tensor:
-        """Returns actions within the bounds as numbers from -1 to 1."""
         x = 2 * (actions.float() - self.low) / (self.high - self.low) - 1
         return x.clamp(-_MAX_X, _MAX_X)
 
@@ -54,11 +55,8 @@ class _BoundedOutput(Output):
 
 class GaussianOutput(_BoundedOutput):
     """The tanh of a Gaussian per number (Haarnoja et al. 2018, appendix C). Its standard deviation
-    is learned and the same in every state.
-
-    Logits are (..., A, 2 D): means, then logarithms of standard deviations, before the tanh.
-    Actions are (..., A, D) float32 within the bounds. `logprob` and `entropy` (...,) belong to the
-    lane's joint action: they are summed over agents and numbers.
+    is learned and the same in every state. Logits are means, then logarithms of standard
+    deviations, before the tanh.
     """
 
     # tanh(5) is 0.9999, and the gradient of a log-probability is inverse to the standard deviation
@@ -109,11 +107,7 @@ class GaussianOutput(_BoundedOutput):
 
 class BetaOutput(_BoundedOutput):
     """A Beta distribution per number (Chou et al. 2017). Its mean and its spread depend on the
-    state. Both parameters exceed 1, so that it has a single mode.
-
-    Logits are (..., A, 2 D): alphas, then betas. Actions are (..., A, D) float32 within the bounds.
-    `logprob` and `entropy` (...,) belong to the lane's joint action: they are summed over agents
-    and numbers.
+    state. Both parameters exceed 1, so that it has a single mode. Logits are alphas, then betas.
     """
 
     def __init__(self, space: spaces.MultiContinuous, width: int):
@@ -159,5 +153,4 @@ def _log_slope(u) -> torch.Tensor:
 
 
 def _log_beta(alpha, beta) -> torch.Tensor:
-    """Returns the logarithm of the beta function."""
     return alpha.lgamma() + beta.lgamma() - (alpha + beta).lgamma()

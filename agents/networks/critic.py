@@ -1,7 +1,6 @@
 """The critic: predicts the return from the actor's features and from privileged observations, in
 numbers normalised by running statistics of returns (PopArt). And the heads of an update together:
-actions, value and auxiliary prediction from the same features, on a GPU in bfloat16 one product,
-one kernel, and one sum of gradients.
+actions, value and auxiliary prediction from the same features, on a GPU one product and one kernel.
 
 N rows, `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; W width, A agents that
 one lane controls, n choices, F predicted features. A row of the product has the prediction, the
@@ -124,7 +123,7 @@ class ValueOutput(nn.Module):
 # ---- Values, and heads together, by kernels ----
 
 
-class HeadSizes(NamedTuple):
+class _Sizes(NamedTuple):
     """The columns of the product of heads. Values alone have only those of the hidden layer."""
 
     n_predicted: int = 0  # F
@@ -134,19 +133,15 @@ class HeadSizes(NamedTuple):
 
     @property
     def first_score(self) -> int:
-        """Index of the first column of scores."""
         return self.n_predicted + -self.n_predicted % _MULTIPLE
 
     @property
     def first_hidden(self) -> int:
-        """Index of the first column of the critic's hidden layer."""
         n_scores = self.n_agents * self.n_choices
         return self.first_score + n_scores + -n_scores % _MULTIPLE
 
 
-def launch_heads(
-    columns: torch.Tensor, value: dict[str, torch.Tensor], sizes: HeadSizes, **fields
-) -> None:
+def _launch_heads(columns, value, sizes, **fields) -> None:
     """Computes what follows from a product (N, columns) bfloat16: `values` (N,) float32 and others
     of the kernel's fields.
     """
@@ -159,15 +154,13 @@ def launch_heads(
     )
 
 
-def value_parameters(output: ValueOutput) -> dict[str, torch.Tensor]:
-    """Returns weight (1, W), bias (1,), scale () and mean () of a critic's output layer."""
+def _value_parameters(output) -> dict[str, torch.Tensor]:
     weight, bias = (leaf.detach() for leaf in output.linear.parameters())
     statistics = dict(value_scale=output.scale, value_mean=output.mean)
     return dict(value_weight=aligned(weight), value_bias=bias, **statistics)
 
 
-def are_few_words(x: torch.Tensor) -> bool:
-    """Returns whether the heads' kernels take so many rows (..., W) of such a width."""
+def _are_few_words(x) -> bool:
     n_rows = x.numel() // max(x.shape[-1], 1)
     return 0 < n_rows <= 2**31 - _STRIP and not x.shape[-1] % _MULTIPLE
 
@@ -176,8 +169,9 @@ def _value_on_gpu(critic, joined) -> torch.Tensor:
     hidden = linear(joined, critic.hidden)
     rows = aligned(hidden.flatten(0, -2))
     values = rows.new_empty(len(rows), dtype=torch.float32)
-    sizes = HeadSizes(width=rows.shape[1])
-    launch_heads(rows, value_parameters(critic.output), sizes, values=values)
+    _launch_heads(
+        rows, _value_parameters(critic.output), _Sizes(width=rows.shape[1]), values=values
+    )
     return values.view(hidden.shape[:-1])
 
 
@@ -185,7 +179,7 @@ def _fits_value(critic, joined) -> bool:
     weight, features = critic.output.linear.weight, joined[0]
     is_bf16 = features.is_cuda and compute_dtype(weight) == torch.bfloat16
     is_known = is_bf16 and weight.dtype == torch.float32 and not torch.is_grad_enabled()
-    return is_known and are_few_words(features)
+    return is_known and _are_few_words(features)
 
 
 class Critic(nn.Module):
@@ -206,22 +200,16 @@ class Critic(nn.Module):
             nn.init.zeros_(self.hidden.bias)
         self.output = ValueOutput(width)
 
-    def forward(
-        self,
-        features: torch.Tensor,
-        privileged: Tree | None = None,
-        lanes: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        """Returns the value of features (..., width) and privileged observations (..., *shape), of
-        which `lanes` (M,) int64 selects some lanes (T, B, ...). None: all.
+    def encode(
+        self, privileged: Tree | None, lanes: torch.Tensor | None = None
+    ) -> torch.Tensor | None:
+        """Returns the intake's `encode` of privileged observations (..., *shape), of which `lanes`
+        (M,) int64 selects some lanes (T, B, ...). None of a plain critic.
         """
-        encoded = self.intake.encode(privileged, lanes) if self.is_asymmetric else None
-        return self.from_encoded(features, encoded)
+        return self.intake.encode(privileged, lanes) if self.is_asymmetric else None
 
-    def from_encoded(
-        self, features: torch.Tensor, encoded: torch.Tensor | None = None
-    ) -> torch.Tensor:
-        """Returns the value from features (..., width) and what the intake's `encode` returned."""
+    def forward(self, features: torch.Tensor, encoded: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns the value from features (..., width) and what `encode` returned."""
         if not self.is_asymmetric:
             return self.output(features)
         assert encoded is not None
@@ -231,6 +219,9 @@ class Critic(nn.Module):
     def _value(self, joined) -> torch.Tensor:
         """Returns the value (...,) from features and projected privileged observations."""
         return self.output(linear(joined, self.hidden, torch.relu))
+
+
+# ---- Heads together ----
 
 
 class _JointHeads(torch.autograd.Function):
@@ -256,7 +247,7 @@ class _JointHeads(torch.autograd.Function):
         results = columns.new_empty(4, len(columns), dtype=torch.float32).unbind()
         names = "logprobs", "entropies", "errors", "values"
         inputs = dict(target=target, actions=actions)
-        launch_heads(columns, value, sizes, **inputs, **dict(zip(names, results, strict=True)))
+        _launch_heads(columns, value, sizes, **inputs, **dict(zip(names, results, strict=True)))
         ctx.sizes = sizes
         ctx.save_for_backward(
             *(features, privileged, weight, of_privileged),
@@ -302,11 +293,11 @@ class _JointHeads(torch.autograd.Function):
 
 
 def _terms_on_gpu(output, critic, prediction, features, encoded, actions, mask=None) -> Terms:
-    sizes = HeadSizes(len(prediction.weight), output.shape[0], output.shape[1], features.shape[-1])
+    sizes = _Sizes(len(prediction.weight), *output.shape, features.shape[-1])
     inputs = features, critic.intake.projected(encoded)
     layers = prediction, output.linear, critic.hidden, critic.output.linear
     parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
-    value = value_parameters(critic.output)
+    value = _value_parameters(critic.output)
     return _JointHeads.apply(sizes, value, encoded.detach(), actions, *inputs, *parameters)
 
 
@@ -315,7 +306,7 @@ def _fits_joint(output, critic, prediction, features, encoded, actions, mask=Non
         return False
     is_bf16 = features.is_cuda and features.dtype == encoded.dtype == torch.bfloat16
     is_float32 = critic.output.linear.weight.dtype == torch.float32
-    return is_bf16 and is_float32 and are_few_words(features)
+    return is_bf16 and is_float32 and _are_few_words(features)
 
 
 @fused(_terms_on_gpu, _fits_joint)
@@ -343,7 +334,7 @@ def head_terms(
     logits = output(features)
     logits = logits if mask is None else output.masked(logits, mask)
     logprobs, entropies = output.terms(logits, actions)
-    return logprobs, entropies, errors, critic.from_encoded(features, encoded)
+    return logprobs, entropies, errors, critic(features, encoded)
 
 
 def prediction_error(

@@ -1,8 +1,4 @@
-"""The output of action values: a duelling network.
-
-`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane
-controls, n choices of each.
-"""
+"""The output of action values: a duelling network. Axes are those of `heads`."""
 
 import math
 
@@ -39,8 +35,8 @@ def _launch_values(operation, hidden, parameters, shape, **fields) -> torch.Tens
     n_rows, n_features = hidden.shape
     values = torch.empty(n_rows, *shape, device=hidden.device)
     names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"
-    unused = dict.fromkeys(("noise", "epsilon", "actions", "logprobs"))
     parameters = (aligned(p.detach()) for p in parameters)
+    unused = dict.fromkeys(("noise", "epsilon", "actions", "logprobs"))
     launch(
         *(LIBRARY, operation, hidden.device, Blocks(-(-n_rows // _BLOCK_ROWS))),
         **dict(zip(names, parameters, strict=True), hidden=hidden, values=values),

@@ -16,10 +16,11 @@ from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
 from megastep.kernels.build.launch import Blocks, launch
 
 LIBRARY = KernelLibrary(Path(__file__).parent / "kernels" / "few_rows", FAST_CUDA_FLAGS)
-_SIZES = LIBRARY.constants
-_TILE = _SIZES["TILE"]
-WIDTHS = 128, 256
-MAX_ROWS = _SIZES["MAX_ROWS"]
+WIDTHS = 128, 256  # of a step
+MAX_ROWS, _TILE, _TILE_THREADS, _TILE_BYTES, _LANES, _UNITS, _THREADS = (
+    LIBRARY.constants[name]
+    for name in "MAX_ROWS TILE TILE_THREADS TILE_BYTES STEP_LANES STEP_UNITS STEP_THREADS".split()
+)
 
 
 @fused(lambda *matrices: True, lambda *matrices: _fit(matrices))
@@ -28,58 +29,42 @@ def fits(*matrices: torch.Tensor) -> bool:
     return False
 
 
-def fits_step(x: torch.Tensor, weight: torch.Tensor) -> bool:
-    """Returns whether `lstm_step` takes inputs (B, W) and their weight."""
-    return x.shape[1] in WIDTHS and fits(x, weight)
-
-
 def _fit(matrices) -> bool:
     rows = matrices[0]
     if not rows.is_cuda or not 0 < len(rows) <= MAX_ROWS:
         return False
-    has_bf16 = torch.cuda.get_device_capability(rows.device) >= (8, 0)
-    return has_bf16 and all(map(_has_words, matrices))
+    return torch.cuda.get_device_capability(rows.device) >= (8, 0) and all(
+        matrix.dtype == torch.bfloat16
+        and not (matrix.shape[1] % 8 or matrix.stride(0) % 8 or matrix.data_ptr() % 16)
+        and matrix.stride(1) == 1
+        and matrix.stride(0) >= matrix.shape[1]
+        for matrix in matrices
+    )
 
 
-def _has_words(matrix) -> bool:
-    """Returns whether a matrix is as the head of this file says."""
-    n_columns, is_bf16 = matrix.shape[1], matrix.dtype == torch.bfloat16
-    has_words = not (n_columns % 8 or matrix.stride(0) % 8 or matrix.data_ptr() % 16)
-    return is_bf16 and has_words and matrix.stride(1) == 1 and matrix.stride(0) >= n_columns
-
-
-def layer(
+def multiply(
     x: torch.Tensor,
     weight: torch.Tensor,
     bias: torch.Tensor | None = None,
+    addend: torch.Tensor | None = None,
+    out: torch.Tensor | None = None,
     has_relu: bool = False,
-    onto: torch.Tensor | None = None,
+    of_inputs: bool = False,
 ) -> torch.Tensor:
-    """Does what `linear.product` does."""
-    result = x.new_empty(len(x), len(weight)) if onto is None else onto
-    return _multiply("product_of_layer", x, weight, result, bias, onto, has_relu)
-
-
-def of_inputs(
-    d: torch.Tensor, weight: torch.Tensor, addend: torch.Tensor | None = None
-) -> torch.Tensor:
-    """Does what `linear.gradient_of_inputs` does."""
-    result = d.new_empty(len(d), weight.shape[1])
-    return _multiply("product_of_inputs", d, weight, result, None, addend)
-
-
-def _multiply(operation, left, right, result, bias, addend, has_relu=False) -> torch.Tensor:
-    (n_rows, n_columns), n_inner = result.shape, left.shape[1]
-    n_tiles = -(-n_columns // _TILE), -(-n_rows // _TILE)
+    """Returns the product of rows (N, K) and a weight (M, K), or (K, M) if `of_inputs`, plus a bias
+    (M,) and an addend (N, M), with a ReLU if `has_relu`; in `out` (N, M), if given.
+    """
+    n_columns = weight.shape[1] if of_inputs else len(weight)
+    out = x.new_empty(len(x), n_columns) if out is None else out
+    n_tiles = -(-n_columns // _TILE), -(-len(x) // _TILE)
     launch(
-        *(LIBRARY, operation, left.device),
-        Blocks(*n_tiles, _SIZES["TILE_THREADS"], _SIZES["TILE_BYTES"]),
-        **dict(left=left, right=right, bias=bias, addend=addend, result=result),
-        **dict(n_rows=n_rows, n_columns=n_columns, n_inner=n_inner, has_relu=int(has_relu)),
-        **dict(left_stride=left.stride(0), right_stride=right.stride(0)),
-        result_stride=result.stride(0),
+        *(LIBRARY, "product_of_inputs" if of_inputs else "product_of_layer", x.device),
+        Blocks(*n_tiles, _TILE_THREADS, _TILE_BYTES),
+        **dict(left=x, right=weight, bias=bias, addend=addend, result=out),
+        **dict(n_rows=len(x), n_columns=n_columns, n_inner=x.shape[1], has_relu=int(has_relu)),
+        **dict(left_stride=x.stride(0), right_stride=weight.stride(0), result_stride=out.stride(0)),
     )
-    return result
+    return out
 
 
 def lstm_step(
@@ -102,9 +87,9 @@ def lstm_step(
     """
     x, output, width = aligned(x), torch.empty_like(x), x.shape[1]
     after = state.map(torch.empty_like)
-    n_blocks = -(-len(x) // _SIZES["STEP_LANES"]) * width // _SIZES["STEP_UNITS"]
+    n_blocks = -(-len(x) // _LANES) * width // _UNITS
     launch(
-        *(LIBRARY, f"lstm_step_{width}", x.device, Blocks(n_blocks, 1, _SIZES["STEP_THREADS"])),
+        *(LIBRARY, f"lstm_step_{width}", x.device, Blocks(n_blocks, threads=_THREADS)),
         **dict(x=x, weight=weight, bias=bias, reset=reset, output=output),
         **dict(last_output=state["output"], last_cell=state["cell"]),
         **dict(next_output=after["output"], next_cell=after["cell"]),

@@ -29,9 +29,9 @@ _STRIP, _STRIP_THREADS = LIBRARY.constants["STRIP"], LIBRARY.constants["STRIP_TH
 
 def _fits(x, layer, activation=None) -> bool:
     weight, parts = layer.weight, x if isinstance(x, tuple) else (x,)
+    dtype = compute_dtype(weight)
     if activation not in (None, torch.relu):
         return False
-    dtype = compute_dtype(weight)
     if parts[0].is_cuda:
         return dtype == torch.bfloat16 and not any(part.shape[-1] % 8 for part in parts)
     are_floats = weight.device.type == "cpu" and dtype == weight.dtype == torch.float32
@@ -156,24 +156,20 @@ def product(
     has_relu: bool = False,
     onto: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns the outputs (..., M) of a linear layer, with a ReLU if `has_relu`.
-
-    Args:
-        x: (..., K).
-        weight: (M, K).
-        bias: (M,); None with `onto`.
-        onto: (N, M), to which the product of x (N, K) is added, in place.
+    """Returns the outputs (..., M) of a linear layer, with a ReLU if `has_relu`, of x (..., K), a
+    weight (M, K) and a bias (M,). Without a bias, the product of x (N, K) is added to `onto` (N, M)
+    in place.
     """
     rows = x.flatten(0, -2)
-    if onto is not None:
+    if bias is None:
+        assert onto is not None
         if few_rows.fits(rows, weight, onto):
-            few_rows.layer(rows, weight, onto=onto)
+            few_rows.multiply(rows, weight, addend=onto, out=onto)
         else:
             onto.addmm_(rows, weight.T)
         return onto.relu_() if has_relu else onto
-    assert bias is not None
     if few_rows.fits(rows, weight) and not len(weight) % 8 and bias.is_contiguous():
-        outputs = few_rows.layer(rows, weight, bias, has_relu)
+        outputs = few_rows.multiply(rows, weight, bias, has_relu=has_relu)
     elif has_relu:
         outputs = torch._addmm_activation(bias, rows, weight.T)  # pyright: ignore[reportPrivateImportUsage]
     else:
@@ -191,7 +187,7 @@ def gradient_of_inputs(
     flat = None if addend is None else addend.flatten(0, -2)
     addends = () if flat is None else (flat,)
     if few_rows.fits(rows, weight, *addends) and all(x.is_contiguous() for x in addends):
-        result = few_rows.of_inputs(rows, weight, flat)
+        result = few_rows.multiply(rows, weight, addend=flat, of_inputs=True)
     else:
         result = rows @ weight if flat is None else torch.addmm(flat, rows, weight)
     return result.unflatten(0, d.shape[:-1])
@@ -215,13 +211,10 @@ def matmul(
     has_relu: bool = False,
 ) -> torch.Tensor:
     """Returns the product of (rows, depth) and (depth, columns) float32 on the CPU, of any strides,
-    plus a bias (columns,), with a ReLU if `has_relu`. Without a gradient.
-
-    Args:
-        out: where to write it, contiguous rows; added to what is there if `adds`. None: a new one.
+    plus a bias (columns,), with a ReLU if `has_relu`. Without a gradient. If given, `out` has it,
+    in contiguous rows, added to what is there if `adds`.
     """
-    if out is None:
-        out = torch.empty(len(a), b.shape[1])
+    out = torch.empty(len(a), b.shape[1]) if out is None else out
     launch(
         *(LIBRARY, "matmul", a.device, 0),
         **dict(a=a, b=b, bias=None if bias is None else bias.contiguous(), out=out),

@@ -59,16 +59,13 @@ _MAX_STEPS, _THREADS, _LANES, _BLOCK_UNITS = (
 
 
 class Form(NamedTuple):
-    """A form of the recurrence with an explicit gradient.
+    """A form of the recurrence with an explicit gradient."""
 
-    Attributes:
-        forward: returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output
-            without a residual and the last cell, (B, W) float32, and what `backward` needs.
-        backward: returns the gradients of the gates (T, B, 4 W), of the bias (4 W,), of the output
-            and the cell before the sequence, (B, W), and of the inputs, None if left to the caller.
-    """
-
+    #: Returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output without a
+    #: residual and the last cell, (B, W) float32, and what `backward` needs.
     forward: Callable[..., tuple]
+    #: Returns the gradients of the gates (T, B, 4 W), of the bias (4 W,), of the output and the
+    #: cell before the sequence, (B, W), and of the inputs, None if left to the caller.
     backward: Callable[..., tuple]
 
 
@@ -78,12 +75,8 @@ class Form(NamedTuple):
 def _forward_in_steps(x, input_weight, bias, weight, reset, output, cell, saves, residual) -> tuple:
     gates = F.linear(x, input_weight, bias)
     outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
-    cells = [torch.empty_like(cell)]
-    launch_units(
-        *("lstm_start", x.dtype, cell),
-        **dict(reset=reset[0], last_output=output, last_cell=cell),
-        **dict(hidden=hiddens[0], cell=cells[0]),
-    )
+    is_first = reset[0, :, None]
+    hiddens[0], cells = output.masked_fill(is_first, 0.0), [cell.masked_fill(is_first, 0.0)]
     next_steps = [*zip(reset[1:], hiddens[1:], strict=True), (None, None)]
     for t, (next_reset, next_hidden) in enumerate(next_steps):
         gates[t].addmm_(hiddens[t], weight.T)
@@ -121,24 +114,19 @@ def _backward_in_steps(input_weight, weight, reset, saved, d_outputs, d_cell) ->
 # ---- On a GPU with clusters of blocks: the recurrent weights stay on the chip ----
 
 
-def _memory(direction, width) -> int:
-    """Returns the bytes of shared memory that a block needs."""
-    return CLUSTERS.constants[f"{direction.upper()}_MEMORY_{width}"]
-
-
 def _fits_clusters(x, *_) -> bool:
     n_steps, n_lanes, width = x.shape
     if not x.is_cuda or x.dtype != torch.bfloat16 or width not in WIDTHS or not n_lanes:
         return False
+    n_bytes = max(CLUSTERS.constants[f"{way}_MEMORY_{width}"] for way in ("FORWARD", "BACKWARD"))
     # for one step, loading the weights takes too long
-    n_bytes = max(_memory(direction, width) for direction in ("forward", "backward"))
     return 2 <= n_steps <= _MAX_STEPS and has_hopper(x.device, n_bytes)
 
 
 def _launch_clusters(direction, width, device, n_lanes, **fields) -> None:
     n_clusters = -(-n_lanes // _LANES)
-    n_blocks, shared = width // _BLOCK_UNITS * n_clusters, _memory(direction, width)
-    blocks = Blocks(n_blocks, threads=_THREADS, shared=shared)
+    shared = CLUSTERS.constants[f"{direction.upper()}_MEMORY_{width}"]
+    blocks = Blocks(width // _BLOCK_UNITS * n_clusters, threads=_THREADS, shared=shared)
     fields |= dict(n_lanes=n_lanes, n_clusters=n_clusters)
     launch(CLUSTERS, f"lstm_sequence_{direction}_{width}", device, blocks, **fields)
 
@@ -324,7 +312,7 @@ def _act_on_gpu(core, x, reset, state, is_residual=False) -> tuple[torch.Tensor,
     bias = cast(core.input.bias, dtype)
     x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
     last = arrdict({key: aligned(state[key].float()) for key in ("output", "cell")})
-    if few_rows.fits_step(x, weight):
+    if core.width in few_rows.WIDTHS and few_rows.fits(x, weight):
         output, after = few_rows.lstm_step(x, weight, bias, reset, last, is_residual)
         return output[None], after
     output, joined = torch.empty_like(x), x.new_empty(len(x), 2 * core.width)

@@ -7,8 +7,7 @@ hidden state is cleared inside a sequence where an episode starts.
 
 Gate and candidate depend on the input alone, not on h. So a sequence takes one matrix product for
 all its steps and then a linear recurrence, computed by a scan, whose gradient is a scan in reverse.
-This is the paper's plain form. The paper's log-space form needs candidates that are never negative,
-and a reset, a factor of 0, has no logarithm.
+The paper's log-space form needs positive candidates, and a reset, a factor of 0, has no logarithm.
 
 T time, B lanes, W width. Gates are laid out (..., 2 W): update gate before its sigmoid, candidate.
 Matrix products run in the compute dtype (autocast's). The recurrence is float32: over hundreds of
@@ -59,7 +58,7 @@ def linear_scan(
 
     Uses parallel doubling (Hillis and Steele 1986): after a pass of stride k, `total` holds the
     last 2k terms of each sum, `product` the factor of what comes before them, and `reset` whether
-    that factor is cut off. Nothing is divided by a product, so factors of 0 are exact.
+    that is cut off. Nothing is divided, so factors of 0 are exact.
 
     Args:
         terms, factors: (T, ...).
@@ -87,38 +86,38 @@ def _split(gates) -> tuple[torch.Tensor, torch.Tensor]:
     return update.sigmoid(), candidate
 
 
-def _forward_on_gpu(gates, reset, start, residual, states, outputs, last) -> None:
+def _forward_on_gpu(gates, reset, start, residual=None, has_states=False) -> tuple:
+    outputs, last = gates.new_empty(*reset.shape, start.shape[1]), torch.empty_like(start)
+    states = torch.empty_like(outputs) if has_states else None
     launch_units(
         *("mingru_step" if len(gates) == 1 else "mingru_forward", gates.dtype, start),
         **dict(gates=gates, reset=reset, start=start, residual=residual),
         **dict(states=states, outputs=outputs, last=last, n_steps=len(gates)),
     )
+    return outputs, last, states
 
 
-@fused(_forward_on_gpu, lambda gates, *_: gates.is_cuda)
-def recurrence(gates, reset, start, residual, states, outputs, last) -> None:
-    """Computes the last three from gates (T, B, 2 W), resets (T, B) bool and the first state (B, W)
-    float32.
-
-    Args:
-        residual: (T, B, W), added to the outputs. None: nothing is.
-        states: (T, B, W), the outputs without the residual. None: not wanted.
-        outputs: (T, B, W).
-        last: (B, W) float32.
+@fused(_forward_on_gpu, lambda gates, *_, **__: gates.is_cuda)
+def recurrence(
+    gates: torch.Tensor,
+    reset: torch.Tensor,
+    start: torch.Tensor,
+    residual: torch.Tensor | None = None,
+    has_states: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """Returns from gates (T, B, 2 W), resets (T, B) bool and the first state (B, W) float32 the
+    outputs (T, B, W), to which a residual (T, B, W) is added; the last state (B, W) float32; and,
+    if `has_states`, the outputs without the residual.
     """
     (z, candidate), reset = _split(gates), reset[..., None]
     terms, factors = z * candidate, 1 - z
     terms[0].addcmul_(factors[0], start.masked_fill(reset[0], 0.0))
     exact = linear_scan(terms, factors, reset)
-    outputs.copy_(exact if residual is None else exact + residual)
-    last.copy_(exact[-1])
-    if states is not None:
-        states.copy_(exact)
+    outputs = (exact if residual is None else exact + residual).to(gates.dtype)
+    return outputs, exact[-1].clone(), exact.to(gates.dtype) if has_states else None
 
 
-def _backward_on_gpu(
-    gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
-) -> torch.Tensor:
+def _backward_on_gpu(gates, reset, start, states, d_outputs, d_last, has_residual) -> tuple:
     n_lanes, width = start.shape
     n_units = 1 if width % 4 else 4
     per_lane = width // n_units  # threads
@@ -126,6 +125,8 @@ def _backward_on_gpu(
     adds_lanes = per_lane <= _LARGEST_BLOCK
     block = per_block * per_lane if adds_lanes else BLOCK
     d_biases = start.new_empty(-(-n_lanes // per_block), gates.shape[-1])
+    d_gates, d_start = torch.empty_like(gates), torch.empty_like(start)
+    d_residual = torch.empty_like(d_outputs) if has_residual else None
     blocks = Blocks(-(-n_lanes * per_lane // block), threads=block, shared=4 * n_units * block)
     launch(
         *(LIBRARY, f"mingru_backward_{DTYPES[gates.dtype]}", start.device, blocks),
@@ -135,15 +136,22 @@ def _backward_on_gpu(
         **dict(n_steps=len(gates), n_lanes=n_lanes, width=width, n_units=n_units),
         adds_lanes=int(adds_lanes),
     )
-    return sum_rows(d_biases)
+    return d_gates, sum_rows(d_biases), d_start, d_residual
 
 
 @fused(_backward_on_gpu, lambda gates, *_: gates.is_cuda)
 def recurrence_backward(
-    gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual
-) -> torch.Tensor:
-    """Computes the last three, gradients of `recurrence`, from those of its outputs and last state,
-    None where not wanted. Returns the gates' gradient summed over steps and lanes, (2 W,) float32.
+    gates: torch.Tensor,
+    reset: torch.Tensor,
+    start: torch.Tensor,
+    states: torch.Tensor,
+    d_outputs: torch.Tensor,
+    d_last: torch.Tensor | None,
+    has_residual: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """Returns the gradients of the gates, of these summed over steps and lanes, (2 W,) float32, of
+    the first state, and of the residual, a new tensor; from those of `recurrence`'s outputs and
+    last state.
     """
     (z, candidate), reset = _split(gates), reset[..., None]
     factors, before = 1 - z, torch.cat([start[None], states[:-1]]).masked_fill(reset, 0.0)
@@ -152,14 +160,11 @@ def recurrence_backward(
         terms = torch.cat([d_outputs[:-1], (d_outputs[-1] + d_last)[None]])
     # Row t needs the factor and reset of step t + 1. The last row is not used.
     d = linear_scan(terms, factors.roll(-1, 0), reset.roll(-1, 0), reverse=True)
-    d_update, d_candidate = d_gates.chunk(2, -1)
-    d_update.copy_(d * (candidate - before) * z * factors)
-    d_candidate.copy_(d * z)
-    if d_start is not None:
-        d_start.copy_((d[0] * factors[0]).masked_fill(reset[0], 0.0))
-    if d_residual is not None:
-        d_residual.copy_(d_outputs)
-    return d_gates.flatten(0, 1).sum(0).float()
+    d_update = d * (candidate - before) * z * factors
+    d_gates = torch.cat([d_update, d * z], -1).to(gates.dtype)
+    d_start = (d[0] * factors[0]).masked_fill(reset[0], 0.0)
+    d_bias = d_gates.flatten(0, 1).sum(0).float()
+    return d_gates, d_bias, d_start, d_outputs.clone() if has_residual else None
 
 
 # ---- One step in one kernel ----
@@ -219,11 +224,9 @@ class _Sequence(torch.autograd.Function):
         needs_backward = has_grad and any(ctx.needs_input_grad)
         if not needs_backward and fits_step(x):
             return step(x, weight, bias, reset, start, is_residual)
-        gates = product(x, weight, bias)
-        outputs, last = torch.empty_like(x), torch.empty_like(start)
-        states = torch.empty_like(x) if is_residual and needs_backward else None
-        residual = x if is_residual else None
-        recurrence(gates, reset, start, residual, states, outputs, last)
+        gates, residual = product(x, weight, bias), x if is_residual else None
+        has_states = is_residual and needs_backward
+        outputs, last, states = recurrence(gates, reset, start, residual, has_states)
         states = outputs if states is None else states
         ctx.save_for_backward(x, weight, gates, reset, start, states)
         return outputs, last
@@ -231,24 +234,19 @@ class _Sequence(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, d_outputs, d_last) -> tuple[torch.Tensor | None, ...]:
-        x, weight, gates, reset, start, states = ctx.saved_tensors
+        x, weight, *saved = ctx.saved_tensors
         d_outputs = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
         d_last = None if d_last is None else aligned(d_last)
-        d_gates = torch.empty_like(gates)
-        d_start = torch.empty_like(start) if ctx.needs_input_grad[4] else None
-        # torch.addmm would copy d_outputs, and a gradient must not change in place
-        d_residual = torch.empty_like(x) if ctx.is_residual else None
-        d_bias = recurrence_backward(
-            *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
+        d_gates, d_bias, d_start, d_x = recurrence_backward(
+            *saved, d_outputs, d_last, ctx.is_residual
         )
         flat = d_gates.flatten(0, 1)
-        if d_residual is None:
-            d_x = (flat @ weight).view_as(x)
-        elif x.is_cuda:
-            d_residual.view(flat.shape[0], -1).addmm_(flat, weight)
-            d_x = d_residual
-        else:  # in one operation, a CPU would add up the product's sums in another order
-            d_x = d_residual.add_((flat @ weight).view_as(x))
+        if d_x is not None and x.is_cuda:  # torch.addmm would copy d_outputs once more
+            d_x.view(len(flat), -1).addmm_(flat, weight)
+        else:
+            product_of_gates = (flat @ weight).view_as(x)
+            # in one operation, a CPU would add up the product's sums in another order
+            d_x = product_of_gates if d_x is None else d_x.add_(product_of_gates)
         return d_x, gradient_of_weights(flat, x.flatten(0, 1)), d_bias, None, d_start, None, None
 
 

@@ -100,9 +100,10 @@ class Policy(nn.Module):
         elif action_space is None:
             raise ValueError("a policy needs an action space too: Policy(env), or both spaces")
         self.obs_space, self.action_space = obs_space, action_space
-        self.settings = dict(width=width, core=core, layers=layers, encoder=encoder)
-        self.settings |= dict(activation=activation, output=output, continuous=continuous)
-        self.settings |= dict(critic=critic, bf16=bf16)
+        self.settings = dict(
+            **dict(width=width, core=core, layers=layers, encoder=encoder, activation=activation),
+            **dict(output=output, continuous=continuous, critic=critic, bf16=bf16),
+        )
         critic, self.seed = None if output == "duelling" else critic, seed
         self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None
@@ -117,8 +118,8 @@ class Policy(nn.Module):
                 from megastep.agents.networks.critic import Critic  # who acts has none
 
                 self.critic = Critic(width, self.privileged_space)
-            if self.privileged_space:
-                self.prediction = nn.Linear(width, self._critic.intake.n_features)
+                if self.privileged_space:
+                    self.prediction = nn.Linear(width, self.critic.intake.n_features)
         if device is not None:
             self.to(device)
 
@@ -129,7 +130,8 @@ class Policy(nn.Module):
 
     @property
     def _critic(self) -> "Critic":
-        return cast("Critic", self.critic)
+        assert self.critic is not None, "this policy has no critic"
+        return self.critic
 
     @property
     def activation_bytes(self) -> int:
@@ -195,7 +197,7 @@ class Policy(nn.Module):
         mask: Tree = None,
     ) -> arrdict:
         """Runs over a sequence without acting. Returns arrdict(logits (T, B, ...), features
-        (T, B, width) that they were computed from, state after the sequence).
+        (T, B, width), state after the sequence).
 
         Args:
             obs: (T, B, ...) per leaf.
@@ -243,7 +245,7 @@ class Policy(nn.Module):
         asymmetric, of privileged observations, or of their `lanes` (M,) int64.
         """
         with self.compute_dtype():
-            return self._critic(features, privileged, lanes)
+            return self._critic(features, self._critic.encode(privileged, lanes))
 
     def prediction_error(
         self, features: torch.Tensor, privileged: Tree, lanes: torch.Tensor | None = None
@@ -251,13 +253,12 @@ class Policy(nn.Module):
         """Returns the error (T, B) of predicting the encoded privileged observations from features:
         a mean squared error in standard deviations. Arguments are those of `value`.
 
-        An auxiliary loss that trains the core and not the critic (Mirowski et al. 2017; with
-        privileged information: Lambrechts et al. 2024).
+        An auxiliary loss that trains the core and not the critic (Lambrechts et al. 2024).
         """
         from megastep.agents.networks.critic import prediction_error
 
         with self.compute_dtype():
-            encoded = self._critic.intake.encode(privileged, lanes)
+            encoded = self._critic.encode(privileged, lanes)
             return prediction_error(self.prediction, features, encoded)
 
     def terms(
@@ -271,24 +272,17 @@ class Policy(nn.Module):
         has_errors: bool = True,
         mask: Tree = None,
     ) -> arrdict:
-        """Returns what a loss needs of a sequence, (T, B) float32 each: `logprobs` of the actions,
-        `entropies` of the policy, `values`, and without a `privileged_space` None, with one the
-        `errors` of `prediction_error`; and `features` (T, B, width).
-
-        Args:
-            obs, reset, state, lanes, mask: as for `unroll`.
-            actions: (T, B, ...); (T, M, ...) with `lanes`.
-            privileged: as for `value`.
-            has_errors: false leaves the errors out, None.
+        """Returns what a loss needs of a sequence, (T, B) float32 each: `logprobs` of the actions
+        (T, B, ...), `entropies`, `values`, and `errors` of `prediction_error`, None without a
+        `privileged_space` or `has_errors`; and `features` (T, B, width). Other arguments are those
+        of `unroll` and `value`.
         """
         from megastep.agents.networks.critic import head_terms
 
         with self.compute_dtype():
             features, _ = self._features(obs, reset, state, lanes)
-            encoded = prediction = None
-            if self.privileged_space:
-                encoded = self._critic.intake.encode(privileged, lanes)
-                prediction = self.prediction if has_errors else None
+            encoded = self._critic.encode(privileged, lanes)
+            prediction = self.prediction if self.privileged_space and has_errors else None
             heads_of = self.output, self._critic, prediction
             terms = head_terms(*heads_of, features, encoded, actions, mask)
         names = "logprobs", "entropies", "errors", "values", "features"

@@ -13,15 +13,18 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+Weights = Callable[[], Iterable[torch.Tensor]]
+
+
 class _Casts(threading.local):
     """What `cast` returned since the outermost `ComputeDtype` of this thread began."""
 
     depth = 0
+    weights: Weights = tuple
 
     def __init__(self) -> None:
         # with the weights themselves, so that no other gets their id
         self.by_weight: dict[tuple, tuple[object, torch.Tensor]] = {}
-        self.weights: Callable[[], Iterable[torch.Tensor]] = tuple
 
 
 _CASTS = _Casts()
@@ -35,11 +38,7 @@ class ComputeDtype(torch.autocast):
     """
 
     def __init__(
-        self,
-        device_type: str,
-        dtype: torch.dtype,
-        enabled: bool = True,
-        weights: Callable[[], Iterable[torch.Tensor]] = tuple,
+        self, device_type: str, dtype: torch.dtype, enabled: bool = True, weights: Weights = tuple
     ):
         super().__init__(device_type, dtype, enabled)
         self._weights = weights

@@ -20,8 +20,6 @@ from megastep.types import Space
 if TYPE_CHECKING:
     from megastep.agents.types import Moments
 
-#: The version of the rules below. A run that began with others cannot continue bit for bit.
-VERSION = 2
 #: The scale of a number that has not varied yet, which makes it 0.
 UNKNOWN_SCALE = LIBRARY.constants["UNKNOWN_SCALE"]
 #: A standard deviation below this fraction of the mean may be rounding errors.
@@ -38,10 +36,7 @@ _TINY = 1e-30  # so that equal numbers are not divided by 0
 class RunningNorm(nn.Module):
     """Subtracts a running mean and divides by a running standard deviation: per channel for images,
     per number for vectors. A number that has not varied yet becomes 0: nothing tells by how much
-    to divide when it does.
-
-    Needed also for images from 0 to 1: if pixels are .87 plus or minus .1, a new network would
-    mostly see the .87. Before the first moments, observations stay as they are, or are 0 after
+    to divide when it does. Before the first moments, observations stay as they are, or are 0 after
     `clear`.
     """
 
@@ -54,9 +49,9 @@ class RunningNorm(nn.Module):
         is_image = isinstance(space, spaces.MultiImage)
         shape = (*space.shape[:2], 1, 1) if is_image else space.shape
         self.pooled_axes = (0, -2, -1) if is_image else (0,)
-        self.register_buffer("mean", torch.zeros(shape))
-        self.register_buffer("scale", torch.ones(shape))
-        self.register_buffer("count", torch.tensor(0.0))
+        start = dict(mean=torch.zeros(shape), scale=torch.ones(shape), count=torch.tensor(0.0))
+        for name, tensor in start.items():
+            self.register_buffer(name, tensor)
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (obs - self.mean) / self.scale
@@ -95,11 +90,11 @@ def _moments_on_gpu(norms, leaves, is_counted=True) -> list[Moments]:
         leaves=b"".join(map(packed_leaf, norms, flat)),
         **dict(is_counted=is_counted, moments=results, n_counted=n_counted, n_lanes=n_lanes),
     )
-    pairs = results.split([2 * size for size in sizes])
-    views = [
-        [each.view_as(norm.mean) for each in pair.chunk(2)] for norm, pair in zip(norms, pairs)
-    ]
-    return [(n_counted, mean, variance) for mean, variance in views]
+    parts = results.split([size for size in sizes for _ in range(2)])
+    means, variances = (
+        [part.view_as(norm.mean) for part, norm in zip(parts[i::2], norms)] for i in range(2)
+    )
+    return [(n_counted, *pair) for pair in zip(means, variances)]
 
 
 @torch.no_grad()
@@ -133,12 +128,16 @@ def moments_of(
 
 
 def _add_on_gpu(norms, moments, is_counted=None) -> None:
-    rows, kept = [], []
-    for norm, (n_counted, mean, variance) in zip(norms, moments, strict=True):
-        kept.append((mean.contiguous(), variance.contiguous(), n_counted.long()))
-        new = dict(zip(("new_mean", "new_variance", "n_counted"), kept[-1], strict=True))
-        own = dict(mean=norm.mean, scale=norm.scale, count=norm.count)
-        rows.append(LIBRARY.params.RunningNormParams(**own, **new, n=mean.numel()))
+    moments = [
+        (n.long(), mean.contiguous(), variance.contiguous()) for n, mean, variance in moments
+    ]
+    rows = [
+        LIBRARY.params.RunningNormParams(
+            **dict(mean=norm.mean, scale=norm.scale, count=norm.count, n=mean.numel()),
+            **dict(n_counted=n_counted, new_mean=mean, new_variance=variance),
+        )
+        for norm, (n_counted, mean, variance) in zip(norms, moments, strict=True)
+    ]
     blocks = Blocks(len(rows), threads=_THREADS)
     fields = dict(norms=b"".join(rows), is_counted=is_counted)
     launch(LIBRARY, "add_moments", norms[0].mean.device, blocks, **fields)

@@ -28,11 +28,11 @@ def products(x, weight, bias, d, addend):
     """Returns what each function does."""
     onto = d.clone()
     return (
-        few_rows.layer(x, weight, bias),
-        few_rows.layer(x, weight, bias, has_relu=True),
-        few_rows.layer(x, weight, onto=onto),
-        few_rows.of_inputs(d, weight),
-        few_rows.of_inputs(d, weight, addend),
+        few_rows.multiply(x, weight, bias),
+        few_rows.multiply(x, weight, bias, has_relu=True),
+        few_rows.multiply(x, weight, addend=onto, out=onto),
+        few_rows.multiply(d, weight, of_inputs=True),
+        few_rows.multiply(d, weight, addend=addend, of_inputs=True),
     )
 
 

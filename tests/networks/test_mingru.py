@@ -26,24 +26,19 @@ def case(n_steps=T, p_reset=0.3):
 
 def recurrence(gates, reset, start, d_outputs, d_last=None, residual=None, on_gpu=False):
     """Returns outputs, the last state, and gradients of the gates, of the first state and of the
-    biases. All but the last are written to tensors that are NaN before.
+    biases.
     """
-    nan, forward, backward = torch.nan, mingru_module.recurrence, mingru_module.recurrence_backward
+    forward, backward = mingru_module.recurrence, mingru_module.recurrence_backward
     if on_gpu:
         forward, backward = mingru_module._forward_on_gpu, mingru_module._backward_on_gpu
-    outputs, last = torch.full_like(d_outputs, nan), torch.full_like(start, nan)
-    states = None if residual is None else torch.full_like(outputs, nan)
-    forward(gates, reset, start, residual, states, outputs, last)
+    outputs, last, states = forward(gates, reset, start, residual, residual is not None)
     if residual is not None:  # as when acting: without states
-        alone = torch.full_like(outputs, nan), torch.full_like(last, nan)
-        forward(gates, reset, start, residual, None, *alone)
-        for result, expected in zip(alone, (outputs, last), strict=True):
+        alone = forward(gates, reset, start, residual)
+        for result, expected in zip(alone, (outputs, last, None), strict=True):
             torch.testing.assert_close(result, expected, rtol=0, atol=0, equal_nan=True)
     states = outputs if states is None else states
-    d_gates, d_start = torch.full_like(gates, nan), torch.full_like(start, nan)
-    d_residual = None if residual is None else torch.full_like(outputs, nan)
-    d_bias = backward(
-        *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
+    d_gates, d_bias, d_start, d_residual = backward(
+        gates, reset, start, states, d_outputs, d_last, residual is not None
     )
     assert residual is None or torch.equal(d_residual, d_outputs)
     return outputs, last, d_gates, d_start, d_bias
@@ -218,8 +213,7 @@ def test_gates_saturate_and_nan_propagates(where, width):
     gates[0, :, :width] = values[:, None]
     start, reset = torch.full((len(values), width), 5.0), torch.zeros(1, len(values)).bool()
     gates, start, reset = (tensor.to(where) for tensor in (gates, start, reset))
-    outputs, last = torch.full_like(gates[..., :width], 7.0).contiguous(), torch.empty_like(start)
-    mingru_module._forward_on_gpu(gates, reset, start, None, None, outputs, last)
+    outputs, last, _ = mingru_module._forward_on_gpu(gates, reset, start)
     expected = (5.0 - 2.0 * values.double().sigmoid()).float()[:, None].expand(-1, width)
     for result in (outputs[0], last):
         torch.testing.assert_close(result.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
@@ -235,8 +229,7 @@ def test_outputs_round_to_nearest_bfloat16(where):
     gates = torch.zeros(1, len(start), 8, dtype=torch.bfloat16, device=where)
     gates[..., :4] = -torch.inf
     reset = torch.zeros(1, len(start), dtype=torch.bool, device=where)
-    outputs, last = gates.new_full((1, *start.shape), torch.nan), torch.full_like(start, torch.nan)
-    mingru_module._forward_on_gpu(gates, reset, start, None, None, outputs, last)
+    outputs, last, _ = mingru_module._forward_on_gpu(gates, reset, start)
     assert torch.equal(last, start)
     assert torch.equal(outputs[0].cpu(), start.cpu().bfloat16())
 
@@ -335,10 +328,7 @@ def step_inputs(n_lanes, width):
 
 def two_kernels(gates, reset, start, residual):
     """Returns outputs and state after the step from rounded gates (1, B, 2 W)."""
-    outputs, last = torch.full_like(gates[..., : start.shape[1]], torch.nan), start.clone()
-    outputs = outputs.contiguous()
-    mingru_module._forward_on_gpu(gates, reset, start, residual, None, outputs, last)
-    return outputs, last
+    return mingru_module._forward_on_gpu(gates, reset, start, residual)[:2]
 
 
 STEPS = pytest.mark.parametrize(

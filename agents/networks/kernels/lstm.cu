@@ -30,24 +30,6 @@ DEVICE void activate(LstmStep<N>& s, const Params& p, const UnitIndex& index) {
     }
 }
 
-struct LstmStart {
-    static constexpr int N_GATES = 4;
-
-    template <class T, int N>
-    DEVICE void run(const LstmStartParams& p, const UnitIndex& index) {
-        float hidden[N], cell[N];
-        bool resets = p.reset[index.lane];
-        read<float>(hidden, p.last_output, index.unit);
-        if (resets)
-            clear(hidden);
-        write<T>(p.hidden, index.unit, hidden);
-        read<float>(cell, p.last_cell, index.unit);
-        if (resets)
-            clear(cell);
-        write<float>(p.cell, index.unit, cell);
-    }
-};
-
 // What a step multiplies by its weights: a row has the inputs, then the last outputs.
 struct LstmJoin {
     static constexpr int N_GATES = 2;
@@ -155,8 +137,6 @@ struct LstmBackward {
     }
 };
 
-INSTANCE(BOUNDS(64) lstm_start_float32, LstmStartParams, run<LstmStart, float>)
-INSTANCE(BOUNDS(64) lstm_start_bfloat16, LstmStartParams, run<LstmStart, Bfloat16>)
 INSTANCE(BOUNDS(64) lstm_join_float32, LstmJoinParams, run<LstmJoin, float>)
 INSTANCE(BOUNDS(64) lstm_join_bfloat16, LstmJoinParams, run<LstmJoin, Bfloat16>)
 INSTANCE(BOUNDS(64) lstm_act_float32, LstmActParams, run<LstmAct, float>)

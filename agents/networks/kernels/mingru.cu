@@ -223,21 +223,9 @@ DEVICE void backward(const MingruBackwardParams& p) {
         backward<T, 1>(p);
 }
 
-KERNEL BOUNDS(64) mingru_step_float32(MingruForwardParams p) {
-    wait_for_previous();
-    run<MingruForward<true>, float>(p);
-}
-KERNEL BOUNDS(64) mingru_step_bfloat16(MingruForwardParams p) {
-    wait_for_previous();
-    run<MingruForward<true>, Bfloat16>(p);
-}
-KERNEL BOUNDS(64) mingru_forward_float32(MingruForwardParams p) {
-    wait_for_previous();
-    run<MingruForward<false>, float>(p);
-}
-KERNEL BOUNDS(64) mingru_forward_bfloat16(MingruForwardParams p) {
-    wait_for_previous();
-    run<MingruForward<false>, Bfloat16>(p);
-}
+INSTANCE(BOUNDS(64) mingru_step_float32, MingruForwardParams, run<MingruForward<true>, float>)
+INSTANCE(BOUNDS(64) mingru_step_bfloat16, MingruForwardParams, run<MingruForward<true>, Bfloat16>)
+INSTANCE(BOUNDS(64) mingru_forward_float32, MingruForwardParams, run<MingruForward<false>, float>)
+INSTANCE(BOUNDS(64) mingru_forward_bfloat16, MingruForwardParams, run<MingruForward<false>, Bfloat16>)
 INSTANCE(BOUNDS(256) mingru_backward_float32, MingruBackwardParams, backward<float>)
 INSTANCE(BOUNDS(256) mingru_backward_bfloat16, MingruBackwardParams, backward<Bfloat16>)

@@ -7,17 +7,6 @@
 // and `cell` are a step's input state: the last step's output and cell, zeroed where a reset clears
 // them. A null pointer means that there is no next step.
 
-struct LstmStartParams {
-    const unsigned char* reset;  // (B) at the first step
-    const float* last_output;    // (B, W)
-    const float* last_cell;      // (B, W)
-    void* hidden;                // (B, W) compute
-    float* cell;                 // (B, W)
-    int n_lanes;
-    int width;
-    int n_units;  // units per thread
-};
-
 struct LstmJoinParams {
     const unsigned char* reset;  // (B)
     const void* x;               // (B, W) compute
