@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float | None:
     """Returns the score of a training run: the mean return, or another statistic, of the episodes
-    in the last reports of its `metrics.jsonl`. None if no episode finished.
+    in the last reports of its `metrics.jsonl`. None if none has one.
 
     Each episode counts once: `episode/NAME` is a mean over a window of `episode/window` episodes,
-    which may include some from earlier reports.
+    which may include some of earlier reports.
     """
     total, n_episodes, end = 0.0, 0, len(rows)
     while end > max(0, len(rows) - n_reports):

@@ -1,30 +1,44 @@
-"""Statistics of finished episodes, accumulated on the device.
+"""Statistics of episodes, accumulated on the device, by when the episodes began.
 
-Axes: T time, B lanes, G groups of lanes, D layouts, S sources of layouts.
+Axes: T time, B lanes, K intervals between reports, C columns: all lanes, each group of lanes, each
+source of layouts; S statistics of an episode.
 """
 
+from __future__ import annotations
+
 import math
+import operator
+import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 
+from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.nonfinite import LIMIT
-from megastep.agents.types import StateDict
-from megastep.kernels.build.kernel_library import FAST_CUDA_FLAGS, KernelLibrary
-from megastep.kernels.build.launch import Blocks, launch
+from megastep.agents.storage.rollout import Rollout
 from megastep.types import Env, optional
 
-LIBRARY = KernelLibrary(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
+if TYPE_CHECKING:
+    from megastep.agents.training.trainer import Trainer
+    from megastep.agents.types import StateDict
 
-#: Means are over at least this many episodes, once so many have ended.
+#: Means are over at least this many episodes, once so many have been counted.
 MIN_EPISODES = 100
-_SAVED = "returns", "lengths", "is_whole", "sums"
+#: Intervals whose episodes are counted at a time. The last one grows while all others wait.
+N_INTERVALS = 16
+#: Steps of an episode after which no report waits for its end.
+LONGEST = 10_000
+_SAVED = "totals", "is_whole", "began", "sums"
 
 
 class EpisodeStats:
-    """Accumulates return, length and metrics of the episodes that end. Only `pop` synchronises.
+    """Accumulates return, length and metrics of episodes. Only `pop` synchronises.
+
+    Of the episodes that end in an interval, there are too many short ones: at the beginning of a
+    run, no other can have ended. So `pop` reports on those that *began* in an interval, once all of
+    them have ended.
 
     Args:
         metrics: names of the metrics that worlds carry.
@@ -34,14 +48,17 @@ class EpisodeStats:
         skip_first: leaves out each lane's first episode, which `desync` cut.
 
     Attributes:
-        returns, lengths: (B,) float64, of the episode that each lane is in.
+        totals: (2, B) float64, return and length so far of the episode that each lane is in.
         is_whole: (B,) bool, whether that episode is to be counted.
-        sums: (4 + 2 M, 1 + G + S) float64 for M metrics, over the episodes that ended since the
-            last `pop`: count, return, squared return, length, each metric, and for each metric the
-            number of episodes left out of it; for all lanes, for each group and for each source.
-        bad_lanes: (M,) int64, the first lane with a metric that was left out; `n_lanes` if none.
-        windows: for all lanes, each group and each source, the sums of the last reports of all
-            ranks, of which the others than the oldest hold fewer than `MIN_EPISODES`.
+        began: (B,) int64, the interval in which it began.
+        intervals: those whose episodes have not all ended, the oldest first. Numbers are reused.
+        newest: () int64, the last of them.
+        sums: (C, S, K) float64, over the episodes that began in an interval and have ended: count,
+            return, squared return, length, each metric, and for each metric how many episodes were
+            left out of it, and for how many of these it was not NaN.
+        windows: for each column, the sums of the last reports of all ranks, of which the others
+            than the oldest hold fewer than `MIN_EPISODES`.
+        infinite: metrics that were infinite or too large, in the last report.
     """
 
     def __init__(
@@ -55,20 +72,19 @@ class EpisodeStats:
     ):
         self.metrics, self.groups = tuple(metrics), tuple(groups or ())
         self.sources = tuple(dict.fromkeys(sources or ()))
-        self.source_of_layout = torch.tensor(
-            [self.sources.index(name) for name in sources or ()], dtype=torch.int32, device=device
-        )
+        numbers = [self.sources.index(name) for name in sources or ()]
+        self.source_of_layout = torch.tensor(numbers, dtype=torch.int32, device=device)
         all_lanes = torch.ones(n_lanes, dtype=torch.bool, device=device)
-        self.members = torch.stack([all_lanes, *(groups or {}).values()], 1).double()  # (B, 1 + G)
-        self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
-        self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
+        self.members = torch.stack([all_lanes, *(groups or {}).values()]).double()
+        self.totals = torch.zeros(2, n_lanes, dtype=torch.float64, device=device)
         self.is_whole = torch.full((n_lanes,), not skip_first, device=device)
-        n_columns = 1 + len(self.groups) + len(self.sources)
-        shape = 4 + 2 * len(self.metrics), n_columns
+        self.began = torch.zeros(n_lanes, dtype=torch.int64, device=device)
+        self.intervals, self.newest = [0], torch.zeros((), dtype=torch.int64, device=device)
+        self.numbers = torch.arange(N_INTERVALS, device=device)[:, None]
+        shape = len(self.members) + len(self.sources), 4 + 3 * len(self.metrics), N_INTERVALS
         self.sums = torch.zeros(shape, dtype=torch.float64, device=device)
-        self.bad_lanes = torch.full((len(self.metrics),), n_lanes, device=device)
-        self.named = set()
-        self.windows = [deque() for _ in range(n_columns)]
+        self.windows = [deque() for _ in self.sums]
+        self.infinite: list[str] = []
 
     def add(
         self,
@@ -90,131 +106,61 @@ class EpisodeStats:
                 beyond the limit is left out of that metric's mean.
             layouts: (T, B) int32, the layout of each episode, read where `done`. For sources.
         """
-        if self._is_fused(reward, learns, metrics):
-            self._add_on_gpu(reward, reset, done, learns, metrics, layouts)
-            return
         reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
-        # cumulative sums over all T rows, minus the sum at the last episode end before each row
-        returns = self.returns + reward.double().cumsum(0)
-        lengths = self.lengths + (~reset).double().cumsum(0)
-        rows = torch.arange(len(reward), device=reward.device)[:, None]
-        last_end = torch.where(done, rows, -1).cummax(0).values
-        previous_end = torch.cat([torch.full_like(last_end[:1], -1), last_end[:-1]])
-        episode_returns = _sum_since(returns, previous_end)
-        counts = done & learns & (self.is_whole | (previous_end >= 0))
-        values = [
-            torch.ones_like(episode_returns),
-            episode_returns,
-            episode_returns**2,
-            _sum_since(lengths, previous_end),
-        ]
-        by_source = None
+        steps = torch.stack([reward.double(), (~reset).double()])
+        totals = self.totals[:, None] + steps.cumsum(1)  # (2, T, B), over episodes
+        at_end = torch.cat([torch.zeros_like(totals[:, :1]), totals], 1)
+        rows = torch.arange(1, len(reward) + 1, device=reward.device)[:, None]
+        ends = torch.where(done, rows, 0).cummax(0).values  # the last end so far, from 1; 0: none
+        before = torch.cat([torch.zeros_like(ends[:1]), ends[:-1]])
+        returns, lengths = totals - at_end.gather(1, before.expand(2, -1, -1))
+        counts = done & learns & (self.is_whole | (before > 0))
+        values = torch.stack([torch.ones_like(returns), returns, returns**2, lengths])
+        if self.metrics:
+            assert metrics is not None
+            of_metrics = torch.stack([metrics[name] for name in self.metrics]).double()
+            is_good = of_metrics.abs() <= LIMIT
+            good = torch.where(is_good, of_metrics, 0.0)
+            values = torch.cat([values, good, ~is_good, ~is_good & ~of_metrics.isnan()])
+        # the first that ends in a lane began before this rollout
+        self._add(counts & (before == 0), values, self.began, layouts)
+        self._add(counts & (before > 0), values, self.newest, layouts)
+        # in place, as a CUDA graph wants it
+        last_end = ends[-1:]
+        self.totals.copy_((totals[:, -1:] - at_end.gather(1, last_end.expand(2, -1, -1)))[:, 0])
+        self.is_whole |= last_end[0] > 0
+        self.began.copy_(torch.where((done | reset).any(0), self.newest, self.began))
+
+    def _add(self, counts, values, began, layouts) -> None:
+        """Adds the episodes that count, (T, B), of values (S, T, B), to the intervals in which they
+        began, (B,) or ().
+        """
+        of_lanes = torch.where(counts, values, 0.0).sum(1) * self.members[:, None]  # (C, S, B)
         if self.sources:
             assert layouts is not None
             last = len(self.source_of_layout) - 1
-            source_of_row = self.source_of_layout[layouts.clamp(0, last).long()]
-            source_of_row = torch.where((layouts >= 0) & (layouts <= last), source_of_row, -1)
-            rows = [counts & (source_of_row == source) for source in range(len(self.sources))]
-            by_source = torch.stack([self._sum(one, values, metrics) for one in rows], 1)
-        columns = self._sum(counts, values, metrics) @ self.members
-        if by_source is not None:
-            columns = torch.cat([columns, by_source.sum(2)], 1)
-        self.sums += columns
-        # in place, as a CUDA graph wants it
-        self.returns.copy_(_sum_since(returns, last_end, slice(-1, None))[0])
-        self.lengths.copy_(_sum_since(lengths, last_end, slice(-1, None))[0])
-        self.is_whole |= done.any(0)
-
-    def _is_fused(self, reward, learns, metrics) -> bool:
-        values = [metrics[name] for name in self.metrics]
-        return (
-            reward.is_cuda
-            and isinstance(learns, torch.Tensor)
-            and len(values) <= LIBRARY.constants["EPISODE_METRICS"]
-            and all(value.dtype == torch.float32 for value in (reward, *values))
-        )
-
-    def _add_on_gpu(self, reward, reset, done, learns, metrics, layouts) -> None:
-        """Does the same as `add` in two kernels."""
-        n_steps, n_lanes = reward.shape
-        values = [metrics[name].contiguous() for name in self.metrics]
-        pack = LIBRARY.params.EpisodeMetricParams
-        of_lanes = self.sums.new_empty(len(self.sums), n_lanes)
-        source_sums = None
-        if self.sources:
-            source_sums = self.sums.new_empty(len(self.sums), len(self.sources), n_lanes)
-            layouts = layouts.contiguous()
-        launch(
-            *(LIBRARY, "episodes", reward.device, n_lanes),
-            metrics=b"".join(pack(values=value) for value in values),
-            reward=reward.contiguous(),
-            reset=reset.contiguous(),
-            done=done.contiguous(),
-            learns=learns.contiguous(),
-            layouts=layouts if self.sources else None,
-            source_of_layout=self.source_of_layout if self.sources else None,
-            returns=self.returns,
-            lengths=self.lengths,
-            is_whole=self.is_whole,
-            sums=of_lanes,
-            source_sums=source_sums,
-            bad_lanes=self.bad_lanes,
-            n_metrics=len(values),
-            n_sources=len(self.sources),
-            n_layouts=len(self.source_of_layout),
-            n_steps=n_steps,
-            n_lanes=n_lanes,
-            limit=LIMIT,
-        )
-        n_sums, n_columns = self.sums.shape
-        blocks = Blocks(n_columns, n_sums, LIBRARY.constants["COLUMNS_THREADS"])
-        launch(
-            *(LIBRARY, "episode_columns", reward.device, blocks),
-            of_lanes=of_lanes,
-            members=self.members,
-            source_sums=source_sums,
-            sums=self.sums,
-            n_groups=self.members.shape[1],
-            n_lanes=n_lanes,
-        )
-
-    def _sum(self, counts, values, metrics) -> torch.Tensor:
-        """Returns the sums over time of the episodes that count, (4 + 2 M, B)."""
-        sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
-        if not self.metrics:
-            return sums
-        of_metrics = torch.stack([metrics[name] for name in self.metrics])  # (M, T, B)
-        is_good = of_metrics.abs() <= LIMIT
-        n_left_out = (counts & ~is_good).sum(1, dtype=torch.float64)
-        lanes = torch.arange(counts.shape[1], device=counts.device)
-        bad_lanes = torch.where(n_left_out > 0, lanes, counts.shape[1]).amin(1)
-        torch.minimum(self.bad_lanes, bad_lanes, out=self.bad_lanes)
-        totals = torch.where(counts & is_good, of_metrics, 0.0).sum(1, dtype=torch.float64)
-        return torch.cat([sums, totals, n_left_out])
-
-    def pop_bad_metrics(self) -> dict[str, int]:
-        """Returns metrics that an episode was left out of, each once, with the first such lane.
-        Synchronises.
-        """
-        lanes = dict(zip(self.metrics, self.bad_lanes.tolist(), strict=True))
-        n_lanes = len(self.returns)
-        bad = {k: lane for k, lane in lanes.items() if lane < n_lanes and k not in self.named}
-        self.named |= bad.keys()
-        return bad
+            source = self.source_of_layout[layouts.clamp(0, last).long()]
+            counts = counts & (layouts >= 0) & (layouts <= last)
+            each = [counts & (source == number) for number in range(len(self.sources))]
+            of_sources = [torch.where(these, values, 0.0).sum(1) for these in each]
+            of_lanes = torch.cat([of_lanes, torch.stack(of_sources)])
+        is_in = (began == self.numbers).double().expand(-1, of_lanes.shape[-1])
+        self.sums += of_lanes @ is_in.T
 
     def pop(
         self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
     ) -> dict[str, float]:
-        """Returns statistics for a report. Synchronises.
+        """Returns statistics for a report, and begins an interval. Synchronises.
 
         Args:
             sum_over_ranks: adds the numbers of the other ranks, where there are any.
 
-        Means are over the episodes that ended since the last call and, if those are fewer than
+        Means are over the episodes of the intervals between reports whose episodes have all ended
+        since the last call, in the order of the intervals, and if these are fewer than
         `MIN_EPISODES`, those of earlier calls, a call at a time. They are absent if there are none.
 
         Metrics:
-            episode/count: episodes that ended since the last report.
+            episode/count: episodes that no earlier report has counted.
             episode/window: episodes that the means are over.
             episode/return: mean return.
             episode/return_std: standard deviation of the return.
@@ -224,12 +170,27 @@ class EpisodeStats:
             episode/NAME/GROUP: the same, but for `return_std`, in the lanes of a role (leader) or
                 of a kind of opponent (now, past, bot), or in the floor plans of a source (maze).
         """
-        reports = sum_over_ranks(self.sums.T).tolist()
-        self.sums.zero_()
+        is_late = self.totals[1] > LONGEST
+        self.began.copy_(torch.where(is_late, self.newest, self.began))
+        n_running = ((self.began == self.numbers) & self.is_whole).sum(1)
+        table = sum_over_ranks(torch.cat([self.sums.flatten(0, 1), n_running[None]])).cpu()
+        sums, n_running = table[:-1].view(self.sums.shape), table[-1].tolist()
+        complete = []
+        while self.intervals and not n_running[self.intervals[0]]:
+            complete.append(self.intervals.pop(0))
+        reports = sums[:, :, complete].sum(2).tolist()
+        self.sums[:, :, complete] = 0.0
+        last = self.intervals[-1:]
+        is_used = [n for n in last if n_running[n] or sums[0, 0, n]]
+        if not last or (is_used and len(self.intervals) < N_INTERVALS):
+            self.intervals.append(min({*range(N_INTERVALS)} - {*self.intervals}))
+            self.newest.fill_(self.intervals[-1])
         totals = [
             _add_report(window, report)
             for window, report in zip(self.windows, reports, strict=True)
         ]
+        n_infinite = reports[0][4 + 2 * len(self.metrics) :]
+        self.infinite = [name for name, n in zip(self.metrics, n_infinite, strict=True) if n]
         stats = self._means(reports[0], totals[0])
         n, _, squared_returns, *_ = totals[0]
         if n:
@@ -255,9 +216,8 @@ class EpisodeStats:
         if n:
             stats |= {"episode/window": int(n), "episode/return": returns / n}
             stats["episode/length"] = lengths / n
-            n_metrics = len(self.metrics)
-            pairs = zip(self.metrics, metrics[:n_metrics], metrics[n_metrics:], strict=True)
-            for name, total, n_left_out in pairs:
+            left_out = metrics[len(self.metrics) :]
+            for name, total, n_left_out in zip(self.metrics, metrics, left_out):
                 if n > n_left_out:
                     stats[f"episode/{name}"] = total / (n - n_left_out)
         return stats
@@ -265,16 +225,21 @@ class EpisodeStats:
     def state_dict(self) -> StateDict:
         """Returns a copy of everything that changes."""
         windows = [torch.tensor(window, dtype=torch.float64) for window in self.windows]
-        return {name: getattr(self, name).clone() for name in _SAVED} | {"windows": windows}
+        state = {name: getattr(self, name).clone() for name in _SAVED}
+        return state | dict(windows=windows, intervals=[*self.intervals])
 
-    def load_state_dict(self, state: StateDict) -> None:
-        """Restores a `state_dict`, unless it has other metrics or groups."""
+    def load_state_dict(self, state: StateDict, has_episodes: bool = True) -> None:
+        """Restores a `state_dict`, unless it has other metrics or groups; without its episodes, of
+        which others than the short ones are lost, only what earlier reports have counted.
+        """
         if state["sums"].shape != self.sums.shape:
             return
-        for name in _SAVED:
-            if name in state:
-                getattr(self, name).copy_(state[name])
         self.windows = [deque(window.tolist()) for window in state["windows"]]
+        self.intervals = [*state["intervals"]]
+        self.newest.fill_(self.intervals[-1])
+        self.began.copy_(self.newest.expand_as(self.began))
+        for name in _SAVED if has_episodes else ():
+            getattr(self, name).copy_(state[name])
 
 
 def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
@@ -293,15 +258,6 @@ def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch
     return groups if stored is None else {name: lanes[stored] for name, lanes in groups.items()}
 
 
-def _sum_since(cumulative, ends, rows=slice(None)) -> torch.Tensor:
-    """Returns cumulative sums (T, B) at some rows, minus those at the row where the last episode
-    ended, -1 if none did.
-    """
-    ends = ends[rows]
-    at_end = torch.where(ends >= 0, cumulative.gather(0, ends.clamp(min=0)), 0.0)
-    return cumulative[rows] - at_end
-
-
 def _add_report(window, report) -> list[float]:
     """Adds a report's sums to a window, in place. Returns the sums over it."""
     if report[0]:
@@ -311,3 +267,105 @@ def _add_report(window, report) -> list[float]:
         window.popleft()
         del counts[0]
     return [math.fsum(column) for column in zip(*window, strict=True)] or [0.0] * len(report)
+
+
+class Episodes:
+    """A callback that counts the episodes of a trainer, whose environment has been reset, and gives
+    the curriculum and the opponents their share. On a GPU it counts by a CUDA graph.
+
+    Attributes:
+        stats: the statistics.
+        opponents: those of the environment, or None.
+    """
+
+    def __init__(self, trainer: Trainer):
+        self.opponents = optional(trainer.env, "opponent_pool")
+        device = torch.device(trainer.env.device)
+        self.graph = CudaGraphUpdate(self.count, device, graph=True)
+        self.counted_tensors: list[torch.Tensor | None] = []
+        self.warned: set[str] = set()
+        self.begin(trainer)
+
+    def begin(
+        self, trainer: Trainer, sources: Sequence[str] | None = None, desync: bool = False
+    ) -> None:
+        """Begins to count, before the first update.
+
+        Args:
+            sources: the name of the source of each layout of the environment, whose episodes have
+                statistics of their own.
+            desync: starts the first episodes at random ages, if the environment has a method
+                `desync()`, and leaves them out.
+        """
+        env, rollout = trainer.env, trainer.rollout
+        allocate_layouts = getattr(trainer.collect, "allocate_layouts", None)
+        if optional(env, "layout") is None or not allocate_layouts:
+            sources = None
+        elif sources:
+            allocate_layouts()
+        if desync := desync and optional(env, "desync") is not None:
+            optional(env, "desync")()
+        groups = lane_groups(env, rollout.learners)
+        self.stats = EpisodeStats(
+            rollout.n_lanes, env.device, tuple(rollout.metrics), groups, desync, sources
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """The means over episodes that reports may have, without `episode/`."""
+        kinds = [] if self.opponents is None else [*self.opponents.matchups]
+        return [*self.stats.names, *(f"won/{kind}" for kind in kinds if kind != "now")]
+
+    def on_update(self, trainer: Trainer, losses: object) -> None:
+        """Counts episodes, and has curriculum and opponents learn from them."""
+        rollout = trainer.rollout
+        (self.graph if self._keeps_tensors(rollout) else self.count)(rollout)
+        if trainer.curriculum is not None:
+            trainer.curriculum.update(rollout)
+        if self.opponents is not None:
+            self.opponents.refresh_snapshots(trainer.policy, trainer.updates)
+
+    def _keeps_tensors(self, rollout) -> bool:
+        """Returns whether a rollout is where it was at the first update, as a CUDA graph wants it.
+        A user's own rollout may replace its tensors, and so may a callback.
+        """
+        if type(rollout) is not Rollout:
+            return False
+        names = "reward", "starts", "terminal", "truncated", "learns", "layouts"
+        tensors = [getattr(rollout, name) for name in names] + [*rollout.metrics.values()]
+        self.counted_tensors = self.counted_tensors or tensors
+        return all(map(operator.is_, tensors, self.counted_tensors))
+
+    def count(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Counts the episodes of a rollout. Returns no metrics."""
+        self.stats.add(
+            rollout.reward,
+            rollout.reset,
+            rollout.terminal | rollout.truncated,
+            rollout.learns[:-1],
+            rollout.metrics,
+            rollout.layouts if self.stats.sources else None,
+        )
+        return {}
+
+    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
+        """Adds the statistics since the last report. Warns once of each metric that was infinite,
+        which NaN, for an episode without such a number, is not. Synchronises.
+        """
+        stats = self.stats.pop(trainer.ranks.sum)
+        for name in self.stats.infinite:
+            if name not in self.warned and trainer.ranks.rank == 0:
+                warnings.warn(
+                    f"metrics.{name} was infinite or beyond {LIMIT:g} at the end of an episode; "
+                    f"such episodes are left out of episode/{name}",
+                    stacklevel=3,
+                )
+            self.warned.add(name)
+        if self.opponents is not None:
+            stats |= self.opponents.pop_win_rates(trainer.ranks.sum)
+        if trainer.curriculum is not None:
+            stats |= trainer.ranks.mean(trainer.curriculum.stats())
+        trainer.latest_stats |= stats
+        metrics |= stats
+        if stats.get("episode/window", 0) >= MIN_EPISODES:
+            trainer.score = stats["episode/return"]

@@ -9,14 +9,13 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
+from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue
 from megastep.agents.distributed.process_group import rank_label
 from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
-    from megastep.agents.training.episode_stats import EpisodeStats
     from megastep.agents.training.trainer import Trainer
     from megastep.agents.types import Learner, RolloutLike
 
@@ -29,7 +28,7 @@ class NonFiniteGuard:
     updates are all skipped. All ranks call it at the same updates; they exchange what they found.
 
     Args:
-        learner: its `check` is read. Without one, only metrics are checked.
+        learner: its `check` is read, if it has one.
 
     Attributes:
         make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,
@@ -49,10 +48,6 @@ class NonFiniteGuard:
         self.n_agents = optional(env, "n_agents")
         self.nonfinite_check = with_defaults(learner, LearnerOptions).check
         self.value, self.hint = None, ""
-
-    def on_measure(self, trainer: Trainer, metrics: object) -> None:
-        """Warns of metrics of episodes."""
-        self.warn_of_metrics(trainer.episodes.stats, trainer.rollout)
 
     def on_report(self, trainer: Trainer, metrics: object) -> None:
         """Checks the last update."""
@@ -100,23 +95,6 @@ class NonFiniteGuard:
             f"too large ({text if value else 'gradients'}). {advice}",
             is_from_env,
         )
-
-    def warn_of_metrics(self, episode_stats: EpisodeStats, rollout: RolloutLike) -> None:
-        """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
-        of_rank = {
-            name: (lane_name(_env_lanes(rollout)[lane], self.n_agents), rank_label())
-            for name, lane in episode_stats.pop_bad_metrics().items()
-        }
-        reports = self.ranks.gather_if_any(of_rank, bool(of_rank))
-        of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
-        episode_stats.named |= of_all.keys()
-        for name, (lane, label) in of_all.items() if self.ranks.rank == 0 else ():
-            where = f" ({label})" * (len(reports) > 1)
-            warnings.warn(
-                f"metrics.{name} of {lane}{where} was not finite at the end of an episode; such "
-                f"episodes are left out of episode/{name}",
-                stacklevel=3,
-            )
 
 
 def _env_lanes(rollout) -> Sequence[int]:

@@ -96,13 +96,11 @@ class RunState:
         trainer.lost = ["added ranks start new episodes"] if is_new_rank else lost
 
     def _of_new_rank(self, state) -> StateDict:
-        """Returns rank 0's state with this rank's generators, and with no episodes since the last
-        report.
-        """
-        stats, own = state["episode_stats"], self.state_dict(has_episodes=False)
+        """Returns rank 0's state with this rank's generators."""
+        own = self.state_dict(has_episodes=False)
         names = [name for name in ("learner", "opponents") if name in state]
         parts = {name: _with_generators(state[name], own[name]) for name in names}
-        return {**state, **parts, "episode_stats": stats | {"sums": 0 * stats["sums"]}}
+        return {**state, **parts}
 
     def _load_episodes(self, state) -> list[str]:
         """Restores env, actor state and episode statistics. Returns what is lost."""
@@ -118,14 +116,11 @@ class RunState:
                 self.env_state.load_state_dict(state["env"])
             except ValueError as error:
                 lost.append(f"{error}; new episodes start")
-        stats = state["episode_stats"]
-        if lost:  # unfinished episodes are, too
-            if "wrappers" in state:
-                optional(self.env_state.env, "load_wrapper_state")(state["wrappers"], False)
-            stats = {name: stats[name] for name in ("sums", "windows")}
-        else:
+        if not lost:
             self.collect.load_state_dict(state["collector"])
-        self.trainer.episodes.stats.load_state_dict(stats)
+        elif "wrappers" in state:
+            optional(self.env_state.env, "load_wrapper_state")(state["wrappers"], False)
+        self.trainer.episodes.stats.load_state_dict(state["episode_stats"], not lost)
         return lost
 
     def warn_of_unreachable(self) -> None:

@@ -11,7 +11,7 @@ from megastep.agents.distributed.ranks import Plan, Ranks, world
 from megastep.agents.runs.saver import NoSaver, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.callbacks import Callbacks, DriftCheck, Losses
-from megastep.agents.training.episodes import Episodes
+from megastep.agents.training.episode_stats import Episodes
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import Timing
 from megastep.agents.training.run_state import RunState

@@ -76,17 +76,18 @@ def test_seeds(here):
 
 def test_resume_keeps_the_configuration_and_its_means_reach_back(here):
     lengths = "env.shortest=7", "env.longest=7", "desync=false"
-    folder = train.run(configured(f"samples={UPDATE}", "learner.lr=0.123", *lengths))
-    cfg = configured(f"resume={folder}", f"samples={2 * UPDATE}", tiny=[])
+    folder = train.run(configured(f"samples={2 * UPDATE}", "learner.lr=0.123", *lengths))
+    cfg = configured(f"resume={folder}", f"samples={4 * UPDATE}", tiny=[])
     assert cfg.learner.lr == 0.123 and cfg.env.n_envs == 4
     assert train.run(cfg) == folder
     rows = json_lines.read(folder / "metrics.jsonl")
-    assert [(row["samples"], row["updates"]) for row in rows] == [(UPDATE, 1), (2 * UPDATE, 2)]
-    assert [(row["episode/count"], row["episode/window"]) for row in rows] == [(4, 4), (4, 8)]
-    assert [row["episode/length"] for row in rows] == [7, 7]
-    assert yaml.safe_load((folder / "config.yaml").read_text())["samples"] == 2 * UPDATE
+    assert [row["samples"] for row in rows] == [n * UPDATE for n in (1, 2, 3, 4)]
+    assert [row["episode/count"] for row in rows] == [0, 8, 4, 4]
+    assert [row.get("episode/window") for row in rows] == [None, 8, 12, 16]
+    assert [row["episode/length"] for row in rows[1:]] == [7, 7, 7]
+    assert yaml.safe_load((folder / "config.yaml").read_text())["samples"] == 4 * UPDATE
     starts = json_lines.read(folder / "provenance.jsonl")
-    assert [start["samples"] for start in starts] == [0, UPDATE]
+    assert [start["samples"] for start in starts] == [0, 2 * UPDATE]
 
 
 def clock_jumps(monkeypatch, seconds):

@@ -297,7 +297,7 @@ def replayed(here, root, folder):
 
 def test_replay_of_a_lineage_has_its_bits_until_the_first_copy_and_its_settings_to_the_end(here):
     """What an ancestor's rollouts and random numbers were after that, no single agent has."""
-    run(*POPULATION, LONG)
+    run(*POPULATION, LONG, "seed=2")
     line, samples = replayed(here, "P", "one")
     rows = json_lines.read(here / "one/metrics.jsonl")
     own = [json_lines.read(here / f"P/member-{n}/metrics.jsonl") for n in range(3)]

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from megastep.agents.training.episode_stats import EpisodeStats, lane_groups
+from megastep.agents.training import episode_stats
+from megastep.agents.training.episode_stats import N_INTERVALS, EpisodeStats, lane_groups
 
 
 def slow_episodes(reward, reset, done, partial):
@@ -22,6 +23,14 @@ def slow_episodes(reward, reset, done, partial):
                 total, length = 0.0, 0
             partial[lane] = total, length
     return finished
+
+
+def popped(episodes):
+    """Returns the statistics of all episodes that have ended, as if no other were running."""
+    episodes.is_whole[:] = False
+    stats = episodes.pop()
+    episodes.is_whole[:] = True
+    return stats
 
 
 def named(stats, group=""):
@@ -43,7 +52,7 @@ def test_episodes_across_rollouts_match_slow_count():
         reward = torch.rand(7, n_lanes) * ~reset
         episodes.add(reward, reset, done)
         finished += slow_episodes(reward, reset, done, partial)
-    stats = episodes.pop()
+    stats = popped(episodes)
     returns = torch.tensor([total for total, _ in finished])
     assert stats["episode/count"] == len(finished) > 20
     assert stats["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
@@ -51,7 +60,7 @@ def test_episodes_across_rollouts_match_slow_count():
     mean_length = sum(length for _, length in finished) / len(finished)
     assert stats["episode/length"] == pytest.approx(mean_length)
     totals = [partial[lane][0] for lane in range(n_lanes)]
-    assert episodes.returns.tolist() == pytest.approx(totals, rel=1e-6)
+    assert episodes.totals[0].tolist() == pytest.approx(totals, rel=1e-6)
 
 
 @pytest.mark.parametrize("bad", [torch.nan, 1e30])
@@ -60,9 +69,9 @@ def test_nonfinite_reward_counts_as_zero(bad):
     episodes.add(torch.tensor([[1.0, 1.0], [bad, 2.0], [3.0, 3.0]]), none, none)
     done = torch.tensor([[True, True]])
     episodes.add(torch.full((1, 2), 4.0), none[:1], done)
-    stats = episodes.pop()
+    stats = popped(episodes)
     assert (stats["episode/count"], stats["episode/return"]) == (2, (8 + 10) / 2)
-    assert not episodes.returns.any() and stats["episode/length"] == 4
+    assert not episodes.totals[0].any() and stats["episode/length"] == 4
 
 
 def test_metrics_are_read_at_episode_ends_and_split_by_role():
@@ -75,7 +84,7 @@ def test_metrics_are_read_at_episode_ends_and_split_by_role():
     laps = torch.where(done, 10.0 * reward, torch.nan)  # metrics are read only on the last step
     metrics = dict(laps=laps, falls=torch.ones(2, 6))
     episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
-    stats = episodes.pop()
+    stats = popped(episodes)
     names = "count", "window", "return", "length", "laps", "falls"
     every = 4, 4, (1 + 7 + 9 + 11) / 4, 7 / 4, 10 * (1 + 5 + 6 + 7) / 4, 1
     assert stats == {
@@ -88,7 +97,7 @@ def test_metrics_are_read_at_episode_ends_and_split_by_role():
     done[:] = False
     done[1, 0] = True
     episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
-    stats = episodes.pop()
+    stats = popped(episodes)
     assert stats["episode/count/leader"] == 1 and stats["episode/return/leader"] == (8 + 1) / 3
     assert stats["episode/count/follower"] == 0 and stats["episode/return/follower"] == 10
 
@@ -105,14 +114,14 @@ def test_sources_are_those_of_the_layouts_where_episodes_end():
     reward = torch.tensor([[1.0, 10.0], [5.0, 20.0]])
     metrics = dict(laps=torch.tensor([[2.0, 0], [torch.nan, 8]]))
     episodes.add(reward, torch.zeros_like(done), done, True, metrics, layouts)
-    stats = episodes.pop()
+    stats = popped(episodes)
     assert (stats["episode/count"], stats["episode/return"]) == (3, (1 + 5 + 30) / 3)
     assert (stats["episode/count/maze"], stats["episode/return/maze"]) == (1, 1)
     assert (stats["episode/laps/maze"], stats["episode/length/maze"]) == (2, 1)
     assert (stats["episode/count/homes"], stats["episode/return/homes"]) == (1, 5)
     assert "episode/laps/homes" not in stats and "episode/return_std/maze" not in stats
     assert stats["episode/count/all"] == 3, "a group of the same name stays the group"
-    assert episodes.pop()["episode/return/maze"] == 1, "a window of its own"
+    assert popped(episodes)["episode/return/maze"] == 1, "a window of its own"
 
 
 def test_lane_groups_by_role_and_matchup():
@@ -135,8 +144,8 @@ def test_only_episodes_of_learning_lanes_count():
         rewards = torch.tensor([[reward, torch.nan]])
         episodes.add(rewards, none, done, learns, dict(laps=rewards))
     expected = {"count": 2, "window": 2, "return": 3, "length": 1, "laps": 3, "return_std": 2}
-    assert episodes.pop() == named(expected)
-    assert not episodes.returns.any(), "the lane that does not learn is cleared too"
+    assert popped(episodes) == named(expected)
+    assert not episodes.totals[0].any(), "the lane that does not learn is cleared too"
 
 
 def add_episodes(episodes, *returns):
@@ -151,17 +160,17 @@ def test_means_reach_back_over_100_episodes():
     episodes = EpisodeStats(1, "cpu")
     for _ in range(4):
         add_episodes(episodes, *[1.0] * 30)
-        episodes.pop()
+        popped(episodes)
     add_episodes(episodes, 101.0)
-    stats = episodes.pop()
+    stats = popped(episodes)
     # without the oldest report 91 would be left
     assert (stats["episode/count"], stats["episode/window"]) == (1, 121)
     assert stats["episode/return"] == pytest.approx(1 + 100 / 121)
     assert stats["episode/return_std"] == pytest.approx(100 / 121 * 120**0.5)
     add_episodes(episodes, *[1.0] * 9)
-    assert episodes.pop()["episode/window"] == 100, "the oldest report is dropped"
+    assert popped(episodes)["episode/window"] == 100, "the oldest report is dropped"
     add_episodes(episodes, *[2.0] * 250)
-    stats = episodes.pop()
+    stats = popped(episodes)
     assert (stats["episode/window"], stats["episode/return"]) == (250, 2)
 
 
@@ -171,9 +180,10 @@ def test_first_episodes_are_left_out_where_they_are_cut():
     done = none.clone()
     done[0, 0] = done[2, 0] = True
     episodes.add(torch.ones(3, 2), none, done)
-    assert (episodes.is_whole.tolist(), episodes.pop()["episode/length"]) == ([True, False], 2)
+    assert episodes.is_whole.tolist() == [True, False]
     episodes.add(torch.ones(3, 2), none, ~none)
-    assert episodes.pop()["episode/count"] == 3 + 2
+    stats = popped(episodes)
+    assert (stats["episode/count"], stats["episode/length"]) == (1 + 3 + 2, (2 + 5) / 6)
 
 
 @pytest.mark.parametrize("bad", [torch.nan, -1e30])
@@ -184,16 +194,15 @@ def test_episode_with_a_nonfinite_metric_is_left_out_of_its_mean(bad):
     none = torch.zeros(1, 4, dtype=torch.bool)
     metrics = dict(laps=torch.tensor([[3.0, bad, 5, bad]]), hits=torch.tensor([[1.0, 2, 3, 4]]))
     episodes.add(torch.ones(1, 4), none, ~none, metrics=metrics)
-    assert episodes.pop_bad_metrics() == {"laps": 1}
-    stats = episodes.pop()
+    stats = popped(episodes)
+    assert episodes.infinite == [] if bad != bad else ["laps"], "NaN stands for no such number"
     assert (stats["episode/laps"], stats["episode/hits"], stats["episode/window"]) == (4, 2.5, 4)
     assert stats["episode/laps/a"] == 4 and "episode/laps/b" not in stats
     assert (stats["episode/hits/a"], stats["episode/hits/b"]) == (2, 3)
     metrics["laps"][0, 1] = 10
     episodes.add(torch.ones(1, 4), none, ~none, metrics=metrics)
-    stats = episodes.pop()  # the window holds both reports
+    stats = popped(episodes)  # the window holds both reports
     assert (stats["episode/laps"], stats["episode/laps/b"]) == ((3 + 5 + 3 + 5 + 10) / 5, 10)
-    assert episodes.pop_bad_metrics() == {}, "named once"
     assert torch.isfinite(episodes.sums).all()
 
 
@@ -203,42 +212,60 @@ def test_sums_are_restored_only_for_the_same_metrics():
     first.add(torch.ones(1, 2), none, done, metrics=dict(a=torch.ones(1, 2)))
     for episodes in (same, other):
         episodes.load_state_dict(first.state_dict())
-    assert same.pop() == first.pop() and other.pop() == {"episode/count": 0}
+    assert popped(same) == popped(first) and popped(other) == {"episode/count": 0}
     add_episodes(rest := EpisodeStats(1, "cpu"), 1.0)
-    rest.pop()
+    popped(rest)
     resumed = EpisodeStats(1, "cpu")
     resumed.load_state_dict(rest.state_dict())
-    assert resumed.pop() == rest.pop() and resumed.windows == rest.windows
+    assert popped(resumed) == popped(rest) and resumed.windows == rest.windows
     assert resumed.windows[0][0] == [1, 1, 1, 1]
 
 
-@pytest.mark.parametrize("n_metrics", [0, 2])
-@pytest.mark.parametrize("sources", [None, ["homes", "maze", "maze", "bench"]])
-def test_gpu_counts_as_the_cpu_does(n_metrics, sources, to_gpu):
-    """Over several rollouts, with groups, NaN rewards and metrics, lanes that do not learn, sources
-    and layouts out of range.
+def test_a_report_is_about_the_episodes_that_began_together():
+    """Episode n of lane i lasts 1 + 5 i steps and more, and loses 1 in each: those that end first
+    are the best. A slow count says which began in an interval, of which there are too many here.
     """
-    n_steps, n_lanes, names = 32, 300, [f"metric{i}" for i in range(n_metrics)]
-    group = torch.rand(n_lanes, generator=torch.Generator().manual_seed(0)) < 0.3
-    options = dict(skip_first=True, sources=sources)
-    stats = [
-        EpisodeStats(n_lanes, to(group).device, names, {"some": to(group)}, **options)
-        for to in (torch.Tensor.cpu, to_gpu)
-    ]
-    for seed in range(3):
-        torch.manual_seed(seed)
-        reward = torch.randn(n_steps, n_lanes)
-        reward[torch.rand(n_steps, n_lanes) < 0.01] = torch.nan
-        flags = [torch.rand(n_steps, n_lanes) < p for p in (0.1, 0.1, 0.9)]
-        metrics = {name: torch.randn(n_steps, n_lanes) for name in names}
-        for values in metrics.values():
-            values[torch.rand(n_steps, n_lanes) < 0.01] = torch.inf
-        layouts = torch.randint(-1, 6, (n_steps, n_lanes), dtype=torch.int32)
-        for one, to in zip(stats, (torch.Tensor.cpu, to_gpu), strict=True):
-            rows = {name: to(values) for name, values in metrics.items()}
-            one.add(to(reward), *map(to, flags), rows, to(layouts))
-    plain, fused = stats
-    assert plain.sums[0].min() > 100
-    for name in ("returns", "lengths", "is_whole", "sums", "bad_lanes"):
-        torch.testing.assert_close(getattr(fused, name).cpu(), getattr(plain, name))
-    assert fused.pop() == pytest.approx(plain.pop())
+    torch.manual_seed(0)
+    n_lanes, n_steps = 6, 4
+    episodes, lasting = EpisodeStats(n_lanes, "cpu"), torch.arange(n_lanes) * 5
+    left, began, ended = lasting + 1, [0] * n_lanes, {}
+    age, reports, intervals = [0] * n_lanes, [], [0]
+    for _ in range(60):
+        done = torch.zeros(n_steps, n_lanes, dtype=torch.bool)
+        for t in range(n_steps):
+            left -= 1
+            done[t] = left == 0
+            for lane in range(n_lanes):
+                age[lane] += 1
+                if done[t, lane]:
+                    ended.setdefault(began[lane], []).append(age[lane])
+                    began[lane], age[lane] = intervals[-1], 0
+            left = torch.where(done[t], lasting + torch.randint(1, 40, (n_lanes,)), left)
+        episodes.add(-torch.ones(n_steps, n_lanes), torch.zeros_like(done), done)
+        stats, lengths = episodes.pop(), []
+        while intervals and intervals[0] not in began:
+            lengths += ended.pop(intervals.pop(0), [])
+        is_used = intervals and (intervals[-1] in began or intervals[-1] in ended)
+        if not intervals or (is_used and len(intervals) < N_INTERVALS):
+            intervals.append(max([-1, *began, *ended, *intervals]) + 1)
+        assert stats["episode/count"] == len(lengths) and len(episodes.intervals) <= N_INTERVALS
+        if lengths:
+            reports.append((-stats["episode/return"], lengths))
+    first, lengths = reports[0]
+    assert first == pytest.approx(sum(lengths) / len(lengths)) and max(lengths) > 25 > min(lengths)
+    counted = [n for _, lengths in reports for n in lengths]
+    assert len(reports) > 10 and reports[-1][0] == pytest.approx(
+        sum(counted[-(n := int(stats["episode/window"])) :]) / n
+    )
+
+
+def test_an_episode_without_an_end_holds_up_no_report(monkeypatch):
+    monkeypatch.setattr(episode_stats, "LONGEST", 30)
+    episodes, none = EpisodeStats(2, "cpu"), torch.zeros(10, 2, dtype=torch.bool)
+    done = none.clone()
+    done[4::5, 0] = True  # lane 1 goes on for ever
+    counts = []
+    for _ in range(8):
+        episodes.add(torch.ones(10, 2), none, done)
+        counts.append(episodes.pop()["episode/count"])
+    assert counts == [0, 0, 0, 3 + 2 + 2, 2, 2, 2, 2]
