@@ -177,6 +177,8 @@ class EnvState:
                 self._set_tensor(path, now, value, more[0], written)
 
     def _set_value(self, path, now, value) -> None:
+        if type(now) is type(value) and now == value:
+            return  # it may be in a tuple
         if type(now) is type(value) and isinstance(now, (*_LISTS, dict, set)):
             now.clear()
             (now.extend if isinstance(now, _LISTS) else now.update)(value)
