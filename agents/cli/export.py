@@ -5,7 +5,7 @@ from typing import Literal
 
 from megastep.agents import console
 from megastep.agents.cli.command import Command, with_member
-from megastep.agents.errors import UserError, user_errors
+from megastep.agents.errors import UserError
 from megastep.agents.factory import settings
 from megastep.agents.runs import folders
 
@@ -34,28 +34,13 @@ def run(
     path = folders.folder_of(source) / FORMATS[format] if file is None else Path(file)
     if path.suffix != suffix:
         raise UserError(f"file={path} must end with {suffix} for format={format}")
-    from megastep.agents import pretrained  # with PyTorch
-    from megastep.agents.export import agent, runtimes
+    from megastep.agents.export import agent, runtimes  # with PyTorch
 
     if format == "safetensors":
         agent.write(run, path)
         console.say(f"Wrote {path} and its card, {path.with_suffix('.md')}")
-        return path
-    policy, env = pretrained.load_with_env(run, "cpu")
-    with user_errors(f"{path} cannot be written: "):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    step = runtimes.Step(policy, env.reset())
-    write, runner = runtimes.write_torch, runtimes.run_torch
-    if format == "onnx":
-        write, runner = runtimes.write_onnx, runtimes.run_onnx
-    with user_errors(f"{path} cannot be written: ", (OSError,)):
-        write(step, path, folders.name_of(source))
-    difference = runtimes.compare(step, runner(path), policy, env, path)
-    inputs, outputs = (", ".join(p.name for p in side) for side in (step.inputs, step.outputs))
-    console.say(
-        f"Wrote {path}: {inputs} -> {outputs}; in 1,000 steps its numbers differ from the policy's "
-        f"by at most {difference:.1g}"
-    )
+    else:
+        console.say(f"Wrote {path}: {runtimes.write(source, path)}")
     return path
 
 

@@ -18,6 +18,7 @@ from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.runs import agent_file, checkpoint, folders, restore, trust
 from megastep.agents.runs.checkpoint import CheckpointError
 from megastep.types import n_lanes
+from tests.helpers.agents import env_of
 
 NAME = "tiny_agent"
 CONFIG = {
@@ -175,16 +176,12 @@ def test_starts_a_run_with_a_new_critic(file, capsys):
 
 @torch.no_grad()
 def test_loads_in_python_and_acts_as_the_run(folder, exported):
-    env = pretrained.make_env(NAME, geometries.sample("maze", 2), n_envs=3, device="cpu")
-    assert (env.n_envs, n_lanes(env), pretrained.names()) == (3, 6, [NAME])
+    env = env_of(NAME, geometries.sample("maze", 2), n_envs=3)
+    assert (env.n_envs, n_lanes(env)) == (3, 6)
     policy, original = pretrained.load(NAME, "cpu"), original_of(exported, env)
     assert policy.critic is None and not any(p.requires_grad for p in policy.parameters())
     assert 0 < agent.rounding_error(policy, original, env, 30) < 0.005
     assert pretrained.load(f"package/{NAME}.safetensors", "cpu").width == 8
-    with pytest.raises(
-        UserError, match="deathmatch has no setting cameras; it has wrappers, n_envs, "
-    ):
-        pretrained.make_env(NAME, geometries.sample("maze", 2), cameras=3)
 
 
 def test_inspect_prints_what_is_in_a_file(file, capsys):
@@ -305,7 +302,7 @@ def test_agent_of_the_package(path):
     assert agent_file.read_metadata(path)["tables"], "evaluated in the suite"
     card, facts = path.with_suffix(".md").read_text(), agent_file.read_metadata(path)["facts"]
     assert f"- samples: {facts['samples']:,}\n" in card and facts["commit"] in card
-    env = pretrained.make_env(path.stem, geometries.sample("homes", 2), n_envs=2, device="cpu")
+    env = env_of(path.stem, geometries.sample("homes", 2), n_envs=2)
     policy = pretrained.load(path.stem, "cpu")
     world, state = env.reset(), policy.initial(n_lanes(env))
     for _ in range(10):
@@ -339,7 +336,7 @@ def test_agent_of_the_package_does_what_its_card_says(name):
     source, settings, n_homes, n_each, least = FIRST_EPISODES[name]
     homes = geometries.sample(source, n_homes, "test", **settings)
     n = n_each * len(homes)
-    env = pretrained.make_env(name, homes, n_envs=n, device="cpu")
+    env = env_of(name, homes, n_envs=n)
     env.spawner.resample = False
     policy = pretrained.load(name, "cpu")
     world, state = env.reset(), policy.initial(n)

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from megastep import contract
-from megastep.agents import pretrained
 from megastep.agents.cli import evaluate, train
 from megastep.agents.runs import agent_file, checkpoint, restore
 
 gymnasium = pytest.importorskip("gymnasium")
 from megastep.envs import Gymnasium  # noqa: E402
 from megastep.hosting.vectorized import VectorizedEnv  # noqa: E402
+from tests.helpers.agents import env_of  # noqa: E402
 
 HELPERS = "tests.helpers.learning_wrappers"
 NORMALIZE = "gymnasium.wrappers:NormalizeObservation"
@@ -122,7 +122,7 @@ def test_runs_carry_what_wrappers_have_learnt(here, loads):
     path = here / "agent.safetensors"
     weights = {name: leaf.float() for name, leaf in saved.state["policy"].items()}
     agent_file.write(path, weights, saved.config, {"samples": 256}, wrappers=learnt)
-    env = pretrained.make_env("run", n_envs=1, device="cpu", vectorization="sync")
+    env = env_of("run", n_envs=1, vectorization="sync")
     assert env.wrapper_state()["1.NormalizeObservation.obs_rms.count"] > count + 25
     restore.load_wrappers(env, agent_file.read(path, "cpu"))
     assert is_same(env.wrapper_state(), learnt)

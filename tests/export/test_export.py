@@ -106,13 +106,13 @@ def test_comparisons_see_a_hidden_state_that_is_never_reset():
 @pytest.mark.parametrize("kind", KINDS)
 def test_files_act_as_the_policy_for_1000_steps(kind, tmp_path):
     policy, env, step = made(kind)
-    runtimes.write_torch(step, tmp_path / "a.pt2")
-    runtimes.compare(step, runtimes.run_torch(tmp_path / "a.pt2"), policy, env, "a")
+    runtimes.save(step, tmp_path / "a.pt2")
+    runtimes.compare(step, runtimes.runner(tmp_path / "a.pt2"), policy, env, "a")
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")
-    runtimes.write_onnx(step, tmp_path / "a.onnx")
-    runtimes.compare(step, runtimes.run_onnx(tmp_path / "a.onnx"), policy, env, "a")
+    runtimes.save(step, tmp_path / "a.onnx")
+    runtimes.compare(step, runtimes.runner(tmp_path / "a.onnx"), policy, env, "a")
     model = onnx.load(tmp_path / "a.onnx")
     assert model.opset_import[0].version >= 18
     assert [port.name for port in model.graph.input] == [port.name for port in step.inputs]
@@ -153,7 +153,7 @@ class Odd(torch.nn.Module):
 def test_a_core_that_cannot_be_exported_is_one_sentence(tmp_path):
     policy = Policy(VECTOR, MOVES, width=8, core=f"{__name__}:Odd")
     with pytest.raises(UserError, match=r"^mine cannot be exported: .*; format=safetensors"):
-        runtimes.write_torch(Step(policy, Noise(VECTOR).reset()), tmp_path / "a.pt2", "mine")
+        runtimes.save(Step(policy, Noise(VECTOR).reset()), tmp_path / "a.pt2", "mine")
     assert not [*tmp_path.iterdir()]
 
 

@@ -11,7 +11,7 @@ from tests.helpers.pages import ROOT
 NOTEBOOK = """
 import sys
 from pathlib import Path
-from megastep import geometries, recording
+from megastep import envs, geometries, recording
 from megastep.agents import factory, pretrained
 from megastep.agents.evaluation import playing, statistics
 from megastep.agents.factory import components
@@ -21,7 +21,7 @@ from megastep.agents.training.trainer import Trainer
 
 homes = geometries.sample("box", 4)
 policy = pretrained.load("explorer_anywhere", device="cpu")
-env = pretrained.make_env("explorer_anywhere", homes, n_envs=4, device="cpu")
+env = envs.Explorer(4, homes, device="cpu")
 (row,) = statistics.summaries(playing.first_episodes(env, policy, max_steps=20))
 assert row["lanes"] == 4
 

@@ -29,6 +29,7 @@ from megastep.web.page import FOLDER, SHIPPED, page
 from megastep.web.program import Replay
 from megastep.web.recording import record
 from megastep.web.scene import scene
+from tests.helpers.agents import env_of
 from tests.helpers.chromium import Browser
 from tests.helpers.web import ENVS, made
 
@@ -136,7 +137,7 @@ def test_packaged_agents_act_as_in_pytorch_for_1000_steps(name, tmp_path):
     settings = dict(n_envs=1, seed=3, resample=True)
     policy = pretrained.load(f"{name}_anywhere", "cpu")
     homes = geometries.sample("homes", 3, "test", seed=7)
-    envs = [pretrained.make_env(f"{name}_anywhere", homes, device="cpu", **settings) for _ in "ab"]
+    envs = [env_of(f"{name}_anywhere", homes, **settings) for _ in "ab"]
     program = record(envs[0])
     acting = add_policy(program, policy, range(n_lanes(envs[0])))
     about = ABOUT | {"policies": [acting._asdict()]}
