@@ -23,6 +23,7 @@ from megastep.agents.factory import check, components
 from megastep.agents.launch import signals
 from megastep.agents.reports import runs as reported
 from megastep.agents.runs import folders
+from megastep.imports import import_path
 from megastep.types import optional
 
 if TYPE_CHECKING:
@@ -75,17 +76,28 @@ class Run:
 
     @functools.cached_property
     def policy(self) -> "Policy":
-        """The trained policy, which only acts: `decision = run.policy.act(world)`."""
-        from megastep.agents import pretrained
+        """The trained policy: `decision = run.policy.act(world)`. Unless the run is the file of an
+        agent, it has its critic: `run.policy.value(decision.features, world.privileged)` in worlds
+        of `run.make(privileged=True)`; a critic that is not asymmetric takes the features alone.
+        """
+        from megastep.agents import hardware  # with PyTorch
+        from megastep.agents.runs import restore
 
-        return pretrained.load(str(self.path))
+        device = hardware.make_device("auto")
+        loaded = folders.load_checkpoint(folders.find(str(self.path)), False, device)
+        has_critic = any(name.startswith("critic.") for name in (loaded.state or {})["policy"])
+        critic = self.config["agent"]["critic"] if has_critic else None
+        env = self.make(1, privileged=True) if critic == "asymmetric" else None
+        return restore.policy_of(loaded, env, device, critic)
 
     def make(self, n_envs: int = 16, geometry: object = None, **changes: object) -> "Env":
-        """Returns an environment like the one of the training, in other floor plans if a geometry
-        is given; by default in the split `test`. `changes` are `split`, `seed`, `device`, and
-        settings of the environment.
+        """Returns an environment like the one of the training, in as many of its floor plans as
+        environments, or in others if a geometry is given; by default in the split `test`. `changes`
+        are `split`, `seed`, `device`, `privileged`, and settings of the environment.
         """
         own = {key: self.config[key] for key in ("env", "geometry")}
+        if "n" in own["geometry"]:
+            own["geometry"] = own["geometry"] | {"n": min(n_envs, own["geometry"]["n"])}
         if geometry is not None:
             own["geometry"] = geometry
         return make(**{"split": "test", **own, "n_envs": n_envs, **changes})
@@ -286,10 +298,10 @@ def _plain(value, key) -> Any:
     value = value.path if isinstance(value, Run) else value
     value = os.fspath(value) if isinstance(value, os.PathLike) else value
     if inspect.isclass(value) or inspect.isfunction(value):
-        if "<" in value.__qualname__:
-            problem = f"{value.__qualname__} has no import path; define it at the top of a module"
-            raise ConfigErrors([(key, problem)])
-        return f"{value.__module__}:{value.__qualname__}"
+        try:
+            return import_path(value)
+        except ValueError as error:
+            raise ConfigErrors([(key, str(error))]) from None
     if value is None or isinstance(value, (bool, str)):
         return value
     if isinstance(value, Mapping):

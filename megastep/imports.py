@@ -36,6 +36,18 @@ def import_object(name: str) -> Callable:
     return imported
 
 
+def import_path(thing: object) -> str:
+    """Returns `module:Class` of a class or function; a name as it is. Raises ValueError if it has
+    none, as it was defined in a function.
+    """
+    if isinstance(thing, str):
+        return thing
+    name = getattr(thing, "__qualname__", "<")
+    if "<" in name:
+        raise ValueError(f"{name} has no import path; define it at the top of a module")
+    return f"{thing.__module__}:{name}"
+
+
 def search_current_folder() -> None:
     """Adds the current folder to `sys.path`: before installed packages, so that none shadows a
     module of the user, and after the standard library, so that a `random.py` there breaks nothing.
@@ -62,10 +74,11 @@ def resolve(name: str, table: Mapping[str, str], base: type) -> type:
     return imported
 
 
-def known_name(name: str, names: Sequence[str]) -> str:
-    """Returns `name`, which is one of `names` or an import path that can be imported. Raises
-    ValueError if it is neither.
+def known_name(name: str | type, names: Sequence[str]) -> str:
+    """Returns `name`, which is one of `names` or a class, or its import path. Raises ValueError if
+    it is neither.
     """
+    name = import_path(name)
     if name not in names:
         if ":" not in name:
             raise ValueError(f"{name!r} is unknown; {closest(name, [*names, 'module:Class'])}")

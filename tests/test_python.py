@@ -18,7 +18,9 @@ from megastep.agents import api
 from megastep.agents.cli import compose
 from megastep.agents.errors import ConfigErrors, UserError
 from megastep.agents.launch import signals
+from megastep.agents.networks.plain_cores import GRU
 from megastep.agents.networks.policy import Policy
+from megastep.agents.runs import checkpoint
 from megastep.agents.selfplay.bots.random import RandomActions
 from tests.helpers import tiny
 from tests.helpers.pages import ROOT, code
@@ -34,6 +36,10 @@ TINY = dict(
     logging={"every": 4},
     device="cpu",
 )
+
+
+class Memory(GRU):
+    """A core of the user's."""
 
 
 class Rover(megastep.envs.Minimal):
@@ -132,6 +138,24 @@ def test_classes_and_groups_as_arguments():
     assert {*cfg.logger} == {"csv", "tensorboard"} and cfg.learner.lr == 0.5
     env = megastep.make(Rover, n_envs=2, geometry="box", device="cpu")
     assert type(env).__name__ == "Rover" and env.n_envs == 2
+
+
+def test_policies_take_classes_and_have_their_critic(here):
+    env = megastep.make("minimal", n_envs=3, geometry="box", device="cpu")
+    assert type(Policy(env, core=Memory).core) is Memory
+    assert Policy(env, core=Memory).settings["core"] == f"{__name__}:Memory"
+    own = {"name": "homes", "n": 6}
+    run = megastep.train(**TINY | {"env": "pointgoal", "geometry": own}, samples=1)
+    env = run.make(n_envs=3, privileged=True)
+    assert env.core.scenery.layouts.n_layouts == 3
+    saved = checkpoint.load_latest(run.path / "checkpoints").state["policy"]
+    policy, world = run.policy, env.reset()
+    assert all(torch.equal(weight, saved[name]) for name, weight in policy.state_dict().items())
+    decision, _ = policy(world, policy.initial(3))
+    values = policy.value(decision.features, world.privileged)
+    assert values.shape == (3,) and values.isfinite().all()
+    with pytest.raises(ValueError, match="the policy has no critic"):
+        policy.actor().value(decision.features)
 
 
 def test_act_carries_and_clears_its_own_hidden_state():

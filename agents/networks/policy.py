@@ -18,7 +18,7 @@ from megastep.agents.networks import cores, heads, intakes, running_norm
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
-from megastep.imports import known_name
+from megastep.imports import import_path, known_name
 from megastep.settings import checked
 from megastep.types import Env, Space, Tree, optional
 
@@ -48,9 +48,9 @@ class Policy(nn.Module):
         action_space: the environment's action space; None with an environment.
         privileged_space: space of what only the critic sees, or None.
         width: units of the recurrent core and of all features.
-        core: a name in `cores.CORES`, or an import path.
+        core: a name in `cores.CORES`, a class, or its import path.
         layers: recurrent cores, stacked with residual connections.
-        encoder: encoder of images, a name in `intakes.ENCODERS`, or an import path.
+        encoder: encoder of images, a name in `intakes.ENCODERS`, a class, or its import path.
         activation: of the intake, and of the hidden layer of the core "none": "relu" or "tanh".
         output: "softmax" samples actions by their probabilities, continuous ones too; "duelling"
             takes the action of the highest value.
@@ -81,9 +81,9 @@ class Policy(nn.Module):
         privileged_space: Space | None = None,
         *,
         width: Annotated[int, Field(ge=1, le=8192)] = 256,
-        core: Annotated[str, _name_in(cores.CORES)] = "lstm",
+        core: Annotated[str | type, _name_in(cores.CORES)] = "lstm",
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
-        encoder: Annotated[str, _name_in(intakes.ENCODERS)] = "linear",
+        encoder: Annotated[str | type, _name_in(intakes.ENCODERS)] = "linear",
         activation: Literal["relu", "tanh"] = "relu",
         output: Literal["softmax", "duelling"] = "softmax",
         continuous: Literal["gaussian", "beta"] = "gaussian",
@@ -99,6 +99,7 @@ class Policy(nn.Module):
             privileged_space = optional(env, "privileged_space")
         elif action_space is None:
             raise ValueError("a policy needs an action space too: Policy(env), or both spaces")
+        core, encoder = import_path(core), import_path(encoder)
         self.obs_space, self.action_space = obs_space, action_space
         self.settings = dict(
             **dict(width=width, core=core, layers=layers, encoder=encoder, activation=activation),
@@ -244,6 +245,8 @@ class Policy(nn.Module):
         """Returns the critic's value (...,) float32 of features (..., width) and, if it is
         asymmetric, of privileged observations, or of their `lanes` (M,) int64.
         """
+        if self.critic is None:
+            raise ValueError("the policy has no critic; files of agents and snapshots have none")
         with self.compute_dtype():
             return self._critic(features, self._critic.encode(privileged, lanes))
 

@@ -17,15 +17,19 @@ if TYPE_CHECKING:
 
 
 def policy_of(
-    loaded: "Checkpoint", env: Env | None = None, device: torch.device | str = "cpu"
+    loaded: "Checkpoint",
+    env: Env | None = None,
+    device: torch.device | str = "cpu",
+    critic: str | None = None,
 ) -> Policy:
-    """Returns the policy of a checkpoint, which only acts: it has no critic, and its weights need
-    no gradient. On a CPU this sets the number of threads that PyTorch uses, as training does.
+    """Returns the policy of a checkpoint, whose weights need no gradient. On a CPU this sets the
+    number of threads that PyTorch uses, as training does.
 
     Args:
         loaded: with its state.
         env: where it is to act. Default: an environment with the spaces of its training.
         device: of the policy without an environment.
+        critic: its kind; None: the policy only acts.
 
     Raises:
         UserError: naming what differs, if the weights do not fit the spaces.
@@ -37,7 +41,8 @@ def policy_of(
         tree = _nested(loaded.config["spaces"])
         if device.type == "cpu":
             share_threads(settings["width"])
-        policy = Policy(tree["obs"], tree["actions"], **{**settings, "critic": None}).to(device)
+        seen = tree["obs"], tree["actions"], optional(env, "privileged_space") if env else None
+        policy = Policy(*seen, **{**settings, "critic": critic}).to(device)
     return load_weights(policy, loaded, env).requires_grad_(False)
 
 
