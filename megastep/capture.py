@@ -59,17 +59,24 @@ class _StateBefore:
         now, replaced = self._walk(), []
         reachable = {id(leaf) for _, _, leaf in now.values()}
         for path, (_, _, old) in self.leaves.items():
+            name = path.partition("]")[2].lstrip(".")  # without the number of its root
             parent, step, new = now.get(path, (None, "", None))
-            if not isinstance(old, torch.Tensor):
-                if path in now:
-                    _refuse_changed(path, old, new)
-            elif isinstance(new, torch.Tensor):
-                if new is not old:
-                    replaced.append((path, parent, step, old, new))
-            elif id(old) not in reachable:
+            is_tensor = isinstance(new, torch.Tensor)
+            if isinstance(old, torch.Tensor):
+                if is_tensor and new is not old:
+                    replaced.append((name, parent, step, old, new))
+                elif not is_tensor and id(old) not in reachable:
+                    raise CaptureError(
+                        f"{name}, a tensor of shape {tuple(old.shape)}, was removed during the "
+                        "call: keep it, and change it in place."
+                    )
+                continue
+            is_same = old is None if is_tensor else old == new or (old != old and new != new)
+            if path in now and not is_same:
                 raise CaptureError(
-                    f"{_readable(path)}, a tensor of shape {tuple(old.shape)}, was removed during "
-                    f"the call: keep it, and change it in place."
+                    f"{name} changed from {old!r} to {'a tensor' if is_tensor else repr(new)} "
+                    "during the call, but a CUDA graph replays tensors only: make it a tensor on "
+                    "the device."
                 )
         overwritten = {_storage(old) for *_, old, _ in replaced}
 
@@ -79,9 +86,8 @@ class _StateBefore:
 
         # all are read before the first is written, as in `self.last, self.now = self.now, new`
         output = _pytree.tree_map(kept, output)
-        replaced = [(*place, old, kept(new)) for *place, old, new in replaced]
-        for path, parent, step, old, new in replaced:
-            _copy_back(path, parent, step, old, new)
+        for place, new in [(place, kept(new)) for *place, new in replaced]:
+            _copy_back(*place, new)
         return output
 
     def undo(self) -> None:
@@ -97,42 +103,25 @@ class _StateBefore:
                     rebind(parent, step, leaf)
 
 
-def _refuse_changed(path, old, new) -> None:
-    """Raises CaptureError if a scalar is another one, or no longer one."""
-    is_tensor = isinstance(new, torch.Tensor)
-    is_same = old is None if is_tensor else old == new or (old != old and new != new)
-    if not is_same:
-        raise CaptureError(
-            f"{_readable(path)} changed from {old!r} to {'a tensor' if is_tensor else repr(new)} "
-            f"during the call, but a CUDA graph replays tensors only: make it a tensor on the "
-            f"device."
-        )
-
-
 def _storage(tensor) -> tuple[torch.device, int]:
     """Returns what is equal for tensors that share memory."""
     with torch._C.DisableTorchFunctionSubclass():  # a ReadOnlyTensor would copy it
         return tensor.device, tensor.untyped_storage().data_ptr()
 
 
-def _copy_back(path, parent, step, old, new) -> None:
+def _copy_back(name, parent, step, old, new) -> None:
     if old.shape != new.shape or old.dtype != new.dtype:
         raise CaptureError(
-            f"{_readable(path)} changed its shape or dtype during the call, from "
-            f"{tuple(old.shape)} {old.dtype} to {tuple(new.shape)} {new.dtype}: keep both fixed."
+            f"{name} changed its shape or dtype during the call, from {tuple(old.shape)} "
+            f"{old.dtype} to {tuple(new.shape)} {new.dtype}: keep both fixed."
         )
     try:
         old.copy_(new)
         rebind(parent, step, old)
     except (TypeError, AttributeError) as error:
         raise CaptureError(
-            f"{_readable(path)} was replaced and cannot be put back ({error}): change it in place."
+            f"{name} was replaced and cannot be put back ({error}): change it in place."
         ) from None
-
-
-def _readable(path) -> str:
-    """Returns a path for messages, without the number of its root."""
-    return path.partition("]")[2].lstrip(".")
 
 
 def _renew_generators(roots) -> None:
@@ -176,16 +165,12 @@ class Graph:
         changed: Callable[[], str | None] = lambda: None,
     ):
         leaves, self._spec = _pytree.tree_flatten(args)
-        self._has_no_arguments = not args
         self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
         inputs = _pytree.tree_unflatten(self._leaves, self._spec)
         numbered = dict(enumerate(roots))
-        tensors = [
-            leaf
-            for leaf in [*leaves, *state_tree(numbered).values()]
-            if isinstance(leaf, torch.Tensor)
-        ]
-        self._device = next((leaf.device for leaf in tensors if leaf.device.type == "cuda"), None)
+        leaves = [*leaves, *state_tree(numbered).values()]
+        devices = [leaf.device for leaf in leaves if isinstance(leaf, torch.Tensor)]
+        self._device = next((device for device in devices if device.type == "cuda"), None)
         with torch.cuda.device(self._device):
             saved, original = snapshot(numbered), _StateBefore(roots)
             try:
@@ -226,8 +211,6 @@ class Graph:
             self._out = before.keep_in_place(function(*inputs))
 
     def __call__(self, *args) -> Any:
-        if not args and self._has_no_arguments:  # whose trees take longer than the rest
-            return self.with_leaves(())
         leaves, spec = _pytree.tree_flatten(args)
         if spec != self._spec:
             raise ValueError(
