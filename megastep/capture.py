@@ -86,8 +86,9 @@ class _StateBefore:
 
         # all are read before the first is written, as in `self.last, self.now = self.now, new`
         output = _pytree.tree_map(kept, output)
-        for place, new in [(place, kept(new)) for *place, new in replaced]:
-            _copy_back(*place, new)
+        replaced = [(*place, old, kept(new)) for *place, old, new in replaced]
+        for name, parent, step, old, new in replaced:
+            _copy_back(name, parent, step, old, new)
         return output
 
     def undo(self) -> None:

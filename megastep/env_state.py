@@ -23,11 +23,11 @@ from megastep.types import Env
 
 __all__ = ["EnvState", "way_back"]
 
-_GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
-_STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
-_NUMBERS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
-_CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque)
+GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
+_STATEFUL = (torch.Tensor, np.ndarray, *GENERATORS)
+_SCALARS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
 _LISTS = (list, collections.deque)
+_CONTAINERS = (*_LISTS, tuple, dict, set, frozenset)
 #: Bytes of a tensor that is left out if it has not changed.
 LARGE = 2**20
 _CHUNK, _FACTOR = 2**20, 0x9E3779B1  # an odd number without a pattern
@@ -69,7 +69,7 @@ class EnvState:
         self.root = python_types.SimpleNamespace(env=env, bot=bot, generators=generators)
         self._first_values, self._first_digests = {}, {}
         for path, node, is_users in self._nodes():
-            if is_writable(node):
+            if _is_writable(node):
                 if self.knows_large and node.nbytes >= LARGE:
                     self._first_digests[path] = _digest(node)
             elif is_users and _is_plain(node):
@@ -94,7 +94,7 @@ class EnvState:
         """
         records, first_paths = {}, {}
         for path, node, is_users in self._nodes():
-            if is_writable(node):
+            if _is_writable(node):
                 first = first_paths.setdefault(_identity(node), path) if node.numel() else path
                 digest = self._first_digests.get(path)
                 if first != path:
@@ -103,8 +103,17 @@ class EnvState:
                     records[path] = "unchanged", digest
                 else:
                     records[path] = "tensor", node.detach(), node.device.type
-            elif record := record_of(node, is_users):
-                records[path] = record
+            elif isinstance(node, GENERATORS):
+                records[path] = "generator", _generator_state(node)
+            elif isinstance(node, np.ndarray) and _is_savable(node.dtype):
+                data = torch.from_numpy(np.frombuffer(node.tobytes(), np.uint8).copy())
+                records[path] = "array", data, node.dtype.str, node.shape
+            elif is_users and _is_plain(node):
+                records[path] = "value", _encoded(node)
+            elif is_users and isinstance(node, _LISTS):
+                records[path] = "list", len(node)
+            elif is_users and isinstance(node, dict) and _is_plain([*node]):
+                records[path] = "dict", _encoded([*node])
         return records
 
     def _resets(self) -> Iterator[tuple[str, Resets]]:
@@ -138,43 +147,44 @@ class EnvState:
     @torch.no_grad()
     def _load(self, records) -> None:
         written = set()
-        for path, (kind, value, *more) in records.items():
+        for path, record in records.items():
             now = node_at(self.root, path)
-            if kind == "list":
-                now = now if isinstance(now, _LISTS) else self._replace(path, [])
-                while len(now) > value:
-                    now.pop()
-            elif kind == "dict":
-                now, keys = (
-                    now if isinstance(now, dict) else self._replace(path, {}),
-                    _decoded(value),
-                )
-                for key in [key for key in now if key not in keys]:
-                    del now[key]
-            elif kind == "value":
-                self._set_value(path, now, _decoded(value))
-            elif kind in ("generator", "repeated"):
-                is_of_another_device = path.startswith(".generators") and now is None
-                if not is_of_another_device and not _set_generator_state(now, value):
-                    raise ValueError(f"{name_of(path)} is no longer the kind of generator it was")
-            elif kind == "unchanged":
-                if not isinstance(now, torch.Tensor) or _digest(now) != value:
-                    raise ValueError(
-                        f"{name_of(path)} is not that of the run; did its homes or class change?"
-                    )
-            elif kind == "same":
-                if _identity(now) != _identity(same := node_at(self.root, value)):
-                    self._replace(path, same)
-            elif kind == "array":
-                dtype, shape = more
-                array = np.frombuffer(value.cpu().numpy().tobytes(), dtype).reshape(shape).copy()
-                is_array = isinstance(now, np.ndarray) and now.flags.writeable
-                if is_array and (now.dtype, now.shape) == (array.dtype, array.shape):
-                    now[...] = array
-                else:
-                    self._replace(path, array)
-            else:
-                self._set_tensor(path, now, value, more[0], written)
+            match record:
+                case "list", length:
+                    now = now if isinstance(now, _LISTS) else self._replace(path, [])
+                    while len(now) > length:
+                        now.pop()
+                case "dict", keys:
+                    now = now if isinstance(now, dict) else self._replace(path, {})
+                    for key in now.keys() - {*_decoded(keys)}:
+                        del now[key]
+                case "value", value:
+                    if _encoded(now) != value:
+                        self._set_value(path, now, _decoded(value))
+                case "generator", state:
+                    is_of_another_device = path.startswith(".generators") and now is None
+                    if not is_of_another_device and not _set_generator_state(now, state):
+                        raise ValueError(
+                            f"{name_of(path)} is no longer the kind of generator it was"
+                        )
+                case "unchanged", digest:
+                    if not isinstance(now, torch.Tensor) or _digest(now) != digest:
+                        raise ValueError(
+                            f"{name_of(path)} is not that of the run; did its homes or class "
+                            "change?"
+                        )
+                case "same", first:
+                    if _identity(now) != _identity(same := node_at(self.root, first)):
+                        self._replace(path, same)
+                case "array", data, dtype, shape:
+                    array = np.frombuffer(data.cpu().numpy().tobytes(), dtype).reshape(shape).copy()
+                    is_array = isinstance(now, np.ndarray) and now.flags.writeable
+                    if is_array and (now.dtype, now.shape) == (array.dtype, array.shape):
+                        now[...] = array
+                    else:
+                        self._replace(path, array)
+                case "tensor", value, device:
+                    self._set_tensor(path, now, value, device, written)
 
     def _set_value(self, path, now, value) -> None:
         if type(now) is type(value) and now == value:
@@ -197,7 +207,7 @@ class EnvState:
             written.add(_identity(now))
             return
         owner = node_at(self.root, _parent(path))
-        is_fixed = isinstance(now, torch.Tensor) and _is_ours(owner) and not _is_dict(owner)
+        is_fixed = isinstance(now, torch.Tensor) and _is_ours(owner) and not isinstance(owner, dict)
         if is_fixed and now.shape != value.shape:  # of another version of megastep
             shapes = f"was {tuple(value.shape)} and is {tuple(now.shape)}"
             raise ValueError(f"the shape of {name_of(path)} {shapes}")
@@ -232,7 +242,7 @@ class EnvState:
         while stack:
             path, node, is_users = stack.pop()
             yield path, node, is_users
-            is_leaf = isinstance(node, (*_NUMBERS, *_CONSTANT, *_STATEFUL))
+            is_leaf = isinstance(node, (*_SCALARS, *_CONSTANT, *_STATEFUL))
             if is_leaf or id(node) in visited or (is_users and _is_plain(node)):
                 continue
             visited.add(id(node))
@@ -249,24 +259,6 @@ def way_back(env: Env) -> Callable[[], None]:
     return lambda: state.load_state_dict(first)
 
 
-def record_of(node, is_users) -> tuple | None:
-    """Returns the record of a node that is no tensor, None if it has none."""
-    if isinstance(node, _GENERATORS):
-        return "generator", _generator_state(node)
-    if isinstance(node, np.ndarray):
-        if not _is_savable(node.dtype):
-            return None
-        data = torch.from_numpy(np.frombuffer(node.tobytes(), np.uint8).copy())
-        return "array", data, node.dtype.str, node.shape
-    if not is_users or isinstance(node, torch.Tensor):
-        return None
-    if _is_plain(node):
-        return "value", _encoded(node)
-    if isinstance(node, _LISTS):
-        return "list", len(node)
-    return ("dict", _encoded([*node])) if _is_dict(node) else None
-
-
 def _tree(kind, tree, function) -> Any:
     """Returns a tree whose dicts are of another kind, with ``function(leaf)`` of each leaf."""
     if not isinstance(tree, dict):
@@ -278,8 +270,9 @@ def as_bytes(tensor) -> torch.Tensor:
     return tensor.detach().cpu().contiguous().view(-1).view(torch.uint8)
 
 
-def is_writable(node) -> bool:
-    return isinstance(node, torch.Tensor) and not isinstance(node, ReadOnlyTensor)
+def _is_writable(node) -> bool:
+    is_tensor = isinstance(node, torch.Tensor) and not isinstance(node, ReadOnlyTensor)
+    return is_tensor and node.layout == torch.strided
 
 
 def _is_ours(node) -> bool:
@@ -295,15 +288,11 @@ def _is_reached(node) -> bool:
     return isinstance(node, known) or _is_plain(node) or hasattr(node, "__dict__")
 
 
-def _is_dict(node) -> bool:
-    return isinstance(node, dict) and _is_plain([*node])
-
-
 def _is_plain(node) -> bool:
     if type(node) in _CONTAINERS:
         parts = [*node, *node.values()] if type(node) is dict else node
         return all(map(_is_plain, parts))
-    return isinstance(node, _NUMBERS)
+    return isinstance(node, _SCALARS)
 
 
 def _is_savable(dtype) -> bool:

@@ -1,11 +1,11 @@
 """What a function changes that steps an environment, and that no CUDA graph repeats."""
 
-import contextlib
 import re
 
 import torch
 
-from megastep.env_state import LARGE, EnvState, as_bytes, is_writable, name_of, record_of
+from megastep.engine.state_tree import node_at
+from megastep.env_state import GENERATORS, LARGE, EnvState, as_bytes, name_of
 from megastep.types import Env
 
 __all__ = ["HostState"]
@@ -24,21 +24,11 @@ class HostState(EnvState):
 
     def __init__(self, env: Env, policies: object = None):
         super().__init__(env, policies)
-        self.before = self._host_records()
-
-    def _host_records(self) -> dict[str, tuple]:
-        records = {}
-        is_on_gpu = torch.device(self.env.device).type == "cuda"
-        for path, node, is_users in self._nodes():
-            is_frozen = is_on_gpu and getattr(node, "device", None) == torch.device("cpu")
-            with contextlib.suppress(TypeError, ValueError, RuntimeError):  # of rare kinds
-                if isinstance(node, torch.Generator):
-                    records[path] = "generator" if is_frozen else "repeated", node.get_state()
-                elif not isinstance(node, torch.Tensor):
-                    records[path] = record_of(node, is_users)
-                elif is_frozen and node.nbytes < LARGE and is_writable(node):
-                    records[path] = "frozen", as_bytes(node).clone()
-        return {path: record for path, record in records.items() if record}
+        self.is_on_gpu = torch.device(env.device).type == "cuda"
+        self.before = self._records()
+        for path, (kind, *parts) in self.before.items():
+            if kind == "tensor":  # what else changes is a copy
+                self.before[path] = "tensor", parts[0].clone() if self._is_frozen(path) else None
 
     def changed(self) -> str | None:
         """Returns the name of something that has changed: a plain value, an array, the length of a
@@ -47,7 +37,7 @@ class HostState(EnvState):
         """
         if not any(is_users for *_, is_users in self._nodes()):
             return None
-        was, now = _comparable(self.before), _comparable(self._host_records())
+        was, now = self._comparable(self.before), self._comparable(self._records())
         changed = sorted(path for path in {*was, *now} if was.get(path) != now.get(path))
         if not changed:
             return None
@@ -56,20 +46,33 @@ class HostState(EnvState):
 
     def restore(self) -> None:
         """Puts all back, but for the lengths of lists and tensors."""
-        now, kinds = self._host_records(), ("array", "generator", "repeated")
+        now = self._records()
         for path, record in self.before.items():
             has_changed = record[0] == "value" and repr(now.get(path)) != repr(record)
-            if has_changed or record[0] in kinds:
+            if has_changed or record[0] in ("array", "generator"):
                 self._load({path: record})
 
+    def _comparable(self, records) -> dict[str, list]:
+        """Returns {name: what is equal for equal values} of what no graph repeats."""
+        comparable = {}
+        for path, (kind, *parts) in records.items():
+            name = f"{path} (its length)" if kind == "list" else path
+            if kind in ("value", "array", "list") or self._is_frozen(path):
+                parts = parts[:1] if kind == "tensor" else parts
+                comparable[name] = [
+                    as_bytes(part).numpy().tobytes()
+                    if isinstance(part, torch.Tensor)
+                    else repr(part)
+                    for part in parts
+                ]
+        return comparable
 
-def _comparable(records) -> dict[str, list]:
-    """Returns {name: what is equal for equal values} of what no graph repeats."""
-    return {
-        f"{path} (its length)" if kind == "list" else path: [
-            part.numpy().tobytes() if isinstance(part, torch.Tensor) else repr(part)
-            for part in parts
-        ]
-        for path, (kind, *parts) in records.items()
-        if kind in ("value", "array", "list", "generator", "frozen")
-    }
+    def _is_frozen(self, path) -> bool:
+        """Returns whether a graph repeats nothing there: a tensor or generator on the wrong device,
+        or a generator that is not PyTorch's.
+        """
+        node = node_at(self.root, path)
+        if isinstance(node, (torch.Tensor, torch.Generator)):
+            is_small = isinstance(node, torch.Generator) or node.nbytes < LARGE
+            return self.is_on_gpu and node.device == torch.device("cpu") and is_small
+        return isinstance(node, GENERATORS)

@@ -1,7 +1,8 @@
-"""Environments of Gymnasium that step one after the other in one process. Workers import this file,
-so without PyTorch.
+"""Environments that step one after the other in one process. Workers import this file, so without
+PyTorch.
 """
 
+import itertools
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -31,27 +32,91 @@ def make_env(spec: Any, wrappers: Sequence[Callable], settings: dict) -> gymnasi
 
 
 class Hosted:
-    """Environments in this process, of Gymnasium or PettingZoo.
+    """N environments of A agents in this process, B = N A lanes. The step after all agents of an
+    environment have ended resets it. Arrays that are returned are valid until the next call.
 
-    Attributes:
+    A subclass has `_begin` and `_step`, which fill the rows of an environment's lanes.
+
+    Args:
         envs: the environments.
-        first: number of the first in messages.
+        spaces: of one lane's observation and action.
         found: what a probe has found about them.
-        n_to_check: steps in which the form of what they return is still checked.
+        check: checks the form of what they return in the first `CHECKED_STEPS`.
+        n_agents: lanes per environment, A.
+        first: number of the first in messages.
     """
 
     HAS_PLAIN_STATE = True  # see :mod:`megastep.env_state`
     max_episode_steps: int | None = None
-    first = 0
-    envs: list[Any]
-    metadata: dict[str, Any]
-    render_mode: str | None
-    single_observation_space: Space
-    single_action_space: Space
 
-    def __init__(self, found: Probe | None, check: bool):
-        self.found, self.n_to_check = found or Probe(), CHECKED_STEPS if check else 0
+    def __init__(
+        self,
+        envs: list[Any],
+        spaces: tuple[Space, Space],
+        found: Probe,
+        check: bool,
+        n_agents: int = 1,
+        first: int = 0,
+    ):
+        self.envs, self.found, self.n_agents, self.first = envs, found, n_agents, first
+        self.n_to_check = CHECKED_STEPS if check else 0
+        self.metadata, self.render_mode = envs[0].metadata, getattr(envs[0], "render_mode", None)
+        self.single_observation_space, self.single_action_space = spaces
+        n = len(envs) * n_agents
+        self.actions = batch_space(self.single_action_space, n)
+        self.batch = create_empty_array(self.single_observation_space, n)
+        self.latest: list[Tree] = [None] * n  # observations
+        self.rewards = np.zeros(n)
+        self.terminated, self.truncated = np.zeros(n, bool), np.zeros(n, bool)
+        self.masks = np.ones((n, max(0, found.n_masked)), bool)
+        self.ended = np.ones(len(envs), bool)
+        self.infos: dict[str, Any] = {"action_mask": self.masks}
         self.frozen: Tree = None  # a state of the wrappers that does not change
+
+    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
+        """Resets every environment. Returns (observations, infos)."""
+        self.ended[:] = True
+        obs, *_, infos = self._advance(itertools.repeat(()), seed)
+        return obs, infos
+
+    def step(self, actions: Tree) -> tuple:
+        """Takes one step. Returns (observations, rewards, terminated, truncated, infos). Infos have
+        `action_mask`, (B, found.n_masked) bool.
+        """
+        return self._advance(zip(*[iter(iterate(self.actions, actions))] * self.n_agents))
+
+    def _advance(self, actions, seeds=None) -> tuple:
+        """Resets environments whose episodes have ended, and steps the others."""
+        e = 0
+        try:
+            for e, (begins, chosen) in enumerate(zip(self.ended.tolist(), actions)):
+                if begins:
+                    self._begin(e, {"seed": int(seeds[e])} if seeds else {})
+                else:
+                    self._step(e, chosen)
+        except (EnvError, MemoryError):
+            raise
+        except Exception as error:
+            raise EnvError.of(error, self._name(e)) from error
+        self.n_to_check = max(0, self.n_to_check - 1)
+        obs = concatenate(self.single_observation_space, self.latest, self.batch)
+        return obs, self.rewards, self.terminated, self.truncated, self.infos
+
+    def _begin(self, e, settings) -> None:
+        raise NotImplementedError
+
+    def _step(self, e, chosen) -> None:
+        raise NotImplementedError
+
+    def _checked(self, e, method, result, agents=None) -> Any:
+        """Returns what environment e returned. Raises BadValue if its form is wrong."""
+        space = self.single_observation_space
+        if self.n_to_check and (clause := problem(method, result, space, agents)):
+            raise BadValue.of(clause, self._name(e))
+        return result
+
+    def _name(self, e) -> str:
+        return f"environment {self.first + e}"
 
     def wrapper_state(self) -> Tree:
         """Returns what the wrappers of the first environment have learnt, by path."""
@@ -93,23 +158,10 @@ class Hosted:
         if errors:
             raise errors[0]
 
-    def _checked(self, e, method, result, agents=None) -> Any:
-        """Returns what environment e returned. Raises BadValue if its form is wrong."""
-        space = self.single_observation_space
-        if self.n_to_check and (clause := problem(method, result, space, agents)):
-            raise BadValue.of(clause, self._name(e))
-        return result
-
-    def _name(self, e) -> str:
-        return f"environment {self.first + e}"
-
 
 class HostedEnvs(Hosted):
-    """N environments of Gymnasium, each with global generators of its own. The step after an
-    episode's end resets it. Infos have
-
-    - `numbers`: (N, len(found.names)), of an environment's last episode, nan where there is none
-    - `action_mask`: (N, found.n_masked) bool
+    """N environments of Gymnasium, each with global generators of its own. Infos also have
+    `numbers`, (N, len(found.names)) of an environment's last episode, nan where there is none.
 
     Args:
         make: makes one environment.
@@ -117,7 +169,7 @@ class HostedEnvs(Hosted):
         first: number of the first in messages and for its seeds.
         found: what a probe has found.
         seed: of the global generators.
-        check: checks the form of what they return in the first `CHECKED_STEPS`.
+        check: as for `Hosted`.
     """
 
     def __init__(
@@ -129,66 +181,37 @@ class HostedEnvs(Hosted):
         seed: int = 0,
         check: bool = True,
     ):
-        super().__init__(found, check)
-        self.first, self.envs, self.generators = first, [], []
+        envs, self.generators, found = [], [], found or Probe()
         for number in range(first, first + n_envs):
             generators = GlobalGenerators([seed, number])
             with generators.installed(KINDS):
-                self.envs.append(make())
-            generators.drop({*KINDS} - {*self.found.generators})  # checkpoints do not hold them
+                envs.append(make())
+            generators.drop({*KINDS} - {*found.generators})  # checkpoints do not hold them
             self.generators.append(generators)
-        env = self.envs[0]
-        self.metadata, self.render_mode = env.metadata, env.render_mode
-        self.single_observation_space = env.observation_space
-        self.single_action_space = env.action_space
-        self.actions = batch_space(env.action_space, n_envs)
-        self.latest: list[Tree] = [None] * n_envs
-        self.batch = create_empty_array(env.observation_space, n_envs)
-        self.rewards, self.ended = np.zeros(n_envs), np.zeros(n_envs, bool)
-        self.terminated, self.truncated = np.zeros(n_envs, bool), np.zeros(n_envs, bool)
-        self.numbers = np.zeros((n_envs, len(self.found.names)))
-        self.masks = np.ones((n_envs, max(0, self.found.n_masked)), bool)
+        spaces = envs[0].observation_space, envs[0].action_space
+        super().__init__(envs, spaces, found, check, first=first)
+        self.numbers = self.infos["numbers"] = np.zeros((n_envs, len(found.names)))
 
-    def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Tree, dict]:
-        """Resets every environment. Returns (observations, infos)."""
-        self.ended[:] = True
-        obs, *_, infos = self._advance([None] * len(self.envs), seed)
-        return obs, infos
+    def _begin(self, e, settings) -> None:
+        self.latest[e], info = self._call(e, "reset", **settings)
+        self.rewards[e] = self.terminated[e] = self.truncated[e] = self.ended[e] = 0
+        if self.found.n_masked > 0:
+            self.masks[e] = allowed_actions(info, self.found.n_masked, self._name(e))
 
-    def step(self, actions: Tree) -> tuple:
-        """Takes one step. Returns (observations, rewards, terminated, truncated, infos), which are
-        valid until the next call.
-        """
-        return self._advance(iterate(self.actions, actions))
-
-    def _advance(self, actions, seeds=None) -> tuple:
-        """Resets environments whose episodes have ended, and steps the others."""
-        latest, rewards = self.latest, self.rewards
-        terminated, truncated = flags = self.terminated, self.truncated
-        is_watched = bool(self.found.generators or self.frozen or self.n_to_check)
-        n_masked, e = self.masks.shape[1], 0
-        try:
-            for e, (action, begins) in enumerate(zip(actions, self.ended.tolist())):
-                if begins:
-                    settings = {"seed": int(seeds[e])} if seeds else {}
-                    latest[e], info = self._call(e, "reset", **settings)
-                    rewards[e] = terminated[e] = truncated[e] = 0
-                else:
-                    env = self.envs[e]
-                    result = self._call(e, "step", action) if is_watched else env.step(action)
-                    latest[e], rewards[e], terminated[e], truncated[e], info = result
-                    if self.found.names and (terminated[e] or truncated[e]):
-                        self._keep_numbers(e, info)
-                if n_masked:
-                    self.masks[e] = allowed_actions(info, n_masked, self._name(e))
-        except (EnvError, MemoryError):
-            raise
-        except Exception as error:
-            raise EnvError.of(error, self._name(e)) from error
-        self.n_to_check = max(0, self.n_to_check - 1)
-        np.logical_or(*flags, out=self.ended)
-        obs = concatenate(self.single_observation_space, latest, self.batch)
-        return obs, rewards, *flags, {"numbers": self.numbers, "action_mask": self.masks}
+    def _step(self, e, chosen) -> None:
+        found, env = self.found, self.envs[e]
+        is_watched = found.generators or self.frozen or self.n_to_check
+        result = self._call(e, "step", *chosen) if is_watched else env.step(*chosen)
+        self.latest[e], self.rewards[e], terminated, truncated, info = result
+        self.terminated[e], self.truncated[e] = terminated, truncated
+        self.ended[e] = is_over = terminated or truncated
+        if is_over and found.names:
+            numbers = numbers_of(info)
+            if recorder := RewardRecorder.inside(env):
+                numbers[TRUE_RETURN] = recorder.recorded_return
+            self.numbers[e] = [numbers.get(name, np.nan) for name in found.names]
+        if found.n_masked > 0:
+            self.masks[e] = allowed_actions(info, found.n_masked, self._name(e))
 
     def _call(self, e, method, *arguments, **settings) -> tuple:
         """Calls an environment, which draws from global generators of its own."""
@@ -197,9 +220,3 @@ class HostedEnvs(Hosted):
         if self.frozen:
             load_wrapper_state(self.envs[e], self.frozen)
         return self._checked(e, method, result)
-
-    def _keep_numbers(self, e, info) -> None:
-        numbers = numbers_of(info)
-        if recorder := RewardRecorder.inside(self.envs[e]):
-            numbers[TRUE_RETURN] = recorder.recorded_return
-        self.numbers[e] = [numbers.get(name, np.nan) for name in self.found.names]

@@ -3,17 +3,16 @@
 import copy
 import importlib
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+from gymnasium.vector.utils import batch_space, iterate
 
 from megastep.hosting.hosted import Hosted
 from megastep.hosting.probe import Probe
 from megastep.hosting.values import allowed_actions, masked_actions
-from megastep.types import Tree
 
 __all__ = ["ParallelEnvs"]
 
@@ -29,8 +28,9 @@ class ParallelEnvs(Hosted):
         wrappers: put around each, in this order.
 
     Attributes:
-        present: (N, A) bool, agents that act in the next step. An agent is not if the reset left it
-            out or its episode has ended, until it is among the environment's agents again.
+        present: (B,) bool, agents that act in the next step, also in infos. An agent is not if the
+            reset left it out or its episode has ended, until it is among the environment's agents
+            again.
     """
 
     def __init__(
@@ -41,34 +41,27 @@ class ParallelEnvs(Hosted):
         check: bool = True,
         wrappers: Sequence[Callable] = (),
     ):
-        super().__init__(None, check)
         parameters = inspect.signature(make).parameters
         if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             kwargs = {"render_mode": "rgb_array", **kwargs}
-
-        self.envs = []
+        envs = []
         for _ in range(n_envs):
             env = _parallel(make(**kwargs))
             for wrapper in wrappers:
                 env = wrapper(env)
-            self.envs.append(env)
-        self.render_mode, env = kwargs.get("render_mode"), self.envs[0]
-        self.agents, self.metadata = list(env.possible_agents), env.metadata
+            envs.append(env)
+        env = envs[0]
+        self.agents = list(env.possible_agents)
         first = env.reset()
-        self.single_observation_space = self._common(env.observation_space)
-        self.single_action_space = self._common(env.action_space)
-        n_lanes = n_envs * len(self.agents)
-        self.actions = batch_space(self.single_action_space, n_lanes)
-        self.batch = create_empty_array(self.single_observation_space, n_lanes)
-        lanes = batch_space(self.single_observation_space, n_lanes)
-        self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]  # observations
+        spaces = self._common(env.observation_space), self._common(env.action_space)
         masks = _masks(*first) if isinstance(first, tuple) and len(first) == 2 else {}
-        sizes = [masked_actions(self.single_action_space, one) for one in masks.values()]
-        self.found = Probe(n_masked=min(sizes, default=0))
-        self.masks = np.ones((n_lanes, max(0, self.found.n_masked)), bool)
-        shape = n_envs, len(self.agents)
-        self.reward, self.present = np.zeros(shape), np.zeros(shape, bool)
-        self.terminated, self.truncated = np.zeros(shape, bool), np.zeros(shape, bool)
+        sizes = [masked_actions(spaces[1], one) for one in masks.values()]
+        found = Probe(n_masked=min(sizes, default=0))
+        super().__init__(envs, spaces, found, check, len(self.agents))
+        self.render_mode = kwargs.get("render_mode")
+        lanes = batch_space(spaces[0], len(self.latest))
+        self.latest = [*iterate(lanes, copy.deepcopy(self.batch))]
+        self.present = self.infos["present"] = np.zeros(len(self.latest), bool)
 
     def _common(self, space_of) -> gymnasium.Space:
         first, *others = self.agents
@@ -79,62 +72,49 @@ class ParallelEnvs(Hosted):
                 )
         return space_of(first)
 
-    def reset(self, *, seed: list[int] | None = None) -> tuple[Tree, dict]:
-        for e in range(len(self.envs)):
-            self._begin(e, seed and seed[e])
-        obs, *_, infos = self._results()
-        return obs, infos
+    def _lanes(self, e) -> Iterator[tuple[int, Any]]:
+        """Yields the lane and the name of each agent of an environment."""
+        return enumerate(self.agents, e * self.n_agents)
 
-    def step(self, actions: Tree) -> tuple:
-        rows = iterate(self.actions, actions)
-        for e, env in enumerate(self.envs):
-            chosen = dict(zip(self.agents, rows))
-            if self.present[e].any():
-                self._step(e, {agent: chosen[agent] for agent in env.agents})
-            else:
-                self._begin(e)
-        return self._results()
-
-    def _begin(self, e, seed=None) -> None:
+    def _begin(self, e, settings) -> None:
         env = self.envs[e]
-        observed, infos = self._checked(e, "reset", env.reset(seed=seed), self.agents)
+        observed, infos = self._checked(e, "reset", env.reset(**settings), self.agents)
         self._observe(e, observed, infos)
-        self.reward[e] = self.terminated[e] = self.truncated[e] = 0
-        self.present[e] = [agent in env.agents and agent in observed for agent in self.agents]
+        for lane, agent in self._lanes(e):
+            self.rewards[lane] = self.terminated[lane] = self.truncated[lane] = 0
+            self.present[lane] = agent in env.agents and agent in observed
+        self.ended[e] = False
 
-    def _step(self, e, actions) -> None:
-        env = self.envs[e]
-        result = self._checked(e, "step", env.step(actions), self.agents)
-        observed, rewards, terminated, truncated, infos = result
+    def _step(self, e, chosen) -> None:
+        env, actions = self.envs[e], dict(zip(self.agents, chosen))
+        result = env.step({agent: actions[agent] for agent in env.agents})
+        observed, rewards, terminated, truncated, infos = self._checked(
+            e, "step", result, self.agents
+        )
         self._observe(e, observed, infos)
-        for a, agent in enumerate(self.agents):
-            was_present = self.present[e, a]
+        self.ended[e] = True
+        for lane, agent in self._lanes(e):
+            was_present = self.present[lane]
             ends, cut = (
                 bool(flags.get(agent, False) or flags.get("__all__", False))
                 for flags in (terminated, truncated)
             )
             is_here = agent in env.agents and agent in observed and not (ends or cut)
-            self.reward[e, a] = rewards.get(agent, 0.0) if was_present else 0.0
-            self.terminated[e, a] = was_present and ends
-            self.truncated[e, a] = was_present and not ends and not is_here
-            self.present[e, a] = is_here
+            self.rewards[lane] = rewards.get(agent, 0.0) if was_present else 0.0
+            self.terminated[lane] = was_present and ends
+            self.truncated[lane] = was_present and not ends and not is_here
+            self.present[lane] = is_here
+            self.ended[e] &= not is_here
 
     def _observe(self, e, observed, infos) -> None:
         n_masked = self.masks.shape[1]
         masks = _masks(observed, infos) if n_masked else {}
-        for a, agent in enumerate(self.agents, e * len(self.agents)):
+        for lane, agent in self._lanes(e):
             if agent in observed:
-                self.latest[a] = observed[agent]
+                self.latest[lane] = observed[agent]
             if n_masked:
                 place = f"environment {e}, {agent}"
-                self.masks[a] = allowed_actions(masks.get(agent, {}), n_masked, place)
-
-    def _results(self) -> tuple:
-        self.n_to_check = max(0, self.n_to_check - 1)
-        obs = concatenate(self.single_observation_space, self.latest, self.batch)
-        flags = self.terminated.ravel(), self.truncated.ravel()
-        infos = {"present": self.present.ravel(), "action_mask": self.masks}
-        return obs, self.reward.ravel(), *flags, infos
+                self.masks[lane] = allowed_actions(masks.get(agent, {}), n_masked, place)
 
 
 def _masks(observed, infos) -> dict[str, Mapping]:

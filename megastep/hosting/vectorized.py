@@ -64,8 +64,8 @@ class VectorizedEnv:
 
         self.id, self.vector, self.n_envs, self.n_agents = id, vector, n_envs, n_agents
         self.device = engine.device("auto" if device is None else device)
-        self._checks = check
         self._seeds: list | None = np.random.SeedSequence(seed).generate_state(n_envs).tolist()
+        self._checks, self._n_to_check = check, CHECKED_STEPS if check else 0
         self.fps = float(vector.metadata.get("render_fps") or 10)
         self.max_episode_steps = vector.max_episode_steps or MAX_EPISODE_STEPS
         try:
@@ -75,23 +75,20 @@ class VectorizedEnv:
             with contextlib.suppress(EnvError):
                 self.close()
             raise ValueError(f"{id}: {error}") from None
-        found = vector.found
+        found, problems = vector.found, []
         if left_out := found.names[MAX_NUMBERS:]:
-            warnings.warn(
-                f"{id}: the last info of an episode has {len(found.names)} numbers; {MAX_NUMBERS} "
-                f"become metrics, and {', '.join(left_out)} do not",
-                stacklevel=3,
+            problems.append(
+                f"the last info of an episode has {len(found.names)} numbers; {MAX_NUMBERS} "
+                f"become metrics, and {', '.join(left_out)} do not"
             )
         if found.n_masked < 0:
-            warnings.warn(
-                f"{id}: info['action_mask'] is not used: it must be a number per action of a "
-                "Discrete space",
-                stacklevel=3,
-            )
+            must = "it must be a number per action of a Discrete space"
+            problems.append(f"info['action_mask'] is not used: {must}")
+        for problem in problems:
+            warnings.warn(f"{id}: {problem}", stacklevel=3)
         self._metrics = identifiers(found.names[:MAX_NUMBERS], {*RESERVED_KEYS, *RESERVED})
         self._has_mask = found.n_masked > 0
         self._ended = np.ones(n_envs * n_agents, bool)
-        self._n_to_check = CHECKED_STEPS if check else 0
 
     def reset(self) -> arrdict:
         """Starts a new episode in every lane. Returns the first world. Raises EnvError."""
@@ -104,8 +101,14 @@ class VectorizedEnv:
         """Takes one step by ``decision["actions"]``. Returns a world. Raises EnvError."""
         chosen = decision["actions"]
         chosen = spaces.map(lambda _, leaf: leaf.cpu().numpy(), self.action_space, chosen)
-        if self._checks:
-            self._check_actions(chosen)
+        for path, leaf in spaces.leaves(chosen, "the action").items() if self._checks else ():
+            if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
+                lane = int(np.argwhere(~np.isfinite(leaf))[0][0])
+                raise BadValue.of(
+                    f"{path} for lane {lane} is not finite, so the policy's weights or "
+                    "observations are not",
+                    str(self.id),
+                )
         return self._world(*self._call(self.vector.step, self._write(chosen)))
 
     def wrapper_state(self) -> Tree:
@@ -118,11 +121,8 @@ class VectorizedEnv:
         """Gives the wrappers of all environments what those of others have learnt, which stays as
         it is if it `is_frozen`. Raises ValueError if they are not in such wrappers.
         """
-        state = {
-            path: value.cpu().numpy() if isinstance(value, torch.Tensor) else value
-            for path, value in state.items()
-        }
-        self.vector.load_wrapper_state(state, is_frozen)
+        tensors = {p: x.cpu().numpy() for p, x in state.items() if isinstance(x, torch.Tensor)}
+        self.vector.load_wrapper_state({**state, **tensors}, is_frozen)
 
     @functools.cached_property
     def resumable(self) -> bool:
@@ -145,9 +145,8 @@ class VectorizedEnv:
                 f"{self.id} renders no images: it has no render mode rgb_array, or env.kwargs "
                 "chooses another"
             )
-        frame = self._call(self.vector.render)[e]
         try:
-            return arrdict(frame=torch.from_numpy(as_frame(frame)))
+            return arrdict(frame=torch.from_numpy(as_frame(self._call(self.vector.render)[e])))
         except ValueError as error:
             raise ValueError(f"{self.id}: {error}") from None
 
@@ -166,16 +165,6 @@ class VectorizedEnv:
             raise
         except Exception as error:
             raise EnvError.of(error, f"{self.id}: an environment") from error
-
-    def _check_actions(self, tree) -> None:
-        for path, leaf in spaces.leaves(tree, "the action").items():
-            if leaf.dtype.kind == "f" and not np.isfinite(leaf).all():
-                lane = int(np.argwhere(~np.isfinite(leaf))[0][0])
-                raise BadValue.of(
-                    f"{path} for lane {lane} is not finite, so the policy's weights or "
-                    "observations are not",
-                    str(self.id),
-                )
 
     def _check_observations(self, obs) -> None:
         """Raises BadValue for those outside their space, and warns once of those beyond a Box."""
