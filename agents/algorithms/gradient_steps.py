@@ -61,10 +61,8 @@ class GradientSteps:
         return steps.end()
 
     With several ranks, gradients and metrics are those of all ranks' minibatches together, and all
-    take or skip the same steps.
-
-    Nothing changes if the rollout holds a NaN, an infinity or a number beyond `nonfinite.LIMIT`, or
-    if the gradient is not finite. Nothing synchronises: conditions are bool tensors on the device.
+    take or skip the same steps. Nothing changes if the rollout or the gradient is not finite, and
+    nothing synchronises: conditions are bool tensors on the device.
 
     Args:
         parameters: parameters to optimise.

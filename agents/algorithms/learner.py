@@ -1,4 +1,4 @@
-"""The contract of learners, and the base class of the built-in ones.
+"""The contract of learners, and the base classes of the built-in ones.
 
 A learner is the class behind `learner=module:Class`. It does not have to inherit from anything: it
 needs the attributes of `megastep.agents.types.Learner`, and is used like this:
@@ -9,24 +9,18 @@ needs the attributes of `megastep.agents.types.Learner`, and is used like this:
         rollout = collect()                      # T steps of B lanes
         losses = learner.update(rollout)         # scalar tensors by name
 
-Rules:
-
-- `collect()` returns a `megastep.agents.types.RolloutLike`; `storage.rollout.Rollout` is one. It
-  may return the same object every time. `collect.rollout` exists before the first call, too.
-- `collect()` and `update()` do not synchronise host and device.
+- `collect()` returns a `megastep.agents.types.RolloutLike`, which may be the same object every
+  time. `collect.rollout` exists before the first call, too. Neither it nor `update()` synchronises.
 - A learner with a `check`, a `nonfinite.NonFiniteCheck`, passes `rollout.floats()` to it in every
   `update()` and skips a rollout with non-finite numbers. The trainer stops after many skipped
   updates in a row. Without a check, a run stops before it saves weights that are not finite.
 - Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. An environment
   with opponents has an attribute `learners`, a bool per lane; only those lanes need to be stored.
 - `collector(env)` resets the environment before it returns: a run then gives the lanes random ages.
-- A collector that acts in the background may return an older rollout. It has a method `wait()`,
-  which blocks until nothing acts in the environment.
 - The constructor's arguments `seed` and `graph` are optional. `seed` receives the run's seed, which
   `generator.stream_seed(seed, name)` turns into that of a random stream of its own; `graph` is true
   if updates should be captured as a CUDA graph.
-- A replay buffer belongs to the learner or to its collector.
-- `megastep.agents.types.LearnerOptions` and `CollectorOptions` list what is optional.
+- `megastep.agents.types.LearnerOptions` and `CollectorOptions` list what else is optional.
 
 Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_rollout`,
 `storage.collector.Collector`, `gradient_steps.GradientSteps`, `cuda_graph.CudaGraphUpdate`,
@@ -34,7 +28,7 @@ Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_r
 """
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Annotated
 
 import torch
@@ -47,23 +41,24 @@ from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.agents.errors import UserError, shortened
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
-from megastep.agents.storage.rollout import Rollout, without_last
+from megastep.agents.storage.rollout import Rollout, make_rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.imports import known_name
 from megastep.schedules import Number, Scheduled
+from megastep.settings import MAX_ENVS, AtMost, checked
+from megastep.types import Env
 
 # Types of settings that several learners have.
 Coefficient = Annotated[float, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0, le=10**6)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
 # Those that may be schedules.
 ScheduledCoefficient = Annotated[Number, Scheduled(ge=0, le=10**6)]
 ScheduledPositive = Annotated[Number, Scheduled(gt=0, le=10**6)]
 ScheduledFraction = Annotated[Number, Scheduled(ge=0, le=1)]
-Warmup = Annotated[int, Field(ge=0, le=10**9)]
 OptimizerName = Annotated[
     str, AfterValidator(functools.partial(known_name, names=optimizers.NAMES))
 ]
@@ -91,26 +86,23 @@ def check_learner(learner: object) -> None:
 class GradientLearner:
     """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
 
-    A subclass adds its settings, `collector`, `bytes_per_env` and `_update`, and sets
-    `n_minibatches` if it splits lanes into minibatches. A subclass of one of the learners adds a
-    loss of its own by `extra_loss` and, for weights that acting does not need, `extra_parameters`.
+    A subclass adds its settings, `bytes_per_env` and `_update`, and sets `loss_coefficients` before
+    it calls this constructor. A subclass of one of the learners adds a loss of its own by
+    `extra_loss` and, for weights that acting does not need, `extra_parameters`.
 
     Args:
         policy: the policy to improve, in place.
+        n_steps: steps of a rollout, T.
         lr: step size. Like `gamma`, `lambda_`, the clips and the coefficients of the loss it is a
             number or a schedule.
-        max_grad_norm: longer gradients are scaled down to this norm.
-        graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
-        seed: seed of the minibatch order and of replay sampling.
-        critic_lr: step size of the critic's own parameters, those under "critic."; it falls
-            with `lr`. None: `lr`.
         weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
+        gamma: discount per step.
+        max_grad_norm: longer gradients are scaled down to this norm.
         optimizer: `adam` or `adamw`, one kernel on a GPU; or the import path of a class like those
             of `torch.optim`.
         warmup: updates over which the step size rises linearly to `lr`.
-        desired_kl: changes the step size after each minibatch so that its KL divergence stays near
-            this many nats (as in rsl_rl). None: it does not.
-        coefficients: numbers and schedules that the loss uses, by name.
+        graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
+        seed: seed of the minibatch order and of replay sampling.
 
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic.
@@ -119,38 +111,41 @@ class GradientLearner:
         loss/grad_norm: norm of the gradient before it is clipped.
         loss/skipped_steps: gradient steps skipped because of non-finite numbers.
 
-    Raises:
-        ValueError: `warmup` or a schedule of `lr` is combined with `desired_kl`.
-
     Attributes:
         coefficients: the `Coefficients` of the loss, and `lr`.
         steps: the `GradientSteps` of the policy's parameters.
         generator: the `SeededGenerator` of all random numbers in an update.
+        loss_coefficients: numbers and schedules of the loss by name, besides `gamma`.
     """
 
     n_minibatches = 1
+    loss_coefficients: dict[str, Number] = {}
+    critic_lr: float | None = None
+    desired_kl: float | None = None
     #: Reads the learning rate from the device, if the learner changes it itself.
     read_lr: Callable[[], float] | None = None
     _is_checked = False
 
+    @checked
     def __init__(
         self,
         policy: Policy,
-        lr: Number,
-        max_grad_norm: float,
-        graph: bool,
-        seed: int,
-        critic_lr: float | None = None,
-        weight_decay: float = 0.0,
-        optimizer: str = "adam",
-        warmup: int = 0,
-        desired_kl: float | None = None,
-        coefficients: Mapping[str, Number] = arrdict(),
+        *,
+        n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
+        lr: ScheduledPositive = 1e-3,
+        weight_decay: Coefficient = 0.0,
+        gamma: ScheduledFraction = 0.995,
+        max_grad_norm: Positive = 0.5,
+        optimizer: OptimizerName = "adam",
+        warmup: Annotated[int, Field(ge=0, le=10**9)] = 0,
+        graph: bool = False,
+        seed: int = 1,
     ):
-        self.policy, self.device = policy, policy.device
-        self.coefficients = Coefficients(policy.device, lr=lr, **coefficients)
-        self.lr, self.warmup, self.desired_kl = self.coefficients.values["lr"], warmup, desired_kl
-        if desired_kl is not None:
+        self.policy, self.device, self.n_steps = policy, policy.device, n_steps
+        numbers = dict(lr=lr, gamma=gamma, **self.loss_coefficients)
+        self.coefficients = Coefficients(policy.device, **numbers)
+        self.lr, self.warmup = self.coefficients.values["lr"], warmup
+        if self.desired_kl is not None:
             if warmup or "lr" in self.coefficients.schedules:
                 raise ValueError(
                     "desired_kl changes the learning rate, so it cannot be combined with warmup "
@@ -158,8 +153,8 @@ class GradientLearner:
                 )
             self.read_lr = self.coefficients.tensors["lr"].item
         factors = {}
-        if critic_lr is not None and policy.critic is not None:
-            factors = dict.fromkeys(policy.critic.parameters(), critic_lr / self.lr)
+        if self.critic_lr is not None and policy.critic is not None:
+            factors = dict.fromkeys(policy.critic.parameters(), self.critic_lr / self.lr)
         layers = (p for name, p in policy.named_parameters() if p.ndim > 1 and "weight" in name)
         self.extra = self._make_extra()
         self.steps = GradientSteps(
@@ -175,6 +170,11 @@ class GradientLearner:
         self.generator = SeededGenerator(stream_seed(seed, "learner"))
         graph = graph and self.optimizer.capturable
         self.cuda_graph = CudaGraphUpdate(self._update, self.device, graph, (self.generator,))
+
+    def collector(self, env: Env, values: bool = True) -> Collector:
+        """Returns a collector of rollouts of `n_steps` steps, with the critic's `values`."""
+        self.policy.clear_stats()
+        return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps, values))
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Learns from a rollout. Returns metrics as tensors () on the device, averaged over the
@@ -251,11 +251,8 @@ class GradientLearner:
     def extra_terms(
         self, features: torch.Tensor, batch: arrdict, taken: Iterable[str] = ()
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Returns `extra_loss`, checked, and its metrics without gradients.
-
-        Raises:
-            UserError: it fails, is not a scalar, teaches nothing, or has the name of another
-                metric, one of those `taken`.
+        """Returns `extra_loss`, checked, and its metrics without gradients. UserError if it fails,
+        is not a scalar, teaches nothing, or has the name of a metric `taken` by the learner.
         """
         name = f"{type(self).__name__}.extra_loss"
         try:
@@ -290,7 +287,7 @@ class GradientLearner:
 
     def state_dict(self) -> StateDict:
         """Returns optimizer, learning rate, coefficients and generators as plain tensors and
-        numbers, without the policy's weights, rollouts and what a replay buffer holds.
+        numbers, without the policy's weights, rollouts and a replay buffer.
         """
         return dict(
             learner=type(self).__name__,
@@ -316,18 +313,19 @@ class GradientLearner:
     def check_state(self, state: StateDict) -> None:
         """Raises ValueError if a `state_dict` is not one that `load_state_dict` continues from."""
         name = type(self).__name__
-        saved_name = state.get("learner", name)
-        if saved_name != name:
+        if (saved_name := state.get("learner", name)) != name:
             raise ValueError(
                 f"the state of a {saved_name} learner cannot be loaded by {name}: use "
                 f"{saved_name}, or start from the policy's weights alone (init=RUN)"
             )
-        saved_extra = [tuple(leaf.shape) for leaf in state.get("extra", [])]
-        own_extra = [tuple(leaf.shape) for leaf in self.extra]
-        if saved_extra != own_extra:
+        saved, own = (
+            [tuple(leaf.shape) for leaf in leaves]
+            for leaves in (state.get("extra", []), self.extra)
+        )
+        if saved != own:
             raise ValueError(
-                f"extra_parameters() have shapes {own_extra}, and those saved have {saved_extra}: "
-                f"continue with the same {name}"
+                f"extra_parameters() have shapes {own}, and those saved have {saved}: continue "
+                f"with the same {name}"
             )
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -345,18 +343,22 @@ class GradientLearner:
 
 
 class ActorCritic(GradientLearner):
-    """Base of PPO and V-trace.
+    """Base of PPO and V-trace. Its policy needs a critic, else ValueError.
 
     Args:
-        policy: a policy with a critic.
-        n_steps: steps of a rollout, T.
-        gamma: discount per step.
+        critic_lr: step size of the critic's own parameters, those under "critic."; it falls
+            with `lr`. None: `lr`.
+        lambda_: decay of GAE, or of V-trace's traces.
         entropy_coef: weight of the entropy bonus, relative to the advantages.
         value_coef: weight of the value's squared error, measured in the value's own scale.
         auxiliary_coef: weight of the policy's `prediction_error`, with an asymmetric critic.
         n_epochs: passes over a rollout.
         n_minibatches: minibatches per pass; lanes are divided among them.
-        settings: those of `GradientLearner`.
+        desired_kl: changes the step size after each minibatch so that its KL divergence stays near
+            this many nats (as in rsl_rl), without `warmup` or a schedule of `lr`. None: it does
+            not.
+
+    Other arguments are those of `GradientLearner`.
 
     Metrics:
         loss/policy: policy loss.
@@ -366,15 +368,29 @@ class ActorCritic(GradientLearner):
         loss/auxiliary: auxiliary loss of predicting the privileged observation.
         loss/kl: KL divergence from the acting policy, in nats.
         loss/explained_variance: fraction of the returns' variance that the value explains.
-
-    Raises:
-        ValueError: the policy has no critic.
     """
 
-    def __init__(self, policy: Policy, n_steps: int, n_epochs: int, n_minibatches: int, **settings):
+    @checked
+    def __init__(
+        self,
+        policy: Policy,
+        *,
+        critic_lr: Positive | None = None,
+        lambda_: ScheduledFraction = 0.95,
+        entropy_coef: ScheduledCoefficient = 0.01,
+        value_coef: ScheduledCoefficient = 0.5,
+        auxiliary_coef: ScheduledCoefficient = 0.5,
+        n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
+        desired_kl: Positive | None = None,
+        **settings,
+    ):
         if policy.critic is None:
             name = type(self).__name__
             raise ValueError(f"{name} needs a policy with a critic: use agent.output=softmax")
-        super().__init__(policy, **settings)
-        self.critic, self.n_steps = policy.critic, n_steps
+        self.critic, self.critic_lr, self.desired_kl = policy.critic, critic_lr, desired_kl
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
+        numbers = dict(lambda_=lambda_, entropy_coef=entropy_coef, value_coef=value_coef)
+        numbers |= dict(auxiliary_coef=auxiliary_coef)
+        self.loss_coefficients = numbers | self.loss_coefficients
+        super().__init__(policy, **settings)

@@ -6,10 +6,9 @@ synchronises: conditions are bool tensors on the device.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms import learner, returns
@@ -18,17 +17,11 @@ from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalis
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments, normalise_masked
-from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.rollout import (
-    SEQUENCES,
-    bytes_per_step,
-    make_rollout,
-    without_last,
-)
+from megastep.agents.storage.rollout import SEQUENCES, bytes_per_step, without_last
 from megastep.arrdict import arrdict
 from megastep.coefficients import on_device
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
-from megastep.settings import MAX_ENVS, AtMost, checked
+from megastep.settings import checked
 from megastep.types import Env, optional
 
 _PARTS = "starts", "actions", "logprobs", "mask"  # of a rollout, that a minibatch copies
@@ -136,7 +129,6 @@ class PPO(learner.ActorCritic):
     """Improves a policy, in place, from rollouts that it collected.
 
     Args:
-        lambda_: lambda of GAE.
         clip: how far the probability ratio of an action may move from 1 before its gradient stops.
         value_clip: how far the value may move from that at the time of acting before its gradient
             stops, in the value's own scale (as in OpenAI Baselines). None: any distance.
@@ -156,41 +148,16 @@ class PPO(learner.ActorCritic):
         self,
         policy: Policy,
         *,
-        n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: learner.ScheduledPositive = 1e-3,
-        critic_lr: learner.Positive | None = None,
-        weight_decay: learner.Coefficient = 0.0,
-        gamma: learner.ScheduledFraction = 0.995,
-        lambda_: learner.ScheduledFraction = 0.95,
         clip: learner.ScheduledPositive = 0.2,
         value_clip: learner.Positive | None = None,
         normalise_advantage: Literal["rollout", "minibatch", "none"] = "rollout",
-        entropy_coef: learner.ScheduledCoefficient = 0.01,
-        value_coef: learner.ScheduledCoefficient = 0.5,
-        auxiliary_coef: learner.ScheduledCoefficient = 0.5,
-        max_grad_norm: learner.Positive = 0.5,
-        n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
         target_kl: learner.Positive | None = None,
-        optimizer: learner.OptimizerName = "adam",
-        warmup: learner.Warmup = 0,
-        desired_kl: learner.Positive | None = None,
-        graph: bool = False,
-        seed: int = 1,
+        **settings,
     ):
-        coefficients = dict(gamma=gamma, lambda_=lambda_, clip=clip, value_coef=value_coef)
-        coefficients |= dict(entropy_coef=entropy_coef, auxiliary_coef=auxiliary_coef)
-        settings = dict(lr=lr, critic_lr=critic_lr, max_grad_norm=max_grad_norm, warmup=warmup)
-        settings |= dict(weight_decay=weight_decay, optimizer=optimizer, desired_kl=desired_kl)
-        settings |= dict(graph=graph, seed=seed, coefficients=coefficients)
-        super().__init__(policy, n_steps, n_epochs, n_minibatches, **settings)
+        self.loss_coefficients = dict(clip=clip)
+        super().__init__(policy, **settings)
         self.value_clip, self.target_kl = value_clip, target_kl
         self.normalise_advantage = normalise_advantage
-
-    def collector(self, env: Env) -> Collector:
-        """Returns a collector of rollouts of `n_steps` steps."""
-        self.policy.clear_stats()
-        return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps))
 
     def bytes_per_env(self, env: Env) -> float:
         """Returns about how many bytes a rollout and a minibatch take per environment."""

@@ -22,8 +22,8 @@ from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.replay import (
     ReplayBuffer,
     ReplaySettings,
-    bytes_per_observation,
     defaults_from,
+    replay_size,
 )
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
 from megastep.agents.types import StateDict
@@ -195,8 +195,6 @@ class R2D2(learner.GradientLearner):
 
     Args:
         policy: a policy with `output="duelling"`.
-        n_steps: steps of a rollout, T.
-        gamma: discount per step.
         return_steps: n of the n-step returns, the rewards summed before bootstrapping.
         target_period: gradient steps between two copies of the weights to the target network.
         epsilon: probability of a random action in lane 0.
@@ -214,9 +212,8 @@ class R2D2(learner.GradientLearner):
         loss/priority_max: largest priority of the stored sequences.
         loss/priority_mean: mean priority of the stored sequences.
 
-    A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
-    statistic, and is never drawn. `state_dict` does not include the replay buffer, which has one
-    of its own.
+    A rollout with a number that is not finite is never drawn. Other arguments and metrics are those
+    of `GradientLearner`.
     """
 
     @checked
@@ -224,32 +221,23 @@ class R2D2(learner.GradientLearner):
         self,
         policy: Policy,
         *,
-        n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: learner.ScheduledPositive = 1e-3,
-        weight_decay: learner.Coefficient = 0.0,
-        gamma: learner.ScheduledFraction = 0.995,
         return_steps: Annotated[int, Field(ge=1, le=1000)] = 10,
         target_period: Annotated[int, Field(ge=1, le=10**6)] = 200,
         epsilon: Annotated[float, Field(gt=0, le=1)] = 0.4,
         epsilon_spread: Annotated[float, Field(ge=0, le=100)] = 3.0,
-        eta: learner.Fraction = 0.9,
+        eta: Annotated[float, Field(ge=0, le=1)] = 0.9,
         max_grad_norm: learner.Positive = 10.0,
-        optimizer: learner.OptimizerName = "adam",
-        warmup: learner.Warmup = 0,
         gradient_steps: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 16,
         replay: Annotated[ReplaySettings, defaults_from(REPLAY)] = REPLAY,
-        graph: bool = False,
-        seed: int = 1,
+        **settings,
     ):
         if policy.output_kind != "duelling":
             raise ValueError("R2D2 needs a policy of action values: use agent.output=duelling")
-        settings = None, weight_decay, optimizer, warmup, None, dict(gamma=gamma)
-        super().__init__(policy, lr, max_grad_norm, graph, seed, *settings)
-        self.n_steps, self.target_period = n_steps, target_period
-        self.return_steps, self.eta = return_steps, eta
+        super().__init__(policy, max_grad_norm=max_grad_norm, **settings)
+        self.target_period, self.return_steps, self.eta = target_period, return_steps, eta
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread
         self.gradient_steps, self.replay_settings = gradient_steps, replay
-        self.length = n_steps + replay.burn_in
+        self.length = self.n_steps + replay.burn_in
         self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
         self.target = policy.actor()
         weights = policy.state_dict()
@@ -262,15 +250,12 @@ class R2D2(learner.GradientLearner):
         on_gpu = self.device.type == "cuda"
         self._beside = torch.cuda.Stream(self.device) if on_gpu else None
 
-    def collector(self, env: Env) -> Collector:
+    def collector(self, env: Env, values: bool = False) -> Collector:
         """Returns an epsilon-greedy collector of rollouts of `n_steps` steps, and allocates the
-        replay buffer.
-
-        Raises:
-            ValueError: if the replay buffer is too small, or a gradient step has no sequence.
+        replay buffer. ValueError if that is too small, or a gradient step has no sequence.
         """
         self.policy.clear_stats()
-        rollout = make_rollout(env, self.policy, self.n_steps, values=False)
+        rollout = make_rollout(env, self.policy, self.n_steps, values)
         ratio, n_lanes = self.replay_settings.ratio, rollout.n_lanes
         if ratio * n_lanes < self.gradient_steps:
             raise ValueError(
@@ -297,8 +282,7 @@ class R2D2(learner.GradientLearner):
         observation.
         """
         settings = self.replay_settings
-        n_bytes = bytes_per_observation(env, self.policy, self.n_steps, settings, logprobs=False)
-        return settings.capacity, n_bytes
+        return replay_size(env, self.policy, self.n_steps, settings, logprobs=False)
 
     def _update(self, rollout) -> dict[str, torch.Tensor]:
         replay = self.replay_buffer

@@ -7,10 +7,9 @@ replayed sequences if there is a replay buffer. Means are over valid steps: thos
 environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field
 
 from megastep.agents.algorithms import learner, returns
 from megastep.agents.algorithms.masked_stats import (
@@ -23,11 +22,11 @@ from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings, bytes_per_observation
-from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings, replay_size
+from megastep.agents.storage.rollout import bytes_per_step, without_last
 from megastep.arrdict import arrdict, cat
 from megastep.dotdict import mapping
-from megastep.settings import MAX_ENVS, AtMost, checked
+from megastep.settings import checked
 from megastep.types import Env, optional
 
 # Metrics count larger ratios as e^20, so that their squares stay finite.
@@ -47,7 +46,6 @@ class VTrace(learner.ActorCritic):
     all actions are about equally good.
 
     Args:
-        lambda_: decay of the traces.
         rho_clip: truncation of the ratios in the policy's gradient and the value's error. At 1,
             actions that became more likely have weight 1.
         c_clip: truncation of the ratios in the traces.
@@ -74,51 +72,28 @@ class VTrace(learner.ActorCritic):
         self,
         policy: Policy,
         *,
-        n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
-        lr: learner.ScheduledPositive = 1e-3,
-        critic_lr: learner.Positive | None = None,
-        weight_decay: learner.Coefficient = 0.0,
-        gamma: learner.ScheduledFraction = 0.995,
-        lambda_: learner.ScheduledFraction = 0.95,
         rho_clip: learner.ScheduledPositive = 1.0,
         c_clip: learner.ScheduledPositive = 1.0,
         advantage_floor: learner.Positive = 0.1,
-        entropy_coef: learner.ScheduledCoefficient = 0.01,
-        value_coef: learner.ScheduledCoefficient = 0.5,
-        auxiliary_coef: learner.ScheduledCoefficient = 0.5,
-        max_grad_norm: learner.Positive = 0.5,
-        n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
-        optimizer: learner.OptimizerName = "adam",
-        warmup: learner.Warmup = 0,
-        desired_kl: learner.Positive | None = None,
         buffer: Literal["rollout", "replay"] = "rollout",
         replay: ReplaySettings = _REPLAY,
-        graph: bool = False,
-        seed: int = 1,
+        **settings,
     ):
         if buffer == "rollout" and replay != _REPLAY:
             raise ValueError("replay settings need buffer=replay, but buffer=rollout")
-        coefficients = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
-        coefficients |= dict(entropy_coef=entropy_coef, value_coef=value_coef)
-        coefficients["auxiliary_coef"] = auxiliary_coef
-        settings = dict(lr=lr, critic_lr=critic_lr, max_grad_norm=max_grad_norm, warmup=warmup)
-        settings |= dict(weight_decay=weight_decay, optimizer=optimizer, desired_kl=desired_kl)
-        settings |= dict(graph=graph, seed=seed, coefficients=coefficients)
-        super().__init__(policy, n_steps, n_epochs, n_minibatches, **settings)
+        self.loss_coefficients = dict(rho_clip=rho_clip, c_clip=c_clip)
+        super().__init__(policy, **settings)
         self.advantage_floor = advantage_floor
         self.replay_settings = replay if buffer == "replay" else None
         self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
 
-    def collector(self, env: Env) -> Collector:
+    def collector(self, env: Env, values: bool = False) -> Collector:
         """Returns a collector of rollouts of `n_steps` steps, and allocates the replay buffer.
         ValueError if that is too small.
         """
-        self.policy.clear_stats()
-        rollout = make_rollout(env, self.policy, self.n_steps, values=False)
-        collect = Collector(env, self.policy, rollout)  # allocates the rollout's optional parts
+        collect = super().collector(env, values)  # allocates the rollout's optional parts
         if self.replay_settings:
-            self.replay_buffer = ReplayBuffer(rollout, self.replay_settings)
+            self.replay_buffer = ReplayBuffer(collect.rollout, self.replay_settings)
         return collect
 
     def bytes_per_env(self, env: Env) -> float:
@@ -135,10 +110,9 @@ class VTrace(learner.ActorCritic):
         """Returns the number of observations that the replay buffer will hold, and the bytes per
         observation; zeros without a replay buffer.
         """
-        settings = self.replay_settings
-        if settings is None:
+        if self.replay_settings is None:
             return 0, 0.0
-        return settings.capacity, bytes_per_observation(env, self.policy, self.n_steps, settings)
+        return replay_size(env, self.policy, self.n_steps, self.replay_settings)
 
     def _update(self, rollout) -> dict[str, torch.Tensor]:
         of_own_rewards = masked_moments(~rollout.reset, rollout.reward)

@@ -316,12 +316,12 @@ class ReplayBuffer:
         copy_tree(self.state_dict(), state)
 
 
-def bytes_per_observation(
+def replay_size(
     env: Env, policy: Policy, n_steps: int, settings: ReplaySettings, logprobs: bool = True
-) -> float:
-    """Returns the size in bytes of a replay buffer per observation, everything included."""
+) -> tuple[int, float]:
+    """Returns the number of observations that a replay buffer will hold, and its bytes for each."""
     meta = torch.device("meta")
     state, of_env = policy.initial(1, meta), (env.obs_space, env.action_space)
     rollout = Rollout(n_steps, 1, *of_env, state, meta, policy.privileged_space, values=False)
     replay_buffer = ReplayBuffer(rollout, settings, logprobs)
-    return replay_buffer.bytes / replay_buffer.capacity
+    return settings.capacity, replay_buffer.bytes / replay_buffer.capacity
