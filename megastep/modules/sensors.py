@@ -148,4 +148,12 @@ class IMU:
         """Draws a numpyified :meth:`state` as three bars per agent on ``ax``, by default on a new
         figure. Returns the axes.
         """
-        return plotting.plot_bars(("turn", "ahead", "left"), state, ax)
+        if ax is None:
+            from matplotlib import pyplot
+
+            ax = pyplot.subplots(figsize=(3, 1.5), layout="constrained")[1]
+        for a, agent in enumerate(state):
+            ax.bar(np.arange(3) + 0.8 * (a + 0.5) / len(state) - 0.4, agent, 0.8 / len(state))
+        ax.set_xticks(range(3), ["turn", "ahead", "left"], fontsize="x-small")
+        ax.set_ylim(-1, 1)
+        return ax

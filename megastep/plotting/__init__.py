@@ -11,67 +11,30 @@ A agents, C channels, H rows and W columns, L lines, K lights, R rays.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from megastep.colour import gamma_decode, gamma_encode
-from megastep.plotting.images import STRIP, camera_colours, plot_bars, plot_images
-from megastep.plotting.marks import (
-    plot_agent,
-    plot_goal,
-    plot_object,
-    plot_shot,
-    plot_trail,
-    plot_view,
-    view_polygon,
-)
-from megastep.plotting.plans import plot_scenery, wall_colours
-from megastep.plotting.styles import AGENTS, Style, current, styled
-
 if TYPE_CHECKING:
-    from megastep.plotting.pictures import (
-        Area,
-        Picture,
-        captioned,
-        encoded,
-        framed,
-        panels,
-        plot_level,
-        rasterise,
-        side_by_side,
-    )
+    from megastep.colour import *  # noqa: F403
+    from megastep.plotting.images import *  # noqa: F403
+    from megastep.plotting.marks import *  # noqa: F403
+    from megastep.plotting.pictures import *  # noqa: F403
+    from megastep.plotting.plans import *  # noqa: F403
+    from megastep.plotting.styles import *  # noqa: F403
 
-__all__ = [
-    "AGENTS",
-    "STRIP",
-    "Area",
-    "Picture",
-    "Style",
-    "camera_colours",
-    "captioned",
-    "encoded",
-    "framed",
-    "current",
-    "gamma_decode",
-    "gamma_encode",
-    "panels",
-    "plot_agent",
-    "plot_bars",
-    "plot_goal",
-    "plot_images",
-    "plot_level",
-    "plot_object",
-    "plot_scenery",
-    "plot_shot",
-    "plot_trail",
-    "plot_view",
-    "rasterise",
-    "side_by_side",
-    "styled",
+_MODULES = {
+    "megastep.colour": "gamma_decode gamma_encode",
+    "megastep.plotting.styles": "AGENTS Style current styled",
+    "megastep.plotting.images": "STRIP camera_colours plot_images",
+    "megastep.plotting.marks": "plot_agent plot_goal plot_object plot_shot plot_trail plot_view "
     "view_polygon",
-    "wall_colours",
-]
+    "megastep.plotting.plans": "plot_scenery wall_colours",
+    "megastep.plotting.pictures": "Area Picture captioned encoded framed panels plot_level "
+    "rasterise side_by_side",
+}
+_NAMES = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_NAMES)
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what needs matplotlib, half a second, when it is first used."""
-    if name not in __all__:
+    """Imports a module when it is first used: those that need matplotlib take half a second."""
+    if name not in _NAMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module("megastep.plotting.pictures"), name)
+    return getattr(importlib.import_module(_NAMES[name]), name)

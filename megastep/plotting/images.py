@@ -1,20 +1,14 @@
-"""Pictures of what agents observe: images, and named numbers as bars."""
-
-from __future__ import annotations
+"""Images that agents observe, as strips below a plan or on matplotlib's axes."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from megastep.colour import gamma_encode
+from megastep.plotting.pictures import Area
 from megastep.plotting.styles import AGENTS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from megastep.plotting.pictures import Area
 
 STRIP = 0.09  # height of a row of pixels on matplotlib's axes, over its width
 
@@ -114,22 +108,3 @@ def _plot_image(ax, image, title, aspect, yaws) -> None:
 def camera_colours(n_cameras: int) -> list[str]:
     """Returns a colour per camera, for its view on the plan and its row of pixels."""
     return [AGENTS[camera % len(AGENTS)] for camera in range(n_cameras)]
-
-
-def plot_bars(names: Sequence[str], values: ArrayLike, ax: Axes | None = None) -> Axes:
-    """Draws numbers in [-1, 1] as bars, one group per name. Returns the axes.
-
-    Args:
-        values: (A, len(names)), or one agent's.
-    """
-    if ax is None:
-        from matplotlib import pyplot
-
-        ax = pyplot.subplots(figsize=(3, 1.5), layout="constrained")[1]
-    values = np.asarray(values, np.float32).reshape(-1, len(names))
-    width = 0.8 / len(values)
-    for a, row in enumerate(values):
-        ax.bar(np.arange(len(names)) + width * (a - (len(values) - 1) / 2), row, width)
-    ax.set_xticks(np.arange(len(names)), names, fontsize="x-small")
-    ax.set_ylim(-1, 1)
-    return ax

@@ -1,27 +1,16 @@
 """What stands on a floor plan: agents and what they see, trails, goals, hits and objects."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.path import Path
+from matplotlib.transforms import IdentityTransform
 from numpy.typing import ArrayLike
 
+from megastep.plotting.pictures import Area
 from megastep.plotting.styles import AGENTS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from megastep.plotting.pictures import Area
 
 AGENT = 5.4  # points: radius at which an agent is drawn at least, 15 pixels across at 100 dpi
 VIEWS, TRAIL, GOAL, OBJECTS, SHOTS, MARKS = range(1, 7)  # above floor and walls
-
-
-def _area(ax) -> Area:
-    from megastep.plotting.pictures import Area  # imports matplotlib
-
-    return Area.on(ax)
 
 
 def view_polygon(
@@ -63,7 +52,7 @@ def plot_view(
 ) -> None:
     """Draws a camera's field of view; arguments as in :func:`view_polygon`."""
     corners = view_polygon(position, angle, fov, distances, reach)
-    _area(ax).polygon(corners, VIEWS, fill=colour, alpha=0.22)
+    Area.on(ax).polygon(corners, VIEWS, fill=colour, alpha=0.22)
 
 
 def plot_agent(
@@ -75,14 +64,11 @@ def plot_agent(
     label: str = "",
 ) -> None:
     """Draws an agent as a disc, at least 15 pixels wide at 100 dpi, with a beak where it looks."""
-    area, position = _area(ax), np.asarray(position, float)
+    area, position = Area.on(ax), np.asarray(position, float)
     ahead = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
     aside = np.array([-ahead[1], ahead[0]])
 
     def beak(renderer) -> None:
-        from matplotlib.path import Path
-        from matplotlib.transforms import IdentityTransform
-
         scale = area.transform.get_matrix()[0, 0]
         size = max(radius * scale, renderer.points_to_pixels(AGENT))
         centre = area.transform.transform(position)
@@ -100,7 +86,7 @@ def plot_agent(
 
 def plot_trail(ax: Area | Axes, points: ArrayLike, colour: str = AGENTS[0]) -> None:
     """Draws where an agent was, (T, 2) metres, the newest last, fading into the past."""
-    area, points = _area(ax), np.asarray(points, float)
+    area, points = Area.on(ax), np.asarray(points, float)
     points = points[np.isfinite(points).all(1)]
     parts = np.array_split(np.arange(len(points)), min(12, max(len(points) // 2, 1)))
     for i, part in enumerate(parts):
@@ -118,14 +104,14 @@ def plot_trail(ax: Area | Axes, points: ArrayLike, colour: str = AGENTS[0]) -> N
 
 def plot_goal(ax: Area | Axes, position: ArrayLike, radius: float) -> None:
     """Draws a goal at (2,) metres as a disc in a ring; it is reached within ``radius`` metres."""
-    area = _area(ax)
+    area = Area.on(ax)
     area.disc(position, 1.6 * radius, GOAL, fill="#1fa94c", alpha=0.25, least=9)
     area.disc(position, radius, GOAL, fill="#1fa94c", edge="#ffffff", width=1.2, least=5)
 
 
 def plot_shot(ax: Area | Axes, start: ArrayLike, end: ArrayLike, colour: str) -> None:
     """Draws a hit as a line from who hits to whom it hits, (2,) metres each."""
-    area = _area(ax)
+    area = Area.on(ax)
     area.line([start, end], SHOTS, colour=colour, width=3.2, alpha=0.35)
     area.line([start, end], SHOTS, colour=colour, width=1.4)
     area.disc(end, 0, SHOTS, fill="#ffffff", alpha=0.0, edge=colour, width=1.6, least=AGENT + 3)
@@ -137,7 +123,7 @@ def plot_object(
     """Draws a disc, a crate or a door, as :class:`megastep.engine.Objects` has them; the colour
     is (3,), sRGB.
     """
-    area, position = _area(ax), np.asarray(position, float)
+    area, position = Area.on(ax), np.asarray(position, float)
     fill, edge = tuple(np.asarray(colour, float)), area.style.colours.text
     ahead = size * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
     aside = np.array([-ahead[1], ahead[0]])

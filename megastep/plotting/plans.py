@@ -5,17 +5,22 @@ from __future__ import annotations
 import collections
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from contourpy import contour_generator
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import RendererAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
+from matplotlib.path import Path
+from matplotlib.transforms import IdentityTransform
 from numpy.typing import ArrayLike
+from PIL import Image, ImageDraw
+from scipy import ndimage
 
 from megastep.colour import gamma_encode
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from megastep.plotting.pictures import Area
+from megastep.plotting.pictures import Area
 
 CELL = 0.05  # metres: of the grid on which rooms are found
 WALL = 2.6  # points: width of walls
@@ -46,8 +51,6 @@ def plot_scenery(
     Raises:
         ValueError: the numbers of lines and of colour arrays differ.
     """
-    from megastep.plotting.pictures import Area
-
     if ax is None:
         from matplotlib import pyplot
 
@@ -80,8 +83,6 @@ class Plan:
 
     def draw(self, renderer) -> None:
         """Draws floor and walls."""
-        from matplotlib.backends.backend_agg import RendererAgg
-
         if not isinstance(renderer, RendererAgg):
             self.draw_floor(renderer)
             self.draw_views(renderer, 0)
@@ -108,9 +109,6 @@ class Plan:
 
     def draw_floor(self, renderer) -> None:
         """Draws the floor, hatched if it counts where agents looked."""
-        from matplotlib.path import Path
-        from matplotlib.transforms import IdentityTransform
-
         theme, area = self.area.style.colours, self.area
         x0, y0, x1, y1 = area.bbox.extents
         page = Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
@@ -121,19 +119,15 @@ class Plan:
 
     def draw_views(self, renderer, first) -> None:
         """Draws the floor that was seen, from the view of a number on."""
-        from matplotlib.path import Path
-
         area, floor = self.area, self.area.style.colours.floor
         for view in () if self.views is None else self.views[first:]:
             area.draw_path(renderer, Path(view, closed=False), area.transform, floor, floor, 0.5)
 
     def draw_walls(self, renderer, is_seen, only: slice | np.ndarray = slice(None)) -> None:
         """Draws texels, all or some: grey where they are not seen."""
-        from matplotlib.collections import LineCollection
-
         theme = self.area.style.colours
         colours = np.where(
-            is_seen[:, None], wall_colours(self.texels, *theme.wall), _rgb(theme.unseen_wall)
+            is_seen[:, None], wall_colours(self.texels, *theme.wall), to_rgb(theme.unseen_wall)
         )
         # projecting caps overlap the neighbours; otherwise the background shows between texels
         drawn = LineCollection(
@@ -155,8 +149,6 @@ class _Pixels:
     """The pixels of a plan, with what has been seen so far."""
 
     def __init__(self, plan: Plan, renderer):
-        from matplotlib.backends.backend_agg import RendererAgg
-
         size = renderer.width, renderer.height, renderer.dpi
         self.floor, self.walls = RendererAgg(*size), RendererAgg(*size)
         plan.draw_floor(self.floor)
@@ -168,8 +160,6 @@ class _Pixels:
 
     def update(self, plan: Plan) -> np.ndarray:
         """Draws what was seen since the last call. Returns the image, (H, W, 4)."""
-        from PIL import Image
-
         seen = self.seen if plan.seen is None else plan.seen
         views, n = self.views if plan.views is None else plan.views, len(self.views)
         if (self.seen & ~seen).any() or (
@@ -197,10 +187,6 @@ def _points(lights) -> np.ndarray:
     return np.ascontiguousarray(points, np.float32)
 
 
-def _rgb(colour: str) -> np.ndarray:
-    return np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-
-
 def texel_segments(lines: ArrayLike, widths: ArrayLike) -> np.ndarray:
     """Returns the endpoints of texels, (T, 2, 2), of lines (L, 2, 2) of ``widths`` texels."""
     lines, widths = np.asarray(lines, np.float32), np.asarray(widths, int)
@@ -226,11 +212,6 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     """Returns the outline of the rooms, a matplotlib path: the floor that is connected with a
     light. If walls do not close it, it is the rectangle around them.
     """
-    from contourpy import contour_generator
-    from matplotlib.path import Path
-    from PIL import Image, ImageDraw
-    from scipy import ndimage
-
     lines = np.frombuffer(lines_bytes, np.float32).reshape(-1, 2, 2)
     if not len(lines):
         return Path(np.zeros((0, 2)))
@@ -275,8 +256,6 @@ def _scale_bar(area, plan) -> None:
     x, y = area.width - 0.14, 0.1
 
     def draw(renderer) -> None:
-        from matplotlib.path import Path
-
         right, left = x, x - metres * per_metre / inch
         bar = Path([(left, y + 0.05), (left, y), (right, y), (right, y + 0.05)])
         area.draw_path(renderer, bar, area._inches, None, theme.faint, 1.2)
