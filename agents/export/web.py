@@ -12,9 +12,8 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import folders, restore
 from megastep.kernels.build.compile import EngineError
 from megastep.types import Env, n_lanes
-from megastep.web.page import module, page
+from megastep.web.page import module, page, scene
 from megastep.web.recording import record
-from megastep.web.scene import scene
 
 #: Most bytes of a page.
 MAX_BYTES = 20_000_000

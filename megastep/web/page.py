@@ -1,25 +1,42 @@
-"""Writes a program, and what a page draws of it, as one HTML file."""
+"""Writes a program, and what a page draws of it, as one HTML file: floor plans, keys that drive."""
 
 import base64
 import gzip
 import html
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from megastep import spaces
+from megastep.core import AGENT_RADIUS
 from megastep.kernels.build.compile import EngineError, wasm, wasm_key, wasm_keys, wasm_tools
+from megastep.kernels.build.launch import ENGINE
+from megastep.modules import MOVES
 from megastep.plotting.styles import AGENTS, THEMES
+from megastep.types import Env, n_lanes, optional
 from megastep.web.program import Buffer, Launch, Leaf, Program, Ref
 
-__all__ = ["SHIPPED", "module", "page"]
+__all__ = ["SHIPPED", "module", "page", "scene"]
 
 FOLDER = Path(__file__).parent
 #: The module that comes with megastep; `make wasm` builds it.
 SHIPPED = FOLDER / "megastep.wasm"
 ALIGNMENT = 8  # bytes, of buffers in the page's data
+OBJECT_BYTES = ENGINE.constants["OBJECT_BYTES"]
+
+#: By key, in the order of two rows of buttons, the action of `megastep.modules.MOVES` and the
+#: continuous one: ahead, left, turn left.
+KEYS = {
+    "a": (1, [0, 1, 0]),
+    "ArrowUp": (3, [1, 0, 0]),
+    "d": (2, [0, -1, 0]),
+    "ArrowLeft": (5, [0, 0, 1]),
+    "ArrowDown": (4, [-1, 0, 0]),
+    "ArrowRight": (6, [0, 0, -1]),
+}
 
 
 def module(program: Program) -> bytes:
@@ -47,7 +64,7 @@ def page(program: Program, about: Mapping, code: bytes) -> str:
 
     Args:
         program: with the sections `reset` and `step`, and those of the policies in ``about``.
-        about: what the page shows, see `megastep.web.scene`.
+        about: what the page shows: `scene`, title, about, policies and seed.
         code: the WebAssembly module.
     """
     buffers, parts, size = [], [], 0
@@ -143,3 +160,74 @@ def _themes() -> str:
         rule = f":root{{{body}}}"
         rules.append(rule if name == "light" else f"@media (prefers-color-scheme:{name}){{{rule}}}")
     return "".join(rules)
+
+
+# ---- What is shown ----
+
+
+def controls(env: Env) -> dict[str, object]:
+    """Returns {key of a keyboard: action} of one lane: the environment's ``controls``, movement by
+    arrow keys, or digits.
+    """
+    own, space, moves = optional(env, "controls"), env.action_space, hasattr(env, "movement")
+    if own is not None:
+        return dict(own)
+    if isinstance(space, spaces.MultiContinuous):
+        return {key: pair[1] for key, pair in KEYS.items()} if moves and space.dim == 3 else {}
+    if moves and space.n_actions == len(MOVES):
+        return {key: pair[0] for key, pair in KEYS.items()}
+    return {str(digit): digit for digit in range(min(space.n_actions, 10))}
+
+
+def scene(env: Env, program: Program, homes: Sequence[str] = ()) -> dict:
+    """Returns what a page shows of an environment: JSON's types.
+
+    Args:
+        program: the recorded environment.
+        homes: names of the floor plans, in the order of the layouts.
+    """
+    space = env.action_space
+    is_discrete = isinstance(space, spaces.MultiDiscrete)
+    shown: dict = {
+        "env": type(env).__name__,
+        "fps": optional(env, "fps"),
+        "n_lanes": n_lanes(env),
+        "controls": controls(env),
+        "rest": 0 if is_discrete else [0] * space.dim,
+        "bounds": None if is_discrete else [list(space.low), list(space.high)],
+        "homes": list(homes),
+    }
+    core = getattr(env, "core", None)
+    if core is not None:
+        from megastep.plotting.plans import room_outlines  # with matplotlib
+
+        layouts = core.scenery.layouts
+        shown |= {
+            "fov": core.fov,
+            "radius": AGENT_RADIUS,
+            "goal": goal(program),
+            "rooms": [
+                room_outlines(layouts.lines[d].numpy(), layouts.lights[d].numpy())
+                for d in range(len(layouts))
+            ],
+        }
+    return shown
+
+
+def goal(program: Program) -> dict | None:
+    """Returns where in memory the place is that the agent is to go to, of the environments that
+    have one: x and y are at ``base``, ``per_layout`` numbers times the layout and ``stride``
+    numbers times ``index`` further, which is a number or where one is.
+    """
+    for launch in program.sections["step"]:
+        values: dict = launch.values
+        if launch.operation == "pointgoal_step":
+            base, index = values["points"], values["goal_index"]
+            stride, per_layout = 2, 2 * values["n_goals"]
+        elif launch.operation in ("memory_step", "keys_step"):
+            index = values["cue"] if "cue" in values else values["n_colours"]  # the goal's object
+            base, stride, per_layout = values["objects.objects"], OBJECT_BYTES // 4, 0
+        else:
+            continue
+        return dict(base=base, per_layout=per_layout, stride=stride, index=index, radius=0.2)
+    return None

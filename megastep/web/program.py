@@ -72,25 +72,18 @@ class Program:
 
     def operations(self) -> dict[KernelLibrary, list[str]]:
         """Returns the operations that are launched, by library."""
-        found: dict[KernelLibrary, list[str]] = {}
+        found: dict[KernelLibrary, dict[str, None]] = {}
         for launch in self.launches:
-            names = found.setdefault(launch.library, [])
-            if launch.operation not in names:
-                names.append(launch.operation)
-        return found
+            found.setdefault(launch.library, {})[launch.operation] = None
+        return {library: [*names] for library, names in found.items()}
 
 
 class Replay:
-    """Runs a program with the CPU's kernels.
-
-    Args:
-        program: what to run. Memory that holds anything at the start is zeros.
-    """
+    """Runs a program with the CPU's kernels. Memory that holds anything at the start is zeros."""
 
     def __init__(self, program: Program):
         self.program = program
-        self.memory = [bytearray(buffer.n_bytes) for buffer in program.buffers]
-        self.start()
+        self.memory = [bytearray(one.contents or bytes(one.n_bytes)) for one in program.buffers]
         self._addresses = [
             ctypes.addressof((ctypes.c_char * max(len(part), 1)).from_buffer(part)) if part else 0
             for part in self.memory
@@ -99,12 +92,6 @@ class Replay:
             name: [self._call(launch) for launch in launches]
             for name, launches in program.sections.items()
         }
-
-    def start(self) -> None:
-        """Gives the memory what it holds at the start."""
-        for part, buffer in zip(self.memory, self.program.buffers, strict=True):
-            if buffer.contents is not None:
-                part[:] = buffer.contents
 
     def run(self, section: str) -> None:
         """Runs the launches of a section, and after `reset` the copies."""

@@ -11,7 +11,6 @@ import gc
 import struct
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -32,14 +31,6 @@ N_CHECKED = 16
 ALLOCATIONS = ("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided")
 
 
-class Written(NamedTuple):
-    """An operator of PyTorch that computed something."""
-
-    operator: str
-    start: int  # address of the storage that it wrote
-    is_late: bool  # a launch had used the storage before
-
-
 class Tape(TorchDispatchMode):
     """Notes launches of kernels, and operators of PyTorch that compute.
 
@@ -47,7 +38,8 @@ class Tape(TorchDispatchMode):
         launches: places are an address and an offset.
         used: addresses of the storages that launches use.
         made: those that operators reserved.
-        written: operators that compute.
+        written: (name, address of the storage, whether a launch had used it before) of operators
+            that compute.
     """
 
     def __init__(self, recorder: "Recorder", is_first: bool = True):
@@ -56,7 +48,7 @@ class Tape(TorchDispatchMode):
         self.launches: list[Launch] = []
         self.used: set[int] = set()
         self.made: dict[int, None] = {}
-        self.written: list[Written] = []
+        self.written: list[tuple[str, int, bool]] = []
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
@@ -74,7 +66,7 @@ class Tape(TorchDispatchMode):
                 if not any(aliases):
                     self.made[start] = None
                 if name not in ALLOCATIONS:
-                    self.written.append(Written(name.strip("_"), start, start in self.used))
+                    self.written.append((name.strip("_"), start, start in self.used))
         return result
 
     def observe(self, library: KernelLibrary, operation: str, packed: bytes) -> None:
@@ -162,7 +154,7 @@ class Recorder:
         used = tape.used | {self.add(leaf) for leaf in leaves.values()}
         for leaf in leaves.values():
             self.use(self.add(leaf))
-        computed = {written.start for written in tape.written}
+        computed = {start for _, start, _ in tape.written}
         for start in tape.made:
             if start in self.index and start not in computed:
                 i = self.index[start]
@@ -180,14 +172,12 @@ class Recorder:
 
     def launches(self, tape: Tape) -> list[Launch]:
         """Returns launches of a tape with places in buffers."""
-
-        def place(value: int | float | Ref | None) -> int | float | Ref | None:
-            return Ref(self.index[value.buffer], value.offset) if isinstance(value, Ref) else value
-
-        return [
-            launch._replace(values={name: place(value) for name, value in launch.values.items()})
-            for launch in tape.launches
-        ]
+        found = []
+        for launch in tape.launches:
+            places = {k: v for k, v in launch.values.items() if isinstance(v, Ref)}
+            places = {k: Ref(self.index[start], offset) for k, (start, offset) in places.items()}
+            found.append(launch._replace(values=launch.values | places))
+        return found
 
     def leaf(self, tensor: torch.Tensor) -> Leaf:
         """Returns a tensor as a leaf of the program."""
@@ -211,10 +201,9 @@ class Recorder:
 
     def refuse_changes(self, one: list[Launch], other: list[Launch]) -> None:
         """Refuses two steps that launch different operations, or with different numbers."""
-        names = [[launch.operation for launch in launches] for launches in (one, other)]
+        names = [", ".join(launch.operation for launch in step) for step in (one, other)]
         if names[0] != names[1]:
-            one_step, next_step = map(", ".join, names)
-            raise self.refusal(f"a step launches {one_step}, and the next {next_step}")
+            raise self.refusal(f"a step launches {names[0]}, and the next {names[1]}")
         for before, after in zip(one, other):
             for field, value in before.values.items():
                 if not isinstance(value, Ref) and value != after.values[field]:

@@ -25,10 +25,9 @@ from megastep.kernels.build.compile import EngineError, wasm_key, wasm_keys, was
 from megastep.kernels.build.kernel_library import SCALAR_WASM_FLAGS
 from megastep.spaces import random_actions
 from megastep.types import n_lanes
-from megastep.web.page import FOLDER, SHIPPED, page
+from megastep.web.page import FOLDER, SHIPPED, page, scene
 from megastep.web.program import Replay
 from megastep.web.recording import record
-from megastep.web.scene import scene
 from tests.helpers.agents import env_of
 from tests.helpers.chromium import Browser
 from tests.helpers.web import ENVS, made
