@@ -34,8 +34,6 @@ from megastep.types import Tree, n_lanes, optional
 from megastep.video import WRITERS, GifWriter, Mp4Writer, as_image
 
 if TYPE_CHECKING:
-    from IPython.display import HTML  # pyright: ignore[reportMissingImports]
-
     from megastep.types import Env, PolicyLike
 
 __all__ = ["Film", "ParallelEncoder", "Player", "film", "film_all"]
@@ -52,10 +50,8 @@ MAX_RETURNS = 4  # of as many agents, one by one
 
 
 class ParallelEncoder:
-    """Draws states as frames of a video, in the order in which they are given.
-
-    Inside its ``with`` block, call it with a state, or :meth:`frame` with a finished image. After
-    the block, use :meth:`save` or :meth:`notebook`.
+    """Draws states as frames of a video. Inside its ``with`` block, call it with a state, or
+    :meth:`frame` with a finished image; after the block, use :meth:`save` or :meth:`notebook`.
 
     Args:
         plot_state: takes a numpyified state, returns a matplotlib figure or an (H, W, 3) uint8
@@ -88,10 +84,7 @@ class ParallelEncoder:
         self._add(lambda: image_of(self._plot_state(numpyify(clone(state)))))
 
     def frame(self, array: ArrayLike) -> None:
-        """Adds an image as the next frame: (H, W, 3), uint8 or floats in [0, 1].
-
-        All frames must have the same size.
-        """
+        """Adds an image as the next frame: (H, W, 3), uint8 or floats in [0, 1]."""
         image = as_image(array)
         self._add(lambda: image)
 
@@ -130,9 +123,8 @@ class ParallelEncoder:
                 raise
 
     def save(self, path: str | os.PathLike) -> Film:
-        """Writes the video to ``path``, an mp4 or GIF as ``format`` says, and returns the path.
-
-        Writes atomically: if it fails, an existing file is unchanged. Creates missing folders.
+        """Writes the video to ``path``, an mp4 or GIF as ``format`` says, and returns the path. If
+        it fails, an existing file is unchanged.
         """
         video, path = self._finished(), Film(path)
         if path.suffix != f".{self._format}":
@@ -142,17 +134,10 @@ class ParallelEncoder:
             )
         return _write(path, video)
 
-    def notebook(self) -> HTML:
-        """Returns the video as an object that notebooks display. The encoder itself is one, too."""
-        html = self._repr_html_()
-        try:
-            from IPython.display import HTML  # pyright: ignore[reportMissingImports]
-        except ImportError:
-            raise ImportError(
-                "showing a video in a notebook needs IPython, which is not installed: pip install "
-                "ipython, or save the video instead"
-            ) from None
-        return HTML(html)
+    def notebook(self) -> ParallelEncoder:
+        """Returns the encoder, which notebooks show as its video."""
+        self._finished()
+        return self
 
     def _repr_html_(self) -> str:
         return _html(self._finished(), f".{self._format}")
@@ -351,13 +336,9 @@ def _add_past(core: dict, starts: np.ndarray, trails: collections.deque, views: 
     if starts.all():
         views.clear()
     seen = [
-        [
-            plotting.view_polygon(position, angle + yaw, core["fov"], distances)
-            for yaw, distances in zip(core["yaws"], of_agent, strict=True)
-        ]
-        for position, angle, of_agent in zip(
-            core["positions"], core["angles"], core["distances"], strict=True
-        )
+        plotting.view_polygon(core["positions"][a], core["angles"][a] + yaw, core["fov"], distances)
+        for a, of_agent in enumerate(core["distances"])
+        for yaw, distances in zip(core["yaws"], of_agent, strict=True)
     ]
-    views.append(np.array(seen, np.float32))
+    views.append(np.array(seen, np.float32).reshape(*core["distances"].shape[:2], -1, 2))
     core["views"] = np.stack(views)

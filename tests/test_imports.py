@@ -139,7 +139,6 @@ OWN_USERS = {
 }
 # The files that may import these packages, directly or through importlib, as glob patterns.
 OUTSIDE_USERS = {
-    "IPython": ("megastep/recording.py",),
     "av": ("megastep/video.py",),
     "cuda": ("megastep/kernels/build/compile.py",),
     "gymnasium": (

@@ -32,14 +32,10 @@ def plot_images(
         yaws: degrees, the camera of each row of pixels, to label it with.
 
     Raises:
-        ValueError: there are no images, or one has another shape.
+        ValueError: an image has another shape.
     """
     stacks = {name: _stack(name, image, transpose) for name, image in images.items()}
-    shape = len(stacks), max(map(len, stacks.values()), default=0)
-    if not all(shape):
-        raise ValueError(
-            "plot_images was given no images; it needs a dict of arrays with at least one each"
-        )
+    shape = len(stacks), max(map(len, stacks.values()))
     if axes is None:
         from matplotlib import pyplot
 

@@ -47,9 +47,6 @@ def plot_scenery(
         seen: one (w,) array of bools per line; texels that are False are grey. Default: all seen.
         views: (n, R, 2), polygons that were seen, in order; the rest of the floor is hatched.
         ax: an area of :func:`panels`, or matplotlib axes. Default: new axes of pyplot.
-
-    Raises:
-        ValueError: the numbers of lines and of colour arrays differ.
     """
     if ax is None:
         from matplotlib import pyplot
@@ -71,11 +68,6 @@ class Plan:
     def __init__(self, area, lines, colours, lights, seen, views) -> None:
         self.area, self.lines, self.lights, self.views = area, lines, lights, views
         self.widths = np.array([len(np.asarray(texels)) for texels in colours], int)
-        if len(self.widths) != len(lines):
-            raise ValueError(
-                f"a plan needs one array of colours per line, but {len(lines)} lines and "
-                f"{len(self.widths)} arrays of colours were given"
-            )
         self.texels = _joined(colours, np.float32, (0, 3))
         self.seen = None if seen is None else _joined(seen, bool, (0,))
         points = lines.reshape(-1, 2) if len(lines) else np.array([[0.0, 0.0], [1.0, 1.0]])
@@ -111,8 +103,7 @@ class Plan:
         """Draws the floor, hatched if it counts where agents looked."""
         theme, area = self.area.style.colours, self.area
         x0, y0, x1, y1 = area.bbox.extents
-        page = Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
-        area.draw_path(renderer, page, IdentityTransform(), theme.outside)
+        area.draw_path(renderer, _rectangle(x0, y0, x1, y1), IdentityTransform(), theme.outside)
         rooms = _rooms(self.lines.tobytes(), _points(self.lights).tobytes())
         fill, hatch = (theme.floor, None) if self.views is None else (theme.unseen, theme.hatch)
         area.draw_path(renderer, rooms, area.transform, fill, hatch=hatch)
@@ -207,6 +198,10 @@ def wall_colours(texels: ArrayLike, least: float = 0.5, greatest: float = 1.0) -
     return hue * (least + (greatest - least) * gamma_encode(np.clip(2.5 * peak, 0, 1)))
 
 
+def _rectangle(x0, y0, x1, y1) -> Path:
+    return Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
+
+
 @functools.lru_cache(MAX_KEPT)
 def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     """Returns the outline of the rooms, a matplotlib path: the floor that is connected with a
@@ -227,8 +222,7 @@ def _rooms(lines_bytes: bytes, lights_bytes: bytes) -> Any:
     parts: Any = ndimage.label(~wall)[0]  # pyright: ignore[reportIndexIssue]
     room = np.isin(parts, parts[rows, columns]) & ~wall
     if not room.any() or room[0, 0]:
-        (x0, y0), (x1, y1) = lines.min((0, 1)), lines.max((0, 1))
-        return Path([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], closed=True)
+        return _rectangle(*lines.min((0, 1)), *lines.max((0, 1)))
     x, y = (low[a] + CELL * np.arange(n) for a, n in ((0, n_columns), (1, n_rows)))
     contours: Any = contour_generator(x, y, room.astype(float), fill_type="OuterCode")
     polygons, codes = contours.filled(0.02, 2)  # to the middle of the walls
@@ -250,16 +244,11 @@ def _scale_bar(area, plan) -> None:
     """Draws a bar of a round number of metres in the plan's lower right corner."""
     if not hasattr(area, "_inches") or not len(plan.lines):
         return
-    theme, per_metre = area.style.colours, area.transform.get_matrix()[0, 0]
-    inch = area.get_figure().dpi
+    inch, per_metre = area.get_figure().dpi, area.transform.get_matrix()[0, 0]
     metres = next((m for m in (1, 2, 5, 10, 20, 50, 100) if m * per_metre > 0.5 * inch), 200)
-    x, y = area.width - 0.14, 0.1
-
-    def draw(renderer) -> None:
-        right, left = x, x - metres * per_metre / inch
-        bar = Path([(left, y + 0.05), (left, y), (right, y), (right, y + 0.05)])
-        area.draw_path(renderer, bar, area._inches, None, theme.faint, 1.2)
-
-    area.add(draw, 8)
-    beside = x - metres * per_metre / inch - 0.07, y + 0.03
-    area.text(beside, f"{metres} m", 8, size=8, colour=theme.faint, align="right", inches=True)
+    right, left, y = area.width - 0.14, area.width - 0.14 - metres * per_metre / inch, 0.1
+    bar = Path([(left, y + 0.05), (left, y), (right, y), (right, y + 0.05)])
+    colour = area.style.colours.faint
+    area.add(lambda r: area.draw_path(r, bar, area._inches, None, colour, 1.2), 8)
+    beside = left - 0.07, y + 0.03
+    area.text(beside, f"{metres} m", 8, size=8, colour=colour, align="right", inches=True)

@@ -77,12 +77,12 @@ class Style:
         return THEMES[self.theme]
 
 
-_STYLE: ContextVar[Style | None] = ContextVar("style", default=None)
+_STYLE: ContextVar[Style] = ContextVar("style", default=Style())  # noqa: B039  (it is frozen)
 
 
 def current() -> Style:
     """Returns the style of pictures that are made here."""
-    return _STYLE.get() or Style()
+    return _STYLE.get()
 
 
 @contextlib.contextmanager
