@@ -1,10 +1,10 @@
 """Generates the 5,000 homes of the package, checks them, and prints statistics.
 
-    python scripts/make_homes.py                      # writes homes.npz and homes.sha256
+    python scripts/make_homes.py                      # writes homes.npz
     python scripts/make_homes.py --count 1000 --dry   # prints only
     python scripts/make_homes.py --count 1000 --dry --density 3 --clutter 1
 
-The files go to megastep/geometries/data/.
+The file goes to megastep/geometries/data/.
 """
 
 import argparse
@@ -21,8 +21,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from megastep.geometries import homes
-from megastep.geometries.homes import database, plan
+from megastep.geometries import databases, homes
+from megastep.geometries.homes import plan
 from scripts import check_homes
 
 # Of real homes, from CubiCasa5k and Raster-to-Vector: (statistic, percentile, min, max).
@@ -101,25 +101,16 @@ def generate(seed, density=1, clutter=0):
     return g, check_homes.errors(g, clutter > 0), seconds
 
 
-def write(plans, path=database.PATH):
-    """Writes a database and its sha256, in the format of sha256sum. Returns the digest."""
-    content = database.pack(plans)
-    digest = hashlib.sha256(content).hexdigest()
-    Path(path).write_bytes(content)
-    Path(path).with_suffix(".sha256").write_text(f"{digest}  {Path(path).name}\n")
-    return digest
-
-
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--count", type=int, default=database.COUNT)
+    parser.add_argument("--count", type=int, default=databases.COUNT)
     parser.add_argument("--dry", action="store_true", help="print and write nothing")
     parser.add_argument("--density", type=float, default=1, help="1 to 3; with --dry")
     parser.add_argument("--clutter", type=float, default=0, help="0 to 1; with --dry")
     args = parser.parse_args(argv)
-    if args.count < 2 or not args.dry and args.count != database.COUNT:
+    if args.count < 2 or not args.dry and args.count != databases.COUNT:
         parser.error(
-            f"--count {args.count}: take at least 2 with --dry, and {database.COUNT} without"
+            f"--count {args.count}: take at least 2 with --dry, and {databases.COUNT} without"
         )
 
     if not 1 <= args.density <= plan.DENSEST or not args.dry and args.density != 1:
@@ -156,7 +147,7 @@ def main(argv=None):
     if messages:
         raise SystemExit(1)
     if not args.dry:
-        print(f"{write(plans)}  {database.PATH.name}, {database.PATH.stat().st_size:,} bytes")
+        print(f"{databases.PATH.write_bytes(databases.pack(plans)):,} bytes in {databases.PATH}")
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.engine",
     "megastep.geometries.checks",
     "megastep.geometries.files",
-    "megastep.geometries.imported",
+    "megastep.geometries.databases",
     "megastep.geometries.plans.imports",
     "megastep.geometries.plans.sheets",
     "megastep.global_generators",
@@ -151,7 +151,7 @@ OUTSIDE_USERS = {
     "hydra": ("agents/api.py", "agents/cli/*.py"),
     "hydra_plugins": ("agents/cli/*.py",),
     "loky": (
-        "megastep/geometries/homes/database.py",
+        "megastep/geometries/databases.py",
         "megastep/geometries/plans/imports.py",
         "megastep/hosting/processes.py",
         "megastep/workers.py",

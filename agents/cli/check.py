@@ -16,11 +16,11 @@ SHOWN = 20  # plans whose errors are printed
 
 def run(path: str) -> None:
     """Checks the floor plans of a file. Raises UserError if there are errors."""
-    from megastep.geometries import checks, files, imported
+    from megastep.geometries import checks, databases
 
     file = Path(path)
     with user_errors():
-        plans = imported.load(file) if imported.is_database(file) else files.load(file)
+        plans = databases.load(file)
     errors = {index: checks.errors(g) for index, g in enumerate(plans)}
     errors = {index: sentences for index, sentences in errors.items() if sentences}
     for index, sentences in list(errors.items())[:SHOWN]:

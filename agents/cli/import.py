@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import sys
+import tempfile
 import time
 import zipfile
 from collections import Counter
@@ -144,23 +145,24 @@ def _import_database(source, path, licence, per, is_sealed) -> None:
     if not path.exists():
         raise UserError(f"path={path} does not exist")
     _confirm(source, licence)
-    from megastep.geometries import imported
+    from megastep.geometries import databases
     from megastep.geometries.plans import imports, sheets
 
     options, suffix = imports.Options(source, per, is_sealed), imports.READERS[source].SUFFIX
-    with user_errors(f"{imported.folder()} cannot be written: ", (OSError,)):
-        imported.prepare()
+    folder = databases.imported_path(source).parent
+    with user_errors(f"{folder} cannot be written: ", (OSError,)):  # before all is read
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
     with console.counting("files"), user_errors():
         n_files = _n_files(path, suffix) or DATABASES[source][-1]
         plans, shown = imports.run(options, path, lambda n: console.count(n, max(n, n_files)))
     geometries = [g for plan in plans for g in plan.geometries]
     numbers = [i for i, plan in enumerate(plans) for _ in plan.geometries]
-    with user_errors(f"{imported.folder()} cannot be written: "):
-        file, digest = imported.write(source, geometries, numbers)
-        sheet, report = (imported.folder() / f"{source}.{kind}" for kind in ("png", "md"))
+    with user_errors(f"{folder} cannot be written: "):
+        file = databases.write_imported(source, geometries, numbers)
+        sheet, report = (folder / f"{source}.{kind}" for kind in ("png", "md"))
         sheets.write(sheet, [(one.name[-40:], *imports.first_home(options, one)) for one in shown])
-        about = f"{file.name}, sha256 {digest}"
-        report.write_text(_report(source, path, plans, len(geometries), about))
+        report.write_text(_report(source, path, plans, len(geometries)))
     n_refused = sum(not plan.geometries for plan in plans)
     console.say(
         f"{len(geometries):,} floor plans of {len(plans):,} files in {file}\n"
@@ -180,7 +182,7 @@ def _n_files(path, suffix) -> int | None:
     return None
 
 
-def _report(source, path, plans, n, file) -> str:
+def _report(source, path, plans, n) -> str:
     """Returns the report of an import in Markdown."""
     title, _, licence, _ = DATABASES[source]
     notes = [(plan.name, note) for plan in plans for note in plan.notes]
@@ -191,7 +193,6 @@ def _report(source, path, plans, n, file) -> str:
     lines = [
         f"# Import of {title}",
         f"- from {path}, licence {licence}",
-        f"- {file}",
         f"- {n:,} floor plans of {len(plans):,} files; {len(refused):,} are refused",
         f"- {n_reachable:,} of {n_rooms:,} rooms can be reached; agents spawn in these alone",
         f"- {sum(note.n_sealed for _, note in notes):,} doors to the outside are closed",

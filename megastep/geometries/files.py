@@ -5,6 +5,7 @@ Files may come from strangers: sizes are limited, pickled objects are refused, a
 ValueError that names file and geometry.
 """
 
+import lzma
 import re
 import zipfile
 import zlib
@@ -27,7 +28,7 @@ HEADER = 128  # bytes of the header that numpy writes
 # What zipfile and numpy raise for broken files.
 UNREADABLE = (
     *(ValueError, EOFError, OSError, SyntaxError, MemoryError, RuntimeError),
-    *(zipfile.BadZipFile, zlib.error),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
 )
 NAME = re.compile(r"(0|[1-9][0-9]{0,5})/([A-Za-z_][A-Za-z0-9_]{0,63})\.npy")
 

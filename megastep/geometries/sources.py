@@ -13,9 +13,9 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from megastep.dotdict import dotdict
+from megastep.geometries import databases, mazes, memory_mazes, toys
 from megastep.geometries import files as npz
-from megastep.geometries import imported, mazes, memory_mazes, toys
-from megastep.geometries.homes import database, plan
+from megastep.geometries.homes import plan
 from megastep.geometry import mirror_image
 from megastep.imports import import_object
 from megastep.settings import checked, closest
@@ -40,7 +40,7 @@ SUITE = {  # the parts of `suite`
 
 
 def _draw(count, n, split, seed) -> list[int]:
-    return database.draw(database.split_range(count, split), n, seed)
+    return databases.draw(databases.split_range(count, split), n, seed)
 
 
 def box(n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.0) -> list[dotdict]:
@@ -79,8 +79,8 @@ def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str)
         path: the file.
     """
     file = Path(path)
-    database = _load(file, file.stat().st_mtime_ns if file.exists() else 0)
-    return [database[i] for i in _draw(len(database), n, split, seed)]
+    geometries = _load(file, file.stat().st_mtime_ns if file.exists() else 0)
+    return [geometries[i] for i in _draw(len(geometries), n, split, seed)]
 
 
 @checked
@@ -103,10 +103,10 @@ def homes(
             walls.
         clutter: 1: furniture leaves narrow gaps to walls, to other furniture and in doorways.
     """
-    indices = _draw(database.COUNT, n, split, seed)
+    indices = _draw(databases.COUNT, n, split, seed)
     if density == 1 and clutter == 0:
-        return [database.home(i, outer) for i in indices]
-    generated = database.generated(tuple(dict.fromkeys(indices)), density, clutter, outer)
+        return [databases.home(i, outer) for i in indices]
+    generated = databases.generated(tuple(dict.fromkeys(indices)), density, clutter, outer)
     return [generated[i] for i in indices]
 
 
@@ -126,7 +126,7 @@ def cubicasa(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[do
         n, split, seed: how many are drawn, from which split, in which order. Floors of one home
             are in the same split.
     """
-    return imported.pick("cubicasa", n, split, seed)
+    return databases.pick("cubicasa", n, split, seed)
 
 
 def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
@@ -135,7 +135,7 @@ def houseexpo(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[d
     Args:
         n, split, seed: how many are drawn, from which split, in which order.
     """
-    return imported.pick("houseexpo", n, split, seed)
+    return databases.pick("houseexpo", n, split, seed)
 
 
 def _generated(module, n, split, seed, n_bytes, size, **options) -> list[dotdict]:
@@ -287,7 +287,7 @@ def suite(
         plans: a further part: `cubicasa` or `houseexpo`, if it is imported, or an `.npz` file of
             floor plans, whose part is called `plans`.
     """
-    if plans in imported.NAMES:
+    if plans in databases.IMPORTED:
         parts = parts | {plans: 512}
     elif plans is not None:
         parts = parts | {"plans": {"source": "files", "n": 512, "path": plans}}

@@ -12,14 +12,8 @@ from megastep import geodesics, geometries, geometry
 from megastep.dotdict import dotdict
 from megastep.engine import AGENT_RADIUS
 from megastep.geodesics import PathGraph
-from megastep.geometries import checks, homes
-from megastep.geometries.homes import (
-    database,
-    partition,
-    plan,
-    portable_generator,
-    regions,
-)
+from megastep.geometries import checks, databases, homes
+from megastep.geometries.homes import partition, plan, portable_generator, regions
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from scripts import check_homes, make_homes
 
@@ -47,13 +41,13 @@ def cluttered():
 @pytest.fixture(scope="module")
 def some_packaged():
     """One in a hundred homes of the package."""
-    return [database.home(index) for index in range(0, database.COUNT, 100)]
+    return [databases.home(index) for index in range(0, databases.COUNT, 100)]
 
 
 @pytest.fixture(scope="module")
 def packaged():
     """All homes of the package."""
-    return [database.home(index) for index in range(database.COUNT)]
+    return [databases.home(index) for index in range(databases.COUNT)]
 
 
 def test_numbers_equal_published_splitmix64():
@@ -157,15 +151,15 @@ def test_no_room_has_cells_inside_furniture(dense):
 def test_dense_homes_of_the_source_are_generated_ones(monkeypatch, tmp_path):
     """In two processes, in one, and from the cache."""
     monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(database, "SEEDS_EACH", 2)
+    monkeypatch.setattr(databases, "SEEDS_EACH", 2)
     drawn = []
     for each in 2, 100:
-        monkeypatch.setattr(database, "SEEDS_EACH", each)
+        monkeypatch.setattr(databases, "SEEDS_EACH", each)
         for _ in range(2):
-            database.generated.cache_clear()
+            databases.generated.cache_clear()
             drawn.append(geometries.sample("homes", 5, "test", density=1.5, clutter=0.5))
         shutil.rmtree(tmp_path / "cache")
-    database.generated.cache_clear()
+    databases.generated.cache_clear()
     for plans in drawn:
         assert [g.id for g in plans] == [g.id for g in geometries.sample("homes", 5, "test")]
         for g in plans:
@@ -205,7 +199,7 @@ def blocked(plans, wider):
 
 def test_packaged_homes_equal_generated_ones(generated):
     for g in [*generated[::6], homes.generate(4999)]:
-        stored = database.home(g.id)
+        stored = databases.home(g.id)
         for key, value in stored.items():
             assert np.array_equal(value, g[key]), (g.id, key)
             assert getattr(value, "dtype", None) == getattr(g[key], "dtype", None)
@@ -270,28 +264,24 @@ def test_a_turned_home_has_the_same_fingerprint(generated):
     assert make_homes.fingerprint(turned) != make_homes.fingerprint(other)
 
 
-def test_a_damaged_database_is_named(tmp_path):
-    for name in ("homes.npz", "homes.sha256"):
-        shutil.copy(database.PATH.with_name(name), tmp_path / name)
-    path = tmp_path / "homes.npz"
-    assert (database.home(3, path=path).walls == database.home(3).walls).all()
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    database._packaged.cache_clear()
-    with pytest.raises(ValueError, match="homes.npz' are damaged .*install megastep again"):
-        database.home(4, path=path)
-    path.with_suffix(".sha256").unlink()
-    with pytest.raises(ValueError, match="homes.npz' cannot be read"):
-        database.home(5, path=path)
-
-
-def test_a_written_database_can_be_read(tmp_path, generated):
+def test_a_written_database_can_be_read_and_a_damaged_one_is_named(
+    tmp_path, generated, monkeypatch
+):
     path, plans = tmp_path / "homes.npz", generated[:3]
-    digest = make_homes.write(plans, path)
-    assert path.with_suffix(".sha256").read_text() == f"{digest}  homes.npz\n"
-    assert hashlib.sha256(path.read_bytes()).hexdigest() == digest
-    assert make_homes.write(plans, path) == digest, "equal homes give equal bytes"
+    content = databases.pack(plans)
+    assert databases.pack(plans) == content, "equal homes give equal bytes"
+    path.write_bytes(content)
+    stored = databases.read(path, 3, "")
     for index, g in enumerate(plans):
-        stored = database.home(index, path=path)
-        assert all(np.array_equal(stored[key], g[key]) for key in stored)
+        home = stored.home(index, g.id)
+        assert all(np.array_equal(home[key], g[key]) for key in home)
+    monkeypatch.setattr(databases, "PATH", path)
+    for k in range(1, 8):
+        path.write_bytes(
+            content[: k * len(content) // 9] + b"??" + content[k * len(content) // 9 + 2 :]
+        )
+        databases._packaged.cache_clear()
+        databases.home.cache_clear()
+        with pytest.raises(ValueError, match="homes.npz' cannot be read .*install megastep again"):
+            databases.home(4)
+    databases._packaged.cache_clear()

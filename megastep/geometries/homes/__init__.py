@@ -2,8 +2,7 @@
 
 `generate(seed)` generates a home in steps: the number and kinds of rooms, the outline, a partition
 into rooms, doors and openings, walls. A seed gives the same home on every machine
-(`portable_generator`). `database` holds the 5,000 homes of seeds 0 to 4,999, which come with the
-package.
+(`portable_generator`). The homes of seeds 0 to 4,999 come with the package.
 """
 
 import numpy as np
