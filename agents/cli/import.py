@@ -155,13 +155,14 @@ def _import_database(source, path, licence, per, is_sealed) -> None:
         tempfile.TemporaryFile(dir=folder).close()
     with console.counting("files"), user_errors():
         n_files = _n_files(path, suffix) or DATABASES[source][-1]
-        plans, shown = imports.run(options, path, lambda n: console.count(n, max(n, n_files)))
+        plans = imports.run(options, path, lambda n: console.count(n, max(n, n_files)))
     geometries = [g for plan in plans for g in plan.geometries]
     numbers = [i for i, plan in enumerate(plans) for _ in plan.geometries]
     with user_errors(f"{folder} cannot be written: "):
         file = databases.write_imported(source, geometries, numbers)
         sheet, report = (folder / f"{source}.{kind}" for kind in ("png", "md"))
-        sheets.write(sheet, [(one.name[-40:], *imports.first_home(options, one)) for one in shown])
+        shown = ((p.name[-40:], p.drawing, p.geometries[0]) for p in plans if p.drawing is not None)
+        sheets.write(sheet, [*shown])
         report.write_text(_report(source, path, plans, len(geometries)))
     n_refused = sum(not plan.geometries for plan in plans)
     console.say(

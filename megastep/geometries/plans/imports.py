@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from megastep.geometries.plans.outlines import Drawing, Notes
 
 READERS = {"cubicasa": cubicasa, "houseexpo": houseexpo}
 BATCH = 16  # files that a process gets at a time
-PENDING = 4  # batches per process that are read ahead
+AHEAD = 8 * BATCH  # files per process that are held at once
 #: What libraries raise for broken files, but for ValueError.
 UNREADABLE = (
     *(shapely.errors.GEOSException, RecursionError, MemoryError, ArithmeticError, LookupError),
@@ -30,11 +30,12 @@ SHOWN = 12  # plans of the contact sheet
 
 
 class Plan(NamedTuple):
-    """What a file became: geometries and notes, or why it is refused."""
+    """What a file became: geometries, notes and the first one's drawing, or why it is refused."""
 
     name: str
-    geometries: list[dotdict]
-    notes: list[Notes]
+    geometries: Sequence[dotdict] = ()
+    notes: Sequence[Notes] = ()
+    drawing: Drawing | None = None
     refusal: str = ""
 
 
@@ -57,7 +58,7 @@ def _home(drawing, sealed=True, tolerance=outlines.CURVED) -> tuple[dotdict, Not
 
 @contextlib.contextmanager
 def _refused() -> Iterator[None]:
-    """Turns whatever a stranger's file makes libraries raise into a ValueError."""
+    """Turns whatever a stranger's file makes libraries raise into a ValueError of one line."""
     try:
         yield
     except UNREADABLE as error:
@@ -68,77 +69,53 @@ def _line(error) -> str:
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
-def first_home(options: Options, member: safe.Member) -> tuple[Drawing, dotdict]:
-    """Returns the first floor of a file that is a home, and its geometry."""
-    reader = READERS[options.source]
-    for drawing in reader.read(member.content or b"", options.per):
-        with contextlib.suppress(ValueError):
-            return drawing, _home(drawing, options.sealed, reader.TOLERANCE)[0]
-    raise ValueError(f"{member.name!r} has no home")
-
-
 def read(options: Options, member: safe.Member) -> Plan:
     """Returns the plan of a file. A floor that is no home is a warning if another floor is one."""
     name, reader = member.name, READERS[options.source]
     if member.content is None:
-        return Plan(name, [], [], member.refusal)
-    made, refusals = [], []
+        return Plan(name, refusal=member.refusal)
+    homes, refusals = [], []
     try:
         with _refused():
             floors = reader.read(member.content, options.per)
     except ValueError as error:
-        return Plan(name, [], [], _line(error))
+        return Plan(name, refusal=_line(error))
     for drawing in floors:
         try:
-            made.append(_home(drawing, options.sealed, reader.TOLERANCE))
+            homes.append((*_home(drawing, options.sealed, reader.TOLERANCE), drawing))
         except ValueError as error:
             refusals.append(_line(error))
-    if not made:
-        return Plan(name, [], [], "; ".join(dict.fromkeys(refusals)))
+    if not homes:
+        return Plan(name, refusal="; ".join(dict.fromkeys(refusals)))
+    geometries, notes, drawings = zip(*homes)
     if refusals:
-        made[0][1].warnings.append(f"{len(refusals)} floors are left out: {'; '.join(refusals)}")
-    return Plan(name, [g for g, _ in made], [notes for _, notes in made])
-
-
-def _read_all(options, members) -> list[Plan]:
-    return [read(options, member) for member in members]
+        notes[0].warnings.append(f"{len(refusals)} floors are left out: {'; '.join(refusals)}")
+    return Plan(name, geometries, notes, drawings[0])
 
 
 def run(
     options: Options, path: Path, show: Callable[[int], None], processes: int | None = None
-) -> tuple[list[Plan], list[safe.Member]]:
-    """Returns the plans of all files of an archive, folder or file, sorted by name, and the first
-    files that are plans. `show` is called with the number of files that are read, by as many
+) -> list[Plan]:
+    """Returns the plans of all files of an archive, folder or file, sorted by name, with the
+    drawings of the first. `show` is called with the number of files that are read, by as many
     `processes`; None: one per core. Raises ValueError if none is a plan, or one is damaged.
     """
     n_processes = loky.cpu_count() if processes is None else processes
-    suffix = READERS[options.source].SUFFIX
-    members = safe.members(path, suffix)
-    batches = iter(lambda: [*itertools.islice(members, BATCH)], [])
+    suffix, read_one = READERS[options.source].SUFFIX, functools.partial(read, options)
+    members, each, size = safe.members(path, suffix), map, BATCH
     plans: list[Plan] = []
-    shown: list[safe.Member] = []
-
-    def keep(batch, result) -> None:
-        plans.extend(result)
-        good = [one for one, plan in zip(batch, result) if plan.geometries]
-        shown.extend(good[: SHOWN - len(shown)])
-        show(len(plans))
-
-    # a small archive is read here, as processes take a while to start
-    for batch in itertools.islice(batches, 1 if n_processes > 1 else None):
-        keep(batch, _read_all(options, batch))
-    if (second := next(batches, None)) is not None:
+    n_shown = 0
+    with contextlib.ExitStack() as stack:
         try:
-            with workers.terminal_signals_blocked(), workers.pool(n_processes) as pool:
-                submit = functools.partial(pool.submit, _read_all, options)
-                pending = []
-                for batch in itertools.chain([second], batches):
-                    pending.append((batch, submit(batch)))
-                    if len(pending) >= PENDING * n_processes:
-                        done, result = pending.pop(0)
-                        keep(done, result.result())
-                for done, result in pending:
-                    keep(done, result.result())
+            while batch := [*itertools.islice(members, size)]:
+                for plan in each(read_one, batch):
+                    plans.append(plan if n_shown < SHOWN else plan._replace(drawing=None))
+                    n_shown += plan.drawing is not None
+                    show(len(plans))
+                if each is map and n_processes > 1:  # many files, worth starting processes for
+                    stack.enter_context(workers.terminal_signals_blocked())
+                    pool = stack.enter_context(workers.pool(n_processes))
+                    each, size = functools.partial(pool.map, chunksize=BATCH), AHEAD * n_processes
         except BrokenExecutor as error:
             text = "a process was killed, perhaps as memory is short; nothing is imported"
             raise ValueError(text) from error
@@ -147,7 +124,7 @@ def run(
         if plans:
             reason = f"of {len(plans):,} files, {plans[0].name!r} is refused: {plans[0].refusal}"
         raise ValueError(f"{str(path)!r} has no floor plan that can be used; {reason}")
-    return sorted(plans, key=lambda plan: plan.name), shown
+    return sorted(plans, key=lambda plan: plan.name)
 
 
 # ---- One plan of one's own ----
