@@ -10,8 +10,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import shapely
+import svgelements
 from shapely.geometry.base import BaseGeometry
-from svgelements import Close, Color, Line, Matrix, Move, Path, Viewbox
+from svgelements import Close, Color, Line, Matrix, Move, Path
 
 from megastep.geometries.plans import outlines, safe
 from megastep.geometries.plans.outlines import Drawing
@@ -31,26 +32,35 @@ INHERITED = {
     **{"fill": "black", "fill-rule": "nonzero", "fill-opacity": "1", "color": "black"},
     **{"stroke": "none", "stroke-width": "1", "stroke-opacity": "1", "stroke-linecap": "butt"},
     **{"stroke-linejoin": "miter", "stroke-miterlimit": "4", "visibility": "visible"},
+    "font-size": "16",  # pixels of an em
 }
 OWN = {
     **{"display": "inline", "opacity": "1", "transform": "", "vector-effect": "none"},
     "overflow": "hidden",
 }
 #: Pixels of a unit, of which 96 are an inch.
-UNITS = {
-    **{"px": 1, "in": 96, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 4 / 3, "pc": 16},
-    **{"em": 16, "rem": 16},
-}
+UNITS = {"px": 1, "in": 96, "cm": 96 / 2.54, "mm": 96 / 25.4, "pt": 4 / 3, "pc": 16, "rem": 16}
 LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(%|[a-z]*)", re.I)
 RULE = re.compile(r"([^{}]+)\{([^{}]*)\}")
-#: What is ignored: fonts, other files, and styles of print and other media.
-MEDIA = re.compile(
-    r"@(?:import|charset)[^;]*;|@font-face[^}]*\}|@media[^{]*\{(?:[^{}]*\{[^{}]*\})*[^{}]*\}"
+#: What is ignored: comments, fonts, other files, and styles of other media than screens.
+IGNORED = re.compile(
+    r"/\*.*?\*/|<!--|-->|@(?:import|charset)[^;]*;|@font-face[^}]*\}"
+    r"|@media(?!\s+(?:screen|all)\s*\{)[^{]*\{(?:[^{}]*\{[^{}]*\})*[^{}]*\}",
+    re.S,
 )
+MEDIA = re.compile(r"@media[^{]*\{((?:[^{}]*\{[^{}]*\})*)[^{}]*\}")
 COMPOUND = re.compile(r"(>?)(\*|[\w-]+)?((?:[.#][\w-]+)*)")
 CURVE = np.linspace(0, 1, 49)  # points of a curve, which are simplified later
-CAPS = {"butt": "flat", "round": "round", "square": "square"}
-JOINS = {"round": "round", "bevel": "bevel"}
+CAPS = {"round": "round", "square": "square"}
+#: Elements with the attributes that are their shape, of which two of an ellipse or a rounded
+#: rectangle have the other as default.
+SHAPES = {
+    "rect": (svgelements.Rect, ("x", "y", "width", "height", "rx", "ry")),
+    "circle": (svgelements.Circle, ("cx", "cy", "r")),
+    "ellipse": (svgelements.Ellipse, ("cx", "cy", "rx", "ry")),
+    "line": (svgelements.SimpleLine, ("x1", "y1", "x2", "y2")),
+}
+DEFAULTS = {"rx": "ry", "ry": "rx"}
 MAX_PATHS = 1 << 19  # characters of all marked paths
 MAX_SHAPES = 20_000
 MAX_WORK = 2_000_000  # of elements, each of which costs as much as VISIT rules of style
@@ -115,13 +125,13 @@ def apply(matrix: Matrix, points: np.ndarray) -> np.ndarray:
     return points @ linear + (matrix.e, matrix.f)
 
 
-def length(text: str, whole: float) -> float:
+def length(text: str, whole: float, em: float = 16) -> float:
     """Returns a length in pixels, of which `whole` are 100 %. Raises ValueError."""
     match = LENGTH.fullmatch(text.strip())
-    unit = match[2].lower() or "px" if match else ""
-    if not match or unit != "%" and unit not in UNITS:
+    sizes = UNITS | {"": 1, "%": whole / 100, "em": em}
+    if not match or match[2].lower() not in sizes:
         raise ValueError(f"{text[:40]!r} is no length that is read")
-    return float(match[1]) * (whole / 100 if unit == "%" else UNITS[unit])
+    return float(match[1]) * sizes[match[2].lower()]
 
 
 def is_marked(element: Element, mark: str) -> bool:
@@ -170,8 +180,7 @@ class _Reader:
         self._visit(root, _Place(Matrix(), INHERITED, 1.0, "", (0, 0), None, ()))
 
     def _add_rules(self, text) -> None:
-        text = re.sub(r"/\*.*?\*/|<!--|-->", "", text, flags=re.S)
-        for selectors, body in RULE.findall(MEDIA.sub("", text)):
+        for selectors, body in RULE.findall(MEDIA.sub(r"\1", IGNORED.sub("", text))):
             for selector in selectors.split(","):
                 words = re.sub(r"\s*>\s*", " >", selector.strip()).split()
                 parts = [COMPOUND.fullmatch(word) for word in words]
@@ -212,6 +221,10 @@ class _Reader:
         for key in ("fill", "stroke"):
             if style[key].lower() == "currentcolor":
                 style[key] = style["color"]
+        above = float(place.style["font-size"])
+        is_length = LENGTH.fullmatch(style["font-size"])
+        em = length(style["font-size"], above, above) if is_length else above
+        style["font-size"] = str(em)
         once = {key: own.get(key, value) for key, value in OWN.items()}
         if once["display"] == "none":
             return
@@ -223,7 +236,7 @@ class _Reader:
         def of(key, default: Any = 0) -> float:
             axis = next((letter for letter in key if letter in "xywh"), "r")
             whole = size["yh".count(axis)] if axis != "r" else np.hypot(size[0], size[1]) / 2**0.5
-            return length(str(own.get(key, default)), whole)
+            return length(str(own.get(key, default)), whole, em)
 
         if name in ("svg", "symbol"):
             own |= box or {}
@@ -239,10 +252,8 @@ class _Reader:
                     corners = shapely.get_coordinates(shapely.box(x, y, x + width, y + height))
                     visible = shapely.Polygon(apply(matrix, corners) * self.scale)
                     clip = visible if clip is None else clip & visible
-                aspect = own.get("preserveAspectRatio")
-                box_of: Any = (x, y, width, height, *view, aspect)
-                moved = Viewbox.viewbox_transform(*box_of)
-                matrix = transform(moved, matrix)
+                sizes: Any = (x, y, width, height, *view, own.get("preserveAspectRatio"))
+                matrix = transform(svgelements.Viewbox.viewbox_transform(*sizes), matrix)
             size = view[2], view[3]
         place = _Place(matrix, style, opacity, kind, size, clip, chain)
         if name == "use":
@@ -256,9 +267,9 @@ class _Reader:
             self._visit(target, place._replace(matrix=moved), box)
         elif kind and style["visibility"] == "visible" and opacity > 0:
             self._paint(name, own, of, place, once["vector-effect"] == "non-scaling-stroke")
-        if name != "use":
-            for child in element:
-                self._visit(child, place)
+        children = [child for child in element if "requiredExtensions" not in child.attrib]
+        for child in children[: {"use": 0, "switch": 1}.get(name)]:
+            self._visit(child, place)
 
     def _paint(self, name, own, of, place, is_fixed) -> None:
         """Adds what a shape covers: its fill and its stroke."""
@@ -286,54 +297,29 @@ class _Reader:
                 self.meetings = outlines.check_meetings(drawn, self.meetings)
                 first = outlines.area_of(rings, style["fill-rule"] == "evenodd")
             shapes.append(first)
-        width = length(style["stroke-width"], float(np.hypot(*place.size)) / 2**0.5)
+        whole = float(np.hypot(*place.size)) / 2**0.5
+        width = length(style["stroke-width"], whole, float(style["font-size"]))
         if width > 0 and is_painted(style["stroke"], style["stroke-opacity"]):
             size = self.scale[0] * (1 if is_fixed else area**0.5)
-            pen: dict = dict(
-                distance=max(width, outlines.GRID / size) / 2,
-                cap_style=CAPS.get(style["stroke-linecap"], "flat"),
-                join_style=JOINS.get(style["stroke-linejoin"], "mitre"),
-                mitre_limit=max(1.0, length(style["stroke-miterlimit"], 1)),
-            )
+            half = max(width, outlines.GRID / size) / 2
             self.meetings = outlines.check_meetings(drawn, self.meetings)
+            to_metres = (lambda points: points * self.scale) if is_fixed else metres
             for line, is_closed in lines:
                 line = apply(place.matrix, line) if is_fixed else line
-                closes = is_closed and len(np.unique(line, axis=0)) > 2
-                stroke = (shapely.LinearRing if closes else shapely.LineString)(line).buffer(**pen)
-                if is_fixed:
-                    shapes.append(shapely.transform(stroke, lambda p: p * self.scale))
-                else:
-                    shapes.append(shapely.transform(stroke, metres))
+                stroke = _stroke(line, is_closed, half, style)
+                shapes.append(shapely.transform(stroke, to_metres))
         if place.clip is not None:
             shapes = [shape & place.clip for shape in shapes]
         self.shapes[place.kind] += [shape for shape in shapes if not shape.is_empty]
 
     def _outline(self, name, own, of) -> list[tuple[np.ndarray, bool]]:
         """Returns the lines (P, 2) of a shape, and whether each is closed; none for a group."""
-        if name == "rect":
-            x, y, width, height = (of(key) for key in ("x", "y", "width", "height"))
-            if width <= 0 or height <= 0:
-                return []
-            rx, ry = of("rx", own.get("ry", 0)), of("ry", own.get("rx", 0))
-            rx, ry = min(rx, width / 2), min(ry, height / 2)
-            if rx <= 0 or ry <= 0:
-                corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-                return [(np.array(corners), True)]
-            arc, across, down = f"a{rx} {ry} 0 0 1 ", width - 2 * rx, height - 2 * ry
-            return _path(
-                f"M{x + rx} {y}h{across}{arc}{rx} {ry}v{down}{arc}{-rx} {ry}h{-across}"
-                f"{arc}{-rx} {-ry}v{-down}{arc}{rx} {-ry}z"
-            )
+        if name in SHAPES:
+            shape, keys = SHAPES[name]
+            return _lines(shape(*(of(key, own.get(DEFAULTS.get(key), 0)) for key in keys)))
         if name in ("polygon", "polyline"):
             points = safe.points(own.get("points", ""))
             return [(points, name == "polygon")] if len(points) > 1 else []
-        if name == "line":
-            return [(np.array([[of("x1"), of("y1")], [of("x2"), of("y2")]]), False)]
-        if name in ("circle", "ellipse"):
-            radii = (of("r"),) * 2 if name == "circle" else (of("rx"), of("ry"))
-            angles = np.linspace(0, 2 * np.pi, 128, endpoint=False)
-            circle = np.stack([np.cos(angles), np.sin(angles)], 1)
-            return [(circle * radii + (of("cx"), of("cy")), True)] if min(radii) > 0 else []
         if name == "image":
             self.unread["image"] += 1
         if name != "path" or not own.get("d"):
@@ -341,7 +327,10 @@ class _Reader:
         self.n_characters += len(own["d"])
         if self.n_characters > MAX_PATHS:
             raise ValueError(f"its marked paths have more than {MAX_PATHS:,} characters")
-        return _path(own["d"])
+        try:
+            return _lines(own["d"])
+        except (IndexError, TypeError, AttributeError, ZeroDivisionError) as error:
+            raise ValueError(f"the path {own['d'][:30]!r} cannot be read") from error
 
 
 def _matches(parts, chain) -> bool:
@@ -362,14 +351,39 @@ def _matches(parts, chain) -> bool:
     return True
 
 
-def _path(text) -> list[tuple[np.ndarray, bool]]:
-    """Returns the lines of a path with its curves flattened."""
-    try:
-        segments = list(Path(text))
-    except (ValueError, IndexError, TypeError, AttributeError, ZeroDivisionError) as error:
-        raise ValueError(f"the path {text[:30]!r} cannot be read") from error
+def _stroke(line, is_closed, half, style) -> BaseGeometry:
+    """Returns the area within `half` of a line (P, 2), with the style's caps and joins."""
+    is_step = np.abs(np.roll(line, -1, 0) - line).max(1) > 1e-9 * np.abs(line).max()
+    is_step[-1] |= not is_closed
+    line = line[is_step]
+    join: Any = style["stroke-linejoin"]
+    cap: Any = CAPS.get(style["stroke-linecap"], "flat")
+    closes = is_closed and len(np.unique(line, axis=0)) > 2
+    if is_closed and not closes:  # there and back, with a join at either end
+        cap = "round" if join == "round" else "flat"
+    path = (shapely.LinearRing if closes else shapely.LineString)(line if len(line) > 1 else [])
+    limit = max(1.0, length(style["stroke-miterlimit"], 1))
+    corners = np.array(path.coords) @ (1, 1j)
+    steps = np.diff(np.append(corners, corners[1:2]) if closes else corners)
+    cosines = (steps[1:] * steps[:-1].conj() / np.abs(steps[1:] * steps[:-1])).real
+    is_sharp = limit**2 * (1 + cosines) < 2 - 1e-9  # for the mitre limit
+    if join in ("round", "bevel") or not is_sharp.any():
+        join = join if join in ("round", "bevel") else "mitre"
+        return path.buffer(half, cap_style=cap, join_style=join, mitre_limit=limit)
+    if closes:  # begins and ends within its first step
+        middle = line[:2].mean(0, keepdims=True)
+        line = np.concatenate([middle, line[1:], line[:1], middle])
+    cuts = [0, *is_sharp.nonzero()[0] + 1, len(line) - 1]  # GEOS would not bevel sharp corners
+    pieces = [shapely.LineString(line[a : b + 1]) for a, b in zip(cuts, cuts[1:])]
+    pens: dict = dict(cap_style="flat", join_style="mitre", mitre_limit=limit)
+    area = path.buffer(half, cap_style=cap, join_style="bevel")
+    return shapely.union_all([area, *(piece.buffer(half, **pens) for piece in pieces)])
+
+
+def _lines(path) -> list[tuple[np.ndarray, bool]]:
+    """Returns the lines of a path, or of what makes one, with its curves flattened."""
     lines, points = [], []
-    for segment in [*segments, Move((0, 0))]:
+    for segment in [*Path(path), Move((0, 0))]:
         if isinstance(segment, (Move, Close)):
             if len(points) > 1:
                 lines.append((np.array(points), isinstance(segment, Close)))
@@ -378,8 +392,7 @@ def _path(text) -> list[tuple[np.ndarray, bool]]:
             points.append(tuple(segment.end))
         else:
             with np.errstate(all="ignore"):  # what is not finite is refused below
-                curve = np.asarray(segment.npoint(CURVE))
-            points += [tuple(row) for row in curve[1:].tolist()]
+                points += [tuple(row) for row in np.asarray(segment.npoint(CURVE))[1:].tolist()]
     for line, _ in lines:
         if not np.isfinite(line).all() or np.abs(line).max() > safe.MAX_COORDINATE:
             raise ValueError("a coordinate of a path is not finite, or too large")
