@@ -42,15 +42,14 @@ from megastep.agents.errors import UserError, shortened
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.copies import copy_all
-from megastep.agents.storage.rollout import Rollout, make_rollout, without_last
+from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
 from megastep.coefficients import Coefficients
 from megastep.imports import known_name
 from megastep.schedules import Number, Scheduled
 from megastep.settings import MAX_ENVS, AtMost, checked
-from megastep.types import Env
+from megastep.types import Env, optional
 
 # Types of settings that several learners have.
 Coefficient = Annotated[float, Field(ge=0, le=10**6)]
@@ -86,8 +85,8 @@ def check_learner(learner: object) -> None:
 class GradientLearner:
     """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
 
-    A subclass adds its settings, `bytes_per_env` and `_update`, and sets `loss_coefficients` before
-    it calls this constructor. A subclass of one of the learners adds a loss of its own by
+    A subclass adds its settings and `_update`, and sets `loss_coefficients` before it calls this
+    constructor. A subclass of one of the learners adds a loss of its own by
     `extra_loss` and, for weights that acting does not need, `extra_parameters`.
 
     Args:
@@ -118,7 +117,7 @@ class GradientLearner:
         loss_coefficients: numbers and schedules of the loss by name, besides `gamma`.
     """
 
-    n_minibatches = 1
+    n_minibatches = n_networks = 1
     loss_coefficients: dict[str, Number] = {}
     critic_lr: float | None = None
     desired_kl: float | None = None
@@ -175,6 +174,19 @@ class GradientLearner:
         """Returns a collector of rollouts of `n_steps` steps, with the critic's `values`."""
         self.policy.clear_stats()
         return Collector(env, self.policy, make_rollout(env, self.policy, self.n_steps, values))
+
+    def minibatch_rows(self) -> float:
+        """Returns the rows of a minibatch per lane of the environment."""
+        return (self.n_steps + 1) / self.n_minibatches
+
+    def bytes_per_env(self, env: Env) -> float:
+        """Returns about how many bytes a rollout and a minibatch take per environment."""
+        per_row = bytes_per_step(env, self.policy)
+        activations = self.n_networks * self.policy.activation_bytes
+        # values are of the features of a whole rollout, 4 bytes per unit
+        rollout = (self.n_steps + 1) * (per_row + 4 * self.policy.width)
+        minibatch = self.minibatch_rows() * (per_row + activations)
+        return optional(env, "n_agents") * (rollout + minibatch)
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Learns from a rollout. Returns metrics as tensors () on the device, averaged over the
@@ -283,6 +295,11 @@ class GradientLearner:
                 )
         return extra, {key: value.detach() for key, value in own.items()}
 
+    @torch.no_grad()
+    def _load_extra(self, saved) -> None:
+        for parameter, source in zip(self.extra, saved, strict=True):
+            parameter.copy_(source)
+
     # ---- State ----
 
     def state_dict(self) -> StateDict:
@@ -302,13 +319,11 @@ class GradientLearner:
         """Takes over what another learner of the same class and sizes has learnt, the policy's
         weights too, in place. Generators and rollouts stay this one's.
         """
-        own, others = self.policy.state_dict(), other.policy.state_dict()
-        copy_all((own[name], others[name]) for name in own)
+        self.policy.load_state_dict(other.policy.state_dict())
         self.steps.optimizer.load_state_dict(other.steps.optimizer.state_dict())
         self.coefficients.set(**other.coefficients.values)
         self.steps.copy_from(other.steps)
-        with torch.no_grad():
-            copy_all(zip(self.extra, other.extra, strict=True))
+        self._load_extra(other.extra)
 
     def check_state(self, state: StateDict) -> None:
         """Raises ValueError if a `state_dict` is not one that `load_state_dict` continues from."""
@@ -334,9 +349,7 @@ class GradientLearner:
         self.steps.load_state_dict(state)
         saved = state["coefficients"]
         self.coefficients.set(**{k: v for k, v in saved.items() if k in self.coefficients.values})
-        with torch.no_grad():
-            for parameter, saved in zip(self.extra, state.get("extra", []), strict=True):
-                parameter.copy_(saved)
+        self._load_extra(state.get("extra", []))
         self.generator.load_state_dict(state["generator"], self.device)
         self.policy.generator.load_state_dict(state["policy_generator"], self.device)
         self.cuda_graph.restart()

@@ -25,9 +25,15 @@ _NONE = MappingProxyType({})
 
 
 class _Optimizer:
-    def __init__(self, parameters: Iterable[torch.nn.Parameter], lr: torch.Tensor):
+    """Base: parameters, of which groups have factors of the step size and weight decays."""
+
+    def __init__(self, parameters, lr: torch.Tensor, lr_factors: Factors, weight_decays: Factors):
         self.parameters, self.lr = list(parameters), lr
         self.n_steps: torch.Tensor = torch.zeros((), device=lr.device)
+        self.groups: dict[tuple[float, float], list] = {}
+        for p in self.parameters:
+            key = lr_factors.get(p, 1.0), weight_decays.get(p, 0.0)
+            self.groups.setdefault(key, []).append(p)
 
     @torch.no_grad()
     @fused(
@@ -71,15 +77,20 @@ class Adam(_Optimizer):
         lr_factors: Factors = _NONE,
         weight_decays: Factors = _NONE,
     ):
-        super().__init__(parameters, lr)
+        super().__init__(parameters, lr, lr_factors, weight_decays)
         self.betas, self.eps = betas, eps
         self.means = [torch.zeros_like(p) for p in self.parameters]
         self.squares = [torch.zeros_like(p) for p in self.parameters]
-        # those of one step size and one decay are updated by one operation
-        self.groups: dict[tuple[float, float], list] = {}
-        for row in zip(self.parameters, self.means, self.squares, strict=True):
-            key = lr_factors.get(row[0], 1.0), weight_decays.get(row[0], 0.0)
-            self.groups.setdefault(key, []).append(row)
+
+    def rows(self) -> Iterator[tuple[float, float, list[tuple[torch.Tensor, ...]]]]:
+        """Yields factor and weight decay of each group, and of its parameters with a gradient the
+        parameter, gradient and running means.
+        """
+        moments = dict(zip(self.parameters, zip(self.means, self.squares), strict=True))
+        for (factor, weight_decay), members in self.groups.items():
+            rows = [(p, p.grad, *moments[p]) for p in members if p.grad is not None]
+            if rows:
+                yield factor, weight_decay, rows
 
     def step(
         self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None = None, max_norm: float = 0.0
@@ -102,22 +113,20 @@ class Adam(_Optimizer):
         """Takes a `step` that `n_steps` counts already."""
         if grad_norm is not None:
             torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
-        for (factor, weight_decay), members in self.groups.items():
-            rows = [(p, p.grad, *moments) for p, *moments in members if p.grad is not None]
-            if rows:
-                torch._fused_adamw_(  # pyright: ignore[reportPrivateImportUsage]
-                    *map(list, zip(*rows)),
-                    max_exp_avg_sqs=[],
-                    state_steps=[self.n_steps] * len(rows),
-                    lr=self.lr if factor == 1 else self.lr * factor,
-                    beta1=self.betas[0],
-                    beta2=self.betas[1],
-                    weight_decay=weight_decay,
-                    eps=self.eps,
-                    amsgrad=False,
-                    maximize=False,
-                    found_inf=(~is_taken).float(),
-                )
+        for factor, weight_decay, rows in self.rows():
+            torch._fused_adamw_(  # pyright: ignore[reportPrivateImportUsage]
+                *map(list, zip(*rows)),
+                max_exp_avg_sqs=[],
+                state_steps=[self.n_steps] * len(rows),
+                lr=self.lr if factor == 1 else self.lr * factor,
+                beta1=self.betas[0],
+                beta2=self.betas[1],
+                weight_decay=weight_decay,
+                eps=self.eps,
+                amsgrad=False,
+                maximize=False,
+                found_inf=(~is_taken).float(),
+            )
 
     def state_dict(self) -> StateDict:
         """Returns the number of steps and both running means."""
@@ -147,15 +156,10 @@ class Imported(_Optimizer):
         lr_factors: Factors,
         weight_decays: Factors,
     ):
-        super().__init__(parameters, lr)
-        groups: dict[tuple[float, float], list] = {}
-        for p in self.parameters:
-            key = lr_factors.get(p, 1.0), weight_decays.get(p, 0.0)
-            groups.setdefault(key, []).append(p)
-        self.factors, rate = [factor for factor, _ in groups], float(lr)
+        super().__init__(parameters, lr, lr_factors, weight_decays)
         settings = [
-            {"params": members, "lr": rate * factor, **({"weight_decay": decay} if decay else {})}
-            for (factor, decay), members in groups.items()
+            dict(params=ps, lr=float(lr) * factor, **(dict(weight_decay=decay) if decay else {}))
+            for (factor, decay), ps in self.groups.items()
         ]
         try:
             self.inner = import_object(name)(settings)
@@ -176,7 +180,7 @@ class Imported(_Optimizer):
             return
         self.n_steps += 1
         torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
-        for group, factor in zip(self.inner.param_groups, self.factors, strict=True):
+        for group, (factor, _) in zip(self.inner.param_groups, self.groups, strict=True):
             group["lr"] = float(self.lr) * factor
         with torch.enable_grad():
             self.inner.step()
@@ -229,22 +233,15 @@ def _update_on_gpu(adam, is_taken, grad_norm, max_norm) -> None:
 def _launches(adam) -> Iterator[tuple[list[bytes], int]]:
     """Yields the packed rows of a launch and its number of blocks."""
     rows, n_blocks = [], 0
-    for (factor, weight_decay), members in adam.groups.items():
-        for p, mean, square in members:
-            if p.grad is None:
-                continue
+    for factor, weight_decay, members in adam.rows():
+        for p, gradient, mean, square in members:
             if len(rows) == _MAX_ROWS:
                 yield rows, n_blocks
                 rows, n_blocks = [], 0
-            addresses = [x.data_ptr() for x in (p, p.grad, mean, square)]
-            names = "parameter", "gradient", "mean", "square"
-            rows.append(
-                LIBRARY.params.AdamRowParams(
-                    **dict(zip(names, addresses, strict=True)),
-                    **dict(n=p.numel(), first_block=n_blocks),
-                    is_aligned=int(not any(address % 16 for address in addresses)),
-                    **dict(lr_factor=factor, weight_decay=weight_decay),
-                )
-            )
+            tensors = dict(parameter=p, gradient=gradient, mean=mean, square=square)
+            is_aligned = not any(x.data_ptr() % 16 for x in tensors.values())
+            fields = dict(n=p.numel(), first_block=n_blocks, is_aligned=int(is_aligned))
+            fields |= dict(lr_factor=factor, weight_decay=weight_decay)
+            rows.append(LIBRARY.params.AdamRowParams(**tensors, **fields))
             n_blocks += max(1, -(-p.numel() // (4 * _THREADS)))
     yield rows, n_blocks

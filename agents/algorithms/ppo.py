@@ -17,12 +17,11 @@ from megastep.agents.algorithms.masked_stats import masked_mean, pooled_normalis
 from megastep.agents.networks.fused import fused
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments, normalise_masked
-from megastep.agents.storage.rollout import SEQUENCES, bytes_per_step, without_last
+from megastep.agents.storage.rollout import SEQUENCES, without_last
 from megastep.arrdict import arrdict
 from megastep.coefficients import on_device
 from megastep.kernels.build.launch import BLOCK, Blocks, launch
 from megastep.settings import checked
-from megastep.types import Env, optional
 
 _PARTS = "starts", "actions", "logprobs", "mask"  # of a rollout, that a minibatch copies
 _COEFFICIENTS = "clip", "value_coef", "entropy_coef", "auxiliary_coef"
@@ -158,15 +157,6 @@ class PPO(learner.ActorCritic):
         super().__init__(policy, **settings)
         self.value_clip, self.target_kl = value_clip, target_kl
         self.normalise_advantage = normalise_advantage
-
-    def bytes_per_env(self, env: Env) -> float:
-        """Returns about how many bytes a rollout and a minibatch take per environment."""
-        # A minibatch holds its part of the rollout and of the activations. Values are computed from
-        # the features of the whole rollout, 4 bytes per unit.
-        rollout = bytes_per_step(env, self.policy)
-        minibatch = (rollout + self.policy.activation_bytes) / self.n_minibatches
-        per_step = rollout + (minibatch + 4 * self.policy.width)
-        return optional(env, "n_agents") * (self.n_steps + 1) * per_step
 
     def _update(self, rollout) -> "dict[str, torch.Tensor]":
         transitions = rollout.transitions()

@@ -25,14 +25,14 @@ from megastep.agents.storage.replay import (
     defaults_from,
     replay_size,
 )
-from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.agents.storage.rollout import make_rollout, without_last
 from megastep.agents.types import StateDict
 from megastep.arrdict import arrdict
 from megastep.coefficients import on_device
 from megastep.dotdict import mapping
 from megastep.kernels.build.launch import Blocks, launch
 from megastep.settings import MAX_ENVS, checked
-from megastep.types import Env, Tree, World, optional
+from megastep.types import Env, Tree, World
 
 #: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
@@ -49,12 +49,14 @@ _N_SUMS, _N_METRICS = (LIBRARY.constants[f"N_TD_{name}"] for name in ("SUMS", "M
 
 
 class Result(NamedTuple):
-    """What a minibatch gives."""
+    """What a minibatch gives: a loss (), metrics (), priorities (M,), and the number () of valid
+    steps.
+    """
 
-    loss: torch.Tensor  # (), the mean of the weighted squared errors over the valid steps
-    metrics: dict[str, torch.Tensor]  # () by name
-    priorities: torch.Tensor  # (M,)
-    n_valid: torch.Tensor  # (), the number of valid steps
+    loss: torch.Tensor
+    metrics: dict[str, torch.Tensor]
+    priorities: torch.Tensor
+    n_valid: torch.Tensor
 
 
 class _Loss(torch.autograd.Function):
@@ -67,8 +69,7 @@ class _Loss(torch.autograd.Function):
         n_rows, n_sequences, n_agents, n_choices = q.shape
         n_blocks = -(-n_sequences // _SEQUENCES)
         d_q = torch.empty_like(q, memory_format=torch.contiguous_format)
-        values = q.new_empty(n_rows, n_sequences)
-        priorities = q.new_empty(n_sequences)
+        values, priorities = q.new_empty(n_rows, n_sequences), q.new_empty(n_sequences)
         sums, metrics = q.new_empty(n_blocks, _N_SUMS), q.new_empty(_N_METRICS)
         names = *_ENDS, "actions", "starts", "learns", "weight", "age"
         tensors = {name: batch[name].contiguous() for name in names}
@@ -117,7 +118,7 @@ def td_loss(
     eta: float,
 ) -> Result:
     """Computes the error of action values from n-step returns of a target network (Kapturowski et
-    al. 2019, section 2.3), with the priorities that follow from it.
+    al. 2019, section 2.3): the mean of the weighted squared errors over the valid steps.
 
     Args:
         q: (T+1, M, A, n) of the online network, or a tree of these.
@@ -216,6 +217,8 @@ class R2D2(learner.GradientLearner):
     of `GradientLearner`.
     """
 
+    n_networks = 2
+
     @checked
     def __init__(
         self,
@@ -268,14 +271,9 @@ class R2D2(learner.GradientLearner):
         self.replay_buffer = ReplayBuffer(rollout, self.replay_settings, logprobs=False)
         return collect
 
-    def bytes_per_env(self, env: Env) -> float:
-        """Returns about how many bytes a rollout and a minibatch take per environment."""
-        # A minibatch has its share of what is replayed per rollout; two networks have activations.
-        per_step = bytes_per_step(env, self.policy)
-        fraction = self.replay_settings.ratio / self.gradient_steps
-        rollout = (self.n_steps + 1) * per_step
-        minibatch = fraction * (self.length + 1) * (per_step + 2 * self.policy.activation_bytes)
-        return optional(env, "n_agents") * (rollout + minibatch)
+    def minibatch_rows(self) -> float:
+        """Returns the rows of a minibatch per lane of the environment."""
+        return self.replay_settings.ratio / self.gradient_steps * (self.length + 1)
 
     def replay_size(self, env: Env) -> tuple[int, float]:
         """Returns the number of observations that the replay buffer will hold, and the bytes per
@@ -327,17 +325,19 @@ class R2D2(learner.GradientLearner):
         q = now.logits
         if self._beside is not None:
             torch.cuda.current_stream(self.device).wait_stream(self._beside)
-        steps = arrdict({name: batch[name] for name in _STEPS})
-        steps = mapping(lambda leaf: leaf[burn_in:])(steps)
+        rest = mapping(lambda leaf: leaf[burn_in:])
+        learned = rest(arrdict({name: batch[name] for name in _STEPS}))
         scale = self.reward_scale.masked_fill(self.reward_scale == 0, 1.0)
-        steps["reward"] = steps.reward / scale
-        learned = arrdict({**steps, "weight": batch.weight, "age": batch.age})
-        settings = dict(gamma=self.coefficients["gamma"])
-        settings |= dict(return_steps=self.return_steps, eta=self.eta)
-        result = td_loss(q, target_q, learned, self.policy.output, **settings)
+        learned = arrdict(
+            learned, reward=learned.reward / scale, weight=batch.weight, age=batch.age
+        )
+        settings = dict(return_steps=self.return_steps, eta=self.eta)
+        result = td_loss(
+            q, target_q, learned, self.policy.output, gamma=self.coefficients["gamma"], **settings
+        )
         result.metrics["q"] = result.metrics["q"] * scale
         if self.has_extra_loss:
-            learned["obs"] = mapping(lambda leaf: leaf[burn_in:])(batch.obs)
+            learned["obs"] = rest(batch.obs)
             learned["valid"] = ~learned.starts[1:] & learned.learns[:-1]
             with self.policy.compute_dtype():
                 extra, own = self.extra_terms(now.features[:-1], learned, result.metrics)
@@ -348,8 +348,7 @@ class R2D2(learner.GradientLearner):
         """Takes over what another learner has learnt, its target network too. In place."""
         super().copy_from(other)
         assert isinstance(other, R2D2)
-        own, others = self.target.state_dict(), other.target.state_dict()
-        copy_all((own[name], others[name]) for name in own)
+        self.target.load_state_dict(other.target.state_dict())
         self.n_taken.copy_(other.n_taken)
         self.reward_scale.copy_(other.reward_scale)
 
@@ -359,7 +358,7 @@ class R2D2(learner.GradientLearner):
         return dict(super().state_dict(), target=self.target.state_dict(), **own)
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Continues from a `state_dict`, which may come from another device."""
+        """Continues from a `state_dict`."""
         super().load_state_dict(state)
         self.target.load_state_dict(state["target"])
         self.n_taken.copy_(state["n_taken"])

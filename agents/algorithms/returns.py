@@ -30,12 +30,12 @@ def _gae_on_gpu(
     (n_steps, n_lanes), device = reward.shape, value.device
     advantages, targets = reward.new_empty(2, n_steps, n_lanes)
     valid = torch.empty_like(advantages, dtype=torch.bool)
-    flags = dict(reset=reset, terminal=terminal, truncated=truncated, learns=learns)
+    inputs = dict(reward=reward, values=value, last_value=last_value, reset=reset)
+    inputs |= dict(terminal=terminal, truncated=truncated)
     launch(
         *(LIBRARY, "gae", device, n_lanes),
-        **dict(reward=reward.contiguous(), values=value.contiguous()),
-        last_value=last_value.contiguous(),
-        **{name: flag if flag is None else flag.contiguous() for name, flag in flags.items()},
+        **{name: leaf.contiguous() for name, leaf in inputs.items()},
+        learns=None if learns is None else learns.contiguous(),
         **dict(advantages=advantages, targets=targets, valid=valid),
         **dict(gamma=on_device(gamma, device), lambda_=on_device(lambda_, device)),
         **dict(n_steps=n_steps, n_lanes=n_lanes),
@@ -86,8 +86,7 @@ def _vtrace_on_gpu(
     numbers = {**dict.fromkeys(("lambda_", "rho_clip", "c_clip"), 1.0), **numbers}
     launch(
         *(LIBRARY, "vtrace", device, n_lanes),
-        **{name: leaf.contiguous() for name, leaf in steps.items()},
-        truncated=truncated.contiguous(),
+        **{name: leaf.contiguous() for name, leaf in (steps | dict(truncated=truncated)).items()},
         values=torch.cat([value, last_value[None]]),
         **dict(advantages=advantages, targets=targets),
         **{name: on_device(number, device) for name, number in numbers.items()},
@@ -134,18 +133,13 @@ def vtrace(
     rho = ratio.clamp(max=rho_clip)
     delta = rho * (reward + gamma * following.masked_fill(terminal, 0.0) - value)
     delta = delta.masked_fill(reset, 0.0)
-    discounts = (gamma * lambda_ * ratio.clamp(max=c_clip)).masked_fill(
-        terminal | truncated | reset, 0.0
-    )
+    ends = terminal | truncated | reset
+    discounts = (gamma * lambda_ * ratio.clamp(max=c_clip)).masked_fill(ends, 0.0)
     targets = value + linear_scan(delta, discounts, reverse=True)
-
-    beyond = torch.where(truncated, following, _following(targets, last_value)).masked_fill(
-        terminal, 0.0
-    )
-    advantages = rho * (reward + gamma * beyond - value)
-    return arrdict.arrdict(
-        advantages=advantages.masked_fill(reset, 0.0), targets=targets, valid=~reset
-    )
+    beyond = torch.where(truncated, following, _following(targets, last_value))
+    advantages = rho * (reward + gamma * beyond.masked_fill(terminal, 0.0) - value)
+    advantages = advantages.masked_fill(reset, 0.0)
+    return arrdict.arrdict(advantages=advantages, targets=targets, valid=~reset)
 
 
 def n_step_returns(
@@ -184,9 +178,7 @@ def rescale(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
 
 
 def inverse_rescale(y: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
-    """Returns the inverse of `rescale`, exact for large values. Near 0 its error is the rounding
-    error of a float32 near 1.
-    """
+    """Returns the inverse of `rescale`."""
     size = y.abs()
     root = 2 * (size + 1 + eps) / ((1 + 4 * eps * (size + 1 + eps)).sqrt() + 1)
     return y.sign() * (root.square() - 1)

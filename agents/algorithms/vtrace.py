@@ -23,11 +23,11 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import masked_moments
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, ReplaySettings, replay_size
-from megastep.agents.storage.rollout import bytes_per_step, without_last
+from megastep.agents.storage.rollout import without_last
 from megastep.arrdict import arrdict, cat
 from megastep.dotdict import mapping
 from megastep.settings import checked
-from megastep.types import Env, optional
+from megastep.types import Env
 
 # Metrics count larger ratios as e^20, so that their squares stay finite.
 _MAX_LOG_RATIO = 20.0
@@ -96,15 +96,10 @@ class VTrace(learner.ActorCritic):
             self.replay_buffer = ReplayBuffer(collect.rollout, self.replay_settings)
         return collect
 
-    def bytes_per_env(self, env: Env) -> float:
-        """Returns about how many bytes the rollout and a minibatch take per environment."""
-        # A minibatch has its share of fresh and replayed steps, with their activations.
-        fraction = 1 / self.n_minibatches
-        if self.replay_settings:
-            fraction *= 1 + self.replay_settings.ratio
-        per_step = bytes_per_step(env, self.policy) * (1 + fraction)
-        per_step += self.policy.activation_bytes * fraction
-        return optional(env, "n_agents") * (self.n_steps + 1) * per_step
+    def minibatch_rows(self) -> float:
+        """Returns the rows of a minibatch per lane of the environment, replayed ones included."""
+        ratio = self.replay_settings.ratio if self.replay_settings else 0.0
+        return (1 + ratio) * super().minibatch_rows()
 
     def replay_size(self, env: Env) -> tuple[int, float]:
         """Returns the number of observations that the replay buffer will hold, and the bytes per

@@ -193,7 +193,6 @@ class Policy(nn.Module):
         obs: Tree,
         reset: torch.Tensor,
         state: arrdict,
-        lanes: torch.Tensor | None = None,
         burn_in: int = 0,
         mask: Tree = None,
     ) -> arrdict:
@@ -202,20 +201,19 @@ class Policy(nn.Module):
 
         Args:
             obs: (T, B, ...) per leaf.
-            reset: (T, B) bool; clears a lane's hidden state before the step. (T, M) with `lanes`.
-            state: hidden state before the sequence, of M lanes with `lanes`.
-            lanes: (M,) int64, the lanes of `obs` to run over. None: all.
+            reset: (T, B) bool; clears a lane's hidden state before the step.
+            state: hidden state before the sequence.
             burn_in: steps at the start, fewer than T, that only warm up the hidden state. They have
                 no gradients, and the result leaves them out.
-            mask: (T, M, A, n) bool per discrete action space, allowed actions. None: all.
+            mask: (T, B, A, n) bool per discrete action space, allowed actions. None: all.
         """
         with self.compute_dtype():
             n_apart = burn_in if torch.is_grad_enabled() else 0  # without gradients, one pass does
             if n_apart:
                 first = mapping(lambda leaf: leaf[:n_apart])(obs)
-                state = self.warm_up(first, reset[:n_apart], state, lanes)
+                state = self.warm_up(first, reset[:n_apart], state)
                 obs, reset = mapping(lambda leaf: leaf[n_apart:])(obs), reset[n_apart:]
-            features, state = self._features(obs, reset, state, lanes)
+            features, state = self._features(obs, reset, state)
             features = features[burn_in - n_apart :]
             logits = self.output(features)
             if mask is not None:
@@ -223,12 +221,10 @@ class Policy(nn.Module):
             return arrdict(logits=logits, features=features, state=state)
 
     @torch.no_grad()
-    def warm_up(
-        self, obs: Tree, reset: torch.Tensor, state: arrdict, lanes: torch.Tensor | None = None
-    ) -> arrdict:
+    def warm_up(self, obs: Tree, reset: torch.Tensor, state: arrdict) -> arrdict:
         """Returns the hidden state after a sequence, without gradients; see `unroll`."""
         with self.compute_dtype():
-            _, state = self._features(obs, reset, state, lanes)
+            _, state = self._features(obs, reset, state)
         # autocast would give these casts of the weights, which have no gradients, to later steps
         torch.clear_autocast_cache()
         return state
@@ -277,8 +273,9 @@ class Policy(nn.Module):
     ) -> arrdict:
         """Returns what a loss needs of a sequence, (T, B) float32 each: `logprobs` of the actions
         (T, B, ...), `entropies`, `values`, and `errors` of `prediction_error`, None without a
-        `privileged_space` or `has_errors`; and `features` (T, B, width). Other arguments are those
-        of `unroll` and `value`.
+        `privileged_space` or `has_errors`; and `features` (T, B, width). With `lanes` (M,) int64
+        only of these lanes of `obs` and `privileged`: other arguments have M lanes then, not B, and
+        are those of `unroll` and `value`.
         """
         from megastep.agents.networks.critic import head_terms
 

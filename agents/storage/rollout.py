@@ -20,6 +20,7 @@ from megastep.types import Env, Space, Tree, n_lanes, optional
 
 #: Parts of a rollout that `Rollout.sequences` selects from.
 SEQUENCES = "obs starts learns actions logprobs reward terminal truncated privileged mask".split()
+Pairs = list[tuple[torch.Tensor, torch.Tensor]]  # (target, source)
 _BYTES_OF_THE_REST = 64  # of a step: everything except observations
 
 
@@ -134,8 +135,7 @@ class Rollout:
         pairs = [(getattr(self, name)[t], world[name]) for name in names]
         pairs += [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
         pairs += self._of_world(t + 1, world)
-        if decision is not None:
-            pairs += self._of_decision(t, decision)
+        pairs += [] if decision is None else self._of_decision(t, decision)
         if layout is not None:
             n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
             by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
@@ -144,15 +144,13 @@ class Rollout:
         copy_all(pairs)
         return self.world(t + 1)
 
-    def _of_decision(self, t, decision) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Returns (target, source) pairs for a decision at time t."""
+    def _of_decision(self, t, decision) -> Pairs:
         pairs = _pairs(self.actions, t, decision["actions"])
         if "logprobs" in decision:
             pairs.append((self.logprobs[t], decision["logprobs"]))
         return pairs
 
-    def _of_world(self, t, world) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Returns (target, source) pairs for the observation of time t."""
+    def _of_world(self, t, world) -> Pairs:
         pairs = [*_pairs(self.obs, t, world["obs"]), (self.starts[t], world["reset"])]
         if "learns" in world:
             pairs.append((self.learns[t], world["learns"]))
@@ -161,16 +159,6 @@ class Rollout:
         if self.mask is not None:
             pairs += _pairs(self.mask, t, world["mask"])
         return pairs
-
-    def state_dict(self) -> dict[str, Tree]:
-        """Returns every tensor: trees by name."""
-        names = *SEQUENCES, "values", "metrics", "layouts", "state"
-        parts = {name: getattr(self, name) for name in names}
-        return {name: part for name, part in parts.items() if part is not None}
-
-    def load_state_dict(self, state: dict[str, Tree]) -> None:
-        """Copies the tensors of a `state_dict`, which may be on another device."""
-        copy_tree(self.state_dict(), state)
 
     # ---- Lanes of the environment and lanes of the rollout ----
 
@@ -195,7 +183,7 @@ class Rollout:
 
     @property
     def reset(self) -> torch.Tensor:
-        """(T, B) bool, true where the action was ignored because a new episode started."""
+        """(T, B) bool, true where the action was ignored because an episode started."""
         return self.starts[1:]
 
     def world(self, t: int) -> arrdict:
@@ -303,8 +291,7 @@ def without_last(tree: Tree) -> Tree:
     return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
 
 
-def _pairs(rows, t, tree) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Returns (target, source) pairs of the leaves of row t and of a tree."""
+def _pairs(rows, t, tree) -> Pairs:
     targets, sources = spaces.leaves(rows), spaces.leaves(tree)
     return [(target[t], sources[path]) for path, target in targets.items()]
 

@@ -143,7 +143,7 @@ def learnt(policy, world, privileged, lanes, weights):
     sum of it, each on the CPU by name.
     """
     starts, state = world.reset[:, lanes], policy.initial(len(lanes))
-    now = policy.unroll(world.obs, starts, state, lanes)
+    now = policy.unroll(mapping(lambda leaf: leaf[:, lanes])(world.obs), starts, state)
     # the same actions whatever the logits are
     actions = mapping(lambda leaf: (weights[0] > 0).long()[..., None])(now.logits)
     outputs = policy.terms(world.obs, starts, state, actions, privileged, lanes)

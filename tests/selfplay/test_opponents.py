@@ -14,6 +14,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.runs.saver import Saver
 from megastep.agents.selfplay.mixed_policy import score_pairs
 from megastep.agents.selfplay.opponents import Opponents
+from megastep.agents.storage.rollout import SEQUENCES
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
@@ -72,7 +73,8 @@ def collected(device, has_streams, is_captured=False):
     tensors = []
     for n_updates in range(1, 5):
         rollout = collector()
-        tensors += [leaf.clone() for leaf in tree_leaves(rollout.state_dict())]
+        parts = [getattr(rollout, name) for name in (*SEQUENCES, "values", "state")]
+        tensors += [leaf.clone() for leaf in tree_leaves(parts)]
         with torch.no_grad():
             for weight in policy.parameters():
                 weight.mul_(1.5)
