@@ -8,6 +8,7 @@ import sys
 import pytest
 import torch
 
+from megastep import spaces
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.cli import evaluate, export, record, train
@@ -15,10 +16,12 @@ from megastep.agents.errors import UserError
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import json_lines
 from megastep.agents.storage.replay import ReplaySettings
+from megastep.arrdict import arrdict
 from tests.helpers import headed, pages
 from tests.helpers.made_up import PRIVILEGED, Numbers, made_up, weights
 from tests.helpers.tiny import ON_GPU, TINY
 
+PAGE = pages.ROOT / "docs" / "hooks.md"
 T = 5
 SETTINGS = dict(n_steps=T, n_minibatches=2, lr=1e-2)
 REPLAY = ReplaySettings(capacity=2**10, burn_in=1, ratio=2.0)
@@ -280,7 +283,7 @@ def test_a_head_is_not_needed_to_play(here):
 
 
 def test_commands_and_code_of_the_page_work(here, monkeypatch):
-    text = (pages.ROOT / "docs" / "hooks.md").read_text()
+    text = PAGE.read_text()
     learner, schedule = pages.code(text)
     (here / "my_ppo.py").write_text(learner)
     (here / "my_schedules.py").write_text(schedule)
@@ -288,3 +291,19 @@ def test_commands_and_code_of_the_page_work(here, monkeypatch):
         for _, words in pages.commands(text):
             small = "env.n_envs=4", "env.res=8", "agent.width=8", "samples=128"
             assert train.main([*words, *small, "geometry=box", "device=cpu"]) == 0, words
+
+
+def test_fields_of_a_rollout_have_the_shapes_that_the_page_says():
+    _, rollout = made_up(privileged=PRIVILEGED)
+    mask = torch.ones(rollout.n_lanes, 1, 2, dtype=torch.bool)
+    rollout.allocate_optional(arrdict(metrics=arrdict(age=rollout.reward[0]), mask=mask))
+    rollout.allocate_layouts()
+    sizes, named = {"T": rollout.n_steps, "T+1": rollout.n_steps + 1, "B": rollout.n_lanes}, set()
+    for names, shape in re.findall(r"^\| (`.+?) \| \((.+?)\) \|", PAGE.read_text(), re.M):
+        lead = tuple(sizes[axis] for axis in shape.split(", ") if axis in sizes)
+        for name in re.findall(r"\w+", names):
+            named.add(name)
+            for leaf in spaces.leaves(getattr(rollout, name)).values():
+                assert leaf.shape[: len(lead)] == lead, name
+    tensors = {name for name, value in vars(rollout).items() if isinstance(value, torch.Tensor)}
+    assert named >= tensors | {"obs", "privileged", "metrics", "state", "reset", "mask"}
