@@ -182,6 +182,11 @@ def load_player(loaded: checkpoint.Checkpoint, env: Env, run: checkpoint.Checkpo
     return Player(name_of(loaded), restore.policy_of(loaded, env), loaded)
 
 
+def is_bot(name: str) -> bool:
+    """Returns whether a name stands for what needs no weights: a bot, or an import path."""
+    return name in ("bot", *BOTS) or (":" in name and not os.path.exists(name))
+
+
 def find_player(
     name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Env, trust: bool
 ) -> Player:
@@ -195,7 +200,7 @@ def find_player(
     Raises:
         UserError: if this player cannot play there.
     """
-    if name in ("bot", *BOTS) or (":" in name and not os.path.exists(name)):
+    if is_bot(name):
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     try:
         path = folders.find(name)

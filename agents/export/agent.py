@@ -15,7 +15,7 @@ import torch
 
 from megastep.agents import console, factory, package
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.evaluation import tables
+from megastep.agents.evaluation import eval_env, tables
 from megastep.agents.factory import check, components, settings
 from megastep.agents.networks.policy import Policy
 from megastep.agents.runs import (
@@ -87,10 +87,11 @@ def command_of(words: str) -> str:
 
 def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
     """Returns the evaluations of a run after so many samples, oldest first: titles, commands
-    without their run, and rows. Of an environment with floor plans those in geometry=suite, or, if
-    there are none, those in homes of the run's own source.
+    without their run, and rows, of others only those whom everybody has. Of an environment with
+    floor plans those in geometry=suite, or, if there are none, those in homes of the run's own
+    source.
     """
-    tables: dict[bool, list[dict]] = {False: [], True: []}
+    suites, others = [], []
     own = vars(components.settings_for("geometry", components.SUITE))
     files = sorted((folder / "evaluations").glob("*.json"), key=lambda path: path.stat().st_mtime)
     for path in files:
@@ -99,7 +100,10 @@ def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
         geometry = how.get("geometry") or {}
         is_suite = geometry.get("name") == components.SUITE
         is_other = how.get("env") is not None or (has_homes and geometry and not is_suite)
-        if table.get("step") != step or is_other:
+        kind = "against" if how.get("against") else "baseline"
+        players = how.get(kind) or []
+        rows = _rows_of_known(table["rows"], kind, players)
+        if table.get("step") != step or is_other or not rows:
             continue
         words = ["geometry=suite"] * is_suite
         for key, value in geometry.items() if is_suite else ():
@@ -108,14 +112,25 @@ def tables_of(folder: Path, step: int, has_homes: bool) -> list[dict]:
         words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed") if key in how]
         words += ["greedy=true"] * how.get("greedy", False)
         words += [f"max_steps={how['max_steps']}"] * (how.get("max_steps") is not None)
-        words += ["baseline=none"] * (how.get("baseline") == [] and not how.get("against"))
-        for key in ("baseline", "against"):
-            if how.get(key) and how[key] != ["random"]:  # the default
-                words.append(f"{key}={','.join(how[key])}")
+        if (known := [*filter(_is_known, players)]) != ["random"]:  # the default
+            words.append(f"{kind}={','.join(known) or 'none'}")
         title = re.sub(f"^{re.escape(folder.name)}(?=, )", "the agent", table["title"])
-        about = {"title": title, "command": " ".join(words), "rows": table["rows"]}
-        tables[is_suite].append(about)
-    return tables[has_homes] or tables[False]
+        about = {"title": title, "command": " ".join(words), "rows": rows}
+        (suites if is_suite else others).append(about)
+    return (suites if has_homes else []) or others
+
+
+def _is_known(player: str) -> bool:
+    """Whether a colleague has a player: a bot, an agent of the package, or an import path."""
+    return eval_env.is_bot(player) or player in folders.pretrained()
+
+
+def _rows_of_known(rows, kind, players) -> "list[Row]":
+    """Returns the rows of the agent itself, and of the players that a colleague has."""
+    names = [*dict.fromkeys(row.get("against", row.get("agent")) for row in rows)]
+    typed = [None] * (kind == "baseline") + [*dict.fromkeys(players)]
+    known = [name for name, one in zip(names, typed) if one is None or _is_known(one)]
+    return [row for row in rows if row.get("against", row.get("agent")) in known]
 
 
 def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
@@ -219,10 +234,8 @@ def card(name: str, config: "Config", facts: "Row", rows: "Sequence[Row]") -> st
     words = f"env={labels.get(env['name'], env['name'])}"
     words += f" env.id={env['id']}" if env.get("id") else ""
     trusted = " trust=true" * bool(trust.foreign_names(config))
-    commands, has_homes = (
-        [table["command"] for table in rows],
-        components.takes_geometries(env["name"]),
-    )
+    commands = [table["command"] for table in rows]
+    has_homes = components.takes_geometries(env["name"])
     # in place of files that only the author has
     files = [v for k, v in check.leaves(train["geometry"]) if k.rpartition(".")[2] == "path" and v]
     homes = " geometry=homes" * bool(files and has_homes)

@@ -43,7 +43,8 @@ def exported(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         assert train.main([*TINY, "samples=512", "checkpoints.snapshots=2", "folder=run"]) == 0
-        for words in ([], ["against=bot"]):
+        shutil.copytree("run", "mine")  # a run that a colleague lacks
+        for words in ([], ["against=mine,bot"]):
             assert evaluate.main(["run=run", *SUITE, *words]) == 0
         assert (
             export.main(["run=run", "format=safetensors", f"file=agents/{NAME}.safetensors"]) == 0
@@ -93,6 +94,8 @@ def test_file_has_the_results_of_the_run(file, exported):
     assert tables[0]["rows"][0]["return"] == written["rows"][0]["return"]
     assert tables[0]["command"] == f"geometry=suite '{PARTS}' split=test episodes=8 seed=1"
     assert "the agent, 512 samples, in deathmatch: 8 duels" in tables[1]["title"]
+    assert {row["against"] for row in tables[1]["rows"]} == {"bot"}
+    assert tables[1]["command"].endswith(" against=bot") and "mine" not in json.dumps(tables)
 
 
 @pytest.mark.parametrize(
