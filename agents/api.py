@@ -248,8 +248,7 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
 
     Raises:
         UserError: the policy is of another class or acts in other spaces, `make` did not return the
-            environment, the policy acts otherwise once it is rounded, or the file cannot be
-            written.
+            environment, a weight is too large, or the file cannot be written.
     """
     from megastep.agents.export import agent  # with PyTorch
     from megastep.agents.networks.policy import Policy
@@ -273,7 +272,7 @@ def save(policy: "Policy", env: "Env", file: "str | os.PathLike") -> Run:
     config = {"train": train, "spaces": restore.spaces_of(policy)}
     state = {"policy": policy.state_dict(), "wrappers": optional(env, "wrapper_state")()}
     loaded = checkpoint.Checkpoint(Path("The policy"), 0, {}, config, {}, state)
-    agent.write_loaded(loaded, path, {"samples": 0})
+    agent.write_loaded(loaded, path, {"samples": 0}, env=env)
     trust.remember(trust.foreign_names(config))
     return Run(path)
 

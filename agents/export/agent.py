@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 
@@ -30,16 +30,11 @@ from megastep.agents.runs import (
     typed_json,
 )
 from megastep.atomic_files import write_atomically
-from megastep.dotdict import leaves
-from megastep.types import n_lanes
+from megastep.types import Env
 
 if TYPE_CHECKING:
     from megastep.agents.types import Config, Row
 
-#: Bound of `rounding_error`. Float16 changes a weight by at most 1 part in 2,048.
-MAX_ERROR = 0.005
-#: Environments and steps in which it is measured.
-N_ENVS, N_STEPS = 64, 256
 #: Settings of a run that are of no use to others, or name files of the machine that trained it.
 PRIVATE = dict(
     folder=None, resume=None, rerun=None, init=None, more_samples=None, more_seconds=None
@@ -58,25 +53,6 @@ def rounded(policy: Policy) -> dict[str, torch.Tensor]:
         if not tensor.isfinite().all():
             raise UserError(f"{name} has numbers beyond 65,504, the largest of float16")
     return {name: tensor.detach().cpu() for name, tensor in state.items()}
-
-
-@torch.no_grad()
-def rounding_error(exported: Policy, original: Policy, env, n_steps: int = N_STEPS) -> float:
-    """Returns how far the logits of two policies are apart, as a fraction of their size: of root
-    mean squares over all lanes and steps. Both see what the original's actions lead to.
-    """
-    world = env.reset()
-    states = [policy.initial(n_lanes(env), env.device) for policy in (exported, original)]
-    generator = torch.Generator(env.device).manual_seed(1)
-    difference = size = 0.0
-    for _ in range(n_steps):
-        mine, states[0] = exported(world, states[0], sample=False)
-        theirs, states[1] = original(world, states[1], generator=generator)
-        for one, other in zip(leaves(mine["logits"]), leaves(theirs["logits"]), strict=True):
-            difference += (one.double() - other.double()).square().sum().item()
-            size += other.double().square().sum().item()
-        world = env.step(theirs)
-    return (difference / max(size, 1e-300)) ** 0.5
 
 
 def command_of(words: str) -> str:
@@ -133,16 +109,12 @@ def _rows_of_known(rows, kind, players) -> "list[Row]":
     return [row for row in rows if row.get("against", row.get("agent")) in known]
 
 
-def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
-    """Writes an agent's file and its card.
+def write(run: str, file: Path) -> None:
+    """Writes the file of an agent, NAME.safetensors, and its card. Raises UserError if a weight is
+    too large, or they cannot be written.
 
     Args:
         run: a run's folder, or one of its checkpoints.
-        file: NAME.safetensors.
-        max_error: bound of `rounding_error`.
-
-    Raises:
-        UserError: the run acts otherwise once it is rounded, or cannot be written.
     """
     loaded = folders.load_checkpoint(folders.find(run), False, factory.make_device("cpu"))
     if not loaded.numbers:
@@ -155,18 +127,17 @@ def write(run: str, file: Path, max_error: float = MAX_ERROR) -> None:
         console.warn(f"the card has no results, for {command} was not run")
     lines = json_lines.read(folder / provenance.FILE, typed_json.Start)
     lines = [line for line in lines if line["samples"] < loaded.step]
-    commits = dict.fromkeys(line.get("commit", "unknown") for line in lines)
     made_with = {"device": "unknown", "torch": "unknown", "ranks": 1, **loaded.made_with}
     facts = {
         "commands": [command_of(line["command"]) for line in lines if "command" in line],
-        "commit": ", ".join(commits) or "unknown",
+        "commit": ", ".join(dict.fromkeys(line.get("commit", "unknown") for line in lines)),
         "samples": loaded.step,
         "seconds": round(loaded.numbers["seconds"], 1),
         "device": made_with["device"].removeprefix("cuda "),
         "torch": made_with["torch"],
         "ranks": made_with["ranks"],
     }
-    write_loaded(loaded, file, facts, rows, max_error)
+    write_loaded(loaded, file, facts, rows)
 
 
 def write_loaded(
@@ -174,39 +145,29 @@ def write_loaded(
     file: Path,
     facts: "Row",
     rows: "Sequence[Row]" = (),
-    max_error: float = MAX_ERROR,
+    env: Env | None = None,
 ) -> None:
-    """Writes a loaded checkpoint as an agent's file with a card, as `write` does. `facts` say how
-    it was trained; `rows` are its evaluations, see `tables_of`.
+    """Writes a loaded checkpoint as an agent's file with a card, as `write` does.
+
+    Args:
+        facts: how it was trained.
+        rows: its evaluations, see `tables_of`.
+        env: where it must be able to act.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", file.stem):
         raise UserError(
             f"{file.stem!r} is not a name for an agent; use small letters, digits and _"
         )
-    assert loaded.state is not None
     config = {**loaded.config, "train": loaded.config["train"] | PRIVATE}
-    trained = factory.config_of(loaded)
-    homes = factory.spread(factory.homes(trained.env, trained.geometry, "test"), N_ENVS)
-    env = factory.construct(
-        settings.changed(trained.env, n_envs=N_ENVS), geometries=homes, seed=1, device="cpu"
-    )
-    restore.load_wrappers(env, loaded)
-    original, exported = (restore.policy_of(loaded, env) for _ in range(2))
-    state = rounded(original)
-    exported.load_state_dict(state)
-    error = rounding_error(exported, original, env)
-    if not error <= max_error:
-        raise UserError(
-            f"{loaded.path} acts otherwise with weights in float16: its logits differ by "
-            f"{error:.1%}, and may by {max_error:.1%}"
-        )
+    state = rounded(restore.policy_of(loaded, env))
     if names := trust.foreign_names(config):
         console.warn(f"{file} needs {', '.join(names)}, and of others who load it trust=true")
-    facts = {"environment": config["train"]["env"]["name"], **facts, "rounding": error}
-    facts |= {"parameters": sum(v.numel() for v in state.values())}
+    facts = {"environment": config["train"]["env"]["name"], **facts}
+    facts["parameters"] = sum(v.numel() for v in state.values())
+    wrappers = cast(dict, loaded.state).get("wrappers")
     with user_errors(f"{file} cannot be written: "):
         file.parent.mkdir(parents=True, exist_ok=True)
-        agent_file.write(file, state, config, facts, rows, loaded.state.get("wrappers"))
+        agent_file.write(file, state, config, facts, rows, wrappers)
         write_card(file, config, facts, rows)
 
 
@@ -223,29 +184,37 @@ def write_card(file: Path, config: "Config", facts: "Row", rows: "Sequence[Row]"
         console.warn(f"{path} is not a card of {file.stem} and stays as it is")
         return
     _, found, by_hand = text.partition(f"\n{BY_HAND}\n")
-    by_hand = f"{BY_HAND}\n{by_hand}" if found else default_words(config)
-    write_atomically(path, f"{title}\n{card(file.name, config, facts, rows)}\n\n{by_hand}".encode())
+    if not found:
+        train = config["train"]
+        where = f"It was trained in `geometry={components.label(train['geometry']['name'])}`. "
+        where *= components.takes_geometries(train["env"]["name"])
+        spaces = "; ".join(f"`{name}` {space}" for name, space in config["spaces"].items())
+        by_hand = (
+            "\nA baseline, an opponent, or a start for training.\n\n## Limits\n\n"
+            f"{where}Its observations and actions must be {spaces}.\n"
+        )
+    parts = title, card(file.name, config, facts, rows), f"{BY_HAND}\n{by_hand}"
+    write_atomically(path, "{}\n{}\n\n{}".format(*parts).encode())
 
 
 def card(name: str, config: "Config", facts: "Row", rows: "Sequence[Row]") -> str:
     """Returns the part of a card that follows from the agent's file of a name."""
     train, env = config["train"], config["train"]["env"]
     labels = {path: label for label, path in components.members("env").items()}
-    words = f"env={labels.get(env['name'], env['name'])}"
-    words += f" env.id={env['id']}" if env.get("id") else ""
+    task = f"env={labels.get(env['name'], env['name'])}"
+    task += f" env.id={env['id']}" if env.get("id") else ""
     trusted = " trust=true" * bool(trust.foreign_names(config))
-    commands = [table["command"] for table in rows]
-    has_homes = components.takes_geometries(env["name"])
+    commands = " ".join(f"{table['command']} " for table in rows)
     # in place of files that only the author has
     files = [v for k, v in check.leaves(train["geometry"]) if k.rpartition(".")[2] == "path" and v]
-    homes = " geometry=homes" * bool(files and has_homes)
-    suite = " geometry=suite" if any("geometry=suite" in words for words in commands) else homes
-    duels = " against=bot" * any(re.search(r" against=(\S+,)?bot\b", words) for words in commands)
+    homes = " geometry=homes" * bool(files and components.takes_geometries(env["name"]))
+    suite = " geometry=suite" if "geometry=suite " in commands else homes
+    duels = " against=bot" * bool(re.search(r"against=(\S+,)?bot\b", commands))
     learner = " agent.critic=plain" * (train["agent"].get("critic") is None)
     learner = " learner=r2d2" if train["agent"].get("output") == "duelling" else learner
     learner += " env.n_envs=16" * (env.get("n_envs", 16) < 16)  # for the learner's minibatches
     parts = [
-        f"A trained agent of megastep (`pip install {package.DISTRIBUTION}`) for `{words}`. In the "
+        f"A trained agent of megastep (`pip install {package.DISTRIBUTION}`) for `{task}`. In the "
         f"folder of `{name}`:",
         f"```\nmegastep evaluate run={name}{suite}{duels}{trusted}\n"
         f"megastep record run={name}{homes}{duels}{trusted}\n"
@@ -257,36 +226,24 @@ def card(name: str, config: "Config", facts: "Row", rows: "Sequence[Row]") -> st
             f"It needs `{'`, `'.join(foreign)}`: modules that can be imported, such as files in "
             "the current folder. `trust=true` runs their code, so read it before."
         )
-    ranks, device = facts.get("ranks", 1), facts.get("device", "unknown")
+    ranks, device = facts.get("ranks", 1), facts.get("device", "")
     lines = {
         "command": "; then ".join(f"`{command}`" for command in facts.get("commands", ())),
-        "commit": facts.get("commit", "unknown"),
+        "commit": facts.get("commit"),
         "samples": f"{facts['samples']:,}",
         "seconds of training": f"{facts.get('seconds', 0):,}",
         "device": f"{ranks} x {device}" if ranks > 1 else device,
-        "PyTorch": facts.get("torch", "unknown"),
+        "PyTorch": facts.get("torch"),
         "size": f"{facts['parameters']:,} numbers: weights in float16, no critic",
-        "error of rounding": f"{100 * facts['rounding']:.2g} % of its logits' root mean square",
     }
-    lines = [f"- {key}: {text}" for key, text in lines.items() if text not in ("", "0", "unknown")]
+    lines = [
+        f"- {k}: {text}" for k, text in lines.items() if text not in (None, "", "0", "unknown")
+    ]
     parts += ["## Training", "\n".join(lines), "## Evaluations" if rows else "Not evaluated."]
     for table in rows:
-        head, cells = tables.grid(table["rows"])
         parts += [
             f"`megastep evaluate run={name} {table['command']}{trusted}`, measured before the "
             f"weights were rounded. {table['title']}:",
-            console.table(head, cells, is_markdown=True),
+            console.table(*tables.grid(table["rows"]), is_markdown=True),
         ]
     return "\n\n".join(parts)
-
-
-def default_words(config: "Config") -> str:
-    """Returns what a new card says where people write."""
-    train = config["train"]
-    spaces = "; ".join(f"`{name}` {space}" for name, space in config["spaces"].items())
-    where = f"It was trained in `geometry={components.label(train['geometry']['name'])}`. "
-    where *= components.takes_geometries(train["env"]["name"])
-    return (
-        f"{BY_HAND}\n\nA baseline, an opponent, or a start for training.\n\n## Limits\n\n"
-        f"{where}Its observations and actions must be {spaces}.\n"
-    )
