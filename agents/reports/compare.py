@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from megastep.agents import console
 from megastep.agents.errors import UserError, user_errors
 from megastep.agents.reports import runs, seeds
@@ -16,14 +18,29 @@ from megastep.settings import closest
 FORMATS = (".pdf", ".svg", ".png")
 
 
-def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> Path:
+def write(
+    paths: Sequence[Path],
+    file: Path,
+    metric: str = "episode/return",
+    labels: Sequence[str] | None = None,
+    title: str | None = None,
+    xlabel: str = "samples",
+    ylabel: str | None = None,
+    legend: str = "best",
+) -> Path:
     """Draws a metric over samples, a line per group of runs that differ in their seeds alone, with
     a 95 % bootstrap interval over seeds. Prints the interquartile means, and writes the plot and,
     beside it, a .csv of its lines. Returns the plot's path.
 
+    Args:
+        metric: a key of `metrics.jsonl`; `eval/NAME` of `evaluations/` as well.
+        labels: of the lines, in the order of their runs. Default: the settings that differ.
+        ylabel: default: the metric.
+        legend: a place of matplotlib's, such as `upper-left`, or `none`.
+
     Raises:
-        UserError: a folder is not a run, a run has not reported the metric, matplotlib fails, or a
-            file cannot be written.
+        UserError: a folder is not a run, a run has not reported the metric, there are more or fewer
+            labels than lines, matplotlib fails, or a file cannot be written.
     """
     with user_errors("drawing needs matplotlib, which fails: ", (ImportError, ValueError)):
         from matplotlib.figure import Figure  # which takes a while
@@ -37,24 +54,31 @@ def write(paths: Sequence[Path], file: Path, metric: str = "episode/return") -> 
             raise UserError("these runs share no metric, so they cannot be compared")
         raise UserError(f"not all of these runs report {metric!r}; {closest(metric, shared)}")
     groups, left_out = runs.without_interrupted(runs.groups_of(every))
+    labels = [*groups] if labels is None else labels
+    if len(dict.fromkeys(labels)) != len(groups):
+        raise UserError(f"labels= takes {len(groups)} different ones here, for {', '.join(groups)}")
     table, scores = [], {}
     figure = Figure(figsize=(5.5, 3.6), layout="constrained")
     axes = figure.subplots()
-    for name, group in groups.items():
-        one = seeds.band([run.curve(metric) for run in group])
-        (line,) = axes.plot(one["x"], one["mean"], label=f"{name} ({len(group)})")
-        axes.fill_between(one["x"], one["lower"], one["upper"], alpha=0.2, color=line.get_color())
-        columns = zip(*(one[key].tolist() for key in ("x", "mean", "lower", "upper")), strict=True)
-        table += [[name, *("" if math.isnan(value) else value for value in row)] for row in columns]
+    for name, group in zip(labels, groups.values(), strict=True):
+        band = seeds.band([run.curve(metric) for run in group])
+        x, mean, lower, upper = band.values()
+        marker = "o" if np.ptp(x) == 0 else None
+        (line,) = axes.plot(x, mean, marker=marker, label=f"{name} ({len(group)})")
+        axes.fill_between(x, lower, upper, alpha=0.2, color=line.get_color())
+        rows = zip(*(part.tolist() for part in band.values()), strict=True)
+        table += [[name, *("" if math.isnan(value) else value for value in row)] for row in rows]
         scores[name] = [value for run in group if (value := run.score(metric)) is not None]
-    axes.set_xlabel("samples")
-    axes.set_ylabel(metric, parse_math=False)  # a $ is a $
+    texts = [axes.set_xlabel(xlabel), axes.set_ylabel(ylabel or metric)]
+    texts += [axes.set_title(title)] if title else []
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
-    for text in figure.legend(fontsize="small", loc="outside lower left").get_texts():
-        text.set_parse_math(False)
+    if legend != "none":
+        texts += axes.legend(fontsize="small", loc=legend.replace("-", " ")).get_texts()
+    for text in texts:
+        text.set_parse_math(False)  # a $ is a $
     plot, text = io.BytesIO(), io.StringIO()
-    figure.savefig(plot, format=file.suffix[1:], dpi=200, bbox_inches="tight")  # long names
+    figure.savefig(plot, format=file.suffix[1:], dpi=200)
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([["runs", "samples", "mean", "lower", "upper"], *table])
     with user_errors(f"{file} cannot be written: "):

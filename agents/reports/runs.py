@@ -37,10 +37,12 @@ class Run(NamedTuple):
         return {k: v for k, v in leaves(self.config) if k.split(".")[0] not in OF_A_SEED}
 
     def score(self, metric: str = "episode/return") -> float | None:
-        """Returns the mean of a metric over the last reports, of returns weighted by episodes."""
+        """Returns the mean of a metric over the last reports, of returns weighted by episodes; of
+        evaluations the last.
+        """
         if metric == "episode/return":
             return scores.mean(self.metrics)
-        values = [row[metric] for row in self.metrics if row.get(metric) is not None][-10:]
+        values = self.curve(metric)[1][-1 if metric.startswith("eval/") else -10 :]
         return sum(values) / len(values) if values else None
 
     @property
@@ -57,10 +59,34 @@ class Run(NamedTuple):
         return bool(done) and max(done) < 0.9 and not has_stop
 
     def curve(self, metric: str) -> tuple[list[float], list[float]]:
-        """Returns the samples and values of a metric of `metrics.jsonl` or `perf.jsonl`."""
+        """Returns the samples and values of a metric of `metrics.jsonl` or `perf.jsonl`, `eval/` of
+        `evaluations/` as well: in the run's own environment and unseen homes, actions sampled.
+        """
         rows = self.perf if metric.startswith("perf/") else self.metrics
-        points = [(row["samples"], row[metric]) for row in rows if row.get(metric) is not None]
-        return [x for x, _ in points], [y for _, y in points]
+        points = {row["samples"]: row[metric] for row in rows if row.get(metric) is not None}
+        for step, means in self._evaluated() if metric.startswith("eval/") else ():
+            if (value := means.get(metric)) is not None:
+                points[step] = value
+        return [*sorted(points)], [points[x] for x in sorted(points)]
+
+    def names(self) -> list[str]:
+        """Returns the names of the numbers that it reports."""
+        cells = [cell for row in self.metrics + self.perf for cell in row.items()]
+        texts = {"samples", *(key for key, value in cells if isinstance(value, str))}
+        cells += [cell for _, means in self._evaluated() for cell in means.items()]
+        return [key for key in dict(cells) if key not in texts]
+
+    def _evaluated(self) -> "list[tuple[int, Row]]":
+        """Returns the samples, and the means by metric, of evaluations as in training."""
+        found = []
+        for table in self.evaluations:
+            row, how = table["rows"][0], table.get("evaluation", {})
+            is_alike = how.get("split") == "test" and not any(map(how.get, scores.OTHERWISE))
+            if is_alike and "return" in row and "step" in table:
+                means = {name: one.get("mean") for name, one in row.get("metrics", {}).items()}
+                means |= {"return": row["return"], "length": row.get("length")}
+                found.append((table["step"], {f"eval/{name}": x for name, x in means.items()}))
+        return found
 
 
 def read(folder: Path) -> Run:
@@ -69,15 +95,13 @@ def read(folder: Path) -> Run:
     if not (folder / "config.yaml").exists():
         raise UserError(f"{folder} is not a run: it has no config.yaml")
     config = config_yaml.read(folder / "config.yaml")
-    metrics, perf = (
-        json_lines.read(folder / name, typed_json.Metrics)
-        for name in ("metrics.jsonl", "perf.jsonl")
-    )
+    names, kind = ("metrics.jsonl", "perf.jsonl"), typed_json.Metrics
+    metrics, perf = (json_lines.read(folder / name, kind) for name in names)
     if not metrics:
         raise UserError(f"{folder} has no metrics yet; its first report writes metrics.jsonl")
     starts = json_lines.read(folder / "provenance.jsonl", typed_json.Start)
     tables = [*map(scores.evaluation, sorted((folder / "evaluations").glob("*.json")))]
-    return Run(folder, config, metrics, perf, starts, evaluations=tables)
+    return Run(folder, config, metrics, perf, starts, tables)
 
 
 def expanded(names: Sequence[str]) -> list[Path]:
@@ -101,9 +125,11 @@ def groups_of(runs: Sequence[Run]) -> dict[str, list[Run]]:
     named: dict[str, list[Run]] = {}
     for group in by_settings.values():
         text = ", ".join(f"{key}={group[0].settings().get(key)}" for key in keys[:4])
-        if not text or text in named:
-            text = f"{text} {group[0].folder.name}".strip()
-        named[text] = group
+        for more in ("", group[0].folder.name, str(group[0].folder)):
+            name = f"{text} {more}".strip()
+            if name and name not in named:
+                break
+        named[name] = group
     return named
 
 
@@ -114,10 +140,12 @@ def without_interrupted(groups: dict[str, list[Run]]) -> tuple[dict[str, list[Ru
     kept, sentences = {}, []
     for name, group in groups.items():
         kept[name] = [run for run in group if not run.is_interrupted] or group
-        for run in group[: len(group) * (len(kept[name]) < len(group))]:
-            if run.is_interrupted:
-                text = f"interrupted after {run.metrics[-1]['samples']:,} samples"
-                sentences.append(f"{run.folder} is left out: it was {text}")
+        sentences += [
+            f"{run.folder} is left out: it was interrupted after "
+            f"{run.metrics[-1]['samples']:,} samples"
+            for run in group
+            if run not in kept[name]
+        ]
     return kept, sentences
 
 
@@ -130,10 +158,5 @@ def differing(runs: Iterable[Run]) -> list[str]:
 
 def metrics_of(runs: Sequence[Run]) -> list[str]:
     """Returns the names of numbers that all runs report, in the order of the first run."""
-    names = []
-    for run in runs:
-        cells = [cell for row in run.metrics + run.perf for cell in row.items()]
-        texts = {key for key, value in cells if isinstance(value, str)}
-        names.append([key for key in dict(cells) if key not in texts])
-    shared = [name for name in names[0] if all(name in other for other in names[1:])]
-    return [name for name in shared if name != "samples"]
+    names = [run.names() for run in runs]
+    return [name for name in names[0] if all(name in other for other in names[1:])]

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import stats
 
 from megastep.agents.evaluation.statistics import bounds, resamples
 
@@ -17,17 +18,13 @@ def iqm(scores: ArrayLike) -> float:
     """Returns the interquartile mean: of the middle half of all scores, of any shape. A quarter of
     them, rounded down, is left out at either end.
     """
-    ordered = np.sort(np.asarray(scores, float), axis=None)
-    n_cut = len(ordered) // 4
-    return float(ordered[n_cut : len(ordered) - n_cut].mean())
+    return float(stats.trim_mean(scores, 0.25, axis=None))
 
 
 def interval(
     scores: Sequence[ArrayLike],
     statistic: Callable[[np.ndarray], float] = iqm,
     level: float = 0.95,
-    n_resamples: int = 2000,
-    seed: int = 1,
 ) -> tuple[float, float, float]:
     """Returns a statistic of all tasks' scores and its stratified bootstrap interval:
     `(value, lower, upper)`. The runs of each task are resampled by themselves.
@@ -38,12 +35,8 @@ def interval(
     tasks = [np.asarray(task, float) for task in scores]
     if max(map(len, tasks)) < 2:
         return statistic(np.concatenate(tasks)), math.nan, math.nan
-    draw = np.random.default_rng(seed)
-    resampled = []
-    for _ in range(n_resamples):
-        drawn = [task[draw.integers(len(task), size=len(task))] for task in tasks]
-        resampled.append(statistic(np.concatenate(drawn)))
-    lower, upper = bounds(resampled, level)
+    drawn = [task[resamples(len(task), seed=i)] for i, task in enumerate(tasks)]
+    lower, upper = bounds([*map(statistic, np.concatenate(drawn, 1))], level)
     return statistic(np.concatenate(tasks)), float(lower), float(upper)
 
 
@@ -70,11 +63,7 @@ def profile(scores: Sequence[ArrayLike], thresholds: ArrayLike) -> np.ndarray:
 
 
 def band(
-    curves: Sequence[tuple[ArrayLike, ArrayLike]],
-    n_points: int = 200,
-    level: float = 0.95,
-    n_resamples: int = 500,
-    seed: int = 1,
+    curves: Sequence[tuple[ArrayLike, ArrayLike]], n_points: int = 200, level: float = 0.95
 ) -> dict[str, np.ndarray]:
     """Returns the mean curve of several seeds with its bootstrap interval: {x, mean, lower, upper},
     (n_points,) each. Curves, `(x, y)` of each seed, are interpolated from where all have points to
@@ -90,6 +79,5 @@ def band(
         of_n, at = values[:n, n_there == n], n_there == n
         mean[at] = of_n.mean(0)
         if n > 1:
-            means = of_n[resamples(n, n_resamples, seed)].mean(1)
-            lower[at], upper[at] = bounds(means, level, axis=0)
+            lower[at], upper[at] = bounds(of_n[resamples(n, 500)].mean(1), level, axis=0)
     return {"x": x, "mean": mean, "lower": lower, "upper": upper}

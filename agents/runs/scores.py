@@ -9,6 +9,9 @@ from megastep.agents.runs import json_lines, typed_json
 if TYPE_CHECKING:
     from megastep.agents.types import Row
 
+#: Settings of an evaluation in another environment or in other homes than those in training.
+OTHERWISE = "env", "geometry", "greedy", "against", "max_steps"
+
 
 def mean(rows: "list[Row]", name: str = "return", n_reports: int = 10) -> float | None:
     """Returns the score of a training run: the mean return, or another statistic, of the episodes

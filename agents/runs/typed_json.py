@@ -87,6 +87,7 @@ _how |= dict.fromkeys(("baseline", "against"), NotRequired[list[str] | None])
 Evaluation = _object(
     title=str,
     rows=Annotated[list[_object(**_result)], Field(min_length=1)],
+    step=NotRequired[_Count],
     evaluation=NotRequired[_object(**_how)],
     episodes=NotRequired[dict[str, list]],
 )

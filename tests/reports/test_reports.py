@@ -129,6 +129,24 @@ def test_comparison_is_a_plot_and_its_numbers(here, capsys):
     assert (first[0], first[-1]) == pytest.approx((values[0], values[-1]))
 
 
+def test_comparison_of_evaluations_with_words_of_ones_own(here):
+    """Two runs, each evaluated once: points at their numbers of samples."""
+    for name in "ac":
+        assert evaluate.main([f"run={name}", "episodes=8", "device=cpu"]) == 0
+    words = ["run=a,c", "metric=eval/length", "file=own.svg", "labels=[$_one_$,two]", "legend=none"]
+    assert compare.main([*words, "title=Who lasts?", "xlabel=steps", "ylabel=length"]) == 0
+    plot = (here / "own.svg").read_text()
+    assert all(f"<!-- {text} -->" in plot for text in ("Who lasts?", "steps", "length"))
+    assert "two (1)" not in plot, "no legend"
+    with open(here / "own.csv", newline="") as file:
+        first, *_, last = csv.DictReader(file)
+    for row, name, run in (first, "$_one_$", "a"), (last, "two", "c"):
+        (table,) = map(json.loads, (f.read_text() for f in (here / run).glob("evaluations/*.json")))
+        point = float(row["samples"]), float(row["mean"])
+        assert (row["runs"], *point) == (name, table["step"], table["rows"][0]["length"])
+    assert compare.main(["run=a,c", "labels=[one]", "file=own.svg"]) == 2
+
+
 def test_an_interrupted_seed_is_left_out_and_named(here, tmp_path, capsys):
     for name in "ab":
         shutil.copytree(here / name, tmp_path / f"${name}$_")
@@ -180,6 +198,7 @@ def test_refused(here, main, words, sentence, capsys):
 def test_runs_that_share_no_metric(here, tmp_path, capsys):
     odd = shutil.copytree(here / "a", tmp_path / "odd")
     (odd / "perf.jsonl").unlink()
+    shutil.rmtree(odd / "evaluations", ignore_errors=True)  # of other tests
     (odd / "metrics.jsonl").write_text('{"samples": 1, "x": 1.0}\n')
     words = f"run=[{here / 'a'},{odd}]", f"file={tmp_path / 'plot.pdf'}"
     assert compare.main([*words]) == 2

@@ -1,16 +1,8 @@
 """Statistics over seeds, by hand and beside another program's."""
 
 import numpy as np
-import pytest
 
 from megastep.agents.reports import seeds
-
-
-@pytest.mark.parametrize("n", [1, 4, 7, 30])
-def test_interquartile_mean_is_that_of_scipy(n):
-    stats = pytest.importorskip("scipy.stats")
-    scores = np.random.default_rng(n).normal(size=(n, 3))
-    assert seeds.iqm(scores) == pytest.approx(stats.trim_mean(scores, 0.25, axis=None))
 
 
 def test_tasks_are_resampled_by_themselves():
