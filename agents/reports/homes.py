@@ -27,20 +27,19 @@ def section(run: runs.Run) -> list[str]:
         try:
             name, by_home = score_by_home(table["episodes"])
             plans = plans_of(run, table)
-            worst = sorted(by_home, key=by_home.__getitem__)
-            if len(worst) < 2 or not all(0 <= home < len(plans) for home in worst):
-                continue
         except (UserError, ConfigErrors, *ODD) as error:
             return [f"<p>Homes are not drawn: {html.escape(str(error))}</p>"]
-        best = worst[max(N_WORST, len(worst) - N_BEST) :]
+        worst = sorted(by_home, key=by_home.__getitem__)
+        if len(worst) < 2 or not all(0 <= home < len(plans) for home in worst):
+            continue
         span = by_home[worst[0]], by_home[worst[-1]]
-        n_left = len(worst) - len(worst[:N_WORST]) - len(best)
-        left = f"; {n_left:,} between them are not drawn" if n_left > 0 else ""
+        drawn = worst[:N_WORST] + worst[max(N_WORST, len(worst) - N_BEST) :]
+        n_left = len(worst) - len(drawn)
         text = (
-            f"{table.get('title', '')}. By {name}, worst first: {span[0]:.3g} to {span[1]:.3g} in "
-            f"{len(worst):,} homes{left}."
+            f"{table['title']}. By {name}, worst first: {span[0]:.3g} to {span[1]:.3g} in "
+            f"{len(worst):,} homes{f'; {n_left:,} between them are not drawn' * (n_left > 0)}."
         )
-        shown = [figure(home, plans[home], by_home[home], span) for home in worst[:N_WORST] + best]
+        shown = [figure(home, plans[home], by_home[home], span) for home in drawn]
         return [
             "<h2>Homes, worst first</h2>",
             f"<p>{html.escape(text)} <code>record.py home=N</code> films one of this split.</p>",

@@ -3,6 +3,7 @@
 Charts are drawn by uPlot (MIT, https://github.com/leeoniya/uPlot), which the page contains.
 """
 
+import contextlib
 import html
 import json
 import math
@@ -42,14 +43,13 @@ def write(paths: Sequence[Path], file: Path) -> Path:
     """
     every, charts = [*map(runs.read, paths)], Charts()
     body = _one(every[0], charts, file) if len(every) == 1 else _several(every, charts)
-    title = every[0].folder.name if len(every) == 1 else f"{len(every)} runs"
     parts = {
-        "TITLE": _text(title),
+        "TITLE": _text(every[0].folder.name if len(every) == 1 else f"{len(every)} runs"),
         "UPLOT_CSS": (HERE / "uPlot.min.css").read_text(),
         "UPLOT_JS": (HERE / "uPlot.iife.min.js").read_text(),
         # the text of a script ends at the first </script
         "CHARTS": json.dumps(charts, separators=(",", ":")).replace("<", "\\u003c"),
-        "BODY": body,
+        "BODY": "\n".join(body),
     }
     page = (HERE / "page.html").read_text("utf-8")
     for name, part in parts.items():
@@ -63,36 +63,21 @@ def write(paths: Sequence[Path], file: Path) -> Path:
 # ---- One run ----
 
 
-def _one(run: runs.Run, charts: "Charts", file: Path) -> str:
+def _one(run: runs.Run, charts: "Charts", file: Path) -> list[str]:
     """Returns the body of a report of one run. Adds its charts."""
-    samples, score = run.metrics[-1]["samples"], run.score()
     seconds = run.perf[-1].get("perf/seconds", 0) if run.perf else 0
-    result = f"{samples:,} samples in {console.duration(seconds)}"
-    if score is not None:
+    result = f"{run.metrics[-1]['samples']:,} samples in {console.duration(seconds)}"
+    if (score := run.score()) is not None:
         result += f", mean return {score:.4g} in training"
-    facts = {}
-    for row in run.provenance[-1:]:
-        shown = "command", "time", "commit", "megastep", "torch", "python", "device"
-        facts = {name: row[name] for name in shown if row.get(name)}
-    if len(run.provenance) > 1:
-        times = f"{len(run.provenance) - 1} times, last after {row['samples']:,} samples"
-        facts |= {"command": str(run.provenance[0].get("command", "")), "resumed": times}
-        facts["last command"] = str(row.get("command", ""))
-    # the settings that the command of the first start named, as the run has them
-    words = str(run.provenance[0].get("command", "")).split() if run.provenance else []
-    keys = {word.lstrip("-+").partition("=")[0] for word in words if "=" in word}
-    facts |= {key: value for key, value in runs.leaves(run.config) if key in keys}
     parts = [f"<h1>{_text(run.folder.name)}</h1>", f"<p>{_text(run.task)}</p>"]
     parts += [f'<p class="result">{_text(result)}</p>', "<h2>What it was</h2>"]
-    parts.append(_table([], [[key, str(value)] for key, value in facts.items()], heads=True))
-    evaluations = []
+    parts += [_table([], [[key, str(value)] for key, value in _facts(run).items()], heads=True)]
+    tables_of_run = []
     for table in run.evaluations:
-        try:
+        with contextlib.suppress(*homes.ODD):  # of another version, or a stranger's
             head, rows = tables.grid([*table["rows"], *table.get("differences", ())])
-        except homes.ODD:
-            continue  # of another version, or a stranger's
-        evaluations += [f"<p>{_text(str(table.get('title', '')))}</p>", _table(head, rows)]
-    parts += ["<h2>Evaluations</h2>", *evaluations] if evaluations else []
+            tables_of_run += [f"<p>{_text(table['title'])}</p>", _table(head, rows)]
+    parts += ["<h2>Evaluations</h2>", *tables_of_run] if tables_of_run else []
     parts += homes.section(run)
     parts += ["<h2>Curves</h2>", _curves([run], [([run], "")], charts)]
     films = [os.path.relpath(film, file.parent) for film in sorted(run.folder.glob("*.mp4"))]
@@ -103,23 +88,37 @@ def _one(run: runs.Run, charts: "Charts", file: Path) -> str:
         n_bytes = sum(part.stat().st_size for part in path.glob("*") if part.is_file())
         rows.append([path.name, f"{checkpoint.step_of(path):,}", f"{n_bytes / 1e6:.1f} MB"])
     kept = _table(["checkpoint", "samples", "size"], rows) if rows else "<p>None is kept.</p>"
-    return "\n".join([*parts, "<h2>Checkpoints</h2>", kept])
+    return [*parts, "<h2>Checkpoints</h2>", kept]
+
+
+def _facts(run) -> dict[str, object]:
+    """Returns the command, versions, and the settings that the first command named."""
+    if not run.provenance:
+        return {}
+    first, last = run.provenance[0], run.provenance[-1]
+    shown = "command", "time", "commit", "megastep", "torch", "python", "device"
+    facts = {name: last[name] for name in shown if last.get(name)}
+    command = str(first.get("command", ""))
+    if len(run.provenance) > 1:
+        times = f"{len(run.provenance) - 1} times, last after {last['samples']:,} samples"
+        facts |= {"command": command, "resumed": times, "last command": last.get("command", "")}
+    keys = {word.lstrip("-+").partition("=")[0] for word in command.split() if "=" in word}
+    return facts | {key: value for key, value in runs.leaves(run.config) if key in keys}
 
 
 # ---- Several runs ----
 
 
-def _several(every: list[runs.Run], charts: "Charts") -> str:
+def _several(every: list[runs.Run], charts: "Charts") -> list[str]:
     """Returns the body of a report that compares runs. Adds its charts."""
     groups, left_out = runs.without_interrupted(runs.groups_of(every))
     tasks = "; ".join(dict.fromkeys(run.task for run in every))
     parts = [f"<h1>{len(every)} runs</h1>", f"<p>{_text(tasks)}</p>"]
-    all_scores = {
+    scores = {
         name: [score for run in group if (score := run.score()) is not None]
         for name, group in groups.items()
     }
-    scored = {name: scores for name, scores in all_scores.items() if scores}
-    rows = seeds.pooled(all_scores)
+    rows = seeds.pooled(scores)
     for row, group in zip(rows, groups.values(), strict=True):
         row.append(f"{max(run.metrics[-1]['samples'] for run in group):,}")
     head = [*(text.format("the return") for text in seeds.POOLED), "samples"]
@@ -131,18 +130,18 @@ def _several(every: list[runs.Run], charts: "Charts") -> str:
     parts += _population(every, charts)
     named = [(group, name) for name, group in groups.items()]
     parts += ["<h2>Curves</h2>", _curves(every, named, charts)]
-    if scored:
+    if scored := {name: values for name, values in scores.items() if values}:
         values = np.concatenate([*scored.values()])
         limits = np.linspace(values.min() - 1e-9, values.max(), 200)
         lines = {name: seeds.profile([values], limits) for name, values in scored.items()}
         place = charts.add("seeds above a return", limits, lines, "return")
         parts += ["<h2>Performance profiles</h2>", f'<div class="grid">{place}</div>']
-    return "\n".join(parts)
+    return parts
 
 
-def _population(every: Sequence[runs.Run], charts: "Charts") -> list[str]:
+def _population(every, charts) -> list[str]:
     """Returns the HTML about the population whose members the runs are, if they are: lineage,
-    settings over time, best and median score. Adds its charts.
+    scores and settings over time.
     """
     path = min(run.folder.parent for run in every) / populations.FILE
     if len({run.folder.parent for run in every}) > 1 or not path.is_file():
@@ -194,21 +193,14 @@ class Charts(list):
         lines: Mapping[str, Iterable],
         x_label: str = "samples",
     ) -> str:
-        """Adds a chart, and returns its place.
-
-        Args:
-            lines: {label: y, or (mean, upper, lower) to draw with a band}.
-        """
+        """Adds a chart, and returns its place. Lines are {label: y, or (mean, upper, lower)}."""
         series, bands = [], []
         for i, (label, y) in enumerate(lines.items()):
-            one = dict(label=label, colour=i, is_bound=False)
-            if not isinstance(y, tuple):
-                series.append({**one, "y": _plain(y)})
-                continue
-            bands.append([3 * i + 2, 3 * i + 3, i])
-            for name, values in zip(("", " upper", " lower"), y, strict=True):
-                about = dict(label=f"{label}{name}", is_bound=bool(name), y=_plain(values))
-                series.append(one | about)
+            bands += [[3 * i + 2, 3 * i + 3, i]] if isinstance(y, tuple) else []
+            parts = y if isinstance(y, tuple) else (y,)
+            for bound, values in zip(("", " upper", " lower"), parts):
+                about = dict(label=f"{label}{bound}", colour=i, is_bound=bool(bound))
+                series.append({**about, "y": _plain(values)})
         place = f"chart-{len(self)}"
         about = dict(id=place, title=title, x_label=x_label, sync=x_label, x=_plain(x))
         self.append({**about, "series": series, "bands": bands})
@@ -227,20 +219,18 @@ def _curves(every: Sequence[runs.Run], groups: Sequence[tuple[list, str]], chart
         curves = [[run.curve(name) for run in group] for group, _ in groups]
         if not all(x for group in curves for x, _ in group):
             continue
-        if len(groups) == len(curves[0]) == 1:
+        if len(every) == 1:
             x, y = curves[0][0]
             n = -(-len(x) // N_POINTS)  # neighbours that are averaged
             x, y = ([np.mean(v[i : i + n]) for i in range(0, len(x), n)] for v in (x, y))
-            lines = {name: y}
-        else:
-            averaged = [seeds.band(group) for group in curves]
-            x = np.unique(np.concatenate([one["x"] for one in averaged]))
-            x, lines = x[:: max(1, len(x) // N_POINTS)], {}
-            for one, (_, label) in zip(averaged, groups, strict=True):
-                lines[label] = tuple(
-                    np.interp(x, one["x"], one[bound], left=np.nan, right=np.nan)
-                    for bound in ("mean", "upper", "lower")
-                )
+            places.append(charts.add(name, x, {name: y}))
+            continue
+        bands = [seeds.band(group) for group in curves]
+        x, lines = np.unique(np.concatenate([band["x"] for band in bands])), {}
+        x = x[:: max(1, len(x) // N_POINTS)]
+        for band, (_, label) in zip(bands, groups, strict=True):
+            at, *bounds = (band[key] for key in ("x", "mean", "upper", "lower"))
+            lines[label] = tuple(np.interp(x, at, y, np.nan, np.nan) for y in bounds)
         places.append(charts.add(name, x, lines))
     return f'<div class="grid">{"".join(places)}</div>'
 
