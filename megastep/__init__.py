@@ -16,6 +16,7 @@ two cores taken, training was 100 times slower. Asleep, they lose a few microsec
 
 import importlib
 import os
+import pkgutil
 import sys
 from typing import TYPE_CHECKING
 
@@ -35,31 +36,7 @@ if TYPE_CHECKING:
 if "torch" not in sys.modules:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-_MODULES = (
-    "adapters",
-    "agents",
-    "arrdict",
-    "capture",
-    "contract",
-    "core",
-    "cubicasa",
-    "cuda",
-    "dotdict",
-    "engine",
-    "envs",
-    "geometries",
-    "geometry",
-    "kernels",
-    "modules",
-    "plotting",
-    "ragged",
-    "recording",
-    "scene",
-    "spaces",
-    "toys",
-    "types",
-)
-#: What the package has from its modules.
+#: What the package has from its modules, which are imported at their first use too.
 _NAMES = {
     **dict.fromkeys(
         ("Run", "evaluate", "load", "make", "record", "runs", "save", "train"), "agents.api"
@@ -69,12 +46,16 @@ _NAMES = {
 
 
 def __getattr__(name) -> "ModuleType":
-    if name in _MODULES:
-        return importlib.import_module(f"{__name__}.{name}")
     if name in _NAMES:
         return getattr(importlib.import_module(f"{__name__}.{_NAMES[name]}"), name)
-    raise AttributeError(f"megastep has no module '{name}'; its modules are {', '.join(_MODULES)}")
+    if name in _modules():
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"megastep has no module '{name}'; its modules: {', '.join(_modules())}")
+
+
+def _modules() -> list[str]:
+    return [module.name for module in pkgutil.iter_modules(__path__) if module.name[0] != "_"]
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES, *_NAMES})
+    return sorted({*globals(), *_modules(), *_NAMES})

@@ -6,6 +6,7 @@ written. Each file ends in a SHA-256 of its name and content: a damaged or renam
 again. If the cache cannot be used, there is one warning, and everything is built at each start.
 """
 
+import contextlib
 import hashlib
 import io
 import math
@@ -29,23 +30,22 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
     the cache cannot be used.
     """
     path = _folder() / name
-    problem = _problem(path.parent)
-    body = None if problem else intact(path)
-    if body is not None:
+    if problem := _problem(path.parent):
+        warn(problem)
+        return build(), None
+    if (body := intact(path)) is not None:
         return body, path
-    if problem is None and path.exists():
+    if path.exists():
         warnings.warn(
             f"{path} is damaged or not owned by this user: it is built again", stacklevel=2
         )
     body = build()
-    if problem is None:
-        try:
-            write_atomically(path, body + _digest(path.name, body), mode=0o600)
-            return body, path
-        except OSError as error:
-            problem = f"{path.parent} cannot be written ({error.strerror})"
-    warn(problem)
-    return body, None
+    try:
+        write_atomically(path, body + _digest(path.name, body), mode=0o600)
+    except OSError as error:
+        warn(f"{path.parent} cannot be written ({error.strerror})")
+        return body, None
+    return body, path
 
 
 def arrays(
@@ -92,27 +92,21 @@ def warn(problem: str) -> None:
 
 def prune(prefix: str, keep: int, max_bytes: float = math.inf) -> None:
     """Deletes the oldest files whose names start with ``prefix``, beyond a number and a size."""
-    try:
+    with contextlib.suppress(OSError):  # another process deletes too, or there is no cache
         paths = sorted(_folder().glob(f"{prefix}*"), key=lambda path: -path.stat().st_mtime)
         for number, path in enumerate(paths):
             max_bytes -= path.stat().st_size
             if number >= keep or max_bytes < 0:
                 path.unlink()
-    except OSError:
-        pass  # another process deletes too, or there is no cache
 
 
 def intact(path: Path) -> bytes | None:
     """Returns a file's content without its digest; None if missing, damaged or not private."""
-    try:
-        with open(path, "rb") as file:
-            if not _is_private(os.fstat(file.fileno())):
-                return None
+    with contextlib.suppress(OSError), open(path, "rb") as file:
+        if _is_private(os.fstat(file.fileno())):
             content = file.read()
-    except OSError:
-        return None
-    body, digest = content[:-DIGEST], content[-DIGEST:]
-    return body if body and _digest(path.name, body) == digest else None
+            body, digest = content[:-DIGEST], content[-DIGEST:]
+            return body if body and _digest(path.name, body) == digest else None
 
 
 def _digest(name, body) -> bytes:

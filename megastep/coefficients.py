@@ -27,14 +27,11 @@ class Coefficients:
     IS_STATELESS = True  # whatever sets them does so again; see `megastep.engine.state_tree`
 
     def __init__(self, device: torch.device | str, **settings: Number):
-        pairs = ((name, schedule_of(value)) for name, value in settings.items())
-        self.schedules = {name: function for name, function in pairs if function is not None}
-        self.values = {
-            name: called(self.schedules[name], 0.0)
-            if name in self.schedules
-            else float(cast(float, value))
-            for name, value in settings.items()
-        }
+        self.schedules, self.values = {}, {}
+        for name, value in settings.items():
+            if (function := schedule_of(value)) is not None:
+                self.schedules[name], value = function, called(function, 0.0)
+            self.values[name] = float(cast(float, value))
         vector = torch.tensor([*self.values.values()], dtype=torch.float32, device=device)
         self.tensors: dict = dict(zip(self.values, vector.unbind()))
         self.is_on_gpu = vector.is_cuda

@@ -1,5 +1,6 @@
 """Devices by name, their free memory, and the number of CPU threads."""
 
+import contextlib
 import functools
 import os
 import socket
@@ -21,35 +22,26 @@ def device(name: str | torch.device = "auto") -> torch.device:
     """Returns a device by name: auto (a GPU if there is one, else the CPU), cpu, cuda or cuda:1.
     Raises EngineError if there is none.
     """
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
-        return (
-            torch.device("cuda", torch.cuda.current_device())
-            if torch.cuda.is_available()
-            else torch.device("cpu")
-        )
+        return torch.device("cuda", torch.cuda.current_device()) if count else torch.device("cpu")
     try:
         requested = torch.device(name)
     except (RuntimeError, TypeError):
-        requested = None
-    if requested is None or requested.type not in ("cpu", "cuda"):
+        requested = torch.device("meta")
+    if requested.type == "cpu":
+        return requested
+    if requested.type != "cuda":
         raise EngineError(f"device={name} is unknown: use auto, cpu, cuda, or cuda: and a number.")
-    if requested.type == "cuda":
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if (requested.index or 0) >= count:
-            raise EngineError(
-                f"device={name} was given, but {_missing(count)}: use device=auto or device=cpu."
-            )
+    if (requested.index or 0) < count:
         return torch.device("cuda", requested.index or 0)
-    return requested
-
-
-def _missing(count) -> str:
-    if count:
-        return f"there are {count} GPUs"
-    built = "" if torch.version.cuda else " and this PyTorch is built for the CPU only"
-    if job := os.environ.get("SLURM_JOB_ID"):
-        built += f", and job {job} of Slurm may have been given none (--gpus-per-node=1)"
-    return f"PyTorch sees no GPU on {socket.gethostname()}{built}"
+    missing = f"there are {count} GPUs"
+    if not count:
+        missing = f"PyTorch sees no GPU on {socket.gethostname()}"
+        missing += "" if torch.version.cuda else " and this PyTorch is built for the CPU only"
+        if job := os.environ.get("SLURM_JOB_ID"):
+            missing += f", and job {job} of Slurm may have been given none (--gpus-per-node=1)"
+    raise EngineError(f"device={name} was given, but {missing}: use device=auto or device=cpu.")
 
 
 def threads() -> int:
@@ -104,13 +96,10 @@ def free_memory(device: torch.device | str) -> int:
             + torch.cuda.memory_reserved(device)
             - torch.cuda.memory_allocated(device)
         )
-    try:
-        with open("/proc/meminfo") as file:
-            return next(
-                int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable")
-            )
-    except (OSError, StopIteration):
-        return 1 << 62
+    with contextlib.suppress(OSError, StopIteration), open("/proc/meminfo") as file:
+        line = next(line for line in file if line.startswith("MemAvailable"))
+        return int(line.split()[1]) * 1024
+    return 1 << 62
 
 
 @functools.cache

@@ -42,9 +42,11 @@ class GlobalGenerators:
 
     def states(self) -> dict[str, object]:
         """Returns the states by kind, equal where nothing was drawn in between."""
-        of_torch = self.torch and self.torch.get_state().tolist()
-        states = repr(self.numpy.bit_generator.state), self.python.getstate(), of_torch
-        return dict(zip(KINDS, states))
+        return dict(
+            numpy=repr(self.numpy.bit_generator.state),
+            python=self.python.getstate(),
+            torch=self.torch and self.torch.get_state().tolist(),
+        )
 
     @contextlib.contextmanager
     def installed(self, kinds: Collection[str]) -> Iterator[None]:

@@ -64,16 +64,12 @@ class Scheduled(annotated_types.BaseMetadata):
     def _bounded(self, value, of_schedule=False) -> float:
         if not isinstance(value, numbers.Real) or isinstance(value, bool):
             raise ValueError(f"expected a number, got {value!r}")
-        number = float(value)
-        is_inside = (
-            math.isfinite(number)
-            and (self.ge is None or number >= self.ge)
-            and (self.gt is None or number > self.gt or (of_schedule and number == self.gt))
-            and (self.le is None or number <= self.le)
-        )
-        if not is_inside:
-            is_closed = of_schedule or self.gt is None
-            lower = f"from {self.gt or self.ge or 0:,}" if is_closed else f"above {self.gt:,}"
+        number, is_open = float(value), self.gt is not None and not of_schedule
+        low = self.ge if self.gt is None else self.gt
+        low = -math.inf if low is None else low
+        is_inside = low <= number <= (math.inf if self.le is None else self.le)
+        if not is_inside or not math.isfinite(number) or (is_open and number == low):
+            lower = f"above {low:,}" if is_open else f"from {low:,}"
             raise ValueError(f"{value} is out of range: allowed is {lower} to {self.le:,}")
         return number
 

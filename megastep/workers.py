@@ -7,13 +7,13 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
 
-__all__ = ["WORKER_ENV", "end_with", "end_with_parent", "pool", "terminal_signals_blocked"]
+__all__ = ["WORKER_ENV", "end_with_parent", "pool", "terminal_signals_blocked"]
 
 #: Environment variables of a worker process: one thread, no screen, and no GPU, because even an
 #: idle CUDA context takes half a gigabyte.
@@ -44,21 +44,18 @@ def terminal_signals_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
-def end_with(is_running: Callable[[], bool]) -> None:
-    """Sends this process SIGTERM once `is_running()`, asked every second, is false."""
+@functools.cache
+def end_with_parent(parent: int) -> None:
+    """Sends this process, a child of ``parent``, SIGTERM within a second of its parent's end. Can
+    initialise a pool's workers.
+    """
 
     def watch() -> None:
-        while is_running():
+        while os.getppid() == parent:
             time.sleep(1)
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@functools.cache
-def end_with_parent(parent: int) -> None:
-    """As :func:`end_with`, for a child of process ``parent``. Can initialise a pool's workers."""
-    end_with(lambda: os.getppid() == parent)
 
 
 def pool(n_workers: int) -> "ProcessPoolExecutor":
