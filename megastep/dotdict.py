@@ -15,10 +15,6 @@ __all__ = ["dotdict", "leaves", "mapping"]
 
 T = TypeVar("T")
 
-_INDENT = 4
-_WIDTH = 120
-_MAX_AXES = 8  # a tuple of more integers is printed as data, not as a shape
-
 
 class dotdict(dict):
     """A dict whose items are also attributes: ``d.k`` reads ``d['k']``; assign with ``d['k'] = v``.
@@ -141,7 +137,7 @@ def _listing(tree: dict, key: object) -> str:
 
 
 def _rows(tree: dict) -> Iterator[str]:
-    column = max((len(str(key)) for key in tree), default=0) + _INDENT
+    column = max((len(str(key)) for key in tree), default=0) + 4
     for key, value in tree.items():
         if isinstance(value, dict):
             yield f"{key!s:<{column}}{type(value).__name__}:"
@@ -154,11 +150,11 @@ def _summary(value, column: int) -> str:
     name = type(value).__name__
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{name}({tuple(value.shape)}, {value.dtype})"
-    is_short = isinstance(value, tuple) and len(value) <= _MAX_AXES
-    if is_short and all(type(size) is int for size in value):  # a shape
+    is_short = isinstance(value, tuple) and len(value) <= 8  # as a shape is
+    if is_short and all(type(size) is int for size in value):
         return str(tuple(value))
     if isinstance(value, (list, tuple, set, frozenset)):
         return f"{name}(({len(value)},))"
     text = " ".join(str(value).split())
-    width = max(_WIDTH - column, 16)
+    width = max(120 - column, 16)
     return text if len(text) <= width else f"{text[: width - 3]}..."

@@ -2,7 +2,7 @@
 out.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -65,10 +65,3 @@ def to_numpy(leaf: torch.Tensor) -> np.ndarray:
 def row(leaf: Tree, lane: int | np.integer) -> Tree:
     """Returns one lane's values of a batch."""
     return leaf[lane]
-
-
-def stacked(rows: Sequence[Tree]) -> Tree:
-    """Returns the values of lanes as a batch of arrays."""
-    if isinstance(rows[0], Mapping):
-        return {key: stacked([one[key] for one in rows]) for key in rows[0]}
-    return np.stack(rows)

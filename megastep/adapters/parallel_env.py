@@ -8,7 +8,8 @@ import gymnasium
 import numpy as np
 import pettingzoo
 
-from megastep.adapters.gymnasium_spaces import row, stacked
+from megastep import arrdict
+from megastep.adapters.gymnasium_spaces import row
 from megastep.adapters.vector_env import VectorEnv
 from megastep.types import Env, Tree, optional
 
@@ -68,7 +69,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):  # pyright: ignore[reportGeneralTypeI
         """
         if not self.agents:
             return {}, {}, {}, {}, {}
-        chosen = stacked([actions[agent] for agent in self.possible_agents])
+        chosen = arrdict.stack([actions[agent] for agent in self.possible_agents])
         obs, rewards, terminated, truncated, facts = self.vector.step(chosen)
         over = optional(self.env, "game_over")
         is_over = bool(np.logical_or(terminated, truncated).all() if over is None else over.all())

@@ -9,12 +9,11 @@ import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from megastep import envs
+from megastep import arrdict, envs
 from megastep.adapters.gymnasium_spaces import (
     as_dtype,
     gymnasium_space,
     row,
-    stacked,
     to_numpy,
     without_agents,
 )
@@ -25,7 +24,6 @@ from megastep.types import Env, Tree, optional
 
 __all__ = ["SingleEnv", "VectorEnv", "make_single", "make_vector"]
 
-FPS = 10
 OUTCOMES = "reward", "terminal", "truncated"
 
 
@@ -58,7 +56,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         copy: bool = True,
         render_mode: str | None = None,
     ):
-        mode = _mode(autoreset_mode)
+        modes = AutoresetMode.__members__
+        mode = modes.get(getattr(autoreset_mode, "name", str(autoreset_mode)).upper())
+        if mode is None:
+            names = ", ".join(modes)
+            raise ValueError(f"autoreset_mode must be one of {names}, not {autoreset_mode!r}")
         needs_masks = mode is not AutoresetMode.NEXT_STEP
         purpose = f"autoreset_mode={mode.name}" if needs_masks else None
         self.lanes = Lanes(env, mode is AutoresetMode.SAME_STEP, purpose)
@@ -69,14 +71,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = gymnasium_space(env.action_space, torch.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        modes, fps = ["rgb_array"] if hasattr(env, "plot_state") else [], optional(env, "fps")
-        if render_mode is not None and render_mode not in modes:
-            cure = "" if modes else "; docs/new-environment.md shows how to draw with plot_state"
+        drawings = ["rgb_array"] if hasattr(env, "plot_state") else []
+        if render_mode is not None and render_mode not in drawings:
+            cure = "" if drawings else "; docs/new-environment.md shows how to draw with plot_state"
             raise ValueError(
-                f"render_mode must be None or one of {modes}, not {render_mode!r}{cure}"
+                f"render_mode must be None or one of {drawings}, not {render_mode!r}{cure}"
             )
         self.render_mode = render_mode
-        self.metadata = dict(autoreset_mode=mode, render_modes=modes, render_fps=fps)
+        fps = optional(env, "fps")
+        self.metadata = dict(autoreset_mode=mode, render_modes=drawings, render_fps=fps)
         self._ended = np.zeros(self.num_envs, bool)
         self._stepped: tuple | None = None
 
@@ -188,16 +191,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.lanes.close()
 
 
-def _mode(given) -> AutoresetMode:
-    if isinstance(given, AutoresetMode):
-        return given
-    modes = {key: mode for mode in AutoresetMode for key in (mode.name.lower(), mode.value.lower())}
-    if str(given).lower() not in modes:
-        names = ", ".join(mode.name for mode in AutoresetMode)
-        raise ValueError(f"autoreset_mode must be one of {names}, not {given!r}")
-    return modes[str(given).lower()]
-
-
 class SingleEnv(gymnasium.Env):
     """An environment of megastep with one lane as a `gymnasium.Env`, in NumPy.
 
@@ -206,7 +199,7 @@ class SingleEnv(gymnasium.Env):
         render_mode: None or ``rgb_array``.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(self, env: Env, render_mode: str | None = None):
         self.vector = VectorEnv(env, AutoresetMode.NEXT_STEP, render_mode=render_mode)
@@ -230,7 +223,7 @@ class SingleEnv(gymnasium.Env):
 
     def step(self, action: Tree) -> tuple[Tree, float, bool, bool, dict[str, Tree]]:
         """Returns (observation, reward, terminated, truncated, info)."""
-        actions = stacked([action])
+        actions = arrdict.stack([action])
         obs, reward, terminated, truncated, infos = self.vector.step(actions)
         flags = bool(terminated[0]), bool(truncated[0])
         return row(obs, 0), float(reward[0]), *flags, _info(infos)

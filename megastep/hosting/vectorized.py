@@ -187,8 +187,13 @@ class VectorizedEnv:
             self._check_observations(obs)
         present = infos.get("present")
         self._ended[:] = terminal | truncated if present is None else ~present
+
+        def copied(space, values) -> np.ndarray:
+            dtype = DTYPES.get(getattr(space, "dtype", None), np.int64)
+            return np.array(values, dtype, order="C")
+
         world = dict(
-            obs=spaces.map(_as_array, self.obs_space, self._read(obs)),
+            obs=spaces.map(copied, self.obs_space, self._read(obs)),
             reward=np.where(reset, 0.0, reward).astype(np.float32),
             reset=reset,
             terminal=terminal,
@@ -201,14 +206,10 @@ class VectorizedEnv:
             world["metrics"] = arrdict(zip(self._metrics, columns))
         if self._has_mask:
             world["mask"] = infos["action_mask"][:, None].copy()
-        return arrdict(world).map(self._sent)
-
-    def _sent(self, array) -> torch.Tensor:
-        """Returns an array as a tensor on the device; to a GPU it goes through pinned memory."""
-        tensor = torch.from_numpy(array)
+        world = arrdict(world).map(torch.from_numpy)
         if self.device.type == "cpu":
-            return tensor
-        return tensor.pin_memory().to(self.device, non_blocking=True)
+            return world
+        return world.map(lambda leaf: leaf.pin_memory().to(self.device, non_blocking=True))
 
 
 @contextlib.contextmanager
@@ -223,11 +224,6 @@ def one_sentence(id: str | None, kwargs: dict | None) -> Iterator[None]:
         )
         cause = f" with env.kwargs={kwargs}" if kwargs else ""
         raise ValueError(f"{id} cannot be made{cause}: {line}") from error
-
-
-def _as_array(space, values) -> np.ndarray:
-    """Returns a copy of observations in the dtype of their space."""
-    return np.array(values, DTYPES.get(getattr(space, "dtype", None), np.int64), order="C")
 
 
 def _plain(value) -> object:
