@@ -83,7 +83,5 @@ class AppendedFile:
 
     def close(self) -> None:
         """Writes `unwritten` and closes the file."""
-        try:
+        with self.file:
             self.flush()
-        finally:
-            self.file.close()

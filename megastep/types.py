@@ -67,41 +67,8 @@ class World(Protocol):
 class Env(Protocol):
     """N copies of a game that are stepped together on one device.
 
-    Optional attributes, whose defaults are in ``DEFAULTS``; read them with :func:`optional`:
-        n_agents: number of lanes per environment, A.
-        fps: steps per second of simulated time, for videos.
-        capturable: False if it steps on the host, where no CUDA graph can repeat a step.
-        resumable: False if a checkpoint cannot hold its state: a resumed run begins new episodes.
-        check(): raises the errors that were flagged on the device. Synchronises host and device.
-        layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
-            of an evaluation are over layouts; without, they are over environments.
-        weigh_layouts(): has new episodes take place in layouts drawn by weights from now on.
-            Returns the cumulative weights, (D,) int32 on the device, which a curriculum changes in
-            place.
-        bot: class of a scripted policy for this environment, whose arguments are settings of the
-            environment, or `env`, the environment itself. It plays as ``opponents.bot`` and
-            ``against=bot``.
-        controls: {key of a keyboard: action}, by which a person drives an agent in a page that
-            ``megastep web`` writes. Default: movement by arrow keys, or digits.
-        roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
-        privileged_space: space of ``world.privileged``.
-        coefficients: a tuple of `megastep.coefficients.Coefficients`, such as weights of rewards,
-            which training has follow their schedules.
-        close(): ends what it started, such as processes. Called after training.
-        wrapper_state(), load_wrapper_state(state, is_frozen): what wrappers around the environments
-            have learnt, such as running statistics, as tensors and numbers by name. It belongs to
-            the policy: evaluations give it to their environments and freeze it.
-        max_episode_steps: steps at which an evaluation cuts an episode off.
-        reset(seed=None, mask=None): a reset that takes a seed and a mask. With a mask, (B,) bool,
-            only these lanes begin an episode; the others keep state and observation to the bit, and
-            their rows are those of the last world. With a seed, an integer or (B,) int64, a seed
-            per lane, the episodes from now on are the same each time. Neither synchronises. See
-            :func:`takes_masks`.
-        game_over: (N,) bool, environments whose game ended with the last world, and with it the
-            episodes of all agents. Default: where all lanes of one end at once.
-        desync(): gives every lane a random age, as if its episode had been going on for some steps,
-            so that lanes do not end their episodes in the same steps. Called after ``reset``.
-        state(e), plot_state(state): draw environment ``e``. Without them there are no videos.
+    Optional attributes have their defaults in ``DEFAULTS``, with which :func:`optional` reads them;
+    docs/new-environment.md describes them under The contract.
     """
 
     n_envs: int
@@ -123,9 +90,11 @@ DEFAULTS: dict[str, Any] = {
     "n_agents": 1,
     "fps": 10.0,
     "capturable": True,
-    "coefficients": (),
+    "coefficients": (),  # `Coefficients`, whose schedules training follows
     "resumable": True,
     "close": lambda: None,
+    # what wrappers have learnt, tensors and numbers by name, which belongs to the policy; another
+    # environment is given it, and whether it is frozen
     "wrapper_state": dict,
     "load_wrapper_state": None,
     "max_episode_steps": 100_000,
@@ -133,7 +102,7 @@ DEFAULTS: dict[str, Any] = {
     "layout": None,
     "weigh_layouts": None,
     "bot": None,
-    "controls": None,
+    "controls": None,  # {key of a keyboard: action}, for a page of `megastep web`
     "roles": None,
     "privileged_space": None,
     "desync": None,
@@ -154,9 +123,7 @@ def optional(owner: object, name: str, defaults: Mapping[str, Any] = DEFAULTS) -
 def takes_masks(env: Env) -> bool:
     """Returns whether an environment has ``reset(seed=None, mask=None)``."""
     own = getattr(env, "takes_masks", None)  # of a wrapper, which depends on what is inside
-    return (
-        own if own is not None else {"seed", "mask"} <= {*inspect.signature(env.reset).parameters}
-    )
+    return {"seed", "mask"} <= {*inspect.signature(env.reset).parameters} if own is None else own
 
 
 def n_lanes(env: Env) -> int:

@@ -23,12 +23,10 @@ class SB3VecEnv(VecEnv):
     in ``VecMonitor`` for statistics of episodes.
 
     A lane begins its next episode in the step that ends one, by a masked reset; the last
-    observation is ``infos[lane]["terminal_observation"]``. Where the environment allows some
-    actions only, ``env_method("action_masks")`` says which, as sb3-contrib's ``MaskablePPO`` asks.
-    The metric ``success`` is also ``is_success``, for success rates.
-
-    SB3 keeps a network per observation in a `torch.nn.ModuleDict`. Observations with the name of an
-    attribute of that class get an underscore: ``keys`` of Keys is ``keys_``.
+    observation is ``infos[lane]["terminal_observation"]``. ``env_method("action_masks")`` says
+    which actions are allowed, as ``MaskablePPO`` asks. The metric ``success`` is also
+    ``is_success``. An observation with the name of an attribute of `torch.nn.ModuleDict`, in which
+    SB3 keeps a network for each, gets an underscore: ``keys`` of Keys is ``keys_``.
 
     Args:
         env: the environment, whose resets take masks.
@@ -38,11 +36,11 @@ class SB3VecEnv(VecEnv):
     def __init__(self, env: Env, render_mode: str | None = None):
         self.vector = VectorEnv(env, AutoresetMode.SAME_STEP, render_mode=render_mode)
         self.env, self.render_mode = env, render_mode
-        self._actions, self._infos, self._names = None, {}, {}
+        self._actions, self._infos = None, {}
         space = self.vector.single_observation_space
-        if isinstance(space, gymnasium.spaces.Dict):
-            self._names = _module_names(space)
-            space = gymnasium.spaces.Dict(self._renamed(space))
+        is_dict = isinstance(space, gymnasium.spaces.Dict)
+        self._names = _module_names(space) if is_dict else {}
+        space = gymnasium.spaces.Dict(self._renamed(space)) if is_dict else space
         super().__init__(self.vector.num_envs, space, self.vector.single_action_space)
         self.metadata["render_fps"] = self.fps
 

@@ -39,23 +39,17 @@ class TorchRLEnv(EnvBase):
         if (privileged := optional(env, "privileged_space")) is not None:
             self._space["privileged"] = privileged
         on = dict(device=self.device_of_env)
-        self.observation_spec = Composite(
-            {key: _spec(part, n, dtype, on) for key, part in self._space.items()}, shape=[n], **on
-        )
-        actions = env.action_space
+        self.observation_spec = _spec(self._space, n, dtype, on)
         world = self.lanes.reset()
         self._is_masked = "mask" in world
         if self._is_masked:
-            mask = without_agents(actions, world["mask"])
+            mask = without_agents(env.action_space, world["mask"])
             self.observation_spec["action_mask"] = _mask_spec(mask, n, on)
-        self.action_spec = _spec(actions, n, torch.float32, on)
+        self.action_spec = _spec(env.action_space, n, torch.float32, on)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, **on)
-        flags = "done", "terminated", "truncated"
-        self.full_done_spec = Composite(
-            {flag: Categorical(2, shape=(n, 1), dtype=torch.bool, **on) for flag in flags},
-            shape=[n],
-            **on,
-        )
+        flag = torch.empty(n, 1, dtype=torch.bool)
+        flags = dict.fromkeys(("done", "terminated", "truncated"), flag)
+        self.full_done_spec = _mask_spec(flags, n, on)
 
     def _tensordict(self, world) -> TensorDict:
         named = _named(world["obs"], "observation")
@@ -99,7 +93,8 @@ def _mask_spec(mask, n, on) -> TensorSpec:
 def _spec(space, n, dtype, on) -> TensorSpec:
     """Returns the spec of n lanes' leaves, (n, ...), without an axis of one agent per lane."""
     if isinstance(space, Mapping):
-        return Composite({k: _spec(part, n, dtype, on) for k, part in space.items()}, shape=[n])
+        parts = {k: _spec(part, n, dtype, on) for k, part in space.items()}
+        return Composite(parts, shape=[n], **on)
     shape = n, *(space.shape[1:] if space.shape[0] == 1 else space.shape)
     if isinstance(space, spaces.MultiDiscrete):
         if len(shape) == 1:

@@ -33,27 +33,7 @@ class Gymnasium(VectorizedEnv):
 
     They step on the CPU: one after the other in this process (sync), or in worker processes, one
     per core (async). With a learner on a GPU, observations cross through pinned memory.
-
-    Observation:
-        Box: (B, 1, n) float32, flattened, or an image (B, 1, C, H, W), uint8 or float32, if it has
-        8 rows and columns or more and up to 4 channels. Discrete: (B, 1) integers from 0.
-        MultiDiscrete: (B, k) integers, or a dict of its numbers if their ranges differ.
-        MultiBinary: (B, 1, n) float32. Tuple and Dict: a dict.
-
-    Actions:
-        Discrete: (B, 1) integers from 0. MultiDiscrete: (B, k), or a dict if the ranges differ.
-        MultiBinary: (B, k), 0 or 1. Box with bounds: (B, 1, n) float32 within them. Tuple and Dict:
-        a dict. A mask in ``info["action_mask"]``, a number per action of a Discrete space, becomes
-        ``world.mask``: actions with 0 are not taken.
-
-    Reward:
-        The environment's own.
-
-    Episode end:
-        Terminal and truncated as the environment says. If it says both, terminal.
-
-    Metrics:
-        The numbers in the last ``info`` of an episode, such as ``is_success``, at most 16.
+    docs/other-environments.md says what becomes of spaces, episodes and the numbers in ``info``.
 
     Args:
         n_envs: number of environments, N.

@@ -20,24 +20,9 @@ INSTALL = "pip install 'megastep-flatland[gymnasium]'"
 class PettingZoo(VectorizedEnv):
     """Any parallel environment of PettingZoo whose agents have the same spaces.
 
-    Observation:
-        As that of :class:`~megastep.envs.gymnasium.Gymnasium`, for each agent. That of an agent
-        that is not there is its last one.
-
-    Actions:
-        As those of Gymnasium, for each agent, with its mask in its ``info["action_mask"]`` or as
-        the part ``action_mask`` of its observation.
-
-    Reward:
-        The environment's own. 0 for an agent that is not there.
-
-    Episode end:
-        Each agent's own: terminal if the environment terminated it, else truncated. The environment
-        is reset when no agent is left. Until then the lane of one that is out, or that the reset
-        left out, begins anew in each step and does not learn.
-
-    Metrics:
-        None.
+    Spaces are those of :class:`~megastep.envs.gymnasium.Gymnasium`, for each agent. One that is not
+    there has its last observation and the reward 0, and begins anew in each step without learning,
+    until no agent is left and the environment is reset. There are no metrics.
 
     Args:
         n_envs: number of environments, N.
