@@ -29,6 +29,7 @@ from megastep.agents.launch import again, signals
 from megastep.agents.runs import folders, provenance
 from megastep.agents.training.budget import reaches
 from megastep.agents.training.callbacks import Progress
+from megastep.types import DEFAULTS, optional
 
 if TYPE_CHECKING:
     from megastep.agents.launch.watch import Team
@@ -218,9 +219,22 @@ class Run:
             return f"{text}, when an evaluation had {goals}"
         latest = trainer.latest_stats
         if "episode/return" not in latest:
-            return f"{text}; no episode ended since the last report"
+            return f"{text}; {self.too_short()}"
         n = f"{latest['episode/window']:,.0f}"
         return f"{text}; mean return {latest['episode/return']:.4g} of the last {n} episodes"
+
+    def too_short(self) -> str:
+        """Returns why a run has no mean return, and how long it has to be for one."""
+        trainer, most = self.training, optional(self.training.env, "max_episode_steps")
+        n_lanes = trainer.rollout.n_lanes * trainer.ranks.n
+        n_steps = trainer.samples // n_lanes
+        length = f"more than {int(trainer.episodes.stats.totals[1].max())}"
+        if most < DEFAULTS["max_episode_steps"]:
+            length, n_steps = f"up to {most}", max(n_steps, most)
+        return (  # twice as many, since the first episodes begin at random ages
+            f"no mean return yet: an episode has {length} steps, and each of {n_lanes} lanes took "
+            f"{trainer.samples // n_lanes}; give samples={2 * n_steps * n_lanes}, or more seconds="
+        )
 
 
 def evaluator(*arguments: Any) -> Any:

@@ -123,8 +123,11 @@ def groups_of(runs: Sequence[Run]) -> dict[str, list[Run]]:
         by_settings.setdefault(repr(sorted(run.settings().items())), []).append(run)
     keys = differing([group[0] for group in by_settings.values()])
     named: dict[str, list[Run]] = {}
+    is_population = len({run.folder.parent for run in runs}) == 1
     for group in by_settings.values():
         text = ", ".join(f"{key}={group[0].settings().get(key)}" for key in keys[:4])
+        if is_population and (member := group[0].settings().get("population.member")) is not None:
+            text = f"member {member}"
         for more in ("", group[0].folder.name, str(group[0].folder)):
             name = f"{text} {more}".strip()
             if name and name not in named:

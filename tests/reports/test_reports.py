@@ -109,6 +109,18 @@ def test_runs_that_differ_in_seeds_are_averaged(here):
     assert chart["bands"] == [[2, 3, 0], [5, 6, 1]]
 
 
+def test_runs_of_a_population_are_called_by_their_numbers(here):
+    one = runs.read(here / "a")
+    members = [
+        one._replace(
+            folder=Path(f"P/member-{n}"),
+            config={**one.config, "population": {"member": n}, "learner": {"lr": n}},
+        )
+        for n in (0, 1)
+    ]
+    assert [*runs.groups_of(members)] == ["member 0", "member 1"]
+
+
 def test_folder_of_a_sweep_stands_for_its_jobs(here, tmp_path):
     for name in "ac":
         shutil.copytree(here / name, tmp_path / "sweep" / name)
