@@ -5,7 +5,7 @@ once per update.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeVar
 
 import torch
@@ -58,10 +58,6 @@ class Ranks(NamedTuple):
     def any(self, condition: bool) -> bool:
         """Returns whether a condition is true on any rank."""
         return any(is_true for (is_true,) in self.exchange([condition]))
-
-    def from_first(self, function: Callable[[], T]) -> T:
-        """Calls a function on rank 0. Returns its result, or raises its error, on every rank."""
-        return function() if self.n == 1 else process_group.from_rank_0(function)
 
     def sum(self, values: torch.Tensor) -> torch.Tensor:
         """Returns the sum of the ranks' tensors, float64 on the host. Synchronises.

@@ -27,7 +27,7 @@ from megastep.agents.runs import (
     restore,
 )
 from megastep.agents.runs.saver import Saver
-from megastep.agents.training import budget, loggers, repeat
+from megastep.agents.training import budget, loggers
 from megastep.agents.training.callbacks import Evaluations, Snapshots
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LearnerOptions, with_defaults
@@ -102,10 +102,10 @@ def make_trainer(
     with factory.errors():
         of_ranks = cfg.checkpoints.replay_every, token, number, n_ranks
         saves = Saver(folder / "checkpoints", config, cfg.checkpoints.keep, made_with, *of_ranks)
-        limits, record = budget_of(cfg, folder, resumed), None
+        limits = budget_of(cfg, folder, resumed)
         if number == 0:  # which alone writes these
-            record = annealing.AnnealingRecord(folder, had["updates"])
-            observers += [record, make_loggers(cfg, folder, had["samples_at_report"]), *callbacks]
+            observers.append(annealing.AnnealingRecord(folder, had["updates"]))
+            observers += [make_loggers(cfg, folder, had["samples_at_report"]), *callbacks]
             if cfg.checkpoints.snapshots:
                 shots = Saver(folder / "snapshots", config, keep_checkpoints=10**9)
                 observers.append(Snapshots(shots, cfg.checkpoints.snapshots))
@@ -131,9 +131,6 @@ def make_trainer(
             sources = factory.sources_of(homes)
             trainer.curriculum = factory.construct(cfg.curriculum, sources=sources, **parts)
         trainer.episodes.begin(trainer, factory.layout_sources(cfg.env, homes), cfg.desync)
-        if record is not None:
-            hint = functools.partial(repeat.hint, trainer, record, resumed is not None)
-            trainer.nonfinite_guard.make_hint = hint
         if resumed:
             with state_errors(resumed.path):
                 trainer.run_state.load_state_dict(had, is_new_rank=number >= resumed.n_ranks)

@@ -159,9 +159,7 @@ class Run:
             ):
                 self.training.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            hint = "" if self.of_each else self.trainers[0].nonfinite_guard.hint
-            text = f"{error}. Earlier checkpoints are in {self.folder}{hint}"
-            raise UserError(text, 1) from error
+            raise UserError(f"{error}. Earlier checkpoints are in {self.folder}", 1) from error
         except DriftError as error:
             raise UserError(f"{error}. Earlier checkpoints are in {self.folder}") from error
         except (MemoryError, RuntimeError) as error:
@@ -196,13 +194,11 @@ class Run:
         from megastep.agents.launch import finishing  # with all that evaluates and films
 
         cfg, folder, samples, result = self.cfg, self.folder, self.training.samples, self.result()
-        guard = self.training.nonfinite_guard
-        nonfinite, hint = guard.value, guard.hint
-        del self.training, self.trainers, guard  # frees GPU memory for the evaluation
+        nonfinite = self.training.nonfinite_guard.value
+        del self.training, self.trainers  # frees GPU memory for the evaluation
         finishing.finish(cfg, folder, samples)
         if nonfinite and nonfinite.is_from_env:
-            learnt = f"All other rollouts were used; the run is in {folder}"
-            raise UserError(f"{nonfinite}. {learnt}{hint}", 1)
+            raise UserError(f"{nonfinite}. All other rollouts were used; the run is in {folder}", 1)
         if cfg.rerun and self.is_first:
             finishing.compare(folder, Path(cfg.rerun))
         console.say(f"{result}. The run is in {folder}\n{finishing.next_command(cfg, folder)}")

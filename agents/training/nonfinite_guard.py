@@ -6,10 +6,9 @@ The learner skips such updates, see `nonfinite.NonFiniteCheck`.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue
+from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.process_group import rank_label
 from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.types import LearnerOptions, with_defaults
@@ -24,17 +23,14 @@ MAX_SKIPPED = 20
 
 
 class NonFiniteGuard:
-    """Warns of the first NaN or infinity of a run, says how to reproduce it, and ends a run whose
-    updates are all skipped. All ranks call it at the same updates; they exchange what they found.
+    """Warns of the first NaN or infinity of a run, and ends a run whose updates are all skipped.
+    All ranks call it at the same updates; they exchange what they found.
 
     Args:
         learner: its `check` is read, if it has one.
 
     Attributes:
-        make_hint: returns how to reproduce the first NaN or infinity, as the rest of a sentence,
-            such as `repeat.hint`. Called on rank 0.
         value: the first NaN or infinity of the run, or None.
-        hint: how to reproduce it, or "".
         tolerates_divergence: a policy that diverged is noted in `has_diverged`, and raises nothing,
             for whoever replaces it. Its updates are skipped, so its weights stay as they are.
         has_diverged: the last `MAX_SKIPPED` updates were skipped.
@@ -44,10 +40,9 @@ class NonFiniteGuard:
 
     def __init__(self, env: Env, learner: Learner, ranks: Ranks = ONE):
         self.learner, self.ranks = learner, ranks
-        self.make_hint: Callable[[NonFiniteValue], str] = lambda value: ""
         self.n_agents = optional(env, "n_agents")
         self.nonfinite_check = with_defaults(learner, LearnerOptions).check
-        self.value, self.hint = None, ""
+        self.value = None
 
     def on_report(self, trainer: Trainer, metrics: object) -> None:
         """Checks the last update."""
@@ -62,8 +57,6 @@ class NonFiniteGuard:
     def check(self, rollout: RolloutLike) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.
 
-        Warns of the first NaN or infinity of the run.
-
         Raises:
             NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
         """
@@ -71,16 +64,18 @@ class NonFiniteGuard:
             return True
         value, n_skipped = self.nonfinite_check.read(rollout.floats())
         if value:
-            value = value.in_env(_env_lanes(rollout), self.n_agents)
+            stored = rollout.learners  # of the environment's lanes
+            lanes = range(rollout.n_lanes) if stored is None else stored.nonzero()[:, 0].tolist()
+            value = value.in_env(lanes, self.n_agents)
         is_bad = value is not None or n_skipped > 0
         reports = self.ranks.gather_if_any((n_skipped, value, rank_label()), is_bad)
         n_skipped = max(report[0] for report in reports)
         _, value, label = next((one for one in reports if one[1]), reports[0])
         text = f"{value}{f' ({label})' * (len(reports) > 1)}"
         if value and self.value is None:
-            self.value, self.hint = value, self.ranks.from_first(lambda: self.make_hint(value))
+            self.value = value
             if self.ranks.rank == 0:
-                warnings.warn(f"{text}; its rollout was skipped{self.hint}", stacklevel=2)
+                warnings.warn(f"{text}; its rollout was skipped", stacklevel=2)
         self.has_diverged = n_skipped >= MAX_SKIPPED
         if not self.has_diverged:
             return n_skipped == 0
@@ -95,9 +90,3 @@ class NonFiniteGuard:
             f"too large ({text if value else 'gradients'}). {advice}",
             is_from_env,
         )
-
-
-def _env_lanes(rollout) -> Sequence[int]:
-    """Returns the environment's lane of each lane of the rollout."""
-    learners = rollout.learners
-    return range(rollout.n_lanes) if learners is None else learners.nonzero()[:, 0].tolist()

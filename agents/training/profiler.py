@@ -1,9 +1,7 @@
 """A profile of a few updates of a run: a trace, and a table of where the time went."""
 
-import contextlib
 import os
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -33,77 +31,62 @@ class Profiler:
 
     def __init__(self, folder: Path, n_updates: int, device: torch.device):
         self.folder, self.n_updates, self.device = folder, n_updates, device
-        self.n_begun, self._range = 0, None
+        self.n_begun, self._range, self._profile = 0, None, None
         os.environ.setdefault("KINETO_LOG_LEVEL", "6")  # it prints a line at each start and stop
-        kinds = torch.profiler.ProfilerActivity
-        on_gpu = [kinds.CUDA] if device.type == "cuda" else []
-        self._profile = torch.profiler.profile(
-            activities=[kinds.CPU, *on_gpu],
-            schedule=torch.profiler.schedule(
-                skip_first=N_SKIPPED - 1, wait=0, warmup=1, active=n_updates, repeat=1
-            ),
-            on_trace_ready=self._write,
-            acc_events=True,
-        )
 
     def on_collect(self, trainer: object) -> None:
         """Begins an update, and its first phase."""
-        with self._tolerating():
-            self._close_range()
-            if self._profile is not None:
-                self._profile.step() if self.n_begun else self._profile.start()
+        if self.n_begun == N_SKIPPED:
+            kinds = torch.profiler.ProfilerActivity
+            on_gpu = [kinds.CUDA] if self.device.type == "cuda" else []
+            self._profile = torch.profiler.profile(activities=[kinds.CPU, *on_gpu], acc_events=True)
+            self._tolerated(self._profile.start)
+        if self.n_begun == N_SKIPPED + self.n_updates:
+            self.close()
         self.n_begun += 1
-        self._start(PHASES[0])
+        self._begin(PHASES[0])
 
     def on_rollout(self, trainer: object, rollout: object) -> None:
         """Begins the second phase."""
-        self._start(PHASES[1])
+        self._begin(PHASES[1])
 
     def on_update(self, trainer: object, losses: object) -> None:
         """Begins the last phase."""
-        self._start(PHASES[2])
+        self._begin(PHASES[2])
 
     def close(self) -> None:
         """Writes the profile of the updates so far, if that has not been done."""
-        with self._tolerating():
-            self._close_range()
-            if self._profile is not None and self.n_begun:
-                self._profile.stop()
+        self._begin(None)
+        if self._profile is not None:
+            self._tolerated(self._write)
         self._profile = None
 
-    def _start(self, phase) -> None:
-        with self._tolerating():
-            self._close_range()
-            if self._profile is not None:
-                self._range = torch.profiler.record_function(phase)
-                self._range.__enter__()
-
-    def _close_range(self) -> None:
+    def _begin(self, phase) -> None:
         if self._range is not None:
             self._range.__exit__(None, None, None)
-            self._range = None
+        self._range = None
+        if self._profile is not None and phase is not None:
+            self._range = torch.profiler.record_function(phase)
+            self._range.__enter__()
 
-    def _write(self, profile) -> None:
-        with self._tolerating():
-            profile.export_chrome_trace(str(self.folder / "profile.json.gz"))
-            kind = "cuda" if self.device.type == "cuda" else "cpu"
-            table = profile.key_averages().table(
-                sort_by=f"self_{kind}_time_total",
-                row_limit=N_ROWS,
-                max_name_column_width=MAX_NAME,
-            )
-            n = min(self.n_updates, self.n_begun - N_SKIPPED)
-            head = f"Updates {N_SKIPPED + 1} to {N_SKIPPED + n} on {self.device}, together"
-            path = self.folder / "profile.txt"
-            write_atomically(path, f"{head}:\n{table}".encode())
-            console.say(f"Profile: {path}, and a trace beside it")
+    def _write(self) -> None:
+        assert self._profile is not None
+        self._profile.stop()
+        self._profile.export_chrome_trace(str(self.folder / "profile.json.gz"))
+        kind = "cuda" if self.device.type == "cuda" else "cpu"
+        table = self._profile.key_averages().table(
+            sort_by=f"self_{kind}_time_total", row_limit=N_ROWS, max_name_column_width=MAX_NAME
+        )
+        head = f"Updates {N_SKIPPED + 1} to {self.n_begun} on {self.device}, together"
+        path = self.folder / "profile.txt"
+        write_atomically(path, f"{head}:\n{table}".encode())
+        console.say(f"Profile: {path}, and a trace beside it")
 
-    @contextlib.contextmanager
-    def _tolerating(self) -> Iterator[None]:
+    def _tolerated(self, call) -> None:
         """Turns an error into a warning, after which nothing is profiled."""
         try:
-            yield
+            call()
         except Exception as error:  # training is worth more
-            self._profile = self._range = None
+            self._profile = None
             reason = str(error).partition("\n")[0]
             warnings.warn(f"The profile could not be made: {reason}", stacklevel=3)

@@ -30,9 +30,6 @@ def one_by_one(monkeypatch):
                     return [value, value]
                 return [value, of_rank_1.pop(0)]
 
-            def from_first(self, function):
-                return function()
-
         monkeypatch.setattr(nonfinite_guard, "rank_label", lambda: LABELS[rank])
         return Made(rank, 2)
 
@@ -69,7 +66,7 @@ def test_nan_of_another_rank_is_told_by_rank_0(tmp_path, one_by_one, recwarn):
 class Three(Ranks):
     """Stands for three ranks of which this one speaks for all."""
 
-    any, mean, sum, from_first = ONE.any, ONE.mean, ONE.sum, ONE.from_first
+    any, mean, sum = ONE.any, ONE.mean, ONE.sum
     gather_if_any = ONE.gather_if_any
 
 
