@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from megastep.agents import console, factory, package
+from megastep.agents import console, factory
 from megastep.agents.distributed.ranks import Ranks, world
 from megastep.agents.errors import UserError, memory_problem, shortened
 from megastep.agents.factory import check, conflicts, settings
@@ -98,7 +98,7 @@ def make_trainer(
         for name in "checkpoints", "snapshots":
             checkpoint.set_aside_after(folder / name, resumed.step)
     config = {"train": check.as_tree(cfg), "spaces": restore.spaces_of(env)}
-    made_with = provenance.made_with(device, package.version(), n_ranks)
+    made_with = provenance.made_with(device, n_ranks)
     with factory.errors():
         of_ranks = cfg.checkpoints.replay_every, token, number, n_ranks
         saves = Saver(folder / "checkpoints", config, cfg.checkpoints.keep, made_with, *of_ranks)

@@ -244,7 +244,7 @@ def record(trainer: Trainer, device: Any, hosts: Sequence[str] = ()) -> None:
     """Writes the settings of an agent that starts to train, and a line about where it does."""
     folder = trainer.saver.folder.parent
     folders.write_config(folder, trainer.saver.config["train"])
-    provenance.record(folder, trainer.samples, device, package.version(), package.ROOT, hosts)
+    provenance.record(folder, trainer.samples, device, hosts)
 
 
 # ---- What ranks check before training ----
@@ -271,11 +271,12 @@ def check_equal(facts: dict[str, object]) -> None:
     """
     everyones = process_group.gather_objects({name: str(value) for name, value in facts.items()})
     for name in dict.fromkeys(name for theirs in everyones for name in theirs):
-        holders: dict[str, list[int]] = {}
-        for rank, theirs in enumerate(everyones):
-            holders.setdefault(theirs.get(name, "missing"), []).append(rank)
-        if len(holders) > 1:
-            values = (f"{value} on {ranks_named(ranks)}" for value, ranks in holders.items())
+        of_ranks = [theirs.get(name, "missing") for theirs in everyones]
+        if len({*of_ranks}) > 1:
+            values = (
+                f"{value} on {ranks_named([n for n, one in enumerate(of_ranks) if one == value])}"
+                for value in dict.fromkeys(of_ranks)
+            )
             raise UserError(
                 f"The ranks differ: {name} is {', and '.join(values)}; start all with the same "
                 "code, packages and options"

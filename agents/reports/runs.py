@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from megastep.agents.errors import UserError
 from megastep.agents.factory.check import leaves
 from megastep.agents.factory.settings import label
-from megastep.agents.runs import config_yaml, folders, json_lines, scores, typed_json
+from megastep.agents.runs import folders, json_lines, scores, typed_json
 
 if TYPE_CHECKING:
     from megastep.agents.types import Config, Row
@@ -94,7 +94,7 @@ def read(folder: Path) -> Run:
     folder = folders.folder_of(folders.find(str(folder)))
     if not (folder / "config.yaml").exists():
         raise UserError(f"{folder} is not a run: it has no config.yaml")
-    config = config_yaml.read(folder / "config.yaml")
+    config = typed_json.read_yaml(folder / "config.yaml")
     names, kind = ("metrics.jsonl", "perf.jsonl"), typed_json.Metrics
     metrics, perf = (json_lines.read(folder / name, kind) for name in names)
     if not metrics:

@@ -28,7 +28,7 @@ import os
 import pickle
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -54,20 +54,16 @@ class CheckpointError(RuntimeError):
 
 
 class DamagedCheckpoint(CheckpointError):
-    """A checkpoint does not match its manifest. An earlier checkpoint may be intact."""
+    """A checkpoint does not match its manifest, or is gone. An earlier one may be intact."""
 
     def __init__(self, path: Path, problem: object):
-        super().__init__(f"Checkpoint {path} is damaged: {shortened(problem, 300)}")
-
-
-class GoneCheckpoint(CheckpointError):
-    """A checkpoint was deleted before all its files were open, because its run saved later ones."""
-
-    def __init__(self, path: Path):
-        super().__init__(
-            f"Checkpoint {path} is gone: a run deletes its earlier checkpoints as it saves later "
-            "ones; name the run's folder to get its newest"
-        )
+        text = f"Checkpoint {path} is damaged: {shortened(problem, 300)}"
+        if not path.exists():
+            text = (
+                f"Checkpoint {path} is gone: a run deletes its earlier checkpoints as it saves "
+                "later ones; name the run's folder to get its newest"
+            )
+        super().__init__(text)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,11 +197,10 @@ def load_latest(
         path = paths.pop()
         try:
             checkpoint = read(path, device, is_whole, rank)
-        except GoneCheckpoint:  # deleted, as its run has saved another
-            paths, messages = list_checkpoints(folder), []
-            continue
         except DamagedCheckpoint as error:
             messages.append(str(error))
+            if not path.exists():  # deleted, as its run has saved another
+                paths, messages = list_checkpoints(folder), []
             continue
         for message in messages:
             warnings.warn(f"{message}; using {path.name} instead", stacklevel=2)
@@ -230,34 +225,38 @@ def read(
 
     Raises:
         DamagedCheckpoint: a file is missing, damaged, or could run code when loaded.
-        GoneCheckpoint: it was deleted before all files were open.
         CheckpointError: another version of megastep wrote it.
     """
     manifest = read_manifest(path)
-    parts = ["state.pt"]
+    written, parts = manifest["files"], ["state.pt"]
     if is_whole:
         parts += [f"rank{rank}.pt"] if rank else PARTS
-        parts = [name for name in parts if name in manifest["files"]]
+        parts = [name for name in parts if name in written]
     is_verified = device is None or (is_whole and rank == 0)
-    names = manifest["files"] if is_verified else [*parts, "config.json"]
-    with _verified(path, manifest, names) as files:
-        try:
+    with contextlib.ExitStack() as stack:
+        files: dict[str, BinaryIO] = {}
+        for name in written if is_verified else [*parts, "config.json"]:
+            with _damage(path, name):
+                files[name] = stack.enter_context(open(path / name, "rb"))
+        for name, file in files.items():
+            with _damage(path, name):
+                digest = _digest(file)
+            if digest != written[name]["sha256"]:
+                raise DamagedCheckpoint(path, f"{name} does not match the SHA-256 in its manifest")
+        with _damage(path, "config.json"):
             config = typed_json.loads(files["config.json"].read())
-        except ValueError as error:
-            raise DamagedCheckpoint(path, f"config.json: {error}") from None
         state: StateDict | None = None if device is None else {}
         for name in parts if state is not None else ():
             state |= _load(path, name, files[name], device if name == "state.pt" else "cpu")
-    n_ranks = 1 + sum(name.startswith("rank") for name in manifest["files"])
+    n_ranks = 1 + sum(name.startswith("rank") for name in written)
     numbers, made_with = manifest["numbers"], manifest["made_with"]
     return Checkpoint(path, manifest["step"], numbers, config, made_with, state, n_ranks)
 
 
 def read_manifest(path: Path) -> Row:
     """Returns a checkpoint's manifest. Raises as `read`."""
-    try:
-        with _readable(path, "manifest.json"):
-            data = (path / "manifest.json").read_bytes()
+    with _damage(path, "manifest.json"):
+        data = (path / "manifest.json").read_bytes()
         manifest = typed_json.loads(data)
         version = manifest["format"]
         if data != sealed({key: value for key, value in manifest.items() if key != "sha256"}):
@@ -267,8 +266,6 @@ def read_manifest(path: Path) -> Row:
             if not {"config.json", "state.pt"} <= manifest["files"].keys():
                 raise ValueError("it lacks config.json or state.pt")
             return manifest
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DamagedCheckpoint(path, f"manifest.json: {error}") from None
     cure = "update megastep"
     if isinstance(version, int) and version < FORMAT:
         cure = "use the commit in the provenance.jsonl of its run"
@@ -279,29 +276,14 @@ def read_manifest(path: Path) -> Row:
 
 
 @contextlib.contextmanager
-def _verified(path: Path, manifest: Row, names: Iterable[str]) -> Iterator[dict[str, BinaryIO]]:
-    """Yields open files of a checkpoint by name, which have the SHA-256 of its manifest."""
-    with contextlib.ExitStack() as stack:
-        files = {}
-        for name in names:
-            with _readable(path, name):
-                files[name] = stack.enter_context(open(path / name, "rb"))
-        for name, file in files.items():
-            with _readable(path, name):
-                digest = _digest(file)
-            if digest != manifest["files"][name]["sha256"]:
-                raise DamagedCheckpoint(path, f"{name} does not match the SHA-256 in its manifest")
-        yield files
-
-
-@contextlib.contextmanager
-def _readable(path, name) -> Iterator[None]:
+def _damage(path: Path, name: str) -> Iterator[None]:
+    """Turns what reading a file raises if it is damaged into DamagedCheckpoint."""
     try:
         yield
     except OSError as error:
-        if not path.exists():
-            raise GoneCheckpoint(path) from None
         raise DamagedCheckpoint(path, f"{name} cannot be read ({error.strerror})") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedCheckpoint(path, f"{name}: {error}") from None
 
 
 def _load(path, name, file, device) -> Any:

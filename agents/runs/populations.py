@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents.errors import UserError, user_errors
-from megastep.agents.runs import checkpoint, config_yaml, json_lines, scores, typed_json
+from megastep.agents.runs import checkpoint, json_lines, scores, typed_json
 
 if TYPE_CHECKING:
     from megastep.agents.types import Row
@@ -52,7 +52,7 @@ def best(root: Path) -> int | None:
     """
     ranked_by, path = RUNNING, folder_of(root, 0) / "config.yaml"
     with contextlib.suppress(KeyError, TypeError):
-        ranked_by = config_yaml.read(path)["population"]["score"] if path.exists() else RUNNING
+        ranked_by = typed_json.read_yaml(path)["population"]["score"] if path.exists() else RUNNING
     return _highest([score_of(folder, ranked_by) for folder in members(root)])
 
 
@@ -103,7 +103,7 @@ def beginning(root: Path) -> checkpoint.Checkpoint:
     Raises UserError if its settings cannot be read.
     """
     path = folder_of(root, 0) / "config.yaml"
-    config = {"train": config_yaml.read(path), "spaces": {}}
+    config = {"train": typed_json.read_yaml(path), "spaces": {}}
     with user_errors(f"{path} cannot be read: "):
         typed_json.check(typed_json.Config, config)
     numbers: dict[str, float] = dict(samples=0, seconds=0, updates=0)

@@ -13,35 +13,22 @@ from pathlib import Path
 
 import torch
 
+from megastep.agents import package
 from megastep.agents.runs.json_lines import JsonLines
 
 FILE = "provenance.jsonl"
 
 
-def record(
-    folder: Path,
-    samples: int,
-    device: torch.device,
-    version: str,
-    source: Path,
-    hosts: Sequence[str] = (),
-) -> None:
-    """Appends a line to a run's `provenance.jsonl`. Never raises; unknown facts are omitted.
-
-    Args:
-        folder: the run folder.
-        samples: environment steps so far; 0 for a new run.
-        device: device that trains.
-        version: megastep's version.
-        source: folder of megastep's source, which may be a git checkout.
-        hosts: machine of each rank.
+def record(folder: Path, samples: int, device: torch.device, hosts: Sequence[str] = ()) -> None:
+    """Appends a line to a run's `provenance.jsonl`, after so many samples, on a device and on the
+    machine of each rank. Never raises; unknown facts are omitted.
     """
     with contextlib.suppress(Exception), contextlib.closing(JsonLines(folder / FILE)) as lines:
         facts = {
             "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
             "command": shlex.join(sys.orig_argv),
-            "commit": commit(source),
-            "megastep": version,
+            "commit": commit(package.ROOT),
+            "megastep": package.version(),
             "torch": torch.__version__,
             "cuda": torch.version.cuda,
             "python": platform.python_version(),
@@ -52,11 +39,11 @@ def record(
         lines.write(samples, {name: text for name, text in facts.items() if text})
 
 
-def made_with(device: torch.device, version: str, n_ranks: int = 1) -> dict[str, str | int]:
+def made_with(device: torch.device, n_ranks: int = 1) -> dict[str, str | int]:
     """Returns versions, device, threads and ranks. Runs that agree in these, in code and in
     configuration, the seed included, are bit-identical.
     """
-    facts = {"torch": torch.__version__, "megastep": version}
+    facts = {"torch": torch.__version__, "megastep": package.version()}
     if n_ranks > 1:
         facts["ranks"] = n_ranks
     if device.type == "cuda":

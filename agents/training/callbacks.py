@@ -89,14 +89,6 @@ class Callbacks(list[Any]):
             getattr(one, "close", lambda: None)()
 
 
-class DriftCheck:
-    """Checks in each report that all ranks have the same weights."""
-
-    def on_measure(self, trainer: Trainer, metrics: dict[str, Any]) -> None:
-        """Raises DriftError if the weights differ."""
-        trainer.ranks.check_drift(trainer.policy, trainer.learner_options.extra)
-
-
 class Losses:
     """Reports what the last update returned, means over the ranks. NaN, where no gradient step was
     taken, is left out.

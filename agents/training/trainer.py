@@ -10,7 +10,7 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.ranks import Plan, Ranks, world
 from megastep.agents.runs.saver import NoSaver, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
-from megastep.agents.training.callbacks import Callbacks, DriftCheck, Losses
+from megastep.agents.training.callbacks import Callbacks, Losses
 from megastep.agents.training.episode_stats import Episodes
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import Timing
@@ -94,7 +94,7 @@ class Trainer:
         self.curriculum: Any = None
         self.timing, self.tuning, self.episodes = Timing(env.device), Tuning(self), Episodes(self)
         self.nonfinite_guard = NonFiniteGuard(env, learner, self.ranks)
-        standard = [self.timing, DriftCheck(), self.tuning, self.episodes, Losses()]
+        standard = [self.timing, self.tuning, self.episodes, Losses()]
         self.callbacks = Callbacks([*standard, *callbacks, self.nonfinite_guard])
         self.run_state = RunState(self)
 
@@ -187,6 +187,7 @@ class Trainer:
         """
         self.wait_for_collector()
         optional(self.env, "check")()
+        self.ranks.check_drift(self.policy, self.learner_options.extra)
         if self.updates % self.log_every == 0:
             self.samples_at_report = self.samples
         self.updates_at_report, self.is_save_due = self.updates, False

@@ -7,6 +7,7 @@ import sys
 import pytest
 import torch
 
+from megastep.agents import package
 from megastep.agents.runs import json_lines, provenance
 
 CPU = torch.device("cpu")
@@ -53,8 +54,10 @@ def test_only_a_checkout_of_its_own_has_a_commit(checkout, tmp_path, monkeypatch
 
 def test_each_start_of_a_run_is_a_line(checkout, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", ["python", "train.py", "folder=two words"])
+    monkeypatch.setattr(package, "version", lambda: "megastep 9.9")
+    monkeypatch.setattr(package, "ROOT", checkout[0])
     for samples in (0, 640):
-        provenance.record(tmp_path, samples, CPU, "megastep 9.9", checkout[0])
+        provenance.record(tmp_path, samples, CPU)
     rows = json_lines.read(tmp_path / "provenance.jsonl")
     assert [row["samples"] for row in rows] == [0, 640]
     row = rows[1]
@@ -65,10 +68,10 @@ def test_each_start_of_a_run_is_a_line(checkout, tmp_path, monkeypatch):
 
 
 def test_no_failure_ends_a_run(tmp_path, monkeypatch):
-    provenance.record(tmp_path / "absent", 0, CPU, "1", tmp_path)
+    provenance.record(tmp_path / "absent", 0, CPU)
 
     def failing(*_, **__):
         raise RuntimeError
 
     monkeypatch.setattr(provenance, "device_name", failing)
-    provenance.record(tmp_path, 0, CPU, "1", tmp_path)
+    provenance.record(tmp_path, 0, CPU)

@@ -79,9 +79,9 @@ def test_samples_of_all_ranks_are_counted(tmp_path):
 def test_provenance_has_the_ranks(tmp_path):
     device = torch.device("cpu")
     for hosts in (["a"], ["a", "a", "b"]):
-        provenance.record(tmp_path, 0, device, "1", tmp_path, hosts)
+        provenance.record(tmp_path, 0, device, hosts)
     alone, three = json_lines.read(tmp_path / provenance.FILE)
     assert "hosts" not in alone and "ranks" not in alone
     assert (three["ranks"], three["hosts"]) == (3, "a, b")
-    assert provenance.made_with(device, "1", 2)["ranks"] == 2
-    assert "ranks" not in provenance.made_with(device, "1")
+    assert provenance.made_with(device, 2)["ranks"] == 2
+    assert "ranks" not in provenance.made_with(device)
