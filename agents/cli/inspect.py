@@ -31,14 +31,14 @@ def run(run: str) -> int:
         try:
             console.say("\n".join((_lines_of_agent if is_agent else _lines)(path)))
             n_printed += 1
-        except checkpoint.GoneCheckpoint as error:
-            if is_one:
-                raise UserError(str(error)) from None
-            if path == paths[-1] and not n_printed:  # the run has saved others meanwhile
-                paths += checkpoint.list_checkpoints(folder)
         except checkpoint.CheckpointError as error:
-            is_damaged = True
-            console.say(str(error))
+            if path.exists():
+                is_damaged = True
+                console.say(str(error))
+            elif is_one:
+                raise UserError(str(error)) from None
+            elif path == paths[-1] and not n_printed:  # the run has saved others meanwhile
+                paths += checkpoint.list_checkpoints(folder)
     return int(is_damaged)
 
 
@@ -49,7 +49,7 @@ def _lines(path: Path) -> Iterator[str]:
     try:
         written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
     except FileNotFoundError:
-        raise checkpoint.GoneCheckpoint(path) from None
+        raise checkpoint.DamagedCheckpoint(path, "") from None
     yield f"{path}: intact, format {manifest['format']}, written {written:%Y-%m-%d %H:%M:%S}"
     yield f"  {'; '.join(f'{name} {value:,.6g}' for name, value in loaded.numbers.items())}"
     if loaded.made_with:
