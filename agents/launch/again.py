@@ -4,7 +4,6 @@ Clusters repeat a job's command after a preemption, a time limit or the loss of 
 """
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,22 +19,9 @@ SLURM_JOB = "SLURM_JOB_ID"
 #: Settings that may change when a run is resumed: where it runs, when it stops and which files it
 #: writes, but nothing that decides what it learns.
 RESUMABLE = (
-    "resume",
-    "samples",
-    "seconds",
-    "more_samples",
-    "more_seconds",
-    "device",
-    "trust",
-    "logging",
-    "evaluation",
-    "checkpoints",
-    "desync",
-    "ranks",
-    "dry_run",
-    "logger",
-    "finish",
-)
+    "resume samples seconds more_samples more_seconds device trust logging evaluation checkpoints "
+    "desync ranks dry_run logger finish"
+).split()
 
 
 class Start(NamedTuple):
@@ -79,7 +65,16 @@ def automatic(cfg: settings.Train) -> Start:
         folders.check_free(str(folder), is_again=True)
         return Start(settings.changed(cfg, folder=str(folder)), folder)
     loaded = folders.load_checkpoint(folders.find(str(folder)), cfg.trust)
-    if errors := [*_differences(loaded.config["train"], check.as_tree(cfg))]:
+    typed, before = check.as_tree(cfg), dict(check.leaves(loaded.config["train"]))
+    free, errors = {*RESUMABLE, "folder", "init"}, []
+    if typed["learner"].get("anneal") == "auto":  # decided when the run began
+        free.add("learner.anneal")
+    for key, value in check.leaves(typed):
+        is_free = {key, key.partition(".")[0]} & free
+        if not is_free and key in before and before[key] != value:
+            was, cure = shortened(before[key], 60), "choose another folder, or init=RUN"
+            errors.append((key, f"was {was} when the run began; {cure}"))
+    if errors:
         raise ConfigErrors(errors)
     numbers, ended = loaded.numbers, None
     budgets = {name: getattr(cfg, name) for name in ("samples", "seconds")}
@@ -88,16 +83,3 @@ def automatic(cfg: settings.Train) -> Start:
     if reaches(evaluation_in(numbers), cfg.evaluation.stop):
         ended = "reached its stop"
     return Start(settings.changed(cfg, resume=str(folder), folder=None, init=None), folder, ended)
-
-
-def _differences(saved, typed) -> Iterator[tuple[str, str]]:
-    """Yields (key, error) for settings outside `RESUMABLE` that differ from the saved ones."""
-    free = {*RESUMABLE, "folder", "init"}
-    if typed["learner"].get("anneal") == "auto":  # decided when the run began
-        free.add("learner.anneal")
-    before = dict(check.leaves(saved))
-    for key, value in check.leaves(typed):
-        is_free = {key, key.partition(".")[0]} & free
-        if not is_free and key in before and before[key] != value:
-            was, cure = shortened(before[key], 60), "choose another folder, or init=RUN"
-            yield key, f"was {was} when the run began; {cure}"

@@ -58,36 +58,24 @@ def next_command(cfg: settings.Train, folder: Path) -> str:
 
 
 def compare(folder: Path, original: Path) -> None:
-    """Checks that two runs have the same metrics. Raises UserError if not."""
-    generation = populations.first_copy(original)
-    cause = generation and (
-        f"in generation {generation} it copied another member, which a run of its own cannot: "
-        f"rerun={original.parent} repeats the whole population"
-    )
-    _check(METRICS, folder, original, cause or "")
-    console.say(f"{METRICS} equals that of {original}, byte for byte.")
-
-
-def compare_population(folder: Path, original: Path) -> None:
-    """Checks that two populations have the same generations, and their members the same metrics.
-    Raises UserError if not.
+    """Checks that two runs have the same metrics, or two populations the same generations and
+    members with the same metrics. Raises UserError if not.
     """
-    members = populations.members(original)
-    for name in (*(f"{member.name}/{METRICS}" for member in members), populations.FILE):
-        _check(name, folder, original)
-    console.say(
-        f"{populations.FILE} and {METRICS} of all {len(members)} members equal those of "
-        f"{original}, byte for byte."
-    )
-
-
-def _check(name: str, folder: Path, original: Path, cause: str = "") -> None:
-    ours, theirs = ((one / name).read_bytes() for one in (folder, original))
-    if ours == theirs:
-        return
-    pairs = enumerate(itertools.zip_longest(ours.split(b"\n"), theirs.split(b"\n")), 1)
-    number = next(number for number, (one, other) in pairs if one != other)
-    cause = cause or (
-        f"equal bits need the same versions, device and threads: see {provenance.FILE} of both"
-    )
-    raise UserError(f"{name} differs from that of {original} from line {number} on; {cause}", 1)
+    members, what = populations.members(original), f"{METRICS} equals that"
+    names = [METRICS]
+    if members:
+        names = [*(f"{member.name}/{METRICS}" for member in members), populations.FILE]
+        what = f"{populations.FILE} and {METRICS} of all {len(members)} members equal those"
+    cause = f"equal bits need the same versions, device and threads: see {provenance.FILE} of both"
+    if generation := populations.first_copy(original):
+        cause = (
+            f"in generation {generation} it copied another member, which a run of its own cannot: "
+            f"rerun={original.parent} repeats the whole population"
+        )
+    for name in names:
+        ours, theirs = ((one / name).read_bytes().split(b"\n") for one in (folder, original))
+        pairs = enumerate(itertools.zip_longest(ours, theirs), 1)
+        if number := next((number for number, (one, other) in pairs if one != other), None):
+            text = f"{name} differs from that of {original} from line {number} on; {cause}"
+            raise UserError(text, 1)
+    console.say(f"{what} of {original}, byte for byte.")

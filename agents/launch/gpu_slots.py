@@ -51,27 +51,26 @@ def taken(cfg: settings.Common, number: int) -> Iterator[settings.Common]:
         return
     size = launcher.n_ranks(cfg) if _has_ranks(cfg) else 1
     first = number % (n_gpus // size) * size
-    with contextlib.ExitStack() as stack:
-        if _has_ranks(cfg):
-            # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
-            before = os.environ.get(VISIBLE)
-            names = (before or ",".join(map(str, range(n_gpus)))).split(",")
-            stack.callback(_make_visible, before)
-            _make_visible(",".join(name.strip() for name in names[first : first + size]))
-        else:
-            import torch
+    if _has_ranks(cfg):
+        # as CUDA_VISIBLE_DEVICES names them: by UUIDs, or numbers other than PyTorch's
+        before = os.environ.get(VISIBLE)
+        names = (before or ",".join(map(str, range(n_gpus)))).split(",")
+        os.environ[VISIBLE] = ",".join(name.strip() for name in names[first : first + size])
+        try:
+            yield cfg
+        finally:
+            del os.environ[VISIBLE]
+            if before is not None:
+                os.environ[VISIBLE] = before
+        return
+    import torch
 
-            stack.callback(torch.cuda.set_device, torch.cuda.current_device())
-            torch.cuda.set_device(first)
-            if cfg.device == "cuda":
-                cfg = settings.changed(cfg, device=f"cuda:{first}")
-        yield cfg
-
-
-def _make_visible(names) -> None:
-    os.environ.pop(VISIBLE, None)
-    if names is not None:
-        os.environ[VISIBLE] = names
+    current = torch.cuda.current_device()
+    torch.cuda.set_device(first)
+    try:
+        yield settings.changed(cfg, device=f"cuda:{first}") if cfg.device == "cuda" else cfg
+    finally:
+        torch.cuda.set_device(current)
 
 
 def _has_ranks(cfg: settings.Common) -> "TypeGuard[settings.Train]":

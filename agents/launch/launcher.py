@@ -189,10 +189,7 @@ def variables(job: Path, n_ranks: int) -> dict[str, str]:
     # a Slurm job may use only some of the machine's cores
     is_linux = hasattr(os, "sched_getaffinity")
     n_cores = len(os.sched_getaffinity(0)) if is_linux else os.cpu_count() or 1
-    defaults = {
-        "OMP_NUM_THREADS": str(max(1, n_cores // n_ranks)),
-        "TORCH_CPP_LOG_LEVEL": "ERROR",
-    }
+    defaults = {"OMP_NUM_THREADS": str(max(1, n_cores // n_ranks)), "TORCH_CPP_LOG_LEVEL": "ERROR"}
     if os.path.exists("/sys/class/net/lo"):  # works even if the host name does not resolve
         defaults["GLOO_SOCKET_IFNAME"] = "lo"
     return changes | {name: text for name, text in defaults.items() if name not in os.environ}

@@ -47,10 +47,9 @@ class PopulationRun(Run):
 
     def __init__(self, cfg: settings.Train, team: Team | None):
         super().__init__(cfg, team)
-        if self.n_ranks > (size := cfg.population.size):
-            problem = f"{self.n_ranks} is more than the {size} members of the population"
-            text = f"{problem}; use population.size={self.n_ranks} or more"
-            raise ConfigErrors([("ranks", text)])
+        if (n := self.n_ranks) > (size := cfg.population.size):
+            text = f"{n} is more than the {size} members of the population"
+            raise ConfigErrors([("ranks", f"{text}; use population.size={n} or more")])
 
     def open(self, locks: contextlib.ExitStack) -> tuple[Path, Any]:
         if self.cfg.resume is None:
@@ -90,10 +89,9 @@ class PopulationRun(Run):
                     homes=homes,
                 )
             known = [populations.RUNNING, populations.EVALUATED, *trainer.episodes.names]
-            if chosen.score not in known:
-                text = f"{chosen.score} is not a mean over episodes here"
-                cure = closest(chosen.score, known)
-                raise ConfigErrors([("population.score", f"{text}; {cure}")])
+            if (score := chosen.score) not in known:
+                text = f"{score} is not a mean over episodes here; {closest(score, known)}"
+                raise ConfigErrors([("population.score", text)])
             record(trainer, self.device)
             self.trainers.append(trainer)
         self.streams.wait()
@@ -149,7 +147,7 @@ class PopulationRun(Run):
             command = folders.command_of("evaluate", "run", root)
             text = f"The best is in {best}\nTo evaluate it: {command}"
         if cfg.rerun and self.is_first:
-            finishing.compare_population(root, Path(cfg.rerun))
+            finishing.compare(root, Path(cfg.rerun))
         console.say(f"Trained {samples:,} samples of each member. {text}")
         process_group.exchange([0])  # the others wait for what follows on rank 0
 
@@ -176,23 +174,16 @@ def table(population: Population, root: Path) -> str:
     first generation, settings. All ranks call it, once all members have written their metrics.
     """
     ranked_by = population.chosen.score
-    scores = population.gathered(
-        [
-            populations.score_of(trainer.saver.folder.parent, ranked_by)
-            for trainer in population.trainers
-        ]
-    )
+    runs = [trainer.saver.folder.parent for trainer in population.trainers]
+    scores = population.gathered([populations.score_of(run, ranked_by) for run in runs])
     generations, keys = populations.read(root / populations.FILE), [*population.chosen.vary]
-    rows = [
-        [
-            str(member),
-            "" if score is None else f"{score:.4g}",
-            str(populations.lineage(generations, member)[0]),
-            *(f"{population.settings[member][key]:.3g}" for key in keys),
-            str(population.n_diverged[member] or ""),
-        ]
-        for member, score in enumerate(scores)
-    ]
+    rows = []
+    for member, score in enumerate(scores):
+        shown = [f"{population.settings[member][key]:.3g}" for key in keys]
+        first = populations.lineage(generations, member)[0]
+        score = "" if score is None else f"{score:.4g}"
+        n_diverged = str(population.n_diverged[member] or "")
+        rows.append([str(member), score, str(first), *shown, n_diverged])
     is_return = ranked_by in (populations.RUNNING, populations.EVALUATED)
     title = "return" if is_return else ranked_by
     return console.table(["member", title, "descends from", *keys, "diverged"], rows)

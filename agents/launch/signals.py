@@ -55,8 +55,7 @@ def exit_on_signals(script: str) -> None:
 
 @contextlib.contextmanager
 def handled(
-    on_first: Callable[[int], None],
-    on_second: Callable[[int], None] = lambda number: None,
+    on_first: Callable[[int], None], on_second: Callable[[int], None] = lambda number: None
 ) -> Iterator[list[int]]:
     """Handles signals for the duration of the context.
 

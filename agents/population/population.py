@@ -32,7 +32,6 @@ from megastep.agents.population import decisions
 from megastep.agents.runs import json_lines, populations
 from megastep.agents.training.callbacks import Evaluations
 from megastep.agents.training.episode_stats import MIN_EPISODES
-from megastep.agents.training.loggers import call_lines
 from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import optional
 
@@ -215,7 +214,7 @@ class Population:
                     one.wait_for_collector()
                 one.saver.wait()
             if self.lines is not None:
-                call_lines(self.lines, "close")
+                self.lines.close()
 
     def _after_round(self) -> None:
         leader, before, is_due = self.leader, self.samples_at_round, False
@@ -341,13 +340,13 @@ class Population:
             of_settings = self.settings[member].items()
             row |= {f"{populations.KEY}{key}": value for key, value in of_settings}
             if self.lines is not None:
-                call_lines(self.lines, "write", self.samples, row)
+                self.lines.write(self.samples, row)
 
     def _are_written(self) -> bool:
         """Flushes the generations to disk, which a checkpoint must not reach beyond. Returns
         whether they are there.
         """
-        return self.lines is None or call_lines(self.lines, "sync")
+        return self.lines is None or self.lines.sync()
 
     def close(self) -> None:
         """Closes the members' environments and files."""

@@ -20,13 +20,12 @@ if TYPE_CHECKING:
 
 class JsonLines:
     """Appends lines to a file, unbuffered. Lines that a full disk refuses are written with the next
-    line.
+    line; the first error is a warning.
     """
 
     def __init__(self, path: Path | str):
         self.path, self.has_warned = Path(path), False
         self.file = AppendedFile(self.path)
-        self.close, self.sync = self.file.close, self.file.sync
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
         """Appends a line. NaN and infinity become null."""
@@ -34,7 +33,27 @@ class JsonLines:
             key: value if isinstance(value, str) or math.isfinite(value) else None
             for key, value in values.items()
         }
-        self.file.write((json.dumps({"samples": step, **json_values}) + "\n").encode())
+        line = json.dumps({"samples": step, **json_values}) + "\n"
+        self._tolerated(self.file.write, line.encode())
+
+    def sync(self) -> bool:
+        """Flushes the lines to disk. Returns whether they are there."""
+        return self._tolerated(self.file.sync)
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._tolerated(self.file.close)
+
+    def _tolerated(self, call, *arguments) -> bool:
+        try:
+            call(*arguments)
+        except OSError as error:
+            if not self.has_warned:
+                text = f"{self.path} cannot be written ({error}); the run goes on"
+                warnings.warn(text, stacklevel=3)
+            self.has_warned = True
+            return False
+        return True
 
 
 def read(path: Path | str, kind: object = None) -> "list[Row]":

@@ -38,8 +38,7 @@ class Saver:
     Args:
         folder: the run's `checkpoints` folder, which all ranks share.
         config: the run's configuration, stored in each checkpoint.
-        keep_checkpoints: number of checkpoints to keep, besides the one with the best score.
-        made_with: versions and devices that the numbers depend on, see `provenance.made_with`.
+        keep_checkpoints, made_with: see `checkpoint.save`.
         replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is saved once per
             this many checkpoints, and with the last one if it has at most `LAST_REPLAY` bytes.
         launch: name of this start, the same on all ranks. Files of others are deleted.
@@ -49,7 +48,6 @@ class Saver:
         error: why the last checkpoint could not be written, as a sentence; None if it was
             written. Valid after `wait`.
         lacks_replay: True if the last call left out the replay buffer.
-        seconds: time that writing the last checkpoint took.
     """
 
     def __init__(
@@ -67,8 +65,7 @@ class Saver:
         self.made_with, self.replay_every = made_with, replay_every
         self.launch, self.rank, self.n_ranks = launch, rank, n_ranks
         self.error: str | None = None
-        self.lacks_replay = False
-        self.seconds, self._n_since_replay, self._number = 0.0, 0, 0
+        self.lacks_replay, self._n_since_replay, self._number = False, 0, 0
         self._pinned = {}
         self._thread: threading.Thread | None = None
         self._failure: tuple[int, int, Exception] | None = None
@@ -109,14 +106,16 @@ class Saver:
         """Returns the state, without a large replay buffer that is not due, or that there is too
         little memory to copy.
         """
-        self.lacks_replay = False
-        n_bytes = _nbytes(state.get("replay"))
+        self.lacks_replay, n_bytes = False, _nbytes(state.get("replay"))
         if n_bytes <= SMALL_REPLAY:
             return state
         self._n_since_replay += 1
         is_due = self._n_since_replay >= self.replay_every
         if is_due or (is_last and n_bytes <= LAST_REPLAY):
-            if n_bytes <= _free_memory() / 2:
+            free = math.inf
+            with contextlib.suppress(ValueError, OSError):  # not known everywhere
+                free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+            if n_bytes <= free / 2:
                 self._n_since_replay = 0
                 return state
             problem = "since there is too little memory to copy it"
@@ -130,7 +129,6 @@ class Saver:
         return self._thread is not None and self._thread.is_alive()
 
     def _write(self, step, state, score) -> None:
-        began = time.monotonic()
         try:
             if self.rank > 0:  # without the policy's weights, which rank 0 saves
                 self.folder.mkdir(parents=True, exist_ok=True)
@@ -142,7 +140,6 @@ class Saver:
                 checkpoint.save(self.folder, *what, self._collect)
         except Exception as error:
             self._failure = step, _nbytes(state), error
-        self.seconds = time.monotonic() - began
 
     def _rank_file(self, rank) -> Path:
         return self.folder / f".rank{rank}-{self.launch}-{self._number}"
@@ -230,15 +227,8 @@ def _on_host(node, path, pinned, devices) -> object:
 
 
 def check_plain(tree: object, name: str) -> None:
-    """Checks that a tree can be loaded without running code: it may hold tensors, numbers, strings,
-    None, and lists, tuples and dicts of these.
-
-    Args:
-        tree: what to check.
-        name: the tree's name in messages.
-
-    Raises:
-        TypeError: naming the path of anything else.
+    """Raises TypeError, naming the path in a tree of this name, for what cannot be loaded without
+    running code. A tree may hold tensors, numbers, strings, None, lists, tuples and dicts.
     """
     if isinstance(tree, (dict, list, tuple)):
         for key, part in tree.items() if isinstance(tree, dict) else enumerate(tree):
@@ -248,13 +238,6 @@ def check_plain(tree: object, name: str) -> None:
             f"{name} is a {type(tree).__module__}.{type(tree).__name__}, and checkpoints hold "
             "tensors, numbers, strings, lists and dicts only: convert it, for example with float()"
         )
-
-
-def _free_memory() -> float:
-    """Returns free memory in bytes, infinity if unknown."""
-    with contextlib.suppress(ValueError, OSError):
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return math.inf
 
 
 def _nbytes(state) -> int:

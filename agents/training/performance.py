@@ -41,18 +41,6 @@ class Timing:
         self._seconds = {}
         self._starts = deque()  # (phase, its start); the ends of all but the last are starts too
 
-    def on_collect(self, trainer: Trainer) -> None:
-        """Begins the first phase."""
-        self.start(PHASES[0])
-
-    def on_rollout(self, trainer: Trainer, rollout: object) -> None:
-        """Begins the second."""
-        self.start(PHASES[1])
-
-    def on_update(self, trainer: Trainer, losses: object) -> None:
-        """Begins the last."""
-        self.start(PHASES[2])
-
     def start(self, phase: str) -> None:
         """Ends the current phase and starts another, without waiting for a GPU."""
         if self.times_phases:
@@ -78,8 +66,7 @@ class Timing:
         seconds, self._seconds = self._seconds, {}
         return seconds
 
-    def _now(self) -> Any:
-        """Returns this moment: seconds, on a GPU an event."""
+    def _now(self) -> Any:  # seconds, on a GPU an event
         if self.device.type != "cuda":
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)

@@ -30,7 +30,6 @@ class RunState:
             self.env_state = EnvState(trainer.env)
         else:
             self.env_state = EnvState(self.opponents.env, self.opponents.scripted)
-        self.replay_buffer = trainer.learner_options.replay_buffer
         self.is_resumable = optional(self.env_state.env, "resumable")  # checkpoints hold it
         self.has_named_unreachable = False
 
@@ -54,7 +53,7 @@ class RunState:
             parts["env"] = self.env_state.state_dict()
             parts["collector"] = self.collect.state_dict()
         others = dict(opponents=self.opponents, curriculum=trainer.curriculum)
-        others["replay"] = self.replay_buffer
+        others["replay"] = trainer.learner_options.replay_buffer
         return parts | {k: part.state_dict() for k, part in others.items() if part is not None}
 
     def of_policy(self) -> StateDict:
@@ -76,8 +75,10 @@ class RunState:
         trainer.samples_at_report = state["samples_at_report"]
         trainer.evaluation = evaluation_in(state)
         trainer.updates_at_checkpoint = trainer.updates_at_report = trainer.updates
-        if is_new_rank:
-            state = self._of_new_rank(state)
+        if is_new_rank:  # with generators of its own
+            own = self.state_dict(has_episodes=False)
+            names = [name for name in ("learner", "opponents") if name in state]
+            state = {**state, **{k: _with_generators(state[k], own[k]) for k in names}}
         trainer.policy.load_state_dict(state["policy"])
         trainer.learner.load_state_dict(state["learner"])
         lost = self._load_episodes(state)
@@ -88,19 +89,12 @@ class RunState:
             self.opponents.load_state_dict(parts)
         if trainer.curriculum is not None:
             trainer.curriculum.load_state_dict(state["curriculum"])
-        if self.replay_buffer is not None:
+        if (replay := trainer.learner_options.replay_buffer) is not None:
             if "replay" in state:
-                self.replay_buffer.load_state_dict(state["replay"])
+                replay.load_state_dict(state["replay"])
             else:
                 lost.append("the replay buffer was not saved and starts empty")
         trainer.lost = ["added ranks start new episodes"] if is_new_rank else lost
-
-    def _of_new_rank(self, state) -> StateDict:
-        """Returns rank 0's state with this rank's generators."""
-        own = self.state_dict(has_episodes=False)
-        names = [name for name in ("learner", "opponents") if name in state]
-        parts = {name: _with_generators(state[name], own[name]) for name in names}
-        return {**state, **parts}
 
     def _load_episodes(self, state) -> list[str]:
         """Restores env, actor state and episode statistics. Returns what is lost."""
@@ -108,9 +102,8 @@ class RunState:
         if "env" not in state:
             lost.append("environments were not saved, so new episodes start")
         elif not state["collector"]:
-            lost.append(
-                f"{type(self.trainer.collect).__name__} has no state_dict, so new episodes start"
-            )
+            kind = type(self.trainer.collect).__name__
+            lost.append(f"{kind} has no state_dict, so new episodes start")
         else:
             try:
                 self.env_state.load_state_dict(state["env"])

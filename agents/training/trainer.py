@@ -10,9 +10,8 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.ranks import Plan, Ranks, world
 from megastep.agents.runs.saver import NoSaver, Saver
 from megastep.agents.training.budget import Budget, Stopwatch
-from megastep.agents.training.callbacks import Callbacks, Losses
+from megastep.agents.training.callbacks import Callbacks, Losses, NonFiniteGuard
 from megastep.agents.training.episode_stats import Episodes
-from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import Timing
 from megastep.agents.training.run_state import RunState
 from megastep.agents.training.tuning import Tuning
@@ -160,10 +159,13 @@ class Trainer:
     def update(self, lr_fraction: float = 1.0) -> None:
         """Collects a rollout and learns from it, at a fraction of the initial learning rate."""
         self.lr_fraction = lr_fraction
+        self.timing.start("collect")
         self.callbacks("on_collect", self)
         self.rollout = self.collect()
+        self.timing.start("update")
         self.callbacks("on_rollout", self, self.rollout)
         losses = self.learner.update(self.rollout)
+        self.timing.start("rest")
         self.samples += self.rollout.n_steps * self.rollout.n_lanes * self.ranks.n
         self.updates += 1
         self.callbacks("on_update", self, losses)
@@ -206,7 +208,7 @@ class Trainer:
         self.seconds_at_checkpoint = self.clock.seconds
         if not self.ranks.any(not self.is_saved or (is_last and self.saver.lacks_replay)):
             return
-        if not is_last and self.ranks.any(not self.callbacks.all("may_save", self)):
+        if not is_last and self.ranks.any(False in self.callbacks("may_save", self)):
             return
         self.run_state.warn_of_unreachable()
         state = self.run_state.state_dict() if state is None else state

@@ -16,7 +16,7 @@ from megastep.agents.algorithms.learner import GradientLearner
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.cli import entry, train
 from megastep.agents.errors import UserError
-from megastep.agents.launch.finishing import compare_population
+from megastep.agents.launch.finishing import compare
 from megastep.agents.population.population import Population
 from megastep.agents.runs import checkpoint, json_lines, populations, scores
 from megastep.agents.training.trainer import Trainer
@@ -267,7 +267,7 @@ def test_a_repeated_population_has_the_same_bits(here, monkeypatch, capsys):
     with open("P/member-1/metrics.jsonl", "a") as file:
         file.write("{}\n")
     with pytest.raises(UserError, match="member-1/metrics.jsonl differs from that of P from line"):
-        compare_population(Path("again"), Path("P"))
+        compare(Path("again"), Path("P"))
     (here / "P" / populations.FILE).unlink()
     err = refused(capsys, "rerun=P", "folder=third")
     assert "population.jsonl does not hold the generations" in err and err.count("\n") == 1

@@ -7,7 +7,7 @@ import torch
 
 from megastep.agents.distributed.ranks import ONE, Ranks
 from megastep.agents.runs import json_lines, provenance
-from megastep.agents.training import nonfinite_guard
+from megastep.agents.training import callbacks
 from megastep.agents.training.episode_stats import EpisodeStats
 from tests.training.test_trainer import UPDATE, make_trainer
 
@@ -30,7 +30,7 @@ def one_by_one(monkeypatch):
                     return [value, value]
                 return [value, of_rank_1.pop(0)]
 
-        monkeypatch.setattr(nonfinite_guard, "rank_label", lambda: LABELS[rank])
+        monkeypatch.setattr(callbacks, "rank_label", lambda: LABELS[rank])
         return Made(rank, 2)
 
     return act_as

@@ -20,9 +20,8 @@ from megastep.agents.runs.annealing import AnnealingRecord
 from megastep.agents.runs.saver import Saver
 from megastep.agents.training import performance
 from megastep.agents.training.budget import Budget
-from megastep.agents.training.callbacks import Evaluations
+from megastep.agents.training.callbacks import MAX_SKIPPED, Evaluations
 from megastep.agents.training.loggers import Loggers
-from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from megastep.agents.training.performance import MAX_AHEAD
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict

@@ -73,19 +73,15 @@ class Loggers:
         values = {name: x for name, x in metrics.items() if name != "samples"}
         perf = {name: x for name, x in values.items() if name.startswith("perf/")}
         of_seed = {name: x for name, x in values.items() if name not in perf}
-        call_lines(self.metrics, "write", step, of_seed)
-        call_lines(self.perf, "write", step, perf)
+        self.metrics.write(step, of_seed)
+        self.perf.write(step, perf)
         self._call_others("write", step, {**of_seed, **perf})
 
     def may_save(self, trainer: object) -> bool:
         """Flushes the metrics to disk, which a checkpoint must not reach beyond. Returns whether
         they are there.
         """
-        try:
-            self.metrics.file.sync()
-        except OSError:
-            return False
-        return True
+        return self.metrics.sync()
 
     def finish(self, step: int, result: RunResult) -> None:
         """Gives the result of the run to all loggers that have a method `finish`."""
@@ -95,8 +91,8 @@ class Loggers:
 
     def close(self) -> None:
         """Closes the files and every logger."""
-        for lines in self.metrics, self.perf:
-            call_lines(lines, "close")
+        self.metrics.close()
+        self.perf.close()
         self._call_others("close")
 
     def _call_others(self, method, *args) -> None:
@@ -107,19 +103,6 @@ class Loggers:
                 del self.others[name]
                 text = f"logger={name} failed and is dropped ({first_line(error)})"
                 warnings.warn(text, stacklevel=3)
-
-
-def call_lines(lines: JsonLines, method: str, *args: object) -> bool:
-    """Calls a method of a file of lines. Returns whether it succeeded; warns of its first error."""
-    try:
-        getattr(lines, method)(*args)
-    except Exception as error:
-        if not lines.has_warned:
-            lines.has_warned = True
-            text = f"{lines.path} cannot be written ({first_line(error)}); the run goes on"
-            warnings.warn(text, stacklevel=3)
-        return False
-    return True
 
 
 def first_line(error: Exception) -> str:
