@@ -221,11 +221,12 @@ class Run:
 
     def too_short(self) -> str:
         """Returns why a run has no mean return, and how long it has to be for one."""
-        trainer, most = self.training, optional(self.training.env, "max_episode_steps")
+        trainer = self.training
         n_lanes = trainer.rollout.n_lanes * trainer.ranks.n
         n_steps = trainer.samples // n_lanes
         length = f"more than {int(trainer.episodes.stats.totals[1].max())}"
-        if most < DEFAULTS["max_episode_steps"]:
+        most = getattr(trainer.env, "limit", None) or optional(trainer.env, "max_episode_steps")
+        if isinstance(most, int) and most < DEFAULTS["max_episode_steps"]:
             length, n_steps = f"up to {most}", max(n_steps, most)
         return (  # twice as many, since the first episodes begin at random ages
             f"no mean return yet: an episode has {length} steps, and each of {n_lanes} lanes took "
