@@ -30,15 +30,6 @@ class Ending(NamedTuple):
     text: str = ""  # the error or the signal; empty after success, or if it was printed already
     folder: str | None = None  # the run folder, after training finished
 
-    def raise_error(self) -> None:
-        """Raises the error or signal that ended the script, as UserError or Interrupted, if any."""
-        if self.code > 128:
-            raise signals.Interrupted(self.code - 128, self.text)
-        if self.code:
-            error = UserError(self.text)
-            error.code = self.code
-            raise error
-
 
 def ending_of(work: Callable[[], int | None]) -> Ending:
     """Calls a function, which returns an exit code or None for 0. Returns how it ended.

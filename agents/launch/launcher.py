@@ -22,7 +22,7 @@ from pathlib import Path
 
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
-from megastep.agents.errors import ConfigErrors, user_errors
+from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check, settings
 from megastep.agents.launch import endings, gpu, signals
 from megastep.agents.runs import typed_json
@@ -85,9 +85,11 @@ def run(cfg: settings.Train) -> Path:
         by_signal = ending.code == 128 + numbers[0]
         name = signal.Signals(numbers[0]).name
         raise signals.Interrupted(numbers[0], ending.text if by_signal else f"stopped by {name}")
-    ending.raise_error()
-    assert ending.folder is not None
-    return Path(ending.folder)
+    if ending.code > 128:
+        raise signals.Interrupted(ending.code - 128, ending.text)
+    if ending.code:
+        raise UserError(ending.text, ending.code)
+    return Path(str(ending.folder))
 
 
 class Job:

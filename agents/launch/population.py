@@ -100,7 +100,8 @@ class PopulationRun(Run):
         """Makes the population of the members of all ranks."""
         cfg, chosen, repeated, visitor = self.cfg, self.cfg.population, None, None
         if cfg.rerun:
-            repeated = populations.samples_of_generations(Path(cfg.rerun) / populations.FILE)
+            generations = populations.read(Path(cfg.rerun) / populations.FILE)
+            repeated = {rows[0]["samples"] for rows in generations[1:]}
         if len(self.trainers) < chosen.size:
             env = self.trainers[0].env
             policy = factory.make_policy(cfg.agent, env, cfg.seed, cfg.agent.critic)

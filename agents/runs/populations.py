@@ -130,11 +130,6 @@ def read(path: Path) -> "list[list[Row]]":
         return groups
 
 
-def samples_of_generations(path: Path) -> set[int]:
-    """Returns the samples of each member after which it may copy another. Raises as `read`."""
-    return {rows[0]["samples"] for rows in read(path)[1:]}
-
-
 def first_copy(folder: Path) -> int | None:
     """Returns the generation in which a member first copied another; None if it never did, or if
     no file says so.

@@ -51,12 +51,9 @@ class Budget:
         """
         if updates < len(self.recorded) and not math.isnan(self.recorded[updates]):
             return self.recorded[updates]
-        over = self.anneal
-        if over == "never":
-            if not self.is_scheduled:
-                return 1.0
-            over = "samples" if self.samples is not None else "seconds"
-        if over == "samples":
+        if self.anneal == "never" and not self.is_scheduled:
+            return 1.0
+        if self.anneal == "samples" or (self.anneal == "never" and self.samples is not None):
             return max(0.0, _fraction_left(samples, self.samples))
         return max(0.0, _fraction_left(seconds, self.seconds))
 

@@ -195,7 +195,8 @@ class Trainer:
         self.updates_at_report, self.is_save_due = self.updates, False
         metrics: dict[str, Any] = {}
         self.callbacks("on_measure", self, metrics)
-        metrics |= self.tuning.scheduled_values()
+        scheduled = self.tuning.scheduled.items()
+        metrics |= {f"schedule/{name}": value for name, value in scheduled if name != "lr"}
         metrics |= {"updates": self.updates, "lr": self.lr, "anneal": self.budget.anneal}
         self.metrics = metrics | {"samples": self.samples}
         self.callbacks("on_report", self, self.metrics)

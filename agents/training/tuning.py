@@ -101,7 +101,3 @@ class Tuning:
         """Reads the learning rate where the learner changes it."""
         if self.options.read_lr:
             trainer.lr = self.options.read_lr()
-
-    def scheduled_values(self) -> dict[str, float]:
-        """Returns the settings that have a schedule, as metrics."""
-        return {f"schedule/{name}": x for name, x in self.scheduled.items() if name != "lr"}
