@@ -52,17 +52,17 @@ def test_only_a_checkout_of_its_own_has_a_commit(checkout, tmp_path, monkeypatch
     assert provenance.commit(folder) is None
 
 
-def test_each_start_of_a_run_is_a_line(checkout, tmp_path, monkeypatch):
+def test_each_start_of_a_run_is_a_line(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "orig_argv", ["python", "train.py", "folder=two words"])
     monkeypatch.setattr(package, "version", lambda: "megastep 9.9")
-    monkeypatch.setattr(package, "ROOT", checkout[0])
+    monkeypatch.setattr(provenance, "commit", lambda path: path.name)
     for samples in (0, 640):
         provenance.record(tmp_path, samples, CPU)
     rows = json_lines.read(tmp_path / "provenance.jsonl")
     assert [row["samples"] for row in rows] == [0, 640]
     row = rows[1]
     assert row["command"] == "python train.py 'folder=two words'"
-    assert (row["commit"], row["megastep"]) == (checkout[1], "megastep 9.9")
+    assert (row["commit"], row["megastep"]) == (package.ROOT.name, "megastep 9.9")
     assert row["torch"] == torch.__version__ and row["device"].startswith("cpu ")
     assert row["python"] == ".".join(map(str, sys.version_info[:3])) and "T" in row["time"]
 

@@ -56,7 +56,7 @@ def test_metrics_by_kind_of_opponent(here):
     assert {f"episode/return/{name}" for name in parts} <= rows[-1].keys()
     assert evaluate.main([f"run={folder}", "against=bot", "episodes=4", "device=cpu"]) == 0
     (path,) = folder.glob("evaluations/*.md")
-    assert "tests.helpers.games:High" in path.read_text(), "bot is the run's own"
+    assert "bot, as right" in path.read_text(), "the environment's own"
 
 
 class Configured(Always):
